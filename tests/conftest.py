@@ -21,11 +21,11 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+from crisalad_jax.config.registry import REGISTRIES
 
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config import plugins
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.config.parts import REGISTRIES
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import COLUMNS, read_places
 from crisalad_jax.data.reading import Reading

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from crisalad_jax.config.registry import REGISTRIES
 
 from crisalad_jax.config import plugins
-from crisalad_jax.config.parts import REGISTRIES
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig

@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from crisalad_jax.config.registry import REGISTRIES
 
 import crisalad_jax as cj
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.config import plugins, source
 from crisalad_jax.config.io import read_config, to_plain
-from crisalad_jax.config.parts import REGISTRIES
 from crisalad_jax.config.plugins import load_plugin
 from crisalad_jax.losses import LossConfig, metric_loss
 from crisalad_jax.nn.model import Model, describe

@@ -22,8 +22,8 @@ from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.download import MissingFileError, download
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, user_cache, write_json
-from crisalad_jax.utils.locks import next_writer
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.locks import lock
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.version import VERSION
 
 OFFLINE, MIRROR = "CRISALAD_OFFLINE", "CRISALAD_MIRROR"
@@ -76,7 +76,7 @@ def _make(model: Published, *, quiet: bool) -> None:
     published = _folder(model) / model.file
     if not published.is_file():
         _check_obtainable(model)
-    with next_writer(_folder(model)):
+    with lock(_folder(model), wait=True):
         if not _is_ready(model):
             _check_torch(model)
             address = None
@@ -153,7 +153,7 @@ def _download(model: Published, target: pathlib.Path, *, quiet: bool) -> str:
         with contextlib.suppress(MissingFileError):
             download(address, target, label=model.name, quiet=quiet)
             return address
-        tell(f"{address}: found no such file; looking at {last}")
+        warn(f"{address}: found no such file; looking at {last}")
     try:
         download(last, target, label=model.name, quiet=quiet)
     except MissingFileError as error:

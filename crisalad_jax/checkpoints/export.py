@@ -31,9 +31,9 @@ from crisalad_jax.checkpoints.runtime import (
 )
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
 from crisalad_jax.config.checks import PATH, check_count, check_types, takes
-from crisalad_jax.config.concise import concise
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
+from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.data.prepare import normalised
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import (
@@ -52,7 +52,7 @@ from crisalad_jax.utils.compiler import number_types
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.files import atomic_folder, check_new_folder, write_json
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.target import PORTABLE, STRAIGHT, lowering_for
 
@@ -77,7 +77,7 @@ _PROBES = 3
 """Images that a program of any number of images is checked with."""
 
 
-@concise()
+@short_repr()
 @dataclasses.dataclass(frozen=True)
 class ExportConfig:
     """The format, the inputs and the platforms of an exported program.
@@ -252,7 +252,7 @@ def write_export(
         _check_calibration(calibration, config, how)
     if config.preprocessing.size_rule != "fixed":
         size = " x ".join(map(str, config.input_size))
-        tell(
+        warn(
             f"{out}: found images of size rule {config.preprocessing.size_rule}; the program takes "
             f"{size} alone"
         )

@@ -34,10 +34,10 @@ from crisalad_jax.checkpoints.torch_io import (
 )
 from crisalad_jax.checkpoints.weights import FORMAT, check_sizes, save_weights, unpack_weights
 from crisalad_jax.config.checks import PATH, choose, takes
-from crisalad_jax.config.concise import brief
-from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
+from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.config.preprocessing import PreprocessingConfig
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.aggregators.vlad import AnyLoc, AnyLocConfig
 from crisalad_jax.nn.backbones import Backbone
 from crisalad_jax.nn.config import ModelConfig
@@ -230,7 +230,7 @@ def write_checkpoint(
             f"{path}: found suffix {path.suffix!r}, expected {' or '.join(wanted)} for {format}"
         )
     shown = check_holds(config, format)
-    is_shown = format != REFERENCE and with_free_fields_of(config, shown) == shown
+    is_shown = format != REFERENCE and with_non_semantic_fields_of(config, shown) == shown
     declared = {
         "format": format,
         "config": to_plain(config),
@@ -352,7 +352,7 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
     if type(theirs) is type(config):
         theirs, params = config.adapt_checkpoint(theirs, params, fresh)
     # Ignore free fields, such as the initialisation: weights do not depend on them.
-    wrong = differences(with_free_fields_of(config, theirs), config, "backbone")
+    wrong = differences(with_non_semantic_fields_of(config, theirs), config, "backbone")
     if wrong:
         raise InputError(f"{path}: this backbone is another than the model's: {'; '.join(wrong)}")
     return params

@@ -12,16 +12,16 @@ import jax
 import numpy as np
 
 from crisalad_jax.checkpoints.safetensors_io import read_safetensors, unseal, write_sealed
-from crisalad_jax.config.fields import essence, with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
-from crisalad_jax.config.source import changed_sources, source_bytes_of, sources_of
+from crisalad_jax.config.part import fingerprint_fields, with_non_semantic_fields_of
+from crisalad_jax.config.plugins import changed_sources, source_bytes_of, sources_of
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.diff_trees import diff_trees, not_finite
 from crisalad_jax.nn.model import Crisalad, Model, check_params, parameter_shapes
 from crisalad_jax.utils.checksums import ChangedFileError
 from crisalad_jax.utils.errors import InputError, few
 from crisalad_jax.utils.files import user_cache
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.version import VERSION
 
@@ -199,7 +199,7 @@ def unpack_weights(
     same_version = header.version == VERSION
     changed = changed_sources(config, header.parts, same_version, header.source_bytes)
     if changed:
-        tell(
+        warn(
             f"{path}: found another source of {', '.join(changed)} than these weights were written "
             "with; descriptors may differ"
         )
@@ -212,7 +212,7 @@ def unpack_weights(
 
 
 def _as_free_as(expected: ModelConfig, config: ModelConfig) -> ModelConfig:
-    free = with_free_fields_of(expected, config)
+    free = with_non_semantic_fields_of(expected, config)
     if config.aggregator.fixed_grid:
         free = dataclasses.replace(free, image_size=config.image_size)
     return free
@@ -277,7 +277,7 @@ def model_hash(params: Crisalad, config: ModelConfig) -> str:
     Returns:
         SHA-256 in hexadecimal digits.
     """
-    plain = essence(config)
+    plain = fingerprint_fields(config)
     if config.aggregator.fixed_grid:
         plain["image_size"] = list(config.image_size)
     digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())

@@ -18,10 +18,9 @@ from typing import Any
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.plugins import has_plugins, load_entry_points, load_plugin, plugin_failure
-from crisalad_jax.utils.errors import InputError, Stopped, how_ended
+from crisalad_jax.utils.errors import InputError, Interrupted, how_ended
 from crisalad_jax.utils.extras import missing_extra
-from crisalad_jax.utils.notes import Note
-from crisalad_jax.utils.output import one_line, printable
+from crisalad_jax.utils.output import Note, one_line, printable
 from crisalad_jax.utils.version import VERSION
 
 _COMMANDS = {
@@ -118,11 +117,11 @@ def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
             abs(number) <= 2**40, f"--{flag}: found {number}, expected a number of at most 2**40"
         )
     if not hasattr(module, "needs_jax") or module.needs_jax(chosen):
-        from crisalad_jax.utils import compiler, kept
+        from crisalad_jax.utils import compiler, executable_cache
 
         compiler.set_up()
         if keep_programs and not has_plugins():
-            kept.keep_programs()
+            executable_cache.cache_executables()
     module.run(chosen)
 
 
@@ -176,7 +175,7 @@ def _exit_code(given: list[str], keep_programs: bool) -> int:
         _check_command(given[0])
         _run(given[0], given[1:], keep_programs)
         return 0
-    except Stopped as stopped:
+    except Interrupted as stopped:
         reason, code = str(stopped), 128 + stopped.number
     except KeyboardInterrupt:
         reason, code = how_ended(signal.SIGINT), 128 + signal.SIGINT

@@ -13,7 +13,7 @@ import rich.table
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.config.checks import check_seed
-from crisalad_jax.config.fields import with_free_fields_of
+from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_format, check_target, write_json
 from crisalad_jax.utils.output import printable
@@ -247,7 +247,7 @@ def untrained(preset: str, flags: Any) -> "tuple[Model, str]":
 def _changed(config: "ModelConfig", flags: Any, like: "ModelConfig | None" = None) -> "ModelConfig":
     """Change how images are resized and computed to what the map and the flags say."""
     if like is not None:
-        config = with_free_fields_of(like, config)
+        config = with_non_semantic_fields_of(like, config)
     if flags.compute_dtype is not None:
         config = dataclasses.replace(config, compute_dtype=flags.compute_dtype)
     return config.resized(flags.image_size, flags.resize)

@@ -7,7 +7,7 @@ import numpy as np
 
 from crisalad_jax.config.preprocessing import BitDepth
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import UInt8, UInt16
 
 PERCENTILES = (1, 99)
@@ -93,7 +93,7 @@ def _note_narrow(image: UInt16[np.ndarray, "..."], name: str) -> None:
             return
         _noted.add(name)
     levels = int(high) // 256 - int(low) // 256 + 1
-    tell(
+    warn(
         f"{name}: 16-bit values from {low:,.0f} to {high:,.0f} of 65,535 become {levels} of 256 "
         "grey levels; --resize contrast-stretch spreads them over all"
     )

@@ -20,7 +20,7 @@ from crisalad_jax.data.positions import AXES, Positions, positions_of, utm_posit
 from crisalad_jax.data.sources import ImageSource, check_rate_used, open_source
 from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float64, Int64
 
 _APART = 4
@@ -64,7 +64,7 @@ def places_by_position(
             "table as --data, @UTM names or EXIF data; --place-frames takes images in order"
         )
     if len(names) < len(source.names):
-        tell(
+        warn(
             f"{root}: left out {len(source.names) - len(names)} of {len(source.names)} images, "
             "which have no position"
         )

@@ -12,7 +12,7 @@ from crisalad_jax.data.images import OnBadImage, list_images
 from crisalad_jax.data.named_table import NamedRow, named_rows
 from crisalad_jax.data.video import is_video
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float64
 
 TABLE = "places.csv"
@@ -107,7 +107,7 @@ def _read_table(table: pathlib.Path, on_bad_image: OnBadImage) -> OwnPlaces:
     if not places:
         raise InputError(f"{table}: found none of {missing} images, expected some")
     if missing:
-        tell(f"{table}: left out {missing} of {len(rows)} images, which are missing")
+        warn(f"{table}: left out {missing} of {len(rows)} images, which are missing")
     return OwnPlaces(table.parent, places, views or None)
 
 

@@ -17,14 +17,14 @@ from typing import Literal
 import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.grouped_places import places_by_order, places_by_position
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.names import Disk, plain
 from crisalad_jax.data.own_places import OwnPlaces, read_own_places, views_in_order
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source, real_path
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float64, Int, Int32, Int64
 
 COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
@@ -195,7 +195,7 @@ def _own_places(root: pathlib.Path, found: OwnPlaces, min_images: int, words: st
             f"{largest}, of {len(found.images)} places{flags}"
         )
     if len(kept) < len(found.images):
-        tell(
+        warn(
             f"{root}: left out {len(found.images) - len(kept)} of {len(found.images)} places, with "
             f"fewer than {min_images} images{words}"
         )
@@ -270,7 +270,7 @@ def _read_city(
             raise _no_image(root, table, line, (city_id, name), stem)
         places.setdefault(place, {})[image] = None
     if missing:
-        tell(f"{table}: left out {missing} rows, whose images are missing")
+        warn(f"{table}: left out {missing} rows, whose images are missing")
     ids = {place % IDS_PER_CITY: place for place in places}
     if len(ids) < len(places):
         first = next(place for place in places if ids[place % IDS_PER_CITY] != place)

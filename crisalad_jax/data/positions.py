@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.named_table import NamedRow, named_rows
 from crisalad_jax.data.names import matched

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Self
 
 from crisalad_jax.config.checks import check_count, check_types
-from crisalad_jax.config.field_docs import with_field_docs
 from crisalad_jax.config.preprocessing import Size
+from crisalad_jax.config.short_repr import with_field_docs
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.loader import THREADS, ImageBatch, ImageCache, image_batches
 from crisalad_jax.data.prepare import Preparation

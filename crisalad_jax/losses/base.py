@@ -11,8 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.classes import ClassesConfig
-from crisalad_jax.config.concise import brief
-from crisalad_jax.config.parts import Part, Registry, count_arguments
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import Registry, count_arguments
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.utils.pytree import expect_like
 
 Similarities = Float[Array, "anchor image"]

@@ -11,8 +11,8 @@ from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import check_types, require, require_fraction, require_positive
-from crisalad_jax.config.concise import concise
-from crisalad_jax.config.fields import free_field
+from crisalad_jax.config.part import non_semantic_field
+from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.nn.attention import Attention, dot_product_attention
 from crisalad_jax.nn.layers import at_least_float32, dropout, gelu, linear, split_key
 from crisalad_jax.nn.torch_layers import EncoderLayer, encoder_layer, init_encoder_layer
@@ -20,7 +20,7 @@ from crisalad_jax.utils.devices import IMAGE, image_mesh
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 
-@concise(switch=("layers", 0))
+@short_repr(switch=("layers", 0))
 @dataclasses.dataclass(frozen=True)
 class CrossImageConfig:
     """The transformer encoder that attends across the images of a batch (paper section 3.4).
@@ -34,7 +34,7 @@ class CrossImageConfig:
     """Number of layers. 0 leaves the encoder out, so that descriptors depend on no other image."""
     heads: int = 16
     feedforward: int = 2048
-    dropout: float = free_field(0.1)
+    dropout: float = non_semantic_field(0.1)
     global_token: bool = True
     """Whether the global token takes part too, cut into tokens of the clusters' width."""
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.loader import ImageBatch
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading

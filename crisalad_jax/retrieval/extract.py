@@ -15,8 +15,8 @@ import numpy as np
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count, check_seed, choose
-from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import check_lines, read_pixels
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
@@ -46,11 +46,11 @@ from crisalad_jax.utils.files import (
     check_target,
     read_json,
     real_path,
-    told_of,
+    wrap_os_errors,
     write_json,
 )
-from crisalad_jax.utils.locks import one_writer
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.locks import lock
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.temporaries import in_use, remove_temporaries, temporary_beside
 
@@ -202,7 +202,7 @@ def extract(
         skipped = read_json(record_of(out), "a record of descriptors")["skipped"]
         return Extracted(listed, descriptors, skipped)
     mine = shares.share.of(len(paths), reading.batch_size)
-    with one_writer(shares.own):
+    with lock(shares.own):
         own = work.resume(shares.own, paths[mine], names[mine])
         listed, skipped = _names_of([own], names[mine])
         found = Extracted(listed, np.empty((0, length), np.float32), skipped)
@@ -313,7 +313,7 @@ class _Work:
             segments = self.opened(folder)
             segments.verify()
         except InputError as error:
-            tell(f"{error}; the work in this folder starts again")
+            warn(f"{error}; the work in this folder starts again")
             _remove_work(folder)
             done, segments = 0, self.opened(folder)
         write_json(folder / _PLAN, plan)
@@ -388,7 +388,7 @@ class _Work:
             raise InputError(f"{self.source}: found {len(names)} images, none of them readable")
         file = temporary_beside(folder / "rows.npy")
         with in_use(file):
-            with told_of(folder), RowFile(file, len(stored), self._length) as target:
+            with wrap_os_errors(folder), RowFile(file, len(stored), self._length) as target:
                 for numbers, rows in self._descriptors(parts, len(stored)):
                     target.write(numbers, rows)
             yield Extracted(stored, open_npy(file, verify=False), skipped), file
@@ -447,7 +447,7 @@ def _work_folder(out: StrPath | None) -> Iterator[pathlib.Path]:
             yield pathlib.Path(temporary)
         return
     folder = pathlib.Path(out).with_name(f"{pathlib.Path(out).name}.partial")
-    with one_writer(folder):
+    with lock(folder):
         remove_temporaries(folder)
         try:
             yield folder
@@ -489,7 +489,7 @@ def _reusable(
             raise InputError("another plan")
     except InputError:
         if any(folder.glob("[0-9]*.json")):
-            tell(f"{folder}: found work of another model or batch size; it starts again")
+            warn(f"{folder}: found work of another model or batch size; it starts again")
         _remove_work(folder)
     done, broken = 0, False
     for record in sorted(folder.glob("[0-9]*.json")):
@@ -501,7 +501,7 @@ def _reusable(
         except (InputError, LookupError, TypeError):
             unusable, skipped = True, False
         if unusable and not broken:
-            tell(f"{record}: found work on other images, or damaged; from there on it starts again")
+            warn(f"{record}: found work on other images, or damaged; from there on it starts again")
         broken = broken or unusable
         if broken:
             record.unlink()

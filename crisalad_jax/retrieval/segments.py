@@ -19,11 +19,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from crisalad_jax.retrieval.maps.store import Store
-from crisalad_jax.utils.checksums import sealed_json
+from crisalad_jax.utils.checksums import checksummed_json
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import durable_path, read_json, write_json
-from crisalad_jax.utils.locks import BusyFolderError, one_writer
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.files import atomic_path, read_json, write_json
+from crisalad_jax.utils.locks import BusyFolderError, lock
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float, Int64
 
 SEGMENT = 256
@@ -45,8 +45,8 @@ def write_record(path: pathlib.Path, value: Mapping[str, Any], indent: int | Non
     Raises:
         InputError: the disk is full, or the folder cannot be written to.
     """
-    with durable_path(path) as temporary:
-        temporary.write_bytes(sealed_json(value, indent))
+    with atomic_path(path, durable=True) as temporary:
+        temporary.write_bytes(checksummed_json(value, indent))
 
 
 class Segments:
@@ -205,7 +205,7 @@ class Shares(NamedTuple):
             return None
         value = read_json(path, "a record of a share")
         if value.get("shares") != self.digest:
-            tell(
+            warn(
                 f"{path}: found a share of other images or settings; its process has to run again, "
                 "as the others do"
             )
@@ -228,9 +228,9 @@ class Shares(NamedTuple):
         """
         with contextlib.ExitStack() as stack:
             try:
-                stack.enter_context(one_writer(self.folder))
+                stack.enter_context(lock(self.folder))
             except BusyFolderError:
-                tell(f"{self.folder}: another process joins the shares")
+                warn(f"{self.folder}: another process joins the shares")
                 yield None
                 return
             found = [self.result(index) for index in range(self.share.count)]

@@ -19,7 +19,7 @@ from crisalad_jax.retrieval.describe import describe_prepared, prepare_image
 from crisalad_jax.retrieval.describer import Describer
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import durable_path, real_path
+from crisalad_jax.utils.files import atomic_path, real_path
 from crisalad_jax.utils.progress import progress_bar
 
 ADDED = "added"
@@ -138,7 +138,7 @@ class MapWorker:
             result.set_exception(error)
             return
         with _failing([result]):
-            with durable_path(root / work.name) as temporary:
+            with atomic_path(root / work.name, durable=True) as temporary:
                 temporary.write_bytes(work.data)
             try:
                 places.append(

@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 from crisalad_jax.synthetic.mesh import Rng
 from crisalad_jax.synthetic.view import Season
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json, told_of, write_json
+from crisalad_jax.utils.files import read_json, wrap_os_errors, write_json
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
 
 Files = Iterator[tuple[str, bytes]]
@@ -88,12 +88,12 @@ def write_set(
     with made_folder(root.parent), in_use(temporary):
         for name, data in files:
             path = temporary / name
-            with told_of(root):
+            with wrap_os_errors(root):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(data)
             if progress is not None and path.suffix == ".jpg":
                 progress(1)
-        with told_of(root):
+        with wrap_os_errors(root):
             write_json(temporary / file, _identity(config))
             os.replace(temporary, root)
 

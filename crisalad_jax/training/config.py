@@ -13,8 +13,9 @@ from crisalad_jax.config.checks import (
     require_fraction,
     require_positive,
 )
-from crisalad_jax.config.concise import concise
-from crisalad_jax.config.parts import OrName, part_field, resolve_names
+from crisalad_jax.config.part import OrName
+from crisalad_jax.config.registry import part_field, resolve_names
+from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.data.augmentations import AUGMENTATIONS, Augmentation
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -27,7 +28,7 @@ def _expect(config: object, name: str, fits: bool, expected: str) -> None:
     require(fits, f"{type(config).__name__}.{name}: found {found!r}, expected {expected}")
 
 
-@concise()
+@short_repr()
 @dataclasses.dataclass(frozen=True)
 class OptimiserConfig:
     """An optimiser of torch, with an optional warm-up and a learning rate that falls.
@@ -92,7 +93,7 @@ class OptimiserConfig:
         _expect(self, "clip_value", one, f"None with clip_norm {self.clip_norm}")
 
 
-@concise(switch=("kind", "none"))
+@short_repr(switch=("kind", "none"))
 @dataclasses.dataclass(frozen=True)
 class MiningConfig:
     """Tuples of a query, its nearest positive and its hardest negatives, by the model as it is.
@@ -141,7 +142,7 @@ class MiningConfig:
         _expect(self, "positive_radius", fits, f"metres above 0, and at most {most}")
 
 
-@concise("model", "loss")
+@short_repr("model", "loss")
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """A whole training run, apart from where its files lie.

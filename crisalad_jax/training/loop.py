@@ -15,9 +15,9 @@ import jax
 import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
-from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.config.source import sources_of
+from crisalad_jax.config.plugins import sources_of
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import THREADS, ImageCache, OnBadImage
 from crisalad_jax.data.places import Places
@@ -37,8 +37,8 @@ from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.training.trainer import LossNotFiniteError, Trainer
 from crisalad_jax.training.validation import Validator
 from crisalad_jax.utils import distributed
-from crisalad_jax.utils.errors import InputError, Stopped
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.errors import InputError, Interrupted
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.signals import SignalState, defer_signals
 
@@ -109,7 +109,7 @@ def fit(
             ground truth; `out` holds something else, or a run of another configuration or start; an
             image cannot be read; there are too few places, classes or images; the loss is no longer
             finite (the state before that step is saved); or a file cannot be written.
-        Stopped: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
+        Interrupted: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
 
     Example:
         >>> import dataclasses
@@ -206,12 +206,12 @@ def _warn_of_extension(config: TrainConfig, record: RunRecord, out: pathlib.Path
     """Warn if a run that is given more epochs differs from one that had them from the start."""
     optimiser = config.optimiser
     if record.stopped_early:
-        tell(
+        warn(
             f"{out}: the run stopped early at step {record.step}, by patience {config.patience}, "
             "which more epochs do not change"
         )
     elif optimiser.schedule == "linear" and optimiser.decay_steps is None:
-        tell(
+        warn(
             f"{out}: the learning rate falls over the whole run, so that it jumps at step "
             f"{record.step}: this is not the run of {config.epochs} epochs at once; "
             "--optimiser.decay-steps keeps a fall's length"
@@ -246,10 +246,10 @@ class _Loop:
                 # A signal to the process group also ends the workers that read images.
                 self._stop_together()
                 raise
-        except Stopped as stopped:
+        except Interrupted as stopped:
             self.save()
             where = f"after step {self.files.record.step}; the same command goes on"
-            raise Stopped(stopped.number, where) from None
+            raise Interrupted(stopped.number, where) from None
 
     def _take_rounds(self, steps: int) -> None:
         """Take rounds, with a validation or a mining before each that needs it.
@@ -315,7 +315,7 @@ class _Loop:
         if number or save_is_due:
             distributed.raise_together(self._log_steps)
         if number:
-            raise Stopped(number)
+            raise Interrupted(number)
         if save_is_due:
             self.save()
 
@@ -377,7 +377,7 @@ class _Loop:
         distributed.raise_together(save)
 
     def _stop_together(self) -> None:
-        """Raise `Stopped` in all processes if one of them was signalled."""
+        """Raise `Interrupted` in all processes if one of them was signalled."""
         (number,) = distributed.all_max(self.signals.number)
         if number:
-            raise Stopped(number)
+            raise Interrupted(number)

@@ -9,7 +9,7 @@ import optax
 from jaxtyping import Array, Int, PyTree
 
 from crisalad_jax.training.config import OptimiserConfig
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 WARMUP_SHARE = 4
 """Divisor of a run's steps: a warm-up takes a quarter of them at most, as BoQ's 10 of 40 epochs."""
@@ -138,7 +138,7 @@ def warn_of_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: in
     if config.warmup_epochs:
         flag, found = "epochs", f"{config.warmup_epochs}, which are {warmup} steps,"
     quarter = f"; at most {longest} steps would be a quarter" if longest else ""
-    tell(
+    warn(
         f"--optimiser.warmup-{flag}: found {found} for a run of {steps} steps, which leaves "
         f"{max(steps - warmup, 0)} at the learning rate and its decay{quarter}"
     )

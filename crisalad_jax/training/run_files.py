@@ -14,7 +14,7 @@ import numpy as np
 from crisalad_jax.checkpoints.train_state import StateStore
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config.io import differences, read_config, to_plain
-from crisalad_jax.config.source import changed_sources
+from crisalad_jax.config.plugins import changed_sources
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
@@ -25,8 +25,8 @@ from crisalad_jax.training.mining import Mined
 from crisalad_jax.training.step import TrainState
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json, told_of, write_json
-from crisalad_jax.utils.locks import one_writer
+from crisalad_jax.utils.files import read_json, wrap_os_errors, write_json
+from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remove_temporaries
 
 SAVE_SECONDS = 300
@@ -112,7 +112,7 @@ class RunFiles:
         out, config = self.out, self._config
         check_run(out, config)
         with contextlib.ExitStack() as opened:
-            opened.enter_context(one_writer(out))
+            opened.enter_context(lock(out))
             self.is_extended = acquire_run(out, config)
             for folder in (out, out / "best"):
                 remove_temporaries(folder)
@@ -126,7 +126,7 @@ class RunFiles:
                 self.record, state = RunRecord(**saved.record), saved.state
                 self._saved = copy.deepcopy(self.record)
             step, validated = self.record.step, self.record.validated
-            with told_of(out):
+            with wrap_os_errors(out):
                 if self.is_extended:
                     extend_run(out, config, step)
                 self._drop_old_best()
@@ -139,7 +139,7 @@ class RunFiles:
     def log(self, values: Mapping[str, int | float], *, of: str = "") -> None:
         """Append a line to the log; see `MetricsLog.write`."""
         if distributed.is_primary():
-            with told_of(self.out):
+            with wrap_os_errors(self.out):
                 self._log.write(values, of=of)
 
     def save_if_best(self, params: Crisalad) -> None:
@@ -148,7 +148,7 @@ class RunFiles:
         paths = [self.out / "best.safetensors"] if steps[0] == self.record.step else []
         if self._config.save_top_k > 1 and self.record.step in steps:
             paths.append(self._best_path(self.record.step))
-        with told_of(self.out):
+        with wrap_os_errors(self.out):
             for path in paths:
                 save_weights(path, Model(params, self._config.model))
 
@@ -162,7 +162,7 @@ class RunFiles:
         The state is written while training goes on.
         """
         if distributed.is_primary() and self._saved != self.record:
-            with told_of(self.out):
+            with wrap_os_errors(self.out):
                 save_weights(self.out / "last.safetensors", Model(params(), self._config.model))
                 self._states.save(self.record.step, state, dataclasses.asdict(self.record))
                 self._drop_old_best()
@@ -171,7 +171,7 @@ class RunFiles:
 
     def close(self) -> None:
         """Wait for files that are being written, and close them."""
-        with told_of(self.out):
+        with wrap_os_errors(self.out):
             self._opened.close()
 
     def _best_path(self, step: int) -> pathlib.Path:

@@ -31,7 +31,7 @@ from crisalad_jax.training.trainable import merge_params, shards_batch
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.devices import Devices, devices_for
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 Batch = tuple[jax.Array, jax.Array, jax.Array]
 """Images, labels, and which images are valid, on the devices."""
@@ -225,7 +225,7 @@ def _choose_devices(config: TrainConfig) -> Devices:
     devices = devices_for(images if spread else jax.process_count(), processes=True)
     found, used = len(jax.devices()), devices.mesh.size
     if spread and used < found and distributed.is_primary():
-        tell(
+        warn(
             f"training: found {found} devices for {images} images a step, of which {used} share "
             "them, the most that divide them in each process"
         )

@@ -10,8 +10,9 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.config.concise import brief
-from crisalad_jax.config.parts import Part, Registry
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import Registry
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.transport.problem import Matrix, Rows
 
 

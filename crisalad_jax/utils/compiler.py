@@ -11,8 +11,7 @@ from jax.extend.core import get_opaque_trace_state
 
 from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.host import usable_cores
-from crisalad_jax.utils.kept import kept
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.target import lowering_platforms, machine, over_devices_of, target
 
 _P = ParamSpec("_P")
@@ -32,7 +31,7 @@ def warn_if_untested() -> None:
     """Warn in one line if the tests do not run with this version of JAX."""
     if jax.__version_info__[:2] not in _TESTED:
         tested = " and ".join(".".join(map(str, version)) for version in _TESTED)
-        tell(
+        warn(
             f"found jax {jax.__version__}, tested are {tested}: results are not checked, and 0.11 "
             "crashes on several devices; pip install --upgrade 'jax>=0.12,<0.13'"
         )

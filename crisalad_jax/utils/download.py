@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import is_html, read_json, told_of, write_json
+from crisalad_jax.utils.files import is_html, read_json, wrap_os_errors, write_json
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.version import VERSION
 
@@ -151,7 +151,7 @@ class _Transfer:
 
     def finish(self) -> None:
         """Give the whole file its name."""
-        with told_of(self._target):
+        with wrap_os_errors(self._target):
             os.replace(self._part, self._target)
             self._note.unlink(missing_ok=True)
 
@@ -209,7 +209,7 @@ class _Transfer:
                 f"{self._target}: found {free:,} bytes free on the disk, expected {missing:,}"
             )
         try:
-            with told_of(self._target):
+            with wrap_os_errors(self._target):
                 if start == 0:
                     self._discard()  # first: a note is of the bytes beside it
                     write_json(self._note, dataclasses.asdict(remote))

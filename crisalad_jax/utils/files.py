@@ -18,8 +18,8 @@ from crisalad_jax.utils.checksums import (
     CHECKSUM,
     ChangedFileError,
     check_sealed,
+    checksummed_json,
     has_damaged_key,
-    sealed_json,
 )
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
@@ -273,7 +273,7 @@ def check_format(what: str, path: str | os.PathLike[str], *suffixes: str) -> Non
 
 
 @contextlib.contextmanager
-def told_of(path: pathlib.Path) -> Iterator[None]:
+def wrap_os_errors(path: pathlib.Path) -> Iterator[None]:
     """Turn an error of the disk in this block into one line that names the file.
 
     Raises:
@@ -305,7 +305,7 @@ def atomic_path(
     """
     path = pathlib.Path(path)
     check_target(path)
-    with made_folder(path.parent), told_of(path):
+    with made_folder(path.parent), wrap_os_errors(path):
         temporary = temporary_beside(path if within is None else within / path.name)
         with in_use(temporary):
             yield temporary
@@ -313,7 +313,7 @@ def atomic_path(
 
 
 @contextlib.contextmanager
-def durable_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
+def atomic_path(path: str | os.PathLike[str], durable=True) -> Iterator[pathlib.Path]:
     """Yield a temporary path as `atomic_path`, and sync the file to disk, safe from power failure.
 
     Raises:
@@ -323,7 +323,7 @@ def durable_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     with atomic_path(path) as temporary:
         yield temporary
         _sync(temporary)
-    with told_of(path):
+    with wrap_os_errors(path):
         _sync(path.parent)
 
 
@@ -380,7 +380,7 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """
     path = pathlib.Path(path)
     check_new_folder(path)
-    with made_folder(path.parent), told_of(path):
+    with made_folder(path.parent), wrap_os_errors(path):
         temporary = temporary_beside(path)
         with in_use(temporary):
             temporary.mkdir()
@@ -410,6 +410,6 @@ def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> None:
     Raises:
         InputError: as `atomic_path`.
     """
-    data = sealed_json(value, indent=2)
+    data = checksummed_json(value, indent=2)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)

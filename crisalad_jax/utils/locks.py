@@ -8,9 +8,9 @@ import time
 from collections.abc import Iterator
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import told_of
-from crisalad_jax.utils.notes import tell
-from crisalad_jax.utils.signals import held_signals
+from crisalad_jax.utils.files import wrap_os_errors
+from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.signals import block_signals
 from crisalad_jax.utils.temporaries import (
     LOCK,
     in_use,
@@ -25,7 +25,7 @@ class BusyFolderError(InputError):
 
 
 @contextlib.contextmanager
-def one_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
+def lock(folder: str | os.PathLike[str]) -> Iterator[None]:
     """Hold the lock of a folder, which is made if needed, while the block writes into it.
 
     The kernel releases the lock at the end of the process at the latest, so a killed process never
@@ -37,7 +37,7 @@ def one_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
     """
     folder = pathlib.Path(folder)
     with contextlib.ExitStack() as stack:
-        with held_signals():
+        with block_signals():
             stack.enter_context(made_folder(folder))
             descriptor = _locked(folder, stack)
             stack.enter_context(in_use(_lock_of(folder)))
@@ -46,8 +46,8 @@ def one_writer(folder: str | os.PathLike[str]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def next_writer(folder: str | os.PathLike[str], *, quiet: bool = False) -> Iterator[None]:
-    """Hold the lock of a folder as `one_writer`, after the process that holds it now.
+def lock(folder: str | os.PathLike[str], *, quiet: bool = False, wait=True) -> Iterator[None]:
+    """Hold the lock of a folder as `lock`, after the process that holds it now.
 
     Args:
         folder: the folder.
@@ -60,11 +60,11 @@ def next_writer(folder: str | os.PathLike[str], *, quiet: bool = False) -> Itera
         waits = False
         while True:
             try:
-                stack.enter_context(one_writer(folder))
+                stack.enter_context(lock(folder))
                 break
             except BusyFolderError:
                 if not waits and not quiet:
-                    tell(f"{folder}: waiting for another process{_holder(_lock_of(folder))}")
+                    warn(f"{folder}: waiting for another process{_holder(_lock_of(folder))}")
                 waits = True
                 time.sleep(POLL)
         yield
@@ -129,10 +129,10 @@ def staged_folder(out: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """Yield a temporary folder; on success move its files into `out`, pages last, else remove it.
 
     Raises:
-        InputError: as `one_writer`; or the disk is full.
+        InputError: as `lock`; or the disk is full.
     """
     out = pathlib.Path(out)
-    with one_writer(out), told_of(out):
+    with lock(out), wrap_os_errors(out):
         remove_temporaries(out)
         temporary = temporary_beside(out / "files")
         with in_use(temporary):

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 import pytest
 import safetensors.numpy
+from crisalad_jax.config.part import Part
 
 import crisalad_jax
 from crisalad_jax.checkpoints import weights
@@ -22,14 +23,13 @@ from crisalad_jax.checkpoints.safetensors_io import write_sealed
 from crisalad_jax.checkpoints.weights import load_weights, model_hash, save_weights
 from crisalad_jax.config import source
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.config.parts import Part
 from crisalad_jax.config.plugins import load_plugin
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import Model, parameter_shapes
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import MODEL, assert_equal, random_params
 

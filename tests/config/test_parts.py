@@ -7,16 +7,16 @@ import pathlib
 from typing import Any
 
 import pytest
-
-from crisalad_jax.config import source
-from crisalad_jax.config.parts import (
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import (
     REGISTRIES,
-    Part,
     Registry,
     count_arguments,
     part_field,
     resolve_names,
 )
+
+from crisalad_jax.config import source
 from crisalad_jax.utils.errors import InputError
 
 

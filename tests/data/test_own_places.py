@@ -9,7 +9,7 @@ from crisalad_jax.data.class_groups import class_groups
 from crisalad_jax.data.places import epoch_batches, read_places
 from crisalad_jax.data.views import views_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 
 
 def _touch(root, *names):

@@ -17,7 +17,7 @@ from crisalad_jax.retrieval.pca import PcaConfig, fit_pca
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import BusyFolderError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.conftest import BATCH, MODEL, describe_single, read_options
 
 
@@ -166,7 +166,7 @@ def test_a_share_that_another_process_joins_says_so(params, town, tmp_path, monk
     def busy(path):
         raise BusyFolderError(f"{path}: busy")
 
-    monkeypatch.setattr("crisalad_jax.retrieval.segments.one_writer", busy)
+    monkeypatch.setattr("crisalad_jax.retrieval.segments.lock", busy)
     with pytest.warns(Note, match="another process joins the shares"):
         found = run(params, town, out, share="1/2")
     assert (found.shares_left, found.joined_elsewhere) == (0, True)

@@ -23,7 +23,7 @@ from crisalad_jax.retrieval.extract import Extracted, extract
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.conftest import BATCH, MODEL, read_options, write_picture
 
 ROOT = pathlib.Path(__file__).parents[2]

@@ -15,7 +15,7 @@ from tensorboardX.proto import event_pb2
 
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.io import read_config
-from crisalad_jax.config.source import sources_of
+from crisalad_jax.config.plugins import sources_of
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.loader import ImageCache
@@ -43,7 +43,7 @@ from crisalad_jax.training.run_files import (
 from crisalad_jax.training.step import init_train_state, step_config, train_step
 from crisalad_jax.training.trainable import merge_params
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.temporaries import temporary_beside
 from tests.conftest import RECIPE, STEPS, random_params

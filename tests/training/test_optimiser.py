@@ -9,8 +9,8 @@ import numpy as np
 import optax
 import pytest
 import torch
+from crisalad_jax.config.registry import REGISTRIES
 
-from crisalad_jax.config.parts import REGISTRIES
 from crisalad_jax.data.places import read_places
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.model import init_crisalad, parameter_shapes
@@ -24,7 +24,7 @@ from crisalad_jax.training.optimiser import (
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.training.step import StepConfig, init_train_state
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from crisalad_jax.utils.pytree import check_drawn, named_leaves
 from tests.conftest import MODEL, RECIPE, STEPS
 from tests.training.test_loop import Interrupted, fail_at

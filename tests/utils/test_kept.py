@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.nn.config import PRESETS
-from crisalad_jax.utils import compiler, kept
+from crisalad_jax.utils import compiler, executable_cache
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def folder(tmp_path, monkeypatch):
     """The folder of kept programs, as a program of its own sets it."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(kept._Folder, "path", None)
-    kept.keep_programs()
+    executable_cache.cache_executables()
     assert kept._Folder.path == tmp_path / "crisalad-jax" / "programs"
     return kept._Folder.path
 
@@ -131,7 +131,7 @@ def test_what_others_may_write_is_not_run(folder, monkeypatch):
     assert kept._read(path, None, []) is None
     folder.chmod(0o777)
     monkeypatch.setattr(kept._Folder, "path", None)
-    kept.keep_programs()
+    executable_cache.cache_executables()
     assert kept._Folder.path is None
 
 

@@ -41,7 +41,7 @@ from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.pytree import named_leaves
 
 _EXPONENT = "aggregation.1.p"
@@ -222,7 +222,7 @@ def _infer_supervlad(read: Reader) -> SuperVladConfig:
         raise InputError(f"{name} found of {count} clusters, expected 5 (1 ghost) or 3 (2 ghosts)")
     ghosts = 1 if count == 5 else 2
     if ghosts == 2:
-        tell(
+        warn(
             f"{name}: found 3 clusters, read as 1 and 2 ghosts, as in 1-clusterVLAD.pth; "
             "one of 2 and a ghost (--supervlad_clusters=2) has the same shape, and cannot be read"
         )

@@ -14,7 +14,7 @@ from crisalad_jax.checkpoints.formats.format import State
 from crisalad_jax.checkpoints.formats.table import public_shapes
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 _WRAPPERS = r"(?<![^.])(?:_orig_mod|module|_fsdp_wrapped_module|_checkpoint_wrapped_module)\."
 _CHUNKS = r"(?<![^.])(blocks\.)\d+\.(?=\d+\.)"
@@ -124,7 +124,7 @@ def _prefix(state: State) -> str | None:
 def _tell_left_out(reading: _Reading, source: str) -> None:
     if reading.left_out:
         kinds = dict.fromkeys(name.partition(".")[0] for name in reading.left_out)
-        tell(
+        warn(
             f"{source}: took the model under {reading.inside.removesuffix('.')}, and left out "
             f"{len(reading.left_out)} tensors of {', '.join(kinds)}"
         )

@@ -12,8 +12,8 @@ from crisalad_jax.checkpoints.formats.families import FORMATS, REFERENCE, VOCABU
 from crisalad_jax.checkpoints.formats.format import State, parts_in_words
 from crisalad_jax.checkpoints.formats.forms import Absent, Entry, Extra
 from crisalad_jax.config.checks import choose
-from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences
+from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.vit import VisionTransformer
 from crisalad_jax.nn.config import ModelConfig
@@ -51,7 +51,7 @@ def check_holds(config: ModelConfig, name: str) -> ModelConfig:
     if name in (REFERENCE, VOCABULARY):  # which have the configuration, or no model
         return config
     read_back = FORMATS[name].infer(state)
-    wrong = differences(_shown(with_free_fields_of(config, read_back)), _shown(config))
+    wrong = differences(_shown(with_non_semantic_fields_of(config, read_back)), _shown(config))
     if wrong:
         raise InputError(
             f"format {name}: cannot tell these apart from the published ones: "

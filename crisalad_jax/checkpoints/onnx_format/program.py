@@ -14,7 +14,7 @@ from crisalad_jax.checkpoints.onnx_format.convert import convert
 from crisalad_jax.checkpoints.onnx_format.graph import OPSET as OPSET
 from crisalad_jax.checkpoints.onnx_format.graph import Graph, Value, is_known, tensor_type
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import told_of
+from crisalad_jax.utils.files import wrap_os_errors
 
 _PAGE = 4096
 """Bytes that arrays next to a program begin at multiples of, so that they can be mapped."""
@@ -86,7 +86,7 @@ def write_onnx(
     model = graph.model(values, [(output, result)], words)
     data = path.with_name(f"{path.name}.data")
     places = _place_constants(model, graph.constants, data.name if beside else None)
-    with told_of(path):
+    with wrap_os_errors(path):
         if beside:
             _write_constants(data, places)
         path.write_bytes(model.SerializeToString(deterministic=True))

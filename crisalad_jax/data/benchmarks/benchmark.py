@@ -5,7 +5,7 @@ import pathlib
 
 import numpy as np
 
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Bool, Float64, Int64
 

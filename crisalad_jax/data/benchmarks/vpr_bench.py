@@ -11,7 +11,7 @@ from crisalad_jax.data.benchmarks.ground_truth import indices, is_nordland_star,
 from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Int64
 
 TRUTH = "ground_truth_new.npy"
@@ -82,7 +82,7 @@ def _match(
             )
         positives[int(index[0])] = matching
     if beyond:
-        tell(
+        warn(
             f"{path}: found {beyond} references after the last of {database} images, where windows "
             "of frames end; left out"
         )

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 from crisalad_jax.config.flags import parse_changes
-from crisalad_jax.config.parts import Part
+from crisalad_jax.config.part import Part
 from crisalad_jax.data.augmentations import Augmentation
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -23,7 +23,7 @@ from crisalad_jax.training.recipes import (
     with_part,
 )
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 AdapterKind = Literal["depthwise", "multi-resolution", "mlp", "none"]
 
@@ -130,7 +130,7 @@ def method_of(name: str, preset: str, what: str = "--methods") -> ComparedMethod
     if name in METHODS:
         return METHODS[name]
     if mines_tuples(name):
-        tell(
+        warn(
             f"{what}: found {name}, whose own recipe mines tuples of queries: it is crisalad+"
             f"{name} here, trained on places as all others are (`crisalad train` has the recipe)"
         )

@@ -14,10 +14,10 @@ from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.public import read_backbone
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_count, check_types
-from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.config.parts import parts_of
-from crisalad_jax.config.source import source_digest
+from crisalad_jax.config.part import parts_of
+from crisalad_jax.config.plugins import source_digest
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.readable import leave_out_unreadable
 from crisalad_jax.data.loader import OnBadImage
@@ -42,7 +42,7 @@ from crisalad_jax.training.run_files import checksum_of_places
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 EPOCHS = 6
 """Number of epochs from random weights: all methods on two small sets, three seeds each, take less
@@ -449,7 +449,7 @@ def _with_short_warmup(variant: Variant, training: TrainConfig, places: Places) 
     steps = per_epoch * training.epochs
     optimiser = with_short_warmup(training.optimiser, steps, per_epoch)
     if optimiser != training.optimiser and variant.trains:
-        tell(  # once of all runs that it is the same for
+        warn(  # once of all runs that it is the same for
             f"warm-up: found {warmup_length(training.optimiser, per_epoch)} steps, shortened to "
             f"{warmup_length(optimiser, per_epoch)} of the run's "
             f"{count_steps(optimiser, steps, per_epoch)}"

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import jax
 
 from crisalad_jax.config.plugins import load_entry_points, load_plugin, loaded_plugins
-from crisalad_jax.utils.errors import InputError, Stopped
-from crisalad_jax.utils.notes import Note, tell
+from crisalad_jax.utils.errors import InputError, Interrupted
+from crisalad_jax.utils.output import Note, warn
 from crisalad_jax.utils.signals import defer_signals
 
 _MEMORY = 0.9
@@ -50,7 +50,7 @@ def run_jobs(work: Callable[..., Any], jobs: int, say: Callable[[str], None]) ->
 
     Raises:
         InputError: what any of them raises as one; the others are ended.
-        Stopped: a signal asked for the end; the same call resumes.
+        Interrupted: a signal asked for the end; the same call resumes.
     """
     spawn = multiprocessing.get_context("spawn")  # a fork of a process that uses JAX can deadlock
     settings = {name: getattr(jax.config, name) for name in _JAX}
@@ -149,7 +149,7 @@ def _pass_on(
                 del running[reader]
                 if process.exitcode:
                     others = "the others go on" if running else "what is left is done here"
-                    tell(
+                    warn(
                         f"--jobs: found process {process.name} ended with code "
                         f"{process.exitcode}; {others}"
                     )
@@ -160,7 +160,7 @@ def _pass_on(
                 say(f"[{process.name}] {text}")
             elif text not in notes:
                 notes.add(text)
-                tell(text)
+                warn(text)
 
 
 def _run(
@@ -190,7 +190,7 @@ def _run(
         work(say=functools.partial(send, "line"), beside=share.beside)
     except InputError as error:
         send("error", error)
-    except Stopped:
+    except Interrupted:
         pass  # the parent has asked for it
 
 

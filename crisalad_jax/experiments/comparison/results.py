@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool
 
-from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
 from crisalad_jax.experiments.comparison.costs import NOTES, AdapterCost, Race

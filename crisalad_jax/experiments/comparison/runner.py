@@ -53,9 +53,9 @@ from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import around, check_target, real_path, write_json
-from crisalad_jax.utils.locks import POLL, BusyFolderError, next_writer, one_writer
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.files import check_target, real_path, split_markers, write_json
+from crisalad_jax.utils.locks import POLL, BusyFolderError, lock
+from crisalad_jax.utils.output import Note
 from crisalad_jax.utils.target import target
 from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries
 
@@ -102,13 +102,13 @@ def compare(
         InputError: what `prepare`, `fit`, `evaluate` and `summarise` raise; the folder holds
             other files, or a run of the same name with other settings; or the page has no place
             for the tables.
-        Stopped: a signal asked for the end; the same call resumes.
+        Interrupted: a signal asked for the end; the same call resumes.
     """
     out = pathlib.Path(out)
     check_target(out / "config.json")
     name = real_path(out).name
     if page is not None:
-        around(pathlib.Path(page), name)
+        split_markers(pathlib.Path(page), name)
     check_count("--jobs", jobs)
     jobs = min(jobs, len(config.names) * config.seeds)
     work = functools.partial(carry_out, config, out, on_bad_image, jobs=jobs)
@@ -117,7 +117,7 @@ def compare(
             run_jobs(functools.partial(work, quiet=True), jobs, say)
             warnings.simplefilter("ignore", Note)  # the processes have told them
         prepared = work(say=say, quiet=quiet)
-    with next_writer(out):
+    with lock(out, wait=True):
         speed = _speed(prepared, out, say, quiet)
         # Table 3 belongs to the paper's rows.
         papers = config.kind == "ablate" and not config.rows
@@ -154,7 +154,7 @@ def carry_out(
 
     Raises:
         InputError: what `compare` raises.
-        Stopped: a signal asked for the end.
+        Interrupted: a signal asked for the end.
     """
     prepared = prepare(config, on_bad_image, quiet=quiet)
     path = out / "config.json"
@@ -162,7 +162,7 @@ def carry_out(
         raise InputError(
             f"{out}: found files but no comparison, expected one or a new or empty folder"
         )
-    with next_writer(out, quiet=quiet):
+    with lock(out, wait=True, quiet=quiet):
         write_json(path, to_plain(config))
     take_runs(prepared, out, say=say, quiet=quiet, jobs=jobs, beside=beside)
     return prepared
@@ -189,7 +189,7 @@ def take_runs(
 
     Raises:
         InputError: what `fit` and `evaluate` raise, or a run was made with other settings.
-        Stopped: what `fit` raises; the same call resumes.
+        Interrupted: what `fit` raises; the same call resumes.
     """
     runs, waits = runs_of(prepared, out), False
     left = runs
@@ -199,7 +199,7 @@ def take_runs(
         began = False
         for run in left:
             try:
-                with one_writer(run.folder):
+                with lock(run.folder):
                     if not run.is_done:  # by another, a moment ago
                         say(progress_words(run, runs, jobs))
                         _complete(prepared, run, quiet, beside)

@@ -22,7 +22,7 @@ from crisalad_jax.experiments.report.style import (
     save,
 )
 from crisalad_jax.experiments.report.tables import NOTHING, Cell, Table, no_formula, write_text
-from crisalad_jax.utils.files import around, write_json
+from crisalad_jax.utils.files import split_markers, write_json
 
 _PAGE_TITLES = {"compare": "Methods compared", "ablate": "What each part brings"}
 
@@ -61,7 +61,7 @@ def markdown(summary: Summary) -> str:
 
 def put_in_page(page: pathlib.Path, name: str, text: str) -> None:
     """Put a text between its marks in a page; raises as `files.around`."""
-    before, after = around(page, name)
+    before, after = split_markers(page, name)
     write_text(page, f"{before}\n{text}\n{after}")
 
 

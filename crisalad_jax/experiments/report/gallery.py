@@ -21,8 +21,7 @@ from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import staged_folder
-from crisalad_jax.utils.notes import tell
-from crisalad_jax.utils.output import counted
+from crisalad_jax.utils.output import counted, warn
 
 _DPI = 120
 _WIDTH, _GAP, _MARGIN = 1.7, 0.16, 0.25
@@ -280,7 +279,7 @@ def _read(files: Sequence[Path], *, strict: bool) -> dict[Path, UInt8[np.ndarray
             lost.append(error)
             images[file] = np.full((round(0.75 * side), side, 3), _BOX, np.uint8)
     if lost:
-        tell(
+        warn(
             f"{counted(len(lost), 'picture')} shown as a grey box, as of {lost[0]}; --map-images "
             "(root=) says where else"
         )

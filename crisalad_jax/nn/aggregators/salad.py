@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_fraction, require_positive
-from crisalad_jax.config.fields import free_field
-from crisalad_jax.config.parts import OrName, part_field, resolve_names
+from crisalad_jax.config.part import OrName, non_semantic_field
+from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, FlattenOrder, TokenShape
 from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid
@@ -79,7 +79,7 @@ class TransportAggregator(Aggregator):
     token_dim: int = 256
     """Width of the global token."""
     hidden: int = 512
-    dropout: float = free_field(0.3)
+    dropout: float = non_semantic_field(0.3)
 
     def __post_init__(self) -> None:
         """Check the ranges."""

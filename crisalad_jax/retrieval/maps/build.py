@@ -12,7 +12,7 @@ import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import choose
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.exif import exif_positions
 from crisalad_jax.data.positions import AXES, Positions, positions_of, utm_positions
 from crisalad_jax.data.reading import Reading
@@ -38,7 +38,7 @@ from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.segments import SEGMENT, Share, Shares, digest_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -241,7 +241,7 @@ def index(
         known = positions_of(table, source.names, images)
     by_exif = table is None and not known.of
     if table is None and known.axes == AXES[1] and metadata is None:
-        tell(f"{images}: the names are of several zones of UTM: positions become lat, lon")
+        warn(f"{images}: the names are of several zones of UTM: positions become lat, lon")
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca)
     reading = reading.fitted(len(source.paths))
     if metadata is None:
@@ -413,7 +413,7 @@ def _by_exif(target: Map, source: ImageSource) -> Positions:
     )
     found = exif_positions(new)
     if found.of and target.axes not in (None, found.axes):
-        tell(
+        warn(
             f"{target.folder}: left out the EXIF positions of {len(found.of)} images, expected "
             f"{', '.join(target.axes or ())} as in the map"
         )

@@ -19,9 +19,9 @@ import numpy as np
 from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
 from crisalad_jax.config.checks import PATH, check_count, takes
-from crisalad_jax.config.concise import brief
-from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.part import with_non_semantic_fields_of
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import Positions
@@ -56,7 +56,7 @@ from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, save_pca
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.locks import one_writer
+from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.shapes import Float, Float32
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
@@ -575,7 +575,7 @@ class Map:
                         f"model: found {type(model).__name__}, expected a Model(params, config) or "
                         "a Runtime"
                     )
-                config = with_free_fields_of(self.config, model.config)
+                config = with_non_semantic_fields_of(self.config, model.config)
                 found = describer_of(model._replace(config=config), groupings)
                 check_model(self.metadata, self.folder, found.digest, "the given model")
             known = self._describer = model, found
@@ -613,7 +613,7 @@ def open_for_appending(
     read_metadata(folder)  # raises where something else is there, before anything is made
     with contextlib.ExitStack() as stack:
         stack.enter_context(made_folder(folder / SEGMENTS))
-        stack.enter_context(one_writer(folder))
+        stack.enter_context(lock(folder))
         existing = read_metadata(folder)
         for each in (folder, folder / SEGMENTS):
             remove_temporaries(each)

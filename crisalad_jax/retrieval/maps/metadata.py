@@ -20,7 +20,7 @@ from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.segments import write_record
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.temporaries import LOCK, is_temporary, remove_temporaries
 
 if TYPE_CHECKING:  # a map is searched without JAX
@@ -202,7 +202,7 @@ def check_model(
         InputError: the hashes differ; the message has both.
     """
     if quantised_from == metadata.model:
-        tell(
+        warn(
             f"{weights}: an int8 program of the model that made {folder}; similarities are rougher"
         )
     elif digest != metadata.model:

@@ -397,7 +397,7 @@ def test_runs_are_shared_with_another_process(finished, config, monkeypatch):
 
     monkeypatch.setattr(runner, "_complete", lambda p, r, *_: one.append(r.seed) or done(r))
     with contextlib.ExitStack() as other:
-        other.enter_context(locks.one_writer(runs[0].folder))
+        other.enter_context(locks.lock(runs[0].folder))
 
         def ended(seconds):
             done(runs[0])

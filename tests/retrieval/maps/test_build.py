@@ -22,7 +22,7 @@ from crisalad_jax.retrieval.maps.build import index as index_source
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import new_metadata
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.conftest import BATCH, MODEL, describe_single, read_options
 
 
