@@ -11,9 +11,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from crisalad_jax.data.exif import exif_position
 from crisalad_jax.data.images import decode_image, read_image
-from crisalad_jax.data.positions import AXES, Positions
+from crisalad_jax.data.positions import AXES, Positions, exif_position
 from crisalad_jax.data.resize import Pixels, resize_image
 from crisalad_jax.data.video import file_of
 from crisalad_jax.retrieval.maps.query import answer_fields, asked_similarity, position_fields

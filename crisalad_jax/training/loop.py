@@ -45,7 +45,6 @@ def fit(
     validation: Benchmark | None = None,
     initial: Crisalad | None = None,
     on_bad_image: OnBadImage = "stop",
-    num_workers: int = 0,
     num_threads: int | None = None,
     shard_state: bool = False,
     quiet: bool = False,
@@ -71,8 +70,8 @@ def fit(
         initial: parameters to start from; None starts from `init_crisalad` with the run's seed.
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them; validations
             leave them out.
-        num_workers: processes that read the training images; 0 reads them by threads of this one.
-        num_threads: number of those threads; None is one for each core that this process may use.
+        num_threads: number of threads that read the training images; None is one for each core that
+            this process may use.
         shard_state: keep what trains and its moments in shards, one a device, not whole on each.
         quiet: no progress bar.
 
@@ -95,17 +94,14 @@ def fit(
     """
     check_learns(config)
     threads = THREADS if num_threads is None else num_threads
-    for name, count in (("num_workers", num_workers), ("num_threads", threads)):
-        if count < 0:
-            raise InputError(f"{name}: found {count}, expected at least 0")
+    if threads < 0:
+        raise InputError(f"num_threads: found {threads}, expected at least 0")
     if validation is not None:
         # A missing ground truth raises now, not after the first epoch.
         validation.ground_truth()
     run = Run(config, places, pathlib.Path(out), initial, validation, shard_state=shard_state)
     with contextlib.closing(run):
-        _train(
-            run, lambda: run.rest_of_round(on_bad_image, num_workers, threads), on_bad_image, quiet
-        )
+        _train(run, lambda: run.rest_of_round(on_bad_image, threads), on_bad_image, quiet)
         distributed.raise_together(run.save)
     record = run.record
     best = record.best[0][0] if record.best else None

@@ -18,10 +18,9 @@ from jaxtyping import PyTree
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.source import changed_sources, sources_of
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.loader import ImageCache, OnBadImage
+from crisalad_jax.data.loader import ImageCache, OnBadImage, one_ahead
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
-from crisalad_jax.data.read_ahead import one_ahead
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.model import Crisalad, cast_params, extract_tokens, init_crisalad
 from crisalad_jax.nn.tokens import TransportStatistics
@@ -373,7 +372,7 @@ class Run:
         return mined, words + (f"; {unreadable} unreadable images left out" if unreadable else "")
 
     def rest_of_round(
-        self, on_bad_image: OnBadImage, num_workers: int, threads: int
+        self, on_bad_image: OnBadImage, threads: int
     ) -> Generator[Batch, None, None]:
         """Yield the batches from the next step to the end of its round; none if the run is done.
 
@@ -385,7 +384,6 @@ class Run:
             "start_step": self.step % self._rounds.steps,
             "part": (jax.process_index(), jax.process_count()),
             "on_bad_image": on_bad_image,
-            "num_workers": num_workers,
             "threads": threads,
             "cache": self._cache,
         }

@@ -6,18 +6,18 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from crisalad_jax.config.checks import PATH, choose, takes
-from crisalad_jax.data.benchmarks import folders, vpr_bench
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.folders_on_disk import (
-    find_split,
-    has_sides,
-    has_split,
-    is_pair,
-    listing,
-)
+from crisalad_jax.data.benchmarks.folders import TRUTH, read_folders
 from crisalad_jax.data.benchmarks.msls import is_msls, read_msls, read_msls_subtask
 from crisalad_jax.data.benchmarks.netvlad import read_netvlad
-from crisalad_jax.data.benchmarks.salad_lists import has_lists, is_list, read_salad_lists
+from crisalad_jax.data.benchmarks.npy_lists import (
+    VPR_BENCH_TRUTH,
+    has_lists,
+    is_list,
+    read_salad_lists,
+    read_vpr_bench,
+)
+from crisalad_jax.data.benchmarks.on_disk import find_split, has_sides, has_split, listing
 from crisalad_jax.data.benchmarks.utm import QUERIES, has_utm_names, read_utm
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
@@ -35,23 +35,19 @@ class Layout(NamedTuple):
     """Whether it names images, which may be missing; the reader takes `on_bad_image`."""
 
 
+_MSLS_OPTIONS = ("split", "radius", "max_heading_difference")
 LAYOUTS = {
     "utm": Layout(
         "a folder of @UTM names", read_utm, ("split", "radius", "queries", "ignore_zones")
     ),
-    "vpr-bench": Layout("a VPR-Bench folder", vpr_bench.read_vpr_bench),
+    "vpr-bench": Layout("a VPR-Bench folder", read_vpr_bench),
     "netvlad": Layout("a .mat file of NetVLAD", read_netvlad, ("radius", "images"), True),
     "salad": Layout(
         ".npy lists of GSV-Cities or SALAD", read_salad_lists, ("split", "images"), True
     ),
-    "msls": Layout("raw MSLS", read_msls, ("split", "radius", "max_heading_difference"), True),
-    "msls-subtask": Layout(
-        "raw MSLS, subtask all",
-        read_msls_subtask,
-        ("split", "radius", "max_heading_difference"),
-        True,
-    ),
-    "folders": Layout("two plain folders", folders.read_folders, ("split", "radius", "frames")),
+    "msls": Layout("raw MSLS", read_msls, _MSLS_OPTIONS, True),
+    "msls-subtask": Layout("raw MSLS, subtask all", read_msls_subtask, _MSLS_OPTIONS, True),
+    "folders": Layout("two plain folders", read_folders, ("split", "radius", "frames")),
 }
 """Layouts by the name that `open_benchmark` takes."""
 
@@ -144,10 +140,11 @@ def _find_layout(root: pathlib.Path, split: str | None, queries: str | None) -> 
         return "msls"
     if has_split(root) or has_sides(root):
         folder, _ = find_split(root, split)
-        plain = (folder / folders.TRUTH).exists() or not has_utm_names(folder, queries or QUERIES)
+        plain = (folder / TRUTH).exists() or not has_utm_names(folder, queries or QUERIES)
         return "folders" if plain else "utm"
-    if is_pair(root, "ref", "query") and ((root / vpr_bench.TRUTH).exists() or not has_lists(root)):
-        return "vpr-bench"
+    if (root / "ref").is_dir() and (root / "query").is_dir():
+        has_truth = (root / VPR_BENCH_TRUTH).exists() or not has_lists(root)
+        return "vpr-bench" if has_truth else "salad"
     if has_lists(root):
         return "salad"
     raise InputError(

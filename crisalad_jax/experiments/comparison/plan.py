@@ -15,7 +15,7 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_types
 from crisalad_jax.config.concise import brief
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.data.benchmarks.readable import leave_out_unreadable
+from crisalad_jax.data.benchmarks.benchmark import leave_out_unreadable
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.experiments.comparison.ablation import (

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.depth import as_rgb
 from crisalad_jax.data.images import read_pixels
+from crisalad_jax.data.prepare import as_rgb
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.experiments.report.gallery import answers_figure, retrieval_figure, thumbnail

@@ -12,9 +12,8 @@ import numpy as np
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.data.exif import exif_positions
 from crisalad_jax.data.loader import OnBadImage
-from crisalad_jax.data.positions import AXES, Positions, positions_of, utm_positions
+from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.nn.config import ModelConfig

@@ -11,7 +11,7 @@ from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.test_msls import write_msls
 from tests.data.benchmarks.test_netvlad import write as write_mat
 from tests.data.benchmarks.test_netvlad import write_images as write_mat_images
-from tests.data.benchmarks.test_salad_lists import (
+from tests.data.benchmarks.test_npy_lists import (
     DATABASE,
     QUERIES,
     TRUTH,
