@@ -25,7 +25,7 @@ import pytest
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config import plugins
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.config.parts import REGISTRIES
+from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import COLUMNS, read_places
 from crisalad_jax.losses import LossConfig
@@ -252,8 +252,7 @@ def own_parts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     for registry in REGISTRIES.values():
         for name in ("_parts", "_presets"):
             monkeypatch.setattr(registry, name, dict(getattr(registry, name)))
-    monkeypatch.setattr(plugins, "_FILES", {})
-    monkeypatch.setattr(plugins, "_LOADED", set())
+    monkeypatch.setattr(plugins, "_LOADED", {})
     before = set(sys.modules)
     yield
     for name in set(sys.modules) - before:

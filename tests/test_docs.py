@@ -10,7 +10,7 @@ import pytest
 
 import crisalad_jax as cj
 from crisalad_jax import sinkhorn
-from crisalad_jax.config.parts import REGISTRIES
+from crisalad_jax.config.registry import REGISTRIES
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"

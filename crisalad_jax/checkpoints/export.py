@@ -35,9 +35,9 @@ from crisalad_jax.checkpoints.runtime import (
 )
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
 from crisalad_jax.config.checks import PATH, check_types, choose, takes
-from crisalad_jax.config.concise import concise
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
+from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.data.prepare import normalised
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import (
@@ -86,7 +86,7 @@ _PROBES = 3
 """Images that a program of any number of images is checked with."""
 
 
-@concise()
+@short_repr()
 @dataclasses.dataclass(frozen=True)
 class ExportConfig:
     """The format, the inputs and the platforms of an exported program.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.config.checks import PATH, takes
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.notes import tell
 

@@ -17,9 +17,9 @@ import numpy as np
 
 from crisalad_jax.checkpoints.engines import EngineName, Precision, Program, load_program
 from crisalad_jax.config.checks import choose
-from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError

@@ -39,9 +39,9 @@ from crisalad_jax.checkpoints.weights import (
     save_weights,
 )
 from crisalad_jax.config.checks import PATH, choose, takes
-from crisalad_jax.config.concise import brief
-from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
+from crisalad_jax.config.part import with_non_semantic_fields_of
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc
 from crisalad_jax.nn.backbones import Backbone
 from crisalad_jax.nn.config import ModelConfig
@@ -148,7 +148,7 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
         layout, config, state = identify(state, source=str(path))
         if text is not None:
             ours = from_plain(ModelConfig, _json(text, path), source=f"{path} ({_SETTINGS})")
-            config = with_free_fields_of(ours, config)
+            config = with_non_semantic_fields_of(ours, config)
     elif count_layers(config) > len(state):
         # Check before making a table of names: the file may claim any depth.
         raise InputError(
@@ -416,7 +416,7 @@ def write_checkpoint(
     path = pathlib.Path(path)
     names = choose("layout", layout, LAYOUTS)
     shown = check_holds(config, layout, extras)
-    is_all = with_free_fields_of(config, shown) == shown
+    is_all = with_non_semantic_fields_of(config, shown) == shown
     settings = None if is_all else json.dumps(to_plain(config))
     metadata = {} if settings is None else {_SETTINGS: settings}
     state = to_state(params, config, layout, extras)
@@ -570,7 +570,7 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
         )
     theirs, params = config.adopt(theirs, checkpoint.params.backbone, fresh)
     # Ignore free fields, such as the initialisation: weights do not depend on them.
-    wrong = differences(with_free_fields_of(config, theirs), config, "backbone")
+    wrong = differences(with_non_semantic_fields_of(config, theirs), config, "backbone")
     if wrong:
         raise InputError(f"{path}: this backbone is another than the model's: {'; '.join(wrong)}")
     return params

@@ -13,9 +13,9 @@ import numpy as np
 import safetensors
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
-from crisalad_jax.config.fields import essence, with_free_fields_of
 from crisalad_jax.config.io import differences, from_plain, to_plain
-from crisalad_jax.config.source import changed_sources, source_bytes_of, sources_of
+from crisalad_jax.config.part import fingerprint_fields, with_non_semantic_fields_of
+from crisalad_jax.config.plugins import changed_sources, sources_of
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.misfits import misfits, not_finite
 from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
@@ -32,7 +32,7 @@ the version of this package, and the name and source's digest of every part."""
 _DIGEST = "model_sha256"
 """Key of the `model_hash` in the metadata."""
 _KINDS = {
-    **dict.fromkeys(("config", "parts", "source_bytes", "aggregator"), dict),
+    **dict.fromkeys(("config", "parts", "aggregator"), dict),
     **dict.fromkeys(("version", _DIGEST), str),
 }
 """Types of the metadata's values."""
@@ -85,7 +85,6 @@ def save_weights(
         "config": to_plain(config),
         "version": VERSION,
         "parts": sources_of(config),
-        "source_bytes": source_bytes_of(config),
         "aggregator": config.aggregator.metadata(params.aggregator),
         _DIGEST: model_hash(params, config),
     }
@@ -179,8 +178,7 @@ def _loaded(
         raise InputError(
             f"{error}; it is in the cache: once it is removed, the same command makes it anew"
         ) from error
-    same_version = metadata["version"] == VERSION
-    changed = changed_sources(config, metadata["parts"], same_version, metadata["source_bytes"])
+    changed = changed_sources(config, metadata["parts"])
     if changed:
         tell(
             f"{path}: found another source of {', '.join(changed)} than these weights were written "
@@ -267,7 +265,7 @@ def _is_pair(value: Any) -> bool:
 
 
 def _as_free_as(expected: ModelConfig, config: ModelConfig) -> ModelConfig:
-    free = with_free_fields_of(expected, config)
+    free = with_non_semantic_fields_of(expected, config)
     if config.aggregator.fixed_grid:
         free = dataclasses.replace(free, image_size=config.image_size)
     return free
@@ -326,7 +324,7 @@ def model_hash(params: Crisalad, config: ModelConfig) -> str:
     Returns:
         SHA-256 in hexadecimal digits.
     """
-    plain = essence(config)
+    plain = fingerprint_fields(config)
     if config.aggregator.fixed_grid:
         plain["image_size"] = list(config.image_size)
     digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
-from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import Size
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import SELF_CHECKED, is_image, read_pixels
 from crisalad_jax.data.opencv import QUIET
 from crisalad_jax.data.video import check_rate, frame_name, milliseconds_of

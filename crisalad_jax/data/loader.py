@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from crisalad_jax.config.checks import choose, takes
-from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import OnBadImage, read_pixels
 from crisalad_jax.data.opencv import ONE_THREAD
 from crisalad_jax.data.places import Order, Places, epoch_batches

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.named_places import (
     NamedPlaces,

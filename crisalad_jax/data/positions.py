@@ -10,7 +10,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.tables import matched, read_table
 from crisalad_jax.utils.errors import InputError

@@ -7,7 +7,7 @@ import pathlib
 import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.benchmark import check_radius, within
 from crisalad_jax.data.benchmarks.msls import is_msls, read_msls

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Int64
 
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.utils.errors import InputError
 
 

@@ -13,8 +13,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.classes import ClassesConfig
-from crisalad_jax.config.concise import brief
-from crisalad_jax.config.parts import Part, Registry, count_arguments
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import Registry, count_arguments
+from crisalad_jax.config.short_repr import brief
 
 Similarities = Float[Array, "anchor image"]
 

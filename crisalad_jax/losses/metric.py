@@ -9,13 +9,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from crisalad_jax.config.checks import require, takes
-from crisalad_jax.config.concise import concise
-from crisalad_jax.config.parts import OrName, part_field, resolve_names
+from crisalad_jax.config.part import OrName
+from crisalad_jax.config.registry import part_field, resolve_names
+from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.losses.base import LOSSES, Loss, LossBatch, Pairs, Similarities, check_value
 from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
 
 
-@concise("kind")
+@short_repr("kind")
 @dataclasses.dataclass(frozen=True)
 class LossConfig:
     """The loss, and the miner that chooses its pairs.

@@ -15,7 +15,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import check_types, require, require_positive
-from crisalad_jax.config.concise import concise
+from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.nn import draw
 from crisalad_jax.nn.convolutions import ConvNorm
 from crisalad_jax.nn.layers import (
@@ -39,7 +39,7 @@ CONV_INIT = 1e-5
 """Initial value of all weights and biases of CricaVPR's convolutions."""
 
 
-@concise(switch=("kind", "none"))
+@short_repr(switch=("kind", "none"))
 @dataclasses.dataclass(frozen=True)
 class AdapterConfig:
     """The adapter of every block (paper section 3.2 and Table 2).

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.config.concise import concise
-from crisalad_jax.config.fields import free_field
-from crisalad_jax.config.parts import OrName, part_field, resolve_names
+from crisalad_jax.config.part import OrName, non_semantic_field
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
+from crisalad_jax.config.registry import part_field, resolve_names
+from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones import BACKBONES, Backbone
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -23,7 +23,7 @@ MOST_PIXELS = 4096
 """Largest side of an image that models describe: attention grows by its fourth power."""
 
 
-@concise("backbone", "aggregator")
+@short_repr("backbone", "aggregator")
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
     """The configuration of CriSALAD, and of the methods that it is compared with.
@@ -37,7 +37,7 @@ class ModelConfig:
         768
     """
 
-    image_size: tuple[int, int] = free_field((224, 224))
+    image_size: tuple[int, int] = non_semantic_field((224, 224))
     """Height and width that images are resized to, multiples of the patch size (but see
     `PreprocessingConfig.size_rule`)."""
     preprocessing: PreprocessingConfig = PreprocessingConfig()
@@ -50,14 +50,14 @@ class ModelConfig:
     """Encoder whose attention runs across the images of a batch."""
     projection: ProjectionConfig = ProjectionConfig()
     """Linear layer over the whole descriptor; by default none."""
-    compute_dtype: Literal["float32", "bfloat16", "float64"] = free_field("float32")
+    compute_dtype: Literal["float32", "bfloat16", "float64"] = non_semantic_field("float32")
     """Type of the matrix products; normalisations, softmax and transport are float32 at least.
     float64 is for numerical studies, under JAX's 64-bit mode."""
-    precision: Literal["highest", "high", "default"] = free_field("highest")
+    precision: Literal["highest", "high", "default"] = non_semantic_field("highest")
     """Precision of float32 products on accelerators, in JAX's words: "highest" is float32, "high"
     fewer bits, and "default" what the platform computes fastest (docs/performance.md). A CPU
     computes in float32. Products of another `compute_dtype` are in that type."""
-    remat: Literal["dots", "full", "none"] = free_field("dots")
+    remat: Literal["dots", "full", "none"] = non_semantic_field("dots")
     """Rematerialisation of a block in the backward pass. "dots" stores the results of large matrix
     products, "full" the block's input alone (least memory, one more forward pass), and "none"
     everything. Results are the same."""

@@ -12,8 +12,8 @@ from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import check_types, require, require_fraction, require_positive
-from crisalad_jax.config.concise import concise
-from crisalad_jax.config.fields import free_field
+from crisalad_jax.config.part import non_semantic_field
+from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.nn import draw
 from crisalad_jax.nn.attention import (
     COLUMNS,
@@ -41,7 +41,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 NORM_EPSILON = 1e-5
 
 
-@concise(switch=("layers", 0))
+@short_repr(switch=("layers", 0))
 @dataclasses.dataclass(frozen=True)
 class CrossImageConfig:
     """The transformer encoder that attends across the images of a batch (paper section 3.4).
@@ -55,7 +55,7 @@ class CrossImageConfig:
     """Number of layers. 0 leaves the encoder out, so that descriptors depend on no other image."""
     heads: int = 16
     feedforward: int = 2048
-    dropout: float = free_field(0.1)
+    dropout: float = non_semantic_field(0.1)
     global_token: bool = True
     """Whether the global token takes part too, cut into tokens of the clusters' width."""
 

@@ -5,11 +5,11 @@ import dataclasses
 from jaxtyping import Array, Float
 
 from crisalad_jax.config.checks import check_types, require
-from crisalad_jax.config.concise import concise
+from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.nn.layers import Linear, l2_normalise, linear
 
 
-@concise(switch=("dim", 0))
+@short_repr(switch=("dim", 0))
 @dataclasses.dataclass(frozen=True)
 class ProjectionConfig:
     """A linear layer with a bias over the unit descriptor, the last of a model.

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 
 
 class TransportStatistics(NamedTuple):

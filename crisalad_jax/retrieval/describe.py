@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Int64
 
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.loader import ImageBatch, ImageCache, OnBadImage
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad

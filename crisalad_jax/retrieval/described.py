@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.utils.shapes import Float32, Int64
 
 

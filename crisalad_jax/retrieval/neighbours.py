@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.retrieval.chunks import UNIT_TOLERANCE
 from crisalad_jax.utils.shapes import Float, Float32, Int, Int64
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.config.checks import PATH, check_seed, check_types, takes
-from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import from_plain, to_plain
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.retrieval.chunks import WIDE, as_rows, pieces, sample
 from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError

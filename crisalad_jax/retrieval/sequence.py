@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from crisalad_jax.config.checks import check_types
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Float64, Int64
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.chunks import check_rows, pieces

@@ -12,15 +12,16 @@ from crisalad_jax.config.checks import (
     require_fraction,
     require_positive,
 )
-from crisalad_jax.config.concise import concise
-from crisalad_jax.config.parts import OrName, part_field, resolve_names
+from crisalad_jax.config.part import OrName
+from crisalad_jax.config.registry import part_field, resolve_names
+from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.data.augmentations import AUGMENTATIONS, Augmentation
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.trainable import EXPECTED, TRAINABLE
 
 
-@concise()
+@short_repr()
 @dataclasses.dataclass(frozen=True)
 class OptimiserConfig:
     """An optimiser of torch, with an optional warm-up and a learning rate that falls.
@@ -105,7 +106,7 @@ def _rises(numbers: tuple[int, ...]) -> bool:
     return all(first < second for first, second in itertools.pairwise(numbers))
 
 
-@concise(switch=("kind", "none"))
+@short_repr(switch=("kind", "none"))
 @dataclasses.dataclass(frozen=True)
 class MiningConfig:
     """Tuples of a query, its nearest positive and its hardest negatives, by the model as it is.
@@ -159,7 +160,7 @@ class MiningConfig:
         )
 
 
-@concise("model", "loss")
+@short_repr("model", "loss")
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """A whole training run, apart from where its files lie.

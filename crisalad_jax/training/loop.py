@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator
 from typing import NamedTuple
 
 from crisalad_jax.config.checks import PATH, takes
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import THREADS, OnBadImage
 from crisalad_jax.data.places import Places

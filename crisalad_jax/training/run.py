@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.config.source import changed_sources, sources_of
+from crisalad_jax.config.plugins import changed_sources, sources_of
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.loader import ImageCache, OnBadImage, one_ahead
 from crisalad_jax.data.places import Places
@@ -252,7 +252,7 @@ class Run:
                     "expected the same, or another folder"
                 )
 
-        changed = changed_sources(self.config, saved["sources"], same_version=False)
+        changed = changed_sources(self.config, saved["sources"])
         if changed:
             raise InputError(
                 f"{self.out}: found another source of {', '.join(changed)} than the run began "
@@ -371,9 +371,7 @@ class Run:
         words = describe_mined(mined)
         return mined, words + (f"; {unreadable} unreadable images left out" if unreadable else "")
 
-    def rest_of_round(
-        self, on_bad_image: OnBadImage, threads: int
-    ) -> Generator[Batch, None, None]:
+    def rest_of_round(self, on_bad_image: OnBadImage, threads: int) -> Generator[Batch, None, None]:
         """Yield the batches from the next step to the end of its round; none if the run is done.
 
         Each is copied to the devices while they compute the one before.

@@ -3,8 +3,8 @@
 from typing import Any, NamedTuple
 
 from crisalad_jax.config.checks import takes
-from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.costs import PartCost, adapter_macs, paper_adapter_macs, part_costs
 from crisalad_jax.training.config import has_adapters

@@ -19,7 +19,7 @@ from jaxtyping import Float, Float32
 from crisalad_jax.checkpoints.torch_io import with_backbone_of
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config.checks import check_seed
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator

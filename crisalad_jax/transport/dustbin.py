@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.concise import brief
-from crisalad_jax.config.parts import Part, Registry
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import Registry
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.transport.diagnose import wide_dtype
 from crisalad_jax.utils.errors import InputError
 

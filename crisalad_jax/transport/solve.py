@@ -9,7 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.transport.config import SinkhornConfig
 from crisalad_jax.transport.diagnose import (
     check_init,

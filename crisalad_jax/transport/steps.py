@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.config.parts import Part, Registry, count_arguments
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import Registry, count_arguments
 from crisalad_jax.transport.problem import Potentials, Problem, ScalingProblem, product
 
 

@@ -10,7 +10,7 @@ import optax
 import pytest
 import torch
 
-from crisalad_jax.config.parts import REGISTRIES
+from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.data.places import read_places
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.model import init_crisalad, parameter_shapes

@@ -13,8 +13,8 @@ from crisalad_jax.checkpoints.layouts.dinov2 import parts_in_words
 from crisalad_jax.checkpoints.layouts.forms import Absent, Entry, Extra
 from crisalad_jax.checkpoints.layouts.readings import Reading, readings
 from crisalad_jax.config.checks import choose
-from crisalad_jax.config.fields import with_free_fields_of
 from crisalad_jax.config.io import differences
+from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.vit import VisionTransformer
 from crisalad_jax.nn.config import ModelConfig
@@ -152,7 +152,7 @@ def check_holds(config: ModelConfig, layout: str, extras: State | None = None) -
     blank = {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
     blank |= {line.theirs: line.stored(extras or {}) for line in lines}
     read_back = infer(blank, source=f"layout {layout}")[1]
-    wrong = differences(_told(with_free_fields_of(config, read_back)), _told(config))
+    wrong = differences(_told(with_non_semantic_fields_of(config, read_back)), _told(config))
     if wrong:
         raise InputError(
             f"layout {layout}: cannot tell these apart from the published ones: "

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from crisalad_jax.config.parts import Part, Registry, count_arguments
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import Registry, count_arguments
 from crisalad_jax.utils.shapes import UInt8
 
 Image = UInt8[np.ndarray, "h w 3"]

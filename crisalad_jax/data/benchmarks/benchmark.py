@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import read_image
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores

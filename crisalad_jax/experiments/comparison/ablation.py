@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from crisalad_jax.config.parts import Part
+from crisalad_jax.config.part import Part
 from crisalad_jax.experiments.comparison.methods import training_with
 from crisalad_jax.experiments.comparison.records import advised
 from crisalad_jax.experiments.comparison.timing import Race, race

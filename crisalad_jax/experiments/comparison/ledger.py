@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from crisalad_jax.config.io import read_config, to_plain
-from crisalad_jax.config.parts import parts_of
-from crisalad_jax.config.source import source_digest
+from crisalad_jax.config.part import parts_of
+from crisalad_jax.config.plugins import source_digest
 from crisalad_jax.experiments.comparison.methods import method_of
 from crisalad_jax.experiments.comparison.plan import ComparisonConfig, Prepared
 from crisalad_jax.experiments.comparison.records import read_result
@@ -204,6 +204,6 @@ def _behind(prepared: Prepared) -> dict[str, str]:
     for variant in prepared.variants:
         for part in map(type, parts_of(variant.training).values()):
             digest = source_digest(part)
-            if digest is not None and not part.__module__.startswith("crisalad_jax."):
+            if digest is not None:
                 digests[f"{part.registry.kind} {part.part_name}"] = digest
     return digests

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from crisalad_jax.config.parts import Part
+from crisalad_jax.config.part import Part
 from crisalad_jax.data.augmentations import Augmentation
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.recipes import (

@@ -13,7 +13,7 @@ from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.torch_io import read_backbone
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.checks import check_types
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.benchmark import leave_out_unreadable
 from crisalad_jax.data.loader import OnBadImage

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
 from crisalad_jax.evaluation.results import ANY

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.config.concise import brief
-from crisalad_jax.config.parts import Part, Registry
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import Registry
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
 from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise
 from crisalad_jax.nn.tokens import Tokens

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_fraction, require_positive
-from crisalad_jax.config.fields import free_field
+from crisalad_jax.config.part import non_semantic_field
 from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.salad import (
@@ -73,7 +73,7 @@ class FolConfig(Aggregator):
     token_dim: int = 256
     """Width of the global token."""
     hidden: int = 512
-    dropout: float = free_field(0.3)
+    dropout: float = non_semantic_field(0.3)
     local_hidden: int = 256
     """Number of channels between the transposed convolutions."""
     local: int = 128

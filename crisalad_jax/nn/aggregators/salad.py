@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require, require_fraction, require_positive
-from crisalad_jax.config.fields import free_field
-from crisalad_jax.config.parts import OrName, part_field, resolve_names
+from crisalad_jax.config.part import OrName, non_semantic_field
+from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones.base import Backbone, FeatureRequest, Features
@@ -78,7 +78,7 @@ class SaladConfig(Aggregator):
     token_dim: int = 256
     """Width of the global token."""
     hidden: int = 512
-    dropout: float = free_field(0.3)
+    dropout: float = non_semantic_field(0.3)
     dustbin: OrName[Dustbin] = part_field(DUSTBINS, "column")
     """Registered dustbin, or its name; it takes the patches that belong to no cluster."""
     epsilon: float = 1.0

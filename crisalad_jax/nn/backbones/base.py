@@ -7,8 +7,9 @@ from typing import Any, ClassVar, Literal, NamedTuple
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.config.concise import brief, concise
-from crisalad_jax.config.parts import Part, Registry
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import Registry
+from crisalad_jax.config.short_repr import brief, short_repr
 from crisalad_jax.nn.layers import split_statistics
 
 
@@ -27,7 +28,7 @@ class Features(NamedTuple):
     float32 at least; None where `FeatureRequest.class_attention` does not ask for it."""
 
 
-@concise()
+@short_repr()
 @dataclasses.dataclass(frozen=True)
 class FeatureRequest:
     """The features that an aggregator requests; by default those after the last layer."""

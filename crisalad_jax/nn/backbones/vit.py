@@ -20,7 +20,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import choose, require, require_positive
-from crisalad_jax.config.fields import free_field
+from crisalad_jax.config.part import non_semantic_field
 from crisalad_jax.nn import draw
 from crisalad_jax.nn.adapter import (
     Adapter,
@@ -128,7 +128,7 @@ class VisionTransformer(Backbone):
     mlp_ratio: float = 4.0
     ffn: Literal["mlp", "swiglu"] = "mlp"
     registers: int = 0
-    layer_scale_init: float = free_field(1.0)
+    layer_scale_init: float = non_semantic_field(1.0)
     adapter: AdapterConfig = AdapterConfig()
 
     def __post_init__(self) -> None:
@@ -245,7 +245,7 @@ class ViTConfig(VisionTransformer):
     position_resize: Literal["dinov2", "plain"] = "dinov2"
     """Resizing of that grid to an image's: as DINOv2's models do, which antialias where there are
     registers; or plain, never antialiased."""
-    position_init: Literal["random", "sincos"] = free_field("random")
+    position_init: Literal["random", "sincos"] = non_semantic_field("random")
     """Initialisation of the position embeddings where no weights are loaded."""
 
     def __post_init__(self) -> None:

@@ -10,8 +10,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from crisalad_jax.config.checks import choose
-from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import PreprocessingConfig
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.sources import check_rate_used, open_source

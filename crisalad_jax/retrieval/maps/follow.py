@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.concise import brief
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.positions import AXES, utm_positions
 from crisalad_jax.data.video import moment_of

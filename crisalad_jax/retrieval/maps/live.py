@@ -9,8 +9,8 @@ import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count, takes
-from crisalad_jax.config.concise import brief
 from crisalad_jax.config.preprocessing import Size
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.live import Frame
 from crisalad_jax.retrieval.maps.follow import Follower
 from crisalad_jax.retrieval.maps.map import Map

@@ -20,8 +20,8 @@ import numpy as np
 from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
 from crisalad_jax.config.checks import PATH, check_count, takes
-from crisalad_jax.config.concise import brief
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import Positions

@@ -5,8 +5,9 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from crisalad_jax.config.checks import choose, takes
-from crisalad_jax.config.parts import REGISTRIES, Part
+from crisalad_jax.config.part import Part
 from crisalad_jax.config.plugins import load_entry_points
+from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig, has_adapters

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from crisalad_jax.config.parts import REGISTRIES
+from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.data.augmentations import AUGMENTATIONS
 from crisalad_jax.experiments.comparison import METHODS, ComparisonConfig, compare, ledger, prepare
 from crisalad_jax.experiments.comparison.ablation import row_training

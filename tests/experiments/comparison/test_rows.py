@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from crisalad_jax.cli import ablate, main
-from crisalad_jax.config.parts import REGISTRIES
+from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.experiments.comparison import AblationRow, ComparisonConfig, parse_row, prepare
 from crisalad_jax.experiments.comparison.plan import labels_of
 from crisalad_jax.experiments.comparison.rows import as_row

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.config.parts import REGISTRIES
+from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.nn.aggregators.base import to_descriptor
 from crisalad_jax.nn.aggregators.class_token import ClassTokenConfig
 from crisalad_jax.nn.aggregators.gem_pyramid import GemPyramid, GemPyramidConfig, gem_pyramid

@@ -14,9 +14,9 @@ import pytest
 import crisalad_jax as cj
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.classes import ClassesConfig
-from crisalad_jax.config.concise import concise_repr
-from crisalad_jax.config.field_docs import field_docs
-from crisalad_jax.config.parts import REGISTRIES, Part
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import REGISTRIES
+from crisalad_jax.config.short_repr import concise_repr, field_docs
 from crisalad_jax.data.live import Frame
 from crisalad_jax.data.loader import ImageBatch
 from crisalad_jax.data.places import Places
@@ -210,7 +210,7 @@ def test_a_class_says_more_than_its_base():
 def test_an_import_reads_no_sources():
     program = (
         "import crisalad_jax as cj; cj.TrainConfig; cj.evaluate; cj.Map\n"
-        "from crisalad_jax.config.field_docs import field_docs\n"
+        "from crisalad_jax.config.short_repr import field_docs\n"
         "assert field_docs.cache_info().currsize == 0\n"
         "assert 'patience: ' in cj.TrainConfig.__doc__"
     )
