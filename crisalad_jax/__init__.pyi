@@ -95,8 +95,8 @@ from crisalad_jax.training.summary import model_summary as model_summary
 from crisalad_jax.training.trainable import merge_params as merge_params
 from crisalad_jax.training.trainable import split_params as split_params
 from crisalad_jax.training.vocabulary import build_vocabulary as build_vocabulary
+from crisalad_jax.utils.compiler import set_up as set_up
 from crisalad_jax.utils.errors import InputError as InputError
 from crisalad_jax.utils.pytree import pytree_dataclass as pytree_dataclass
-from crisalad_jax.utils.session import set_up as set_up
 
 __version__: str

@@ -22,8 +22,8 @@ from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.download import MissingFileError, download
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, user_cache, write_json
-from crisalad_jax.utils.locks import next_writer
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.locks import lock
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.version import VERSION
 
 OFFLINE, MIRROR = "CRISALAD_OFFLINE", "CRISALAD_MIRROR"
@@ -66,7 +66,7 @@ def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
     published = _folder(model) / model.file
     if not published.is_file():
         _check_obtainable(model)
-    with next_writer(_folder(model)):
+    with lock(_folder(model), wait=True):
         if not _is_ready(model):
             _check_torch(model)
             address = None
@@ -181,7 +181,7 @@ def _download(model: Published, target: pathlib.Path, *, quiet: bool) -> str:
                 raise InputError(
                     f"{model.name}: {error}; it may have moved: {model.repository}"
                 ) from error
-            tell(f"{address}: found no such file; looking at {model.url}")
+            warn(f"{address}: found no such file; looking at {model.url}")
         except InputError as error:
             raise InputError(f"{model.name}: {error}") from error
     raise AssertionError("no address")  # `_check_obtainable` has seen one

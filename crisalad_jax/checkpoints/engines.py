@@ -11,7 +11,7 @@ import numpy as np
 from crisalad_jax.config.checks import choose
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 EngineName = Literal["onnxruntime", "openvino"]
 Precision = Literal["float32", "bfloat16"]
@@ -53,7 +53,7 @@ def _openvino(path: pathlib.Path, precision: Precision) -> Program:
     hint = {"float32": "f32", "bfloat16": "bf16"}[precision]
     core = openvino.Core()
     if precision == "bfloat16" and "BF16" not in core.get_property("CPU", _CAPABILITIES):
-        tell("openvino: found a processor without bfloat16 instructions; it computes in float32")
+        warn("openvino: found a processor without bfloat16 instructions; it computes in float32")
     compiled = core.compile_model(path, "CPU", {"INFERENCE_PRECISION_HINT": hint})
     return lambda *inputs: np.array(compiled(list(inputs))[0])
 

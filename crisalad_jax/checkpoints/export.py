@@ -55,7 +55,7 @@ from crisalad_jax.utils.compiler import number_types
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.files import atomic_folder, check_new_folder, write_json
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.target import PORTABLE, STRAIGHT, lowering_for
 
@@ -268,7 +268,7 @@ def write_export(
         _check_calibration(calibration, config, how)
     if config.preprocessing.size_rule != "fixed":
         size = " x ".join(map(str, config.input_size))
-        tell(
+        warn(
             f"{out}: found images of size rule {config.preprocessing.size_rule}; the program takes "
             f"{size} alone"
         )

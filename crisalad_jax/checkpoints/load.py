@@ -9,7 +9,7 @@ from crisalad_jax.checkpoints import starter
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 if TYPE_CHECKING:
     from crisalad_jax.nn.config import ModelConfig
@@ -97,13 +97,13 @@ def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False)
     model = PUBLISHED.get(name)
     if is_there:
         if model is not None or name in starter.FILES:
-            tell(f"{name}: found a file of this name here, and took that, not the model so named")
+            warn(f"{name}: found a file of this name here, and took that, not the model so named")
         return path
     if model is not None:
         from crisalad_jax.checkpoints.cache import cached_weights
 
         for each in (model, *filter(None, [PUBLISHED.get(model.backbone)])):
-            tell(f"{each.name}: {each.licence.words} ({each.repository})")
+            warn(f"{each.name}: {each.licence.words} ({each.repository})")
         return cached_weights(model, quiet=quiet)
     near = nearest_names(path.stem)
     is_name = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name) is not None

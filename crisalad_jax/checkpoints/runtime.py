@@ -24,8 +24,8 @@ from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, user_cache
-from crisalad_jax.utils.locks import next_writer
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.locks import lock
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.version import VERSION
 
 if TYPE_CHECKING:
@@ -370,8 +370,8 @@ def _export(weights: pathlib.Path, settings: Mapping[str, Any], folder: pathlib.
             f"{weights}: found images of size rule {config.preprocessing.size_rule}, expected "
             "fixed: a program takes one size (--resize fixed)"
         )
-    with next_writer(folder.parent):
+    with lock(folder.parent, wait=True):
         if not (folder / MANIFEST).is_file():
-            tell(f"{weights}: exporting it for --runtime, once; into {folder}")
+            warn(f"{weights}: exporting it for --runtime, once; into {folder}")
             how = ExportConfig(settings["grouping"], format=settings["format"])
             write_export(folder, params, config, how)

@@ -9,7 +9,7 @@ import os
 import pathlib
 
 from crisalad_jax.utils.files import real_path
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 NAME = "starter"
 """Its name, for `--weights` and `load`."""
@@ -28,7 +28,7 @@ def default_weights() -> pathlib.Path:
 
 def tell_taken() -> None:
     """Tell that the model in this package was taken."""
-    tell(
+    warn(
         f"no --weights: taking {NAME}, the small model in this package, trained on rendered "
         f"pictures alone (docs/{NAME}.md); for the best recall: --weights {BEST}"
     )

@@ -22,7 +22,7 @@ from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
 from crisalad_jax.utils.checksums import ChangedFileError, checked_safetensors
 from crisalad_jax.utils.errors import InputError, few
 from crisalad_jax.utils.files import check_source, is_html
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.version import VERSION
 
@@ -180,7 +180,7 @@ def _loaded(
         ) from error
     changed = changed_sources(config, metadata["parts"])
     if changed:
-        tell(
+        warn(
             f"{path}: found another source of {', '.join(changed)} than these weights were written "
             "with; descriptors may differ"
         )

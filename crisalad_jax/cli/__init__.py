@@ -18,10 +18,9 @@ from typing import Any
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.plugins import has_plugins, load_entry_points, load_plugin, plugin_failure
-from crisalad_jax.utils.errors import InputError, Stopped, how_ended
+from crisalad_jax.utils.errors import InputError, Interrupted, how_ended
 from crisalad_jax.utils.extras import missing_extra
-from crisalad_jax.utils.notes import Note
-from crisalad_jax.utils.output import one_line, printable
+from crisalad_jax.utils.output import Note, one_line, printable
 from crisalad_jax.utils.version import VERSION
 
 _COMMANDS = {
@@ -129,11 +128,11 @@ def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
 
 
 def _set_up_jax(keep_programs: bool) -> None:
-    from crisalad_jax.utils import compiler, kept
+    from crisalad_jax.utils import compiler, executable_cache
 
-    compiler.set_up()
+    compiler.configure()
     if keep_programs and not has_plugins():
-        kept.keep_programs()
+        executable_cache.cache_executables()
 
 
 _LARGEST = 2**40
@@ -171,7 +170,8 @@ _show_warning: Callable[..., None] = warnings.showwarning
 def main(arguments: Sequence[str] | None = None, *, keep_programs: bool = False) -> int:
     """Run one command, and return its exit code.
 
-    A process of its own may `keep_programs` (`utils.kept`): nothing else changes the code there.
+    A process of its own may `keep_programs` (`utils.executable_cache`): nothing else changes the
+    code there.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given[:1] == ["help"]:  # as of git
@@ -203,7 +203,7 @@ def _exit_code(given: list[str], keep_programs: bool) -> int:
         return 2
     except SystemExit as stop:  # from tyro, after --help
         return _tell_of_plugin(stop) or 0
-    except Stopped as stopped:
+    except Interrupted as stopped:
         print(f"crisalad: {stopped}", file=sys.stderr)
         return 128 + stopped.number
     except KeyboardInterrupt:

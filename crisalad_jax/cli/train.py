@@ -140,7 +140,7 @@ def prepare(arguments: Sequence[str]) -> Sequence[str]:
     given = find_flag(arguments, "--weights")
     if given is None or asked_for(arguments):
         return arguments
-    compiler.set_up()
+    compiler.configure()
     if find_flag(arguments, "--coordinator-address") is not None:
         _check_cached(given)
     weights = find_weights(given, quiet="--quiet" in arguments)

@@ -22,8 +22,7 @@ from crisalad_jax.data.resize import resize_image
 from crisalad_jax.data.video import frame_time, is_video, read_frame
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_bytes, real_path
-from crisalad_jax.utils.notes import tell
-from crisalad_jax.utils.output import counted
+from crisalad_jax.utils.output import counted, warn
 from crisalad_jax.utils.shapes import UInt8
 
 OnBadImage = Literal["skip", "stop"]
@@ -366,7 +365,7 @@ def only_images(
             f"{' '.join(IMAGE_SUFFIXES)}"
         )
     if kinds:
-        tell(f"{source}: skipped {counted(kinds.total(), 'other file')}: {words}")
+        warn(f"{source}: skipped {counted(kinds.total(), 'other file')}: {words}")
     return images
 
 

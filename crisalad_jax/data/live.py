@@ -19,7 +19,7 @@ from crisalad_jax.data.images import SELF_CHECKED, is_image, read_pixels
 from crisalad_jax.data.opencv import QUIET
 from crisalad_jax.data.video import check_rate, frame_name, milliseconds_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 _POLL = 0.05
 """Seconds between two looks into a folder, and four times what a look takes if that is longer."""
@@ -124,7 +124,7 @@ class FolderWatch:
                         self._done.add(path)
                         del waiting[path]
                         if path.exists():
-                            tell(f"{error}; it is left out")
+                            warn(f"{error}; it is left out")
                     continue
                 self._done.add(path)
                 del waiting[path]

@@ -21,7 +21,7 @@ from crisalad_jax.data.sources import ImageSource, check_rate_used, open_source
 from crisalad_jax.data.tables import read_table
 from crisalad_jax.data.video import file_of, frame_time, is_video
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float64, Int64
 
 TABLE = "places.csv"
@@ -122,7 +122,7 @@ def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> NamedPlaces:
     if not places:
         raise InputError(f"{path}: found none of {missing} images, expected some")
     if missing:
-        tell(f"{path}: left out {missing} of {len(rows)} images, which are missing")
+        warn(f"{path}: left out {missing} of {len(rows)} images, which are missing")
     return NamedPlaces(root, places, views or None)
 
 
@@ -162,7 +162,7 @@ def places_by_position(
             "table as --data, @UTM names or EXIF data; --place-frames takes images in order"
         )
     if len(names) < len(source.names):
-        tell(
+        warn(
             f"{root}: left out {len(source.names) - len(names)} of {len(source.names)} images, "
             "which have no position"
         )

@@ -27,7 +27,7 @@ from crisalad_jax.data.named_places import (
 from crisalad_jax.data.tables import Disk, normal_name, read_table
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float64, Int, Int32, Int64
 
 COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
@@ -163,7 +163,7 @@ def _named_places(found: NamedPlaces, min_images: int, words: str = "") -> Place
     flags = " (--place-radius, --place-frames, --min-images)" if words else ""
     _check_some(found.root, kept, found.images.values(), min_images, words, flags)
     if len(kept) < len(found.images):
-        tell(
+        warn(
             f"{found.root}: left out {len(found.images) - len(kept)} of {len(found.images)} places,"
             f" with fewer than {min_images} images{words}"
         )
@@ -310,7 +310,7 @@ def _read_city(
         else:
             raise _no_image(root, path, line, (city_id, path.stem), stem)
     if missing:
-        tell(f"{path}: left out {missing} rows, whose images are missing")
+        warn(f"{path}: left out {missing} rows, whose images are missing")
     ids = {place % IDS_PER_CITY: place for place in places}
     if len(ids) < len(places):
         first = next(place for place in places if ids[place % IDS_PER_CITY] != place)

@@ -10,7 +10,7 @@ import numpy as np
 from crisalad_jax.config.preprocessing import BitDepth, PreprocessingConfig, Size
 from crisalad_jax.data.resize import Pixels, resize_image
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float32, UInt8, UInt16
 
 PERCENTILES = (1, 99)
@@ -90,7 +90,7 @@ def _note_narrow(image: UInt16[np.ndarray, "..."], name: str) -> None:
     low, high = _range(image, PERCENTILES, name)
     if high - low < _NARROW and _noted.acquire(blocking=False):
         levels = int(high) // 256 - int(low) // 256 + 1
-        tell(
+        warn(
             f"{name}: 16-bit values from {low:,.0f} to {high:,.0f} of 65,535 become {levels} of "
             "256 grey levels; --resize contrast-stretch spreads them over all"
         )

@@ -28,7 +28,7 @@ from crisalad_jax.data.video import (
 )
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, read_text
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 _FORMS = (
     "a folder of images, an image, a video, a pattern such as 'frames/*.jpg', a list (.txt) or a "
@@ -81,7 +81,7 @@ def open_source(
     frames = _Frames(1.0 if fps is None else fps, on_bad_image)
     source = _opened(images, frames)
     if fps is None and frames.taken < frames.there:
-        tell(f"{images}: {frames.taken} of {frames.there} frames, 1 per second: --fps")
+        warn(f"{images}: {frames.taken} of {frames.there} frames, 1 per second: --fps")
     return source
 
 

@@ -16,7 +16,7 @@ from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.maps.calibration import Calibration, write_calibration
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.locks import next_writer
+from crisalad_jax.utils.locks import lock
 
 
 @takes(places=Map, benchmark=Benchmark)
@@ -108,7 +108,9 @@ def calibrate(
         model=places.description.model,
         created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     )
-    with next_writer(places.folder):  # an addition removes temporary files beside the description
+    with lock(
+        places.folder, wait=True
+    ):  # an addition removes temporary files beside the description
         write_calibration(places.folder, calibration)
     places.calibration = calibration
     return calibration

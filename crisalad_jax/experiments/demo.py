@@ -31,7 +31,7 @@ from crisalad_jax.training.loop import fit
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, write_json
-from crisalad_jax.utils.locks import one_writer
+from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries
 
@@ -77,7 +77,7 @@ def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> D
         raise InputError(
             f"{out}: found files but no demo, expected a demo or a new or empty folder"
         )
-    with one_writer(out):
+    with lock(out):
         remove_temporaries(out)
         return _demo(config, out, quiet, started)
 

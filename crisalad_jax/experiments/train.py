@@ -74,7 +74,7 @@ def train(
     Raises:
         InputError: what `read_start`, `read_places`, `read_query_set`, `open_benchmark` and `fit`
             raise.
-        Stopped: what `fit` raises; the same call resumes.
+        Interrupted: what `fit` raises; the same call resumes.
 
     Example:
         >>> import dataclasses

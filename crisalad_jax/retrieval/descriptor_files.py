@@ -26,7 +26,7 @@ from crisalad_jax.utils.files import (
     npy_header,
     read_json,
     read_text,
-    told_of,
+    wrap_os_errors,
     write_json,
     write_npy,
 )
@@ -113,7 +113,7 @@ def _write_npy(
         atomic_path(_names_of(path), within) as listed,
         atomic_path(record_of(path), within) as recorded,
     ):
-        with told_of(path):
+        with wrap_os_errors(path):
             if written is None:
                 write_npy(array, descriptors)
             else:

@@ -23,8 +23,8 @@ from crisalad_jax.retrieval.model import Model, model_hash
 from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
-from crisalad_jax.utils.locks import one_writer
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.locks import lock
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Bool, Int64
 from crisalad_jax.utils.temporaries import remove_temporaries
@@ -45,7 +45,7 @@ def partial_folder(out: pathlib.Path) -> Iterator[pathlib.Path]:
         InputError: another process writes these descriptors, or the folder cannot be made.
     """
     folder = out.with_name(f"{out.name}.partial")
-    with one_writer(folder):
+    with lock(folder):
         remove_temporaries(folder)
         try:
             yield folder
@@ -192,7 +192,7 @@ def _begin(folder: pathlib.Path, plan: dict[str, Any]) -> None:
     except InputError:
         pass
     if left:
-        tell(f"{folder}: found work of another model or batch size; it is begun anew")
+        warn(f"{folder}: found work of another model or batch size; it is begun anew")
     for path in left:
         path.unlink()
     write_json(folder / _PLAN, plan)
@@ -213,7 +213,7 @@ def _read(
         except (InputError, TypeError):
             return
         if value.get("images") != _digest(paths[first : first + size]):
-            tell(f"{path}: found work on other images; from there on it is begun anew")
+            warn(f"{path}: found work on other images; from there on it is begun anew")
             return
         if on_bad_image == "stop" and not part.readable.all():
             return  # to be read again, for the error

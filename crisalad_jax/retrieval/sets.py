@@ -27,9 +27,9 @@ from crisalad_jax.retrieval.partial import partial_folder, read_tokens_partly
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.shares import Share
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json, told_of
+from crisalad_jax.utils.files import read_json, wrap_os_errors
 from crisalad_jax.utils.locks import BusyFolderError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.temporaries import in_use, temporary_beside
 
@@ -148,7 +148,7 @@ def describe_set(
         if components is not None:
             descriptors = components.apply(descriptors)
     else:
-        with told_of(folder):
+        with wrap_os_errors(folder):
             written = work.temporary()
             rows = described(params, config, tokens, grouping, **how)
             _write_rows(written, rows, tokens, config, f"{source}: descriptors")
@@ -221,7 +221,7 @@ class SharedSet(NamedTuple):
         left = [share for share in self.share.others() if not self.is_done(self.path(share))]
         for share in left:
             if record_of(self.path(share)).exists():
-                tell(
+                warn(
                     f"{self.path(share)}: found a share of other images or settings; its process "
                     "has to run again, as the others do"
                 )
@@ -267,7 +267,7 @@ def extract_share(
             try:
                 work = stack.enter_context(open_work(shared.out))
             except BusyFolderError:
-                tell(f"{shared.out}: another process joins the shares")
+                warn(f"{shared.out}: another process joins the shares")
             else:
                 result = finish(_joined(shared, work), work, more)
                 _remove(shared)
@@ -289,7 +289,7 @@ def _joined(shared: SharedSet, work: Work) -> DescribedSet:
     length = sets[0][1].shape[1]
     written, start = work.temporary(), 0
     with (
-        told_of(written),
+        wrap_os_errors(written),
         RowFile(written, len(names), length) as file,
         progress_bar("joining", len(names), "rows", quiet=True) as bar,
     ):

@@ -22,7 +22,7 @@ from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answer
 from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import durable_path, real_path
+from crisalad_jax.utils.files import atomic_path, real_path
 from crisalad_jax.utils.progress import progress_bar
 
 ADDED = "added"
@@ -240,7 +240,7 @@ def _kept(root: pathlib.Path, works: Sequence[Addition]) -> Any:
     written: list[pathlib.Path] = []
     try:
         for work in works:
-            with durable_path(root / work.name) as temporary:
+            with atomic_path(root / work.name, durable=True) as temporary:
                 temporary.write_bytes(work.data)
             written.append(root / work.name)
         yield

@@ -17,7 +17,7 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.run import Batch, Run, Told
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.utils import distributed
-from crisalad_jax.utils.errors import InputError, Stopped
+from crisalad_jax.utils.errors import InputError, Interrupted
 from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.signals import SignalState, defer_signals
 
@@ -83,7 +83,7 @@ def fit(
             ground truth; `out` holds something else, or a run of another configuration or start; an
             image cannot be read; there are too few places, classes or images; the loss is no longer
             finite (the state before that step is saved); or a file cannot be written.
-        Stopped: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
+        Interrupted: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
 
     Example:
         >>> import dataclasses
@@ -152,17 +152,17 @@ def _train(run: Run, rest_of_round: _Round, on_bad_image: OnBadImage, quiet: boo
                 # A signal to the process group also ends the workers that read images.
                 _stop_together(signals)
                 raise
-        except Stopped as stopped:
+        except Interrupted as stopped:
             run.save()
             where = f"after step {run.step}; the same command goes on"
-            raise Stopped(stopped.number, where) from None
+            raise Interrupted(stopped.number, where) from None
 
 
 def _stop_together(signals: SignalState) -> None:
-    """Raise `Stopped` in all processes if one of them was signalled."""
+    """Raise `Interrupted` in all processes if one of them was signalled."""
     (number,) = distributed.all_max(signals.number)
     if number:
-        raise Stopped(number)
+        raise Interrupted(number)
 
 
 def _train_round(run: Run, rest_of_round: _Round, signals: SignalState, bar: Bar) -> None:
@@ -185,7 +185,7 @@ def _train_round(run: Run, rest_of_round: _Round, signals: SignalState, bar: Bar
             raise error or InputError(distributed.ANOTHER_FAILED)
         if told.signal:
             finish()
-            raise Stopped(told.signal)
+            raise Interrupted(told.signal)
         if told.save_is_due:
             finish()
             distributed.raise_together(run.save)

@@ -9,7 +9,7 @@ import optax
 from jaxtyping import Array, Int, PyTree
 
 from crisalad_jax.training.config import OptimiserConfig
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 WARMUP_SHARE = 4
 """Divisor of a run's steps: a warm-up takes a quarter of them at most, as BoQ's 10 of 40 epochs."""
@@ -139,7 +139,7 @@ def tell_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) 
             flag, found = "epochs", f"{config.warmup_epochs}, which are {warmup} steps,"
         left = max(steps - warmup, 0)
         quarter = f"; at most {longest} steps would be a quarter" if longest else ""
-        tell(
+        warn(
             f"--optimiser.warmup-{flag}: found {found} for a run of {steps} steps, which leaves "
             f"{left} at the learning rate and its decay{quarter}"
         )

@@ -66,7 +66,7 @@ from crisalad_jax.training.trainable import merge_params, shards_batch
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.devices import Devices, devices_for
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.signals import SignalState
 
 WATCHED_QUERIES = 16
@@ -262,7 +262,7 @@ class Run:
     def _tell_of_extension(self, epochs: int, step: int, record: Mapping[str, Any]) -> None:
         """Tell in a note how a run that is given more epochs differs from one of them at once."""
         if record["stopped_early"]:
-            tell(
+            warn(
                 f"{self.out}: the run stopped early at step {step}, by patience "
                 f"{self.config.patience}, which more epochs do not change"
             )
@@ -272,7 +272,7 @@ class Run:
         # Up to the end of a warm-up the steps that were taken are those of any length.
         taken = {self._learning_rate(step - 1, length) for length in lengths}
         if step and len(taken) > 1:
-            tell(
+            warn(
                 f"{self.out}: the learning rate falls over the whole run, so that it jumps from "
                 f"{before:.3g} to {now:.3g} at step {step}: this is not the run of "
                 f"{self.config.epochs} epochs at once; --optimiser.decay-steps keeps a fall's "
@@ -646,7 +646,7 @@ def _devices(config: TrainConfig) -> Devices:
     devices = devices_for(images if spread else jax.process_count(), processes=True)
     found, used = len(jax.devices()), devices.mesh.size
     if spread and used < found and distributed.is_primary():
-        tell(
+        warn(
             f"training: found {found} devices for {images} images a step, of which {used} share "
             "them, the most that divide them in each process"
         )

@@ -23,7 +23,7 @@ from crisalad_jax.training.mining import Mined
 from crisalad_jax.training.step import TrainState
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
-from crisalad_jax.utils.locks import one_writer
+from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remove_temporaries
 
 
@@ -81,7 +81,7 @@ class RunFiles:
         """
         check_run(out, config)
         with contextlib.ExitStack() as opened:
-            opened.enter_context(one_writer(out))
+            opened.enter_context(lock(out))
             self.extends = claim_run(out, config)
             """Epochs of the run before `config` gave it more; None where it gives none."""
             for folder in (out, out / "best"):

@@ -16,7 +16,7 @@ from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 
 def read_start(
@@ -48,7 +48,7 @@ def read_start(
             raise InputError("--backbone: found beside --weights, expected only one of the two")
         params, theirs = load_weights(find_weights(weights, quiet=quiet), expected=config.model)
         if theirs.images_in_words != config.model.images_in_words:
-            tell(
+            warn(
                 f"{weights}: found weights for images at {theirs.images_in_words}; this run trains "
                 f"and is saved with {config.model.images_in_words}"
             )

@@ -34,7 +34,7 @@ from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, check_target
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import progress_bar
 
 IMAGES = 500
@@ -326,7 +326,7 @@ def _read_features(
             unreadable += [paths[i] for i in batch.indices[there & ~batch.valid]]
             bar.advance(int(there.sum()))
     if unreadable:
-        tell(f"images: {len(unreadable)} unreadable left out, {unreadable[0]} the first")
+        warn(f"images: {len(unreadable)} unreadable left out, {unreadable[0]} the first")
     return np.concatenate(parts) if parts else np.empty((0, config.backbone.dim), np.float32)
 
 

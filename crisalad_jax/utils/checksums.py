@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 CHECKSUM = "checksum"
 """Key of the digest, the first of its object."""
@@ -38,7 +38,7 @@ def with_blank(value: Mapping[str, Any]) -> dict[str, Any]:
     return {CHECKSUM: BLANK} | {key: each for key, each in value.items() if key != CHECKSUM}
 
 
-def sealed_json(value: Mapping[str, Any], indent: int | None = None) -> bytes:
+def checksummed_json(value: Mapping[str, Any], indent: int | None = None) -> bytes:
     """Return an object as the bytes of a JSON file, with its checksum ahead of all other keys."""
     data = (json.dumps(with_blank(value), indent=indent) + "\n").encode()
     return data.replace(BLANK.encode(), hashlib.sha256(data).hexdigest().encode(), 1)
@@ -75,7 +75,7 @@ class ChangedFileError(InputError):
 
 def tell_unchecked(path: object, missing: str = "no checksum") -> None:
     """Tell that a file, as of another program, has no checksum."""
-    tell(f"{path}: found {missing}, as of other programs; not checked")
+    warn(f"{path}: found {missing}, as of other programs; not checked")
 
 
 def has_damaged_key(value: Mapping[str, Any]) -> bool:

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from crisalad_jax.utils.errors import InputError, Stopped
+from crisalad_jax.utils.errors import InputError, Interrupted
 
 _MESSAGE = 2**16
 """Number of bytes that `run_on_primary` broadcasts: fixed, because JAX compiles for each size."""
@@ -154,7 +154,7 @@ def run_on_primary(work: Callable[[], _T]) -> _T:
     """Run `work` in the primary process alone; return its value, a JSON value, in every process.
 
     Raises:
-        InputError, Stopped: in every process, where `work` raises it.
+        InputError, Interrupted: in every process, where `work` raises it.
     """
     if jax.process_count() == 1:
         return work()
@@ -164,7 +164,7 @@ def run_on_primary(work: Callable[[], _T]) -> _T:
         if is_primary():
             value = work()
             message = {"value": value}
-    except Stopped as stopped:
+    except Interrupted as stopped:
         message = {"stopped": stopped.number}
         raise
     except (InputError, OSError) as error:
@@ -175,7 +175,7 @@ def run_on_primary(work: Callable[[], _T]) -> _T:
     if is_primary():
         return value  # pyright: ignore[reportReturnType]
     if "stopped" in received:
-        raise Stopped(received["stopped"])
+        raise Interrupted(received["stopped"])
     if "error" in received:
         raise InputError(f"process 0: {received['error']}")
     return received["value"]

@@ -31,7 +31,7 @@ def few(problems: Sequence[str]) -> str:
     return "; ".join([*problems[:_MOST], *more])
 
 
-class Stopped(Exception):
+class Interrupted(Exception):
     """A signal asked the program to end, and its work is saved."""
 
     def __init__(self, number: int, where: str = "") -> None:

@@ -18,8 +18,8 @@ from crisalad_jax.utils.checksums import (
     CHECKSUM,
     ChangedFileError,
     check_sealed,
+    checksummed_json,
     has_damaged_key,
-    sealed_json,
 )
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
@@ -273,7 +273,7 @@ def check_format(what: str, path: str | os.PathLike[str], *suffixes: str) -> Non
 
 
 @contextlib.contextmanager
-def told_of(path: pathlib.Path) -> Iterator[None]:
+def wrap_os_errors(path: pathlib.Path) -> Iterator[None]:
     """Turn an error of the disk in this block into one line that names the file.
 
     Raises:
@@ -288,9 +288,9 @@ def told_of(path: pathlib.Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def atomic_path(
-    path: str | os.PathLike[str], within: pathlib.Path | None = None
+    path: str | os.PathLike[str], within: pathlib.Path | None = None, *, durable: bool = False
 ) -> Iterator[pathlib.Path]:
-    """Yield a temporary path beside `path`; rename it to `path` on success, remove it on any error.
+    """Yield a temporary path next to `path`; rename it to `path` on success, else remove it.
 
     The temporary name keeps the suffix, for writers that choose a format by it. Parent folders are
     made as needed.
@@ -299,32 +299,22 @@ def atomic_path(
         path: the file.
         within: a folder on the same disk for the temporary file, which its owner clears; None is
             the folder of `path`.
+        durable: whether to sync the file to disk, safe from power failure.
 
     Raises:
         InputError: what `check_target` raises; or the disk is full, or fails.
     """
     path = pathlib.Path(path)
     check_target(path)
-    with made_folder(path.parent), told_of(path):
+    with made_folder(path.parent), wrap_os_errors(path):
         temporary = temporary_beside(path if within is None else within / path.name)
         with in_use(temporary):
             yield temporary
+            if durable:
+                _sync(temporary)
             os.replace(temporary, path)
-
-
-@contextlib.contextmanager
-def durable_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
-    """Yield a temporary path as `atomic_path`, and sync the file to disk, safe from power failure.
-
-    Raises:
-        InputError: as `atomic_path`.
-    """
-    path = pathlib.Path(path)
-    with atomic_path(path) as temporary:
-        yield temporary
-        _sync(temporary)
-    with told_of(path):
-        _sync(path.parent)
+        if durable:
+            _sync(path.parent)
 
 
 def _sync(path: pathlib.Path) -> None:
@@ -356,7 +346,7 @@ def npy_header(dtype: np.dtype, shape: tuple[int, ...]) -> bytes:
     return file.getvalue()
 
 
-def around(page: pathlib.Path, name: str) -> tuple[str, str]:
+def split_markers(page: pathlib.Path, name: str) -> tuple[str, str]:
     """Split a page around the place `name`, which two comments enclose.
 
     Raises:
@@ -380,7 +370,7 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """
     path = pathlib.Path(path)
     check_new_folder(path)
-    with made_folder(path.parent), told_of(path):
+    with made_folder(path.parent), wrap_os_errors(path):
         temporary = temporary_beside(path)
         with in_use(temporary):
             temporary.mkdir()
@@ -410,6 +400,6 @@ def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> None:
     Raises:
         InputError: as `atomic_path`.
     """
-    data = sealed_json(value, indent=2)
+    data = checksummed_json(value, indent=2)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
-from crisalad_jax.utils.errors import Stopped, how_ended
+from crisalad_jax.utils.errors import Interrupted, how_ended
 from crisalad_jax.utils.temporaries import remove_all_in_use
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
@@ -56,7 +56,7 @@ _holding = _waiting = 0
 
 
 @contextlib.contextmanager
-def held_signals() -> Iterator[None]:
+def block_signals() -> Iterator[None]:
     """Let a signal end this process after the block: for a few calls that belong together.
 
     An example is to make a file, and to note that it has to be removed.
@@ -130,13 +130,13 @@ class SignalState:
         self._before: dict[int, Any] = {}
 
     def check(self) -> None:
-        """Raise `Stopped` if a signal has come."""
+        """Raise `Interrupted` if a signal has come."""
         if self.number:
-            raise Stopped(self.number)
+            raise Interrupted(self.number)
 
     @contextlib.contextmanager
     def at_once(self) -> Iterator[None]:
-        """Raise `Stopped` as soon as a signal arrives, in a block that leaves nothing half done."""
+        """Raise `Interrupted` as a signal arrives, in a block that leaves nothing half done."""
         self._at_once = True
         try:
             self.check()
@@ -155,7 +155,7 @@ class SignalState:
                 earlier(number, frame)
             raise KeyboardInterrupt
         if self._at_once:
-            raise Stopped(number)
+            raise Interrupted(number)
 
     def is_first(self) -> bool:
         """Return whether this is the first call; there is one at each signal."""

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from crisalad_jax.utils.errors import InputError
 
 LOCK = ".crisalad-lock"
-"""Name of the file that a folder's writer locks (see `locks.one_writer`)."""
+"""Name of the file that a folder's writer locks (see `locks.lock`)."""
 
 
 def holds_other_files(folder: pathlib.Path) -> bool:

@@ -22,7 +22,7 @@ from crisalad_jax.checkpoints.export import FORMATS, ExportConfig, write_export
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import Crisalad, describe, init_crisalad, self_mask
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import around
+from crisalad_jax.utils.files import split_markers
 
 ROOT = pathlib.Path(__file__).parents[2]
 MODELS = (
@@ -110,7 +110,7 @@ def main() -> None:
         print(f"| {' | '.join(rows[-1])} |", flush=True)
         gc.collect()
     if given.page is not None:
-        before, after = around(given.page, "zoo")
+        before, after = split_markers(given.page, "zoo")
         given.page.write_text(before + table(rows) + after, encoding="utf-8")
 
 

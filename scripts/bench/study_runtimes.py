@@ -24,7 +24,7 @@ from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.extract import extract
 from crisalad_jax.retrieval.model import Model
-from crisalad_jax.utils.files import around
+from crisalad_jax.utils.files import split_markers
 
 KS = (1, 5, 10)
 ENGINES: tuple[tuple[EngineName, ExportConfig], ...] = (
@@ -88,7 +88,7 @@ def main() -> None:
             lines.append(f"| {' | '.join(cells)} |")
             print(lines[-1], flush=True)
     if given.page is not None:
-        before, after = around(given.page, "runtimes")
+        before, after = split_markers(given.page, "runtimes")
         given.page.write_text(before + "\n".join(lines) + "\n" + after, encoding="utf-8")
 
 

@@ -21,7 +21,7 @@ from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.metrics import Interval
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, init_crisalad
-from crisalad_jax.utils.files import around
+from crisalad_jax.utils.files import split_markers
 
 KS = (1, 5, 10)
 Models = dict[str, tuple[Crisalad, ModelConfig]]
@@ -66,7 +66,7 @@ def main() -> None:
         lines.append(line)
         print(line, flush=True)
     if given.page is not None:
-        before, after = around(given.page, "recalls")
+        before, after = split_markers(given.page, "recalls")
         given.page.write_text(before + "\n".join(lines) + "\n" + after, encoding="utf-8")
 
 

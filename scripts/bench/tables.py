@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import around, atomic_path, check_target
+from crisalad_jax.utils.files import atomic_path, check_target, split_markers
 
 INK, GREY, PALE = "#222222", "#757575", "#e4e4e4"
 # Okabe and Ito's: told apart by the colour-blind.
@@ -68,7 +68,7 @@ def splice(page: pathlib.Path, name: str, table: Table) -> None:
     Raises:
         InputError: the page has no such comments.
     """
-    before, after = around(page, name)
+    before, after = split_markers(page, name)
     with atomic_path(page) as temporary:
         temporary.write_text(before + markdown(table) + after, encoding="utf-8")
 
@@ -116,7 +116,7 @@ def _check_places(
             for path in files_of(name, arguments.out):
                 check_target(path)
             if arguments.page is not None:
-                around(arguments.page, name)
+                split_markers(arguments.page, name)
     except (InputError, OSError) as error:
         parser.error(str(error))
 

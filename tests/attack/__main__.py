@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 
-from crisalad_jax.utils.files import around, atomic_path
+from crisalad_jax.utils.files import atomic_path, split_markers
 from tests.attack.world import ROOT
 
 SCRIPTS = ("kills", "interruptions", "memory", "disks", "damage", "inputs")
@@ -57,7 +57,7 @@ def main() -> int:
             command = [sys.executable, "-m", f"tests.attack.{script}", "--out", str(rows)]
             subprocess.run(command, cwd=ROOT, check=False)
         found = json.loads(rows.read_text(encoding="utf-8"))["rows"]
-    before, after = around(PAGE, "attacks")
+    before, after = split_markers(PAGE, "attacks")
     with atomic_path(PAGE) as temporary:
         temporary.write_text(f"{before}\n{table(found)}\n\n{after}", encoding="utf-8")
     return 1 if any(row["failures"] for row in found) else 0

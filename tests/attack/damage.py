@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.attack.world import ROOT, Row, World, make_products, make_world, write_rows
 
 PROMISE = "refused with one line, or told of; never silent"

@@ -1119,13 +1119,13 @@ def tables() -> Iterator[Case]:
 
 def _sealed(path: pathlib.Path, change: Callable[[Any], Any]) -> None:
     """Change a JSON file, and give it the checksum of what it then is."""
-    from crisalad_jax.utils.checksums import sealed_json
+    from crisalad_jax.utils.checksums import checksummed_json
 
     value = json.loads(path.read_text())
     value.pop("checksum", None)
     changed = change(value)
     if isinstance(changed, dict):
-        path.write_bytes(sealed_json(changed))
+        path.write_bytes(checksummed_json(changed))
     else:
         path.write_text(json.dumps(changed))
 

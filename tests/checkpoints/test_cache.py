@@ -35,10 +35,10 @@ from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import parameter_shapes
-from crisalad_jax.utils.download import Patience
+from crisalad_jax.utils.download import RetryPolicy
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import CACHE, user_cache
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.conftest import assert_equal
 from tests.file_server import FileServer, file_server
 
@@ -57,7 +57,7 @@ MIT, GPL = (
 )
 NO_LICENCE = Licence("no licence file")
 # Long enough for loopback on a loaded machine where nothing stalls.
-QUICK = Patience(timeout=5.0, least=1, attempts=2, pause=0.01)
+QUICK = RetryPolicy(timeout=5.0, least=1, attempts=2, pause=0.01)
 
 
 def state_bytes(seed: int, config: ModelConfig = CONFIG) -> bytes:
@@ -89,7 +89,7 @@ def model(server: FileServer, tmp_path: pathlib.Path, monkeypatch: pytest.Monkey
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     # The stalls and pauses of the default would last for minutes.
-    monkeypatch.setattr(crisalad_jax.utils.download, "Patience", lambda: QUICK)
+    monkeypatch.setattr(crisalad_jax.utils.download, "RetryPolicy", lambda: QUICK)
     tiny = Published(
         name="tiny-model",
         layout="huggingface",
@@ -127,7 +127,7 @@ def fails(name: str, words: str) -> str:
     return str(error.value)
 
 
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
 def test_a_name_loads_what_its_file_holds_and_downloads_once(model, server, tmp_path):
     assert not is_cached(model)
     (tmp_path / FILE).write_bytes(DATA)
@@ -272,7 +272,7 @@ def test_a_file_that_is_not_the_model_is_not_kept(model, server, tmp_path, data,
         cj.load("tiny-model")
 
 
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
 def test_the_server_has_another_file_later(model, server, tmp_path):
     cj.load("tiny-model")
     folder = tmp_path / "cache" / "models" / "tiny-model"
@@ -285,7 +285,7 @@ def test_the_server_has_another_file_later(model, server, tmp_path):
     assert cj.load("tiny-model").config == CONFIG
 
 
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
 def test_changed_bytes_in_the_cache_are_told(model, server, tmp_path):
     weights = cached_weights(model, quiet=True)
     published = weights.with_name(FILE)
@@ -310,7 +310,7 @@ def test_changed_bytes_in_the_cache_are_told(model, server, tmp_path):
     assert len(server.asked) == 1
 
 
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
 def test_what_can_be_made_again_is(model, server):
     weights = cached_weights(model, quiet=True)
     published = weights.with_name(FILE)
@@ -324,7 +324,7 @@ def test_what_can_be_made_again_is(model, server):
     assert len(server.asked) == 1
 
 
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
 def test_another_version_converts_anew(model, server, monkeypatch):
     weights = cached_weights(model, quiet=True)
     before = weights.stat().st_mtime_ns
@@ -334,7 +334,7 @@ def test_another_version_converts_anew(model, server, monkeypatch):
     assert len(server.asked) == 1
 
 
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
 def test_offline_only_the_cache_is_used(model, server, monkeypatch, tmp_path):
     monkeypatch.setenv("CRISALAD_OFFLINE", "1")
     fails("tiny-model", "found none in the cache .*CRISALAD_OFFLINE forbids the network")
@@ -346,7 +346,7 @@ def test_offline_only_the_cache_is_used(model, server, monkeypatch, tmp_path):
     assert len(server.asked) == 1
 
 
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
 @pytest.mark.parametrize("kind", ["http", "file"])
 def test_a_mirror_is_asked_first(model, server, monkeypatch, tmp_path, kind):
     (tmp_path / "files").mkdir()
@@ -377,7 +377,7 @@ def test_a_mirror_that_is_no_address(model, server, monkeypatch):
     assert server.asked == []
 
 
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
 def test_a_file_without_an_address_is_put_there_by_hand(model, monkeypatch, tmp_path):
     register(model, monkeypatch, url=None, note="one of a folder")
     path = tmp_path / "cache" / "models" / "tiny-model" / FILE
@@ -446,7 +446,7 @@ def test_a_file_in_place_of_the_cache(tmp_path):
         cj.load("tiny-model")
 
 
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
 def test_of_two_at_once_one_downloads(model, server):
     server.waits = 0.3
     found: list[pathlib.Path] = []
@@ -473,7 +473,7 @@ cached_weights(dataclasses.replace(model, url=sys.argv[1], file=sys.argv[2]), qu
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
 def test_a_killed_download_is_gone_on_with_by_the_next_process(
     model, server, monkeypatch, tmp_path
 ):

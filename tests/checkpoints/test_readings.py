@@ -23,7 +23,7 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.base import FeatureRequest
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from parity.reference.vit import ViT
 from tests.conftest import assert_equal
 from tests.random_checkpoints import (

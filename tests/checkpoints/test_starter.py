@@ -16,7 +16,7 @@ from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.synthetic import WorldConfig, write_world
 from crisalad_jax.nn.model import describe
 from crisalad_jax.retrieval.photographs import prepare_image
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 
 GOLDEN = pathlib.Path(__file__).parents[2] / "parity" / "goldens" / "starter.npz"
 """Two pictures, and their descriptors where `scripts/starter_golden.py` was run."""

@@ -35,7 +35,7 @@ from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import MODEL, assert_equal, random_params
 

@@ -15,7 +15,7 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.training.config import MiningConfig
 from crisalad_jax.training.start import read_start
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.conftest import MODEL, RECIPE
 
 STARTER = cj.load("starter").config

@@ -159,7 +159,7 @@ def test_weights_by_name(capfd, tmp_path):
     assert "a.png" in out
 
 
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
 def test_a_run_starts_from_weights_by_name():
     start = read_start(dataclasses.replace(RECIPE, model=CONFIG), weights="tiny-model")
     assert start is not None
@@ -167,7 +167,7 @@ def test_a_run_starts_from_weights_by_name():
 
 
 @pytest.mark.slow  # draws the rest of the model
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.notes.Note")
+@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
 def test_a_run_starts_from_a_backbone_by_name():
     model = dataclasses.replace(RECIPE.model, backbone=CONFIG.backbone)
     start = read_start(dataclasses.replace(RECIPE, model=model), backbone="tiny-model")

@@ -15,7 +15,7 @@ from crisalad_jax.data.live import FolderWatch
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.data.sources import open_source
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 
 PHOTOGRAPHS = pathlib.Path(__file__).parents[2].parent / "shared" / "data" / "toy_streets"
 

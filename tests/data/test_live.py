@@ -14,7 +14,7 @@ import crisalad_jax.data.live
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.live import Camera, FolderWatch
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.conftest import write_picture, write_video
 from tests.data.test_sources import LEVELS
 

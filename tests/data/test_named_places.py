@@ -12,7 +12,7 @@ from crisalad_jax.data.class_groups import class_groups, views_of
 from crisalad_jax.data.loader import ImageCache, training_batches
 from crisalad_jax.data.places import epoch_batches, read_places
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.conftest import RECIPE, write_picture, write_video
 from tests.data.test_sources import write_jpeg
 

@@ -11,7 +11,7 @@ import pytest
 
 from crisalad_jax.data.places import Places, epoch_batches, read_places
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 
 COLUMNS = ["place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid"]
 REAL = Path(__file__).parents[2].parent / "shared" / "data"

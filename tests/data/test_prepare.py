@@ -12,7 +12,7 @@ from crisalad_jax.data import prepare
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.prepare import Preparation, as_rgb
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 
 
 @pytest.fixture(autouse=True)

@@ -19,7 +19,7 @@ from crisalad_jax.retrieval.pca import PcaConfig, fit_pca
 from crisalad_jax.retrieval.sets import open_work
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import BusyFolderError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.conftest import BATCH, MODEL
 
 

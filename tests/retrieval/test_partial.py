@@ -21,7 +21,7 @@ from crisalad_jax.retrieval import partial
 from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
 from crisalad_jax.retrieval.extract import Extracted, extract
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.conftest import BATCH, MODEL, write_picture
 
 ROOT = pathlib.Path(__file__).parents[2]

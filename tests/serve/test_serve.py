@@ -28,7 +28,7 @@ from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.query import answer_fields, query
 from crisalad_jax.serve.worker import ADDED
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.conftest import BATCH, MODEL, write_video
 from tests.data.test_sources import write_jpeg
 from tests.serve.conftest import LIMIT, serving

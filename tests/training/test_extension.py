@@ -12,7 +12,7 @@ from crisalad_jax.data.places import read_places
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.conftest import RECIPE
 from tests.training.test_loop import Interrupted, assert_same_run, fail_at
 

@@ -30,11 +30,11 @@ import crisalad_jax.training.run
 from crisalad_jax.utils import compiler
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
-from crisalad_jax.utils.errors import InputError, Stopped
+from crisalad_jax.utils.errors import InputError, Interrupted
 from tests.training.test_interruption import CONFIG
 
 city, town, out = map(pathlib.Path, sys.argv[1:4])
-compiler.set_up()
+compiler.configure()
 crisalad_jax.training.run.SAVE_SECONDS = -1.0
 for statement in sys.argv[4:]:
     exec(statement)
@@ -48,7 +48,7 @@ try:
     )
 except InputError as error:
     sys.exit(str(error))
-except Stopped as stopped:
+except Interrupted as stopped:
     print(stopped)
     sys.exit(128 + stopped.number)
 """

@@ -34,7 +34,7 @@ from crisalad_jax.training.step import train_step
 from crisalad_jax.training.trainable import merge_params
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.signals import SignalState
 from crisalad_jax.utils.temporaries import temporary_beside

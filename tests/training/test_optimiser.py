@@ -24,7 +24,7 @@ from crisalad_jax.training.optimiser import (
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.training.step import StepConfig, init_train_state
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from crisalad_jax.utils.pytree import check_drawn, named_leaves
 from tests.conftest import MODEL, RECIPE, STEPS
 

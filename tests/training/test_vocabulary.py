@@ -28,7 +28,7 @@ from crisalad_jax.training.trainable import split_params
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.cli.test_cli import extract, fails
 from tests.conftest import BATCH, MODEL, RECIPE, assert_equal, random_params
 

@@ -16,7 +16,7 @@ import safetensors
 import safetensors.numpy
 
 from crisalad_jax.checkpoints.safetensors_io import Contents, read_sealed, write_sealed
-from crisalad_jax.utils.checksums import checked_safetensors, sealed_json, sha256_of
+from crisalad_jax.utils.checksums import checked_safetensors, checksummed_json, sha256_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
 
@@ -72,7 +72,7 @@ def arrays(tmp_path) -> pathlib.Path:
 
 @pytest.mark.parametrize("indent", [None, 2])
 def test_json_holds_the_digest_of_its_own_bytes(tmp_path, indent):
-    data = sealed_json(VALUE, indent)
+    data = checksummed_json(VALUE, indent)
     found, expected = by_hashlib(data)
     assert found == expected != ZEROS
     value = json.loads(data)
@@ -103,9 +103,9 @@ def test_safetensors_hold_the_digest_of_their_own_bytes(arrays):
 
 
 def test_the_same_is_written_with_the_same_checksum_and_another_with_another(tmp_path):
-    assert sealed_json(VALUE) == sealed_json(VALUE)
+    assert checksummed_json(VALUE) == checksummed_json(VALUE)
     digests = {
-        by_hashlib(sealed_json(value))[0]
+        by_hashlib(checksummed_json(value))[0]
         for value in (VALUE, VALUE | {"none": 0}, dict(reversed(VALUE.items())))
     }
     assert len(digests) == 3

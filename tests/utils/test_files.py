@@ -13,7 +13,6 @@ from crisalad_jax.utils.files import (
     atomic_path,
     check_new_folder,
     check_target,
-    durable_path,
     read_json,
     write_json,
     write_npy,
@@ -134,7 +133,7 @@ def test_a_durable_file_is_on_the_disk_before_and_after_it_has_its_name(tmp_path
     spied("fsync", os.fsync)
     spied("replace", os.replace)
     folder = tmp_path / "folder"
-    with durable_path(folder / "file.json") as temporary:
+    with atomic_path(folder / "file.json", durable=True) as temporary:
         temporary.write_text("whole")
     assert told == [("fsync", "."), ("replace", "."), ("fsync", "f")]
     assert os.listdir(folder) == ["file.json"]

@@ -14,16 +14,16 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.locks import next_writer, one_writer
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.locks import lock
+from crisalad_jax.utils.output import Note
 
 LOCK = ".crisalad-lock"
 REFUSED = "found another process that writes here"
 
 HOLDER = """
 import sys
-from crisalad_jax.utils.locks import one_writer
-with one_writer(sys.argv[1]):
+from crisalad_jax.utils.locks import lock
+with lock(sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -31,7 +31,7 @@ with one_writer(sys.argv[1]):
 CONTENDERS = """
 import os, sys, time
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.locks import one_writer
+from crisalad_jax.utils.locks import lock
 folder, inside = sys.argv[1:]
 children = []
 for _ in range(4):
@@ -42,7 +42,7 @@ for _ in range(4):
     try:
         while time.monotonic() < end:
             try:
-                with one_writer(folder):
+                with lock(folder):
                     os.close(os.open(inside, os.O_CREAT | os.O_EXCL))
                     os.unlink(inside)
                     taken += 1
@@ -72,7 +72,7 @@ def held(folder: pathlib.Path) -> Iterator[subprocess.Popen[str]]:
 
 def is_free(folder: pathlib.Path) -> bool:
     try:
-        with one_writer(folder):
+        with lock(folder):
             return True
     except InputError as error:
         if REFUSED not in str(error):
@@ -89,7 +89,7 @@ def fails_in(folder: pathlib.Path, work: Callable[[], object] = lambda: None) ->
     """An error while the lock is held."""
 
     def fail() -> None:
-        with one_writer(folder):
+        with lock(folder):
             work()
             raise ZeroDivisionError
 
@@ -101,7 +101,7 @@ def test_a_second_process_is_refused_and_told_of_the_first(tmp_path):
     folder = tmp_path / "out"
     with held(folder) as process:
         before = contents(folder)
-        with pytest.raises(InputError) as error, one_writer(folder):
+        with pytest.raises(InputError) as error, lock(folder):
             pass
         assert str(error.value) == (
             f"{folder}: {REFUSED} (process {process.pid} on {socket.gethostname()}), "
@@ -116,15 +116,15 @@ def test_a_second_process_is_refused_and_told_of_the_first(tmp_path):
 
 
 def test_a_process_is_refused_its_own_folder(tmp_path):
-    with one_writer(tmp_path):
+    with lock(tmp_path):
         with pytest.raises(InputError, match=rf"{REFUSED} \(process {os.getpid()} on "):
-            one_writer(tmp_path).__enter__()
+            lock(tmp_path).__enter__()
         assert (tmp_path / LOCK).exists()
     assert is_free(tmp_path)
 
 
 def test_two_folders_have_two_locks(tmp_path):
-    with one_writer(tmp_path / "a"), one_writer(tmp_path / "b"), one_writer(tmp_path / "a" / "c"):
+    with lock(tmp_path / "a"), lock(tmp_path / "b"), lock(tmp_path / "a" / "c"):
         assert not is_free(tmp_path / "b")
 
 
@@ -134,7 +134,7 @@ def test_the_lock_of_a_killed_process_is_free(tmp_path):
         assert process.wait() == -signal.SIGKILL
         # Its file is left, with its words.
         assert f"process {process.pid} on " in (tmp_path / LOCK).read_text()
-        with one_writer(tmp_path):
+        with lock(tmp_path):
             words = f"process {os.getpid()} on {socket.gethostname()}\n"
             assert (tmp_path / LOCK).read_text() == words
             assert not is_free(tmp_path)
@@ -165,7 +165,7 @@ def test_a_users_files_are_untouched(tmp_path):
     (tmp_path / "folder" / LOCK).write_text("of another folder")
     before = contents(tmp_path)
     assert len(before) == 6
-    with one_writer(tmp_path):
+    with lock(tmp_path):
         assert contents(tmp_path).items() > before.items()
     assert contents(tmp_path) == before
     fails_in(tmp_path)
@@ -195,10 +195,10 @@ def test_a_holder_that_removes_its_file_meanwhile_does_not_give_two_locks(
         monkeypatch.setattr(fcntl, "flock", meanwhile)
         if again == "held":
             with pytest.raises(InputError, match=rf"{REFUSED} \(process 1 on elsewhere\)"):
-                one_writer(tmp_path).__enter__()
+                lock(tmp_path).__enter__()
             assert path.exists()
         else:
-            with one_writer(tmp_path):
+            with lock(tmp_path):
                 monkeypatch.setattr(fcntl, "flock", real)
                 assert path.read_text().startswith(f"process {os.getpid()} on ")
                 assert not is_free(tmp_path)
@@ -223,7 +223,7 @@ def test_a_folder_that_cannot_be_locked_is_one_line(tmp_path):
         ("file/deep", "cannot make this folder: Not a directory"),
         ("out", "cannot be written to: Is a directory"),
     ):
-        with pytest.raises(InputError) as error, one_writer(tmp_path / name):
+        with pytest.raises(InputError) as error, lock(tmp_path / name):
             pass
         assert str(error.value) == f"{tmp_path / name}: {words}"
     assert sorted(os.listdir(tmp_path)) == ["file", "out"]
@@ -236,13 +236,13 @@ def test_the_next_writer_waits_and_tells_of_the_first(tmp_path):
         # Ends the holder while this process waits.
         threading.Timer(0.3, process.stdin.close).start()
         words = rf"out: waiting for another process \(process {process.pid} on "
-        second = next_writer(folder)
+        second = lock(folder, wait=True)
         with pytest.warns(Note, match=words):
             second.__enter__()
         assert process.wait(10) == 0
         assert not is_free(folder)
         second.__exit__(None, None, None)
     assert is_free(folder)
-    with pytest.raises(ZeroDivisionError), next_writer(folder):
+    with pytest.raises(ZeroDivisionError), lock(folder, wait=True):
         raise ZeroDivisionError
     assert is_free(folder)

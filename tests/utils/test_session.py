@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from crisalad_jax.utils.session import Session
+from crisalad_jax.utils.compiler import Session
 
 PROGRAM = """
 import crisalad_jax as cj

@@ -8,7 +8,7 @@ from crisalad_jax.checkpoints.layouts.over_dinov2 import register_over_dinov2
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.supervlad import SuperVladConfig
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 _CONV = "aggregation.conv"
 _GHOSTS = {5: 1, 3: 2}
@@ -34,7 +34,7 @@ def infer_supervlad(state: State) -> SuperVladConfig:
         )
     ghosts = _GHOSTS[count]
     if ghosts == 2:
-        tell(
+        warn(
             f"{_CONV}.weight: found 3 clusters, read as 1 and 2 ghosts, as in 1-clusterVLAD.pth; "
             "one of 2 and a ghost (--supervlad_clusters=2) has the same shape, and cannot be read"
         )

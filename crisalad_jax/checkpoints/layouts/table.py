@@ -20,7 +20,7 @@ from crisalad_jax.nn.backbones.vit import VisionTransformer
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, parameter_shapes
 from crisalad_jax.utils.errors import InputError, few
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.pytree import named_leaves
 
 
@@ -103,7 +103,7 @@ def renamed_to(state: State, names: Set[str]) -> State:
 def _tell_left_out(reading: Reading, source: str) -> None:
     if reading.left_out:
         kinds = dict.fromkeys(name.partition(".")[0] for name in reading.left_out)
-        tell(
+        warn(
             f"{source}: took the model under {reading.inside.removesuffix('.')}, and left out "
             f"{len(reading.left_out)} tensors of {', '.join(kinds)}"
         )

@@ -12,7 +12,7 @@ from crisalad_jax.checkpoints.onnx_format.convert import convert
 from crisalad_jax.checkpoints.onnx_format.graph import OPSET as OPSET
 from crisalad_jax.checkpoints.onnx_format.graph import Graph, Value, is_known, place_constants
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import told_of
+from crisalad_jax.utils.files import wrap_os_errors
 
 
 def onnx_graph(
@@ -81,7 +81,7 @@ def write_onnx(
     model = graph.model(values, [(output, result)], words)
     data = path.with_name(f"{path.name}.data")
     places = place_constants(model, graph.constants, data.name if beside else None)
-    with told_of(path):
+    with wrap_os_errors(path):
         if beside:
             write_constants(data, places)
         path.write_bytes(model.SerializeToString(deterministic=True))

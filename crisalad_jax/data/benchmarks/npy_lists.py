@@ -22,7 +22,7 @@ from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Int64
 
 VPR_BENCH_TRUTH = "ground_truth_new.npy"
@@ -283,7 +283,7 @@ def _read_matches(
             )
         matches.append(found)
     if beyond:
-        tell(
+        warn(
             f"{path}: found {beyond} references after the last of {database} images, where windows "
             "of frames end; left out"
         )

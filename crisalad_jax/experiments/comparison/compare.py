@@ -15,9 +15,9 @@ from crisalad_jax.experiments.comparison.summary import Summary, summarise
 from crisalad_jax.experiments.comparison.tables import markdown, put_in_page, write_tables
 from crisalad_jax.experiments.comparison.workers import run_jobs
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import around, check_target, real_path
-from crisalad_jax.utils.locks import next_writer
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.files import check_target, real_path, split_markers
+from crisalad_jax.utils.locks import lock
+from crisalad_jax.utils.output import Note
 
 
 @takes(config=ComparisonConfig, out=PATH)
@@ -57,13 +57,13 @@ def compare(
     Raises:
         InputError: what `prepare`, `carry_out` and `summarise` raise; or the page has no place for
             the tables.
-        Stopped: a signal asked for the end; the same call resumes.
+        Interrupted: a signal asked for the end; the same call resumes.
     """
     out = pathlib.Path(out)
     check_target(out / "config.json")
     place = real_path(out).name
     if page is not None:
-        around(pathlib.Path(page), place)
+        split_markers(pathlib.Path(page), place)
     if jobs < 1:
         raise InputError(f"--jobs: found {jobs}, expected at least 1")
     jobs = min(jobs, runs_left(config, out))
@@ -74,7 +74,7 @@ def compare(
         prepared = prepare(config, on_bad_image)
     prepared, left_out = without_unreadable(prepared, on_bad_image, quiet=quiet)
     carry_out(prepared, out, say=say, quiet=quiet)
-    with next_writer(out):
+    with lock(out, wait=True):
         # Table 3 belongs to the paper's rows, and takes a minute.
         papers = config.kind == "ablate" and not config.rows
         adapters = adapter_costs_once(out) if papers else []

@@ -15,7 +15,7 @@ from crisalad_jax.training.recipes import (
     split_name,
     with_part,
 )
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 
 class ComparedMethod(NamedTuple):
@@ -74,7 +74,7 @@ def method_of(name: str, preset: str) -> ComparedMethod:
     if name in METHODS:
         return METHODS[name]
     if mines_tuples(name):
-        tell(
+        warn(
             f"--methods: found {name}, whose own recipe mines tuples of queries: it is crisalad+"
             f"{name} here, trained on places as all others are (`crisalad train` has the recipe)"
         )

@@ -42,7 +42,7 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.optimiser import count_steps, warmup_length, with_short_warmup
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 EPOCHS = 6
 """Number of epochs from random weights: all methods on two small sets, three seeds each, take less
@@ -316,7 +316,7 @@ def prepare(config: ComparisonConfig, on_bad_image: OnBadImage = "stop") -> Prep
         _check(variant, config, benchmarks)
     _check_backbone(config, variants)
     for words, names in shortened.items():
-        tell(f"warm-up: {words}, for {', '.join(names)}")
+        warn(f"warm-up: {words}, for {', '.join(names)}")
     return Prepared(config, variants, places, benchmarks)
 
 

@@ -51,8 +51,7 @@ from crisalad_jax.utils.locks import (
     BusyFolderError,
     holder_of,
     is_here,
-    next_writer,
-    one_writer,
+    lock,
 )
 from crisalad_jax.utils.temporaries import LOCK
 
@@ -77,13 +76,13 @@ def carry_out(prepared: Prepared, out: pathlib.Path, *, say: Say, quiet: bool = 
     Raises:
         InputError: what `claim`, `fit` and `evaluate` raise; or a result that is not whole, or of
             another set than is given now.
-        Stopped: what `fit` raises; the same call resumes.
+        Interrupted: what `fit` raises; the same call resumes.
     """
-    with next_writer(out):
+    with lock(out, wait=True):
         claim(out, prepared)
     say(_start_words(prepared))
     take_runs(prepared, out, say=say, quiet=quiet)
-    with next_writer(out):
+    with lock(out, wait=True):
         if not _is_timed(prepared, out):
             say("images described a second, all models in turns")
             write_json(out / "speed.json", _race(prepared, out, quiet))
@@ -110,7 +109,7 @@ def take_runs(
 
     Raises:
         InputError: what `fit` and `evaluate` raise.
-        Stopped: what `fit` raises; the same call resumes.
+        Interrupted: what `fit` raises; the same call resumes.
     """
     numbers = numbers_of(out, prepared.config)
     made, waits = 0, False
@@ -119,7 +118,7 @@ def take_runs(
         for variant, seed in left:
             with contextlib.ExitStack() as stack:
                 try:
-                    stack.enter_context(one_writer(folder_of(out, variant.run, seed)))
+                    stack.enter_context(lock(folder_of(out, variant.run, seed)))
                 except BusyFolderError:
                     continue
                 if _is_done(out, numbers, variant, seed):  # by another process, a moment ago

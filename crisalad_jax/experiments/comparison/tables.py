@@ -15,7 +15,7 @@ from crisalad_jax.experiments.comparison.paired import Difference
 from crisalad_jax.experiments.comparison.summary import KS, Recall, Row, Spread, Summary
 from crisalad_jax.experiments.report.page import ESCAPED
 from crisalad_jax.experiments.report.tables import no_formula
-from crisalad_jax.utils.files import around, atomic_path, write_json
+from crisalad_jax.utils.files import atomic_path, split_markers, write_json
 
 NOTHING = "-"
 
@@ -300,7 +300,7 @@ def write_tables(summary: Summary, out: pathlib.Path) -> None:
 
 def put_in_page(page: pathlib.Path, name: str, text: str) -> None:
     """Put a text between its marks in a page; raises as `files.around`."""
-    before, after = around(page, name)
+    before, after = split_markers(page, name)
     with atomic_path(page) as temporary:
         whole = f"{before}\n{text}\n{after}"
         temporary.write_text(whole, encoding="utf-8", errors=ESCAPED)

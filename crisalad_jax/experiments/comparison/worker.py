@@ -14,7 +14,7 @@ import threading
 import warnings
 from typing import Any
 
-from crisalad_jax.utils.errors import InputError, Stopped
+from crisalad_jax.utils.errors import InputError, Interrupted
 from crisalad_jax.utils.signals import end_at_signals
 
 
@@ -37,7 +37,7 @@ def main() -> int:
     except InputError as error:
         send("error", str(error))
         return 2
-    except Stopped as stopped:
+    except Interrupted as stopped:
         return 128 + stopped.number
     return 0
 
@@ -53,8 +53,8 @@ def _work(task: dict[str, Any], send: Any) -> None:
         without_unreadable,
     )
     from crisalad_jax.experiments.comparison.runner import take_runs
-    from crisalad_jax.utils.locks import next_writer
-    from crisalad_jax.utils.notes import Note
+    from crisalad_jax.utils.locks import lock
+    from crisalad_jax.utils.output import Note
 
     show = warnings.showwarning
 
@@ -73,7 +73,7 @@ def _work(task: dict[str, Any], send: Any) -> None:
     prepared = prepare(config, task["on_bad_image"])
     prepared, _ = without_unreadable(prepared, task["on_bad_image"], quiet=True)
     out = pathlib.Path(task["out"])
-    with next_writer(out, quiet=True):  # after the other processes, in a moment
+    with lock(out, wait=True, quiet=True):  # after the other processes, in a moment
         claim(out, prepared)
     take_runs(
         prepared,

@@ -18,7 +18,7 @@ from crisalad_jax.config.plugins import loaded_plugins
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.experiments.comparison.plan import ComparisonConfig
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.signals import defer_signals
 from crisalad_jax.utils.target import absent_platforms
 
@@ -58,7 +58,7 @@ def run_jobs(
 
     Raises:
         InputError: what any of them raises as one; the others are ended.
-        Stopped: a signal asked for the end; the same call resumes.
+        Interrupted: a signal asked for the end; the same call resumes.
     """
     shares = shares_of(*_devices(), jobs, os.environ.get("CUDA_VISIBLE_DEVICES"))
     task = {
@@ -224,14 +224,14 @@ def _pass_on(
             code = workers[number].returncode
             if code:
                 others = "the others go on" if running else "what is left is done here"
-                tell(f"--jobs: found process {number + 1} ended with code {code}; {others}")
+                warn(f"--jobs: found process {number + 1} ended with code {code}; {others}")
         elif "error" in message:
             raise InputError(message["error"])
         elif "say" in message:
             say(f"[{number + 1}] {message['say']}")
         elif message["note"] not in notes:
             notes.add(message["note"])
-            tell(message["note"])
+            warn(message["note"])
 
 
 def _end_all(workers: Sequence["subprocess.Popen[bytes]"]) -> None:

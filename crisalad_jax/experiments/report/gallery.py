@@ -28,8 +28,7 @@ from crisalad_jax.experiments.report.style import (
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import staged_folder
-from crisalad_jax.utils.notes import tell
-from crisalad_jax.utils.output import counted
+from crisalad_jax.utils.output import counted, warn
 
 _BOX = 0xC4
 """Grey of a picture that is not there."""
@@ -119,7 +118,7 @@ def retrieval_figure(
     if lost:
         box = np.full((round(height * DPI), side, 3), _BOX, np.uint8)
         thumbnails |= dict.fromkeys(lost, box)
-        tell(
+        warn(
             f"{counted(len(lost), 'picture')} shown as a grey box, as of "
             f"{next(iter(lost.values()))}; {elsewhere} says where else"
         )

@@ -26,7 +26,7 @@ from crisalad_jax.experiments.synthetic.view import (
     check_size,
 )
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json, told_of, write_json
+from crisalad_jax.utils.files import read_json, wrap_os_errors, write_json
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
 
 CITY_NAMES = ("Alderby", "Brackwater")
@@ -123,7 +123,7 @@ def _write(
     Raises:
         InputError: the city cannot be written there.
     """
-    with told_of(root):
+    with wrap_os_errors(root):
         temporary.mkdir()
         for city in range(len(CITY_NAMES)):
             yield from _write_train(temporary / "train", config, city)

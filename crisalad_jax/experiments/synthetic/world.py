@@ -33,7 +33,7 @@ from crisalad_jax.experiments.synthetic.view import (
     check_size,
 )
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import told_of, write_json
+from crisalad_jax.utils.files import wrap_os_errors, write_json
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
 
 Variation = Literal["stand", "season", "time", "weather", "traffic", "exposure"]
@@ -150,7 +150,7 @@ def _write(temporary: pathlib.Path, root: pathlib.Path, config: WorldConfig) -> 
     Raises:
         InputError: the world cannot be written there.
     """
-    with told_of(root):
+    with wrap_os_errors(root):
         temporary.mkdir()
         for city in range(-(-config.scenes // SCENES_PER_CITY)):
             scenery = config.sceneries[city % len(config.sceneries)]

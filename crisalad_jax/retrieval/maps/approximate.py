@@ -18,7 +18,7 @@ from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float32
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
@@ -117,7 +117,7 @@ def tell_stale(folder: pathlib.Path, additions: Additions) -> None:
     """Tell of an approximate search that is not used, since it is of fewer or other images."""
     kind = stale_kind(folder, additions)
     if kind is not None:
-        tell(
+        warn(
             f"{folder}: found an approximate search of fewer or other images; the map is searched "
             f"exactly; `crisalad index --search {kind}` builds it anew"
         )

@@ -32,7 +32,7 @@ from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.shares import Share, digest_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import progress_bar
 
 SEGMENT = 256
@@ -260,7 +260,7 @@ def index(
         known = positions_of(table, source.names, images)
     by_exif = table is None and not known.of
     if table is None and known.axes == AXES[1] and description is None:
-        tell(f"{images}: the names are of several zones of UTM: positions become lat, lon")
+        warn(f"{images}: the names are of several zones of UTM: positions become lat, lon")
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca)
     batch_size = useful_batch_size(batch_size, len(source.paths))
     if description is None:
@@ -402,7 +402,7 @@ def _by_exif(target: Map | None, names: Sequence[str], paths: Sequence[pathlib.P
     )
     found = exif_positions(new)
     if target is not None and found.of and target.axes not in (None, found.axes):
-        tell(
+        warn(
             f"{target.folder}: left out the EXIF positions of {len(found.of)} images, expected "
             f"{', '.join(target.axes or ())} as in the map"
         )

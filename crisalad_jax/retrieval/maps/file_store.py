@@ -10,7 +10,7 @@ from crisalad_jax.retrieval.chunks import check_rows
 from crisalad_jax.retrieval.maps.ties import lower_first
 from crisalad_jax.retrieval.neighbours import Neighbours, exact_similarities, rounding
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_source, durable_path, npy_header, write_npy
+from crisalad_jax.utils.files import atomic_path, check_source, npy_header, write_npy
 from crisalad_jax.utils.shapes import Float, Float32, Int64
 
 _SPARE = 16
@@ -43,7 +43,7 @@ class FileStore:
     def add(self, first: int, descriptors: Float[np.ndarray, "n d"]) -> None:
         """Write descriptors to a file; see `Store.add`."""
         path = self._path(first)
-        with durable_path(path) as temporary:
+        with atomic_path(path, durable=True) as temporary:
             write_npy(temporary, descriptors.astype(self._dtype))
         self._counts[first] = len(descriptors)
 

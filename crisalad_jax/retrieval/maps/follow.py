@@ -14,7 +14,7 @@ from crisalad_jax.data.positions import AXES, utm_positions
 from crisalad_jax.data.video import moment_of
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.sequence import BayesFilter, SequenceState
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float32, Float64, Int64
 
 _NUMBERS = 2**25
@@ -92,7 +92,7 @@ class Follower:
                 self.state = self._filter.start(self.state.common, along)
                 self._read = read
                 return
-        tell(
+        warn(
             "sequence: not all names of the map and of the queries say when or where they were "
             "taken, so a frame counts as an image of the map, and the camera moves by at most "
             f"{self._filter.reach:g} images a frame; where the map has more frames a second, raise "

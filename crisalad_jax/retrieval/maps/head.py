@@ -14,10 +14,10 @@ from crisalad_jax.checkpoints.starter import FILES, resolved
 from crisalad_jax.config.io import from_plain
 from crisalad_jax.retrieval.maps.store import store_name
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
-from crisalad_jax.utils.checksums import sealed_json
+from crisalad_jax.utils.checksums import checksummed_json
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import durable_path, read_json
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.files import atomic_path, read_json
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.temporaries import LOCK, is_temporary
 
 FORMAT = 4
@@ -164,7 +164,7 @@ def check_model(
         InputError: the hashes differ; the message has both.
     """
     if quantised_from == description.model:
-        tell(
+        warn(
             f"{weights}: an int8 program of the model that made {folder}; similarities are rougher"
         )
     elif digest != description.model:
@@ -198,6 +198,6 @@ def write_record(path: pathlib.Path, value: Mapping[str, Any], indent: int | Non
     Raises:
         InputError: the disk is full, or the folder cannot be written to.
     """
-    data = sealed_json(value, indent)
-    with durable_path(path) as temporary:
+    data = checksummed_json(value, indent)
+    with atomic_path(path, durable=True) as temporary:
         temporary.write_bytes(data)

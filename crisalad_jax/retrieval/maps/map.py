@@ -54,7 +54,7 @@ from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, save_pca
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
-from crisalad_jax.utils.locks import one_writer
+from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.shapes import Float, Float32
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
@@ -669,7 +669,7 @@ def open_for_appending(
     read_description(folder)  # raises where something else is there, before anything is made
     with contextlib.ExitStack() as stack:
         stack.enter_context(made_folder(folder / SEGMENTS))
-        stack.enter_context(one_writer(folder))
+        stack.enter_context(lock(folder))
         existing = read_description(folder)
         for each in (folder, folder / SEGMENTS):
             remove_temporaries(each)

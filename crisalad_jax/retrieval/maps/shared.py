@@ -16,8 +16,8 @@ from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.shares import Share
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
-from crisalad_jax.utils.locks import BusyFolderError, one_writer
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.locks import BusyFolderError, lock
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import progress_bar
 
 _TOGETHER = 4096
@@ -52,7 +52,7 @@ class SharedMap(NamedTuple):
             return None
         value = read_json(path, "a record of a share")
         if value.get("shares") != self.digest:
-            tell(
+            warn(
                 f"{path}: found a share of other images or settings; its process has to run again, "
                 "as the others do"
             )
@@ -116,7 +116,7 @@ class SharedMap(NamedTuple):
             InputError: a share is damaged or gone; what `Map.append` and `then` raise.
         """
         try:
-            with one_writer(self.out / SHARES):
+            with lock(self.out / SHARES):
                 found = [self.counts(share) for share in self.share.others()]
                 counts = [each for each in found if each is not None]
                 if len(counts) < len(found):
@@ -129,7 +129,7 @@ class SharedMap(NamedTuple):
                 for share in self.share.others():
                     self.marker(share).unlink()
         except BusyFolderError:
-            tell(f"{self.out}: another process joins the shares")
+            warn(f"{self.out}: another process joins the shares")
             return None
         shutil.rmtree(self.out / SHARES, ignore_errors=True)
         return counts

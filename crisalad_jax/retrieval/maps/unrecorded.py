@@ -8,7 +8,7 @@ from crisalad_jax.retrieval.maps.approximate import indexed_images
 from crisalad_jax.retrieval.maps.calibration import CALIBRATION
 from crisalad_jax.retrieval.maps.head import SEGMENTS, has_images
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 _HINT = "put it back, or make a new map in another folder"
 
@@ -57,7 +57,7 @@ def remove_unrecorded(folder: pathlib.Path, images: int) -> None:
     for path in _unrecorded(folder):
         which = _numbers(path)
         path.unlink()
-        tell(
+        warn(
             f"{path}: {which} without a record are removed; a kill leaves such, but so does the "
             "loss of a record"
         )

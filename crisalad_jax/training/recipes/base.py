@@ -13,7 +13,7 @@ from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig, has_adapters
 from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, HEAD
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import tell
+from crisalad_jax.utils.output import warn
 
 Make = Callable[[ModelConfig, str], TrainConfig]
 """Takes the model of a preset and the preset's name; returns the configuration."""
@@ -101,7 +101,7 @@ def recipe(
     base, part = split_name(name)
     found = find_part(part, preset)
     if base is None:
-        tell(f"recipe: found {name}, which is a part: crisalad+{name}, CriSALAD with it in place")
+        warn(f"recipe: found {name}, which is a part: crisalad+{name}, CriSALAD with it in place")
     return with_part(_of_model(RECIPES[base or "crisalad"](size, preset), model), found)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from crisalad_jax.data.benchmarks import open_benchmark, read_salad_lists, read_vpr_bench
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.data.benchmarks.trees import (
     every_tenth,
     lists_of,

@@ -13,7 +13,7 @@ from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.recipes import RECIPES, from_scratch, recipe
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.cli.test_cli import fails
 from tests.conftest import MODEL
 

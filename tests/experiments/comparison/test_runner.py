@@ -399,7 +399,7 @@ def test_runs_are_shared_with_another_process(finished, config, monkeypatch):
 
     monkeypatch.setattr(runner, "_one", lambda p, o, n, v, seed, *_: one.append(seed) or done(seed))
     with contextlib.ExitStack() as other:
-        other.enter_context(locks.one_writer(finished / "crisalad" / "seed-0"))
+        other.enter_context(locks.lock(finished / "crisalad" / "seed-0"))
 
         def ended(seconds):
             done(0)
@@ -427,7 +427,7 @@ def test_the_run_of_a_killed_process_is_free(finished, config, monkeypatch):
 
 def test_a_training_time_is_of_runs_with_a_device_of_their_own(finished, flags, capfd):
     """Of a process of this host; another host's is no neighbour."""
-    with locks.one_writer(finished / "crisalad" / "seed-1"):
+    with locks.lock(finished / "crisalad" / "seed-1"):
         lock = finished / "crisalad" / "seed-1" / temporaries.LOCK
         assert not runner._has_neighbours(finished)  # it is this process's own
         lock.write_text(f"process 1 on {socket.gethostname()}\n")

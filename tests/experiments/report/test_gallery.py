@@ -13,7 +13,7 @@ from crisalad_jax.retrieval.maps.map import MapImage
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.experiments.report.pictures import (
     GREEN,
     RED,

@@ -12,7 +12,7 @@ from crisalad_jax.data.video import moment_of
 from crisalad_jax.retrieval.maps.follow import Follower
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.sequence import BayesFilter
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.killed_appends import description
 from tests.retrieval.test_sequence import walk
 

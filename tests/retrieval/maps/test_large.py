@@ -18,7 +18,7 @@ from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.query import query
 from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, save_pca
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests.conftest import BATCH, MODEL
 from tests.data.test_sources import write_jpeg
 from tests.killed_appends import append_until, description, names, rows

@@ -24,10 +24,10 @@ from crisalad_jax.retrieval.maps.head import check_model, write_record
 from crisalad_jax.retrieval.maps.manifest import describe_map, read_description
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.shared import _add
-from crisalad_jax.utils.checksums import sealed_json
+from crisalad_jax.utils.checksums import checksummed_json
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
-from crisalad_jax.utils.notes import Note
+from crisalad_jax.utils.output import Note
 from tests import killed_appends
 from tests.conftest import MODEL, random_params
 from tests.killed_appends import append_until, description, names, rows
@@ -323,7 +323,7 @@ def test_a_record_of_no_images_below_its_folder_is_refused(folder, fields, words
     """With the right checksum: who forges a record can forge that too."""
     path = folder / "segments/0000000000.json"
     record = json.loads(path.read_text()) | fields
-    path.write_bytes(sealed_json(record))
+    path.write_bytes(checksummed_json(record))
     with pytest.raises(InputError, match=rf"0000000000\.json: not a whole record .*{words}"):
         Map.open(folder)
 
