@@ -9,7 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from crisalad_jax.config.checks import require
+from crisalad_jax.config.checks import require_range
 from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
 from crisalad_jax.utils.shapes import Bool, Int64, UInt8
 
@@ -32,14 +32,8 @@ class RandAugmentConfig(Augmentation):
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require(
-            self.operations >= 0,
-            f"RandAugmentConfig.operations: found {self.operations}, expected at least 0",
-        )
-        require(
-            0 <= self.magnitude < MAGNITUDE_BINS,
-            f"RandAugmentConfig.magnitude: found {self.magnitude}, expected 0 to 30",
-        )
+        require_range(self, 0, math.inf, "operations")
+        require_range(self, 0, MAGNITUDE_BINS - 1, "magnitude")
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
@@ -111,12 +105,7 @@ def _shear_y(image: Image, slope: float) -> Image:
 
 
 def _translate_x(image: Image, pixels: float) -> Image:
-    moved, by = np.zeros_like(image), int(pixels)
-    if by < 0:
-        moved[:, :by] = image[:, -by:]
-    else:
-        moved[:, by:] = image[:, : image.shape[1] - by]
-    return moved
+    return _translate_y(image.swapaxes(0, 1), pixels).swapaxes(0, 1)
 
 
 def _translate_y(image: Image, pixels: float) -> Image:
