@@ -283,6 +283,7 @@ def _read_city(
     # The inner dict serves as an ordered set.
     places: dict[int, dict[str, None]] = {}
     missing = 0
+    city = path.stem
     table = read_table(path, *COLUMNS)
     fields = operator.itemgetter(*map(table.columns.index, COLUMNS))
     for line, row in table.lines:
@@ -302,13 +303,13 @@ def _read_city(
             f"{city_id}_{place % IDS_PER_CITY:07d}_{year:04d}_{month:02d}_{north:03d}"
             f"_{latitude}_{longitude}_{panorama}"
         )
-        image = listings.find((city_id, path.stem), stem)
+        image = listings.find((city_id, city), stem)
         if image is not None:
             places.setdefault(place, {})[image] = None
         elif on_bad_image == "skip":
             missing += 1
         else:
-            raise _no_image(root, path, line, (city_id, path.stem), stem)
+            raise _no_image(root, path, line, (city_id, city), stem)
     if missing:
         warn(f"{path}: left out {missing} rows, whose images are missing")
     ids = {place % IDS_PER_CITY: place for place in places}

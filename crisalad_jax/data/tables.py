@@ -9,7 +9,7 @@ import os
 import pathlib
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from crisalad_jax.data.video import spelled
 from crisalad_jax.utils.errors import InputError
@@ -48,19 +48,20 @@ class Row(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A CSV file, without blank rows and without spaces around its fields."""
+    """A CSV file without its blank rows."""
 
     path: pathlib.Path
     columns: list[str]
-    """The first row."""
-    lines: list[tuple[int, list[str]]]
-    """Number and fields of every further row, as many as there are columns."""
+    """The first row, without spaces around its fields."""
+    lines: Iterator[tuple[int, list[str]]]
+    """Number and fields of every further row, as many as there are columns; they are read once."""
     has_commas: bool
 
     def rows(self) -> Iterator[Row]:
-        """Yield the rows with their fields by column."""
+        """Yield the rows with their fields by column, without spaces around them."""
         for line, fields in self.lines:
-            by_column = dict(zip(self.columns, fields, strict=True))
+            texts = map(str.strip, fields)
+            by_column = dict(zip(self.columns, texts, strict=True))
             yield Row(self.path, line, by_column, self.has_commas)
 
     def named_rows(self) -> Iterator[tuple[str, Row]]:
@@ -96,16 +97,8 @@ def read_table(path: pathlib.Path, *needed: str) -> Table:
             than as many fields as the header.
     """
     check_source(path, "a table of UTF-8 CSV", largest=LARGEST)
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            first = file.readline()
-            file.seek(0)
-            separator = ";" if first.count(";") > first.count(",") else ","
-            reader = csv.reader(file, delimiter=separator)
-            rows = [(reader.line_num, [*map(str.strip, row)]) for row in reader if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read as UTF-8 CSV: {error}") from error
-    columns = rows[0][1] if rows else []
+    lines = _lines(path)
+    separator, columns = next(lines)
     missing = [name for name in needed if name not in columns]
     if missing:
         found = ", ".join(columns) or "none"
@@ -113,15 +106,30 @@ def read_table(path: pathlib.Path, *needed: str) -> Table:
     twice = [name for name in columns if name and columns.count(name) > 1]
     if twice and needed:
         raise InputError(f"{path}: found the column {twice[0]} twice, expected it once")
-    for line, row in rows:
-        if len(row) != len(columns):
-            comma = len(row) > len(columns) and separator == ","
-            hint = "; between commas a decimal is written with a point" if comma else ""
-            raise InputError(
-                f"{path}: line {line}: found {len(row)} fields, expected {len(columns)} "
-                f"({separator.join(columns)}{hint})"
-            )
-    return Table(path, columns, rows[1:], separator == ";")
+    return Table(path, columns, lines, separator == ";")
+
+
+def _lines(path: pathlib.Path) -> Iterator[tuple[Any, list[str]]]:
+    """Yield the separator and the columns, then the number and the fields of every row."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            first = file.readline()
+            file.seek(0)
+            separator = ";" if first.count(";") > first.count(",") else ","
+            reader = csv.reader(file, delimiter=separator)
+            columns = [column.strip() for column in next(filter(None, reader), [])]
+            yield separator, columns
+            for row in filter(None, reader):
+                if len(row) != len(columns):
+                    comma = len(row) > len(columns) and separator == ","
+                    hint = "; between commas a decimal is written with a point" if comma else ""
+                    raise InputError(
+                        f"{path}: line {reader.line_num}: found {len(row)} fields, expected "
+                        f"{len(columns)} ({separator.join(columns)}{hint})"
+                    )
+                yield reader.line_num, row
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read as UTF-8 CSV: {error}") from error
 
 
 def normal_name(name: str) -> str:

@@ -146,8 +146,9 @@ class _Part:
             begun = _Remote(**read_json(self.note, "a note of a download"))
         except (InputError, TypeError):
             return None
-        known = begun.length is not None and (begun.etag, begun.modified) != (None, None)
-        return begun if known and begun.url == url and 0 < self.size() <= begun.length else None
+        if begun.url != url or begun.length is None or (begun.etag, begun.modified) == (None, None):
+            return None
+        return begun if 0 < self.size() <= begun.length else None
 
 
 def _fetch(

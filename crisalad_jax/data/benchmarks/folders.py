@@ -127,9 +127,9 @@ def _by_table(
     path: pathlib.Path, database: dict[str, int], queries: dict[str, int]
 ) -> tuple[Int64[np.ndarray, " _"], ...]:
     table = read_table(path)
-    lines = table.lines if table.columns == _HEADER else [(1, table.columns), *table.lines]
-    if len(table.columns) != 2:
-        lines = []
+    rows = [] if table.columns == _HEADER else [(1, table.columns)]
+    rows += [(line, [field.strip() for field in fields]) for line, fields in table.lines]
+    lines = rows if len(table.columns) == 2 else []
     asked = matched((query for _, (query, _) in lines), queries)
     there = matched((match for _, (_, match) in lines), database)
     matches: dict[str, set[int]] = {}

@@ -1,5 +1,6 @@
 """Find the layout of an evaluation set, and read it with the layout's options."""
 
+import inspect
 import os
 import pathlib
 from collections.abc import Callable
@@ -29,25 +30,28 @@ class Layout(NamedTuple):
 
     words: str
     read: Callable[..., Benchmark]
-    options: tuple[str, ...] = ()
-    """Names of the options that the reader takes beside the path."""
-    names_images: bool = False
-    """Whether it names images, which may be missing; the reader takes `on_bad_image`."""
+
+    @property
+    def options(self) -> list[str]:
+        """Names of the options that the reader takes after the path."""
+        _, *options = inspect.signature(self.read).parameters
+        return [name for name in options if name != _ON_BAD_IMAGE]
+
+    @property
+    def names_images(self) -> bool:
+        """Whether files name images, which may be missing."""
+        return _ON_BAD_IMAGE in inspect.signature(self.read).parameters
 
 
-_MSLS_OPTIONS = ("split", "radius", "max_heading_difference")
+_ON_BAD_IMAGE = "on_bad_image"
 LAYOUTS = {
-    "utm": Layout(
-        "a folder of @UTM names", read_utm, ("split", "radius", "queries", "ignore_zones")
-    ),
+    "utm": Layout("a folder of @UTM names", read_utm),
     "vpr-bench": Layout("a VPR-Bench folder", read_vpr_bench),
-    "netvlad": Layout("a .mat file of NetVLAD", read_netvlad, ("radius", "images"), True),
-    "salad": Layout(
-        ".npy lists of GSV-Cities or SALAD", read_salad_lists, ("split", "images"), True
-    ),
-    "msls": Layout("raw MSLS", read_msls, _MSLS_OPTIONS, True),
-    "msls-subtask": Layout("raw MSLS, subtask all", read_msls_subtask, _MSLS_OPTIONS, True),
-    "folders": Layout("two plain folders", read_folders, ("split", "radius", "frames")),
+    "netvlad": Layout("a .mat file of NetVLAD", read_netvlad),
+    "salad": Layout(".npy lists of GSV-Cities or SALAD", read_salad_lists),
+    "msls": Layout("raw MSLS", read_msls),
+    "msls-subtask": Layout("raw MSLS, subtask all", read_msls_subtask),
+    "folders": Layout("two plain folders", read_folders),
 }
 """Layouts by the name that `open_benchmark` takes."""
 
@@ -121,7 +125,7 @@ def open_benchmark(
                 f"which takes {known}"
             )
     if chosen.names_images:
-        given["on_bad_image"] = on_bad_image
+        given[_ON_BAD_IMAGE] = on_bad_image
     return chosen.read(root, **given)
 
 
