@@ -62,9 +62,10 @@ def check_count(what: str, count: Any) -> None:
     Raises:
         InputError: it is below, or no whole number.
     """
+    whole = "" if fits(int, count) else "a whole number of "
     require(
-        fits(int, count) and count >= 1,
-        f"{what}: found {in_one_line(count)}, expected a whole number of at least 1",
+        not whole and count >= 1,
+        f"{what}: found {in_one_line(count)}, expected {whole}at least 1",
     )
 
 

@@ -438,10 +438,10 @@ def _a_function(problem: Problem, potentials: Potentials) -> Potentials:
             register_step,
             "newton",
             _Sound,
-            "^register_step: found the name 'newton' taken by crisalad_jax.transport.steps."
+            "^register_step 'newton': found the name taken by crisalad_jax.transport.steps."
             "NewtonStep, expected another name for _Sound$",
         ),
-        (register_step, "sinkhorn", _a_function, "found the name 'sinkhorn' taken by .*SinkhornS"),
+        (register_step, "sinkhorn", _a_function, "'sinkhorn': found the name taken by .*SinkhornS"),
         (
             register_step,
             "x",
@@ -451,7 +451,7 @@ def _a_function(problem: Problem, potentials: Potentials) -> Potentials:
         (register_step, "test-bad", _Thawed, "'test-bad': found _Thawed, which is no frozen data"),
         (register_step, "test-bad", _Stranger, "found _Stranger, expected a subclass of Step$"),
         (register_step, "test-bad", _Empty, "'test-bad': found no method step, expected it$"),
-        (register_step, "test-bad", _Named, "found a field 'name', which files keep the part's"),
+        (register_step, "test-bad", _Named, "found a field 'name', which has another meaning"),
         (register_step, "test-bad", 3, "found int, expected a frozen dataclass that inherits from"),
         (register_dustbin, "test-bad", _Sound, "found _Sound, expected a subclass of Dustbin$"),
         (register_dustbin, "test-bad", _a_function, "register_dustbin 'test-bad': found function,"),
