@@ -75,7 +75,7 @@ def test_all_that_is_cached_is_in_one_folder(tmp_path, shared):
     environment |= {"HOME": str(home), "CRISALAD_CACHE": str(cache), "PYTHONPATH": str(ROOT)}
     images = shared / "town" / "images" / "test"
     given = ("--images", images, "--weights", shared / "weights.safetensors", "--out", "d.npy")
-    resizes = "from crisalad_jax.data import resize; resize._compiled()"  # as for many images
+    resizes = "from crisalad_jax.data import resize; resize._machine_code(True)"  # for many images
     for program in (["-m", "crisalad_jax", "extract", *map(str, given)], ["-c", resizes]):
         command = [sys.executable, *program]
         subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
