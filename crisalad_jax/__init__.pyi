@@ -3,7 +3,6 @@
 from . import sinkhorn as sinkhorn
 from .checkpoints.export import ExportConfig as ExportConfig
 from .checkpoints.export import write_export as write_export
-from .checkpoints.load import Model as Model
 from .checkpoints.load import load as load
 from .checkpoints.torch_io import convert as convert
 from .checkpoints.torch_io import read_backbone as read_backbone
@@ -22,6 +21,7 @@ from .data.loader import training_batches as training_batches
 from .data.places import read_places as read_places
 from .data.query_set import QuerySet as QuerySet
 from .data.query_set import read_query_set as read_query_set
+from .data.reading import Reading as Reading
 from .data.resize import resize_image as resize_image
 from .evaluation.calibrate import calibrate as calibrate
 from .evaluation.evaluate import evaluate as evaluate
@@ -51,6 +51,7 @@ from .nn.config import ModelConfig as ModelConfig
 from .nn.config import with_aggregator as with_aggregator
 from .nn.cross_image import CrossImageConfig as CrossImageConfig
 from .nn.model import Crisalad as Crisalad
+from .nn.model import Model as Model
 from .nn.model import attend_across_images as attend_across_images
 from .nn.model import cast_params as cast_params
 from .nn.model import describe as describe
@@ -61,8 +62,9 @@ from .nn.model import self_mask as self_mask
 from .nn.model import valid_mask as valid_mask
 from .nn.projection import ProjectionConfig as ProjectionConfig
 from .nn.tokens import Tokens as Tokens
-from .retrieval.alone import describe_files as describe_files
-from .retrieval.alone import describe_images as describe_images
+from .retrieval.describe import describe_files as describe_files
+from .retrieval.describe import describe_images as describe_images
+from .retrieval.describe import prepare_image as prepare_image
 from .retrieval.extract import extract as extract
 from .retrieval.maps.build import index as index
 from .retrieval.maps.live import query_live as query_live
@@ -70,7 +72,6 @@ from .retrieval.maps.map import Map as Map
 from .retrieval.maps.query import query as query
 from .retrieval.pca import fit_pca as fit_pca
 from .retrieval.pca import load_pca as load_pca
-from .retrieval.photographs import prepare_image as prepare_image
 from .retrieval.search import search as search
 from .retrieval.sequence import BayesFilter as BayesFilter
 from .serve import serve_map as serve_map

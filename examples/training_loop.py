@@ -32,10 +32,11 @@ def main():
     pictures = np.clip(places + noise, 0, 255).astype(np.uint8).reshape(-1, *model.image_size, 3)
     labels = np.repeat(np.arange(PLACES), VIEWS)
 
-    options = {"steps": STEPS, "optimiser": optax.adamw(optax.cosine_decay_schedule(5e-4, STEPS))}
+    optimiser = optax.adamw(optax.cosine_decay_schedule(5e-4, STEPS))
+    static = cj.step_config(config, steps=STEPS, optimiser=optimiser)
     params = cj.init_crisalad(jax.random.key(0), model)
-    state, frozen = cj.init_train_state(params, "all", cj.step_config(config, **options))
-    step = cj.make_train_step(config, **options)
+    state, frozen = cj.init_train_state(params, "all", static)
+    step = cj.make_train_step(static)
 
     losses = []
     for number in range(STEPS):

@@ -11,9 +11,9 @@ import numpy as np
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import load
-from crisalad_jax.experiments.synthetic import View, render
 from crisalad_jax.nn.model import describe
-from crisalad_jax.retrieval.photographs import prepare_image
+from crisalad_jax.retrieval.describe import prepare_image
+from crisalad_jax.synthetic import View, render
 from crisalad_jax.utils.files import atomic_path
 
 GOLDEN = pathlib.Path(__file__).parents[1] / "parity" / "goldens" / "starter.npz"

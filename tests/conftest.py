@@ -11,7 +11,7 @@ import pathlib
 import signal
 import sys
 import unittest.mock
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -28,13 +28,16 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import COLUMNS, read_places
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import Crisalad, parameter_shapes
+from crisalad_jax.nn.model import Crisalad, Model, parameter_shapes
+from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.utils import compiler
@@ -195,7 +198,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     write_city(root / "city")
     write_town(root / "town")
     write_json(root / "recipe.json", to_plain(RECIPE))
-    save_weights(root / "weights.safetensors", random_params(MODEL), MODEL)
+    save_weights(root / "weights.safetensors", Model(random_params(MODEL), MODEL))
     return root
 
 
@@ -258,3 +261,18 @@ def own_parts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     for name in set(sys.modules) - before:
         if name.startswith("crisalad_plugin_"):
             del sys.modules[name]
+
+
+def read_options(options: dict[str, Any]) -> dict[str, Any]:
+    """Put the options that a `Reading` has into one; quiet, with batches of `BATCH`."""
+    fields = {field.name for field in dataclasses.fields(Reading)}
+    chosen = {name: options[name] for name in fields & options.keys()}
+    others = {name: value for name, value in options.items() if name not in fields}
+    return others | {"reading": Reading(**{"batch_size": BATCH, "quiet": True} | chosen)}
+
+
+def describe_single(model: Model, paths: Sequence[pathlib.Path]) -> np.ndarray:
+    """Describe images independently, by tokens and their grouping, in batches of `BATCH`."""
+    describer = describer_of(model)
+    rows = read_tokens(describer, paths, Reading(batch_size=BATCH, quiet=True)).descriptors
+    return group(describer, rows, len(paths), "single", batch_size=BATCH)

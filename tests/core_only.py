@@ -44,10 +44,10 @@ def main() -> None:
     assert losses[-1] < losses[0], losses
 
     cj.save_weights(
-        folder / "weights.safetensors", cj.merge_params(trainable, frozen, config), config
+        folder / "weights.safetensors", cj.Model(cj.merge_params(trainable, frozen, config), config)
     )
     loaded, config = cj.load(folder / "weights.safetensors")
-    found = cj.extract(loaded, config, folder, folder / "descriptors.npy")
+    found = cj.extract(cj.Model(loaded, config), folder, folder / "descriptors.npy")
     names, descriptors = found.names, found.descriptors
     assert names == [f"{number}.png" for number in range(4)]
     assert descriptors.shape == (4, config.descriptor_dim)

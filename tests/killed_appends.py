@@ -16,19 +16,20 @@ from collections.abc import Callable
 import numpy as np
 
 import crisalad_jax.retrieval.maps.file_store
+from crisalad_jax.config.io import to_plain
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.retrieval.maps.manifest import MapDescription, read_description
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.metadata import MapMetadata, read_metadata
 from crisalad_jax.utils.errors import InputError
 
 LENGTH = 48
 
 
-def description(store: str) -> MapDescription:
-    return MapDescription(
+def metadata(store: str) -> MapMetadata:
+    return MapMetadata(
         model="0" * 64,
         weights="w.safetensors",
-        config=ModelConfig(),
+        config=to_plain(ModelConfig()),
         descriptor_length=LENGTH,
         store=store,
         collection="crisalad_map",
@@ -48,7 +49,7 @@ def names(first: int, count: int) -> list[str]:
 
 def append_until(folder: pathlib.Path, total: int, store: str = "files") -> None:
     """In segments of one to five."""
-    with open_for_appending(folder, description(store)) as target:
+    with open_for_appending(folder, metadata(store)) as target:
         while (first := len(target)) < total:
             count = min(1 + first % 5, total - first)
             new = names(first, count)
@@ -58,7 +59,7 @@ def append_until(folder: pathlib.Path, total: int, store: str = "files") -> None
 def check(folder: pathlib.Path) -> int:
     """How many images the map has, all of which are as they were appended."""
     if not any((folder / "segments").glob("[0-9]*.json")):
-        read_description(folder)
+        read_metadata(folder)
         return 0
     with Map.open(folder) as opened:
         opened.verify()

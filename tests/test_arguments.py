@@ -15,7 +15,7 @@ PARAMS = parameter_shapes(PRESET)
 TRAINING = cj.recipe("tiny")
 IMAGES = np.zeros((1, 28, 28, 3), np.uint8)
 KEY = jax.random.key(0)
-NO_CONFIG = "config: found Crisalad, expected ModelConfig"
+NO_MODEL = "model: found Crisalad, expected a Model(params, config)"
 NO_PATH = "found ModelConfig, expected a path"
 CALLS = {
     "train a preset": (
@@ -39,24 +39,15 @@ CALLS = {
         lambda: cj.describe(PARAMS, PRESET, IMAGES),
         "config: found ndarray, expected Model",
     ),
-    "describe_files": (
-        lambda: cj.describe_files(PARAMS, ["a"], PRESET),
-        "config: found list, expected",
-    ),
-    "describe_images": (
-        lambda: cj.describe_images(PARAMS, [IMAGES], PRESET),
-        "config: found list, exp",
-    ),
-    "evaluate": (lambda: cj.evaluate(PRESET, PARAMS, "set"), NO_CONFIG),
-    "evaluate a path": (
-        lambda: cj.evaluate(PARAMS, PRESET, "set"),
-        "benchmark: found 'set', expected B",
+    "describe_files": (lambda: cj.describe_files(PARAMS, PRESET), NO_MODEL),
+    "describe_images": (lambda: cj.describe_images(PARAMS, [IMAGES]), NO_MODEL),
+    "evaluate": (lambda: cj.evaluate(PARAMS, PRESET), "benchmark: found ModelConfig, expected B"),
+    "evaluate swapped": (
+        lambda: cj.describe_files(cj.Model(PRESET, PARAMS), "f"),
+        "params: found ModelConfig, expected Crisalad",
     ),
     "load": (lambda: cj.load(PRESET), f"path: {NO_PATH}"),
-    "save_weights": (
-        lambda: cj.save_weights(PARAMS, "w", PRESET),
-        "params: found str, expected Crisalad",
-    ),
+    "save_weights": (lambda: cj.save_weights("w", PARAMS), NO_MODEL),
     "init_crisalad": (
         lambda: cj.init_crisalad(PRESET, KEY),
         "config: found PRNGKeyArray, expected ModelConfig",
@@ -65,9 +56,12 @@ CALLS = {
         lambda: cj.prepare_image(PRESET, IMAGES[0]),
         "config: found ndarray, expected",
     ),
-    "query": (lambda: cj.query(PARAMS, "m.map", "f"), "places: found Crisalad, expected Map"),
+    "query": (
+        lambda: cj.query(PARAMS, "f"),
+        "places: found Crisalad, expected Map",
+    ),
     "calibrate": (
-        lambda: cj.calibrate("m.map", PARAMS, "s"),
+        lambda: cj.calibrate("m.map", "s"),
         "places: found 'm.map', expected Map",
     ),
     "open": (lambda: cj.Map.open(PRESET), f"folder: {NO_PATH}"),
@@ -102,7 +96,7 @@ CALLS = {
         lambda: cj.metric_loss(IMAGES, IMAGES, PRESET),
         "config: found ModelConfig, expect",
     ),
-    "write_export": (lambda: cj.write_export(PRESET, PARAMS, "o"), f"out: {NO_PATH}"),
+    "write_export": (lambda: cj.write_export(PRESET, cj.Model(PARAMS, "o")), f"out: {NO_PATH}"),
     "a number for a key": (
         lambda: cj.init_crisalad(0, PRESET),
         "key: found 0, expected Array",

@@ -11,7 +11,7 @@ import PIL.Image
 import pytest
 
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
-from crisalad_jax.nn.model import Crisalad, describe, self_mask
+from crisalad_jax.nn.model import Crisalad, Model, describe, self_mask
 from tests.checkpoints.test_export import TOLERANCE, pictures
 from tests.conftest import MODEL
 
@@ -32,7 +32,7 @@ def expected(params: Crisalad) -> np.ndarray:
 
 def test_python_with_onnxruntime(params: Crisalad, tmp_path: pathlib.Path):
     """Pictures of the model's size, stored without loss: the same pixels, so the same numbers."""
-    write_export(tmp_path / "export", params, MODEL, ExportConfig(format="onnx"))
+    write_export(tmp_path / "export", Model(params, MODEL), ExportConfig(format="onnx"))
     names = ["a.png", "b.png"]
     for name, pixels in zip(names, pictures(2), strict=True):
         PIL.Image.fromarray(pixels).save(tmp_path / name)
@@ -45,7 +45,7 @@ def test_python_with_onnxruntime(params: Crisalad, tmp_path: pathlib.Path):
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("cmake") is None, reason="no cmake")
 def test_cpp_with_openvino(params: Crisalad, tmp_path: pathlib.Path):
-    write_export(tmp_path / "export", params, MODEL, ExportConfig(format="openvino"))
+    write_export(tmp_path / "export", Model(params, MODEL), ExportConfig(format="openvino"))
     spec = importlib.util.find_spec("openvino")
     assert spec is not None
     assert spec.origin is not None

@@ -22,7 +22,7 @@ from crisalad_jax.config.io import read_config, to_plain
 from crisalad_jax.config.plugins import load_plugin
 from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.losses import LossConfig, metric_loss
-from crisalad_jax.nn.model import describe
+from crisalad_jax.nn.model import Model, describe
 from crisalad_jax.sinkhorn import SinkhornConfig, solve
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
@@ -108,7 +108,7 @@ import crisalad_jax as cj
 @cj.register_recipe("salad")
 def mine(model, preset):
     return cj.TrainConfig(model=model)
-""", "register_recipe 'salad': found the name taken by crisalad_jax.training.recipes.salad, exp"),
+""", "register_recipe 'salad': found the name taken by crisalad_jax.training.recipes.dinov2, exp"),
 }  # fmt: skip
 
 
@@ -203,7 +203,7 @@ def save_with_step(path: pathlib.Path, name: str) -> None:
     """Write a model whose transport has a step of this name."""
     salad = dataclasses.replace(MODEL.aggregator, sinkhorn=SinkhornConfig(step=name))
     config = dataclasses.replace(WITHOUT_ENCODER, aggregator=salad)
-    save_weights(path, random_params(config), config)
+    save_weights(path, Model(random_params(config), config))
 
 
 @pytest.mark.usefixtures("_unchecked")
@@ -297,7 +297,7 @@ def test_an_aggregator_that_returns_something_else(
         describe(params, np.zeros((2, *config.image_size, 3), np.uint8), config)
     words = f"aggregator {name}: {BAD_AGGREGATORS[name]}"
     assert str(error.value) == words
-    save_weights(weights, params, config)
+    save_weights(weights, Model(params, config))
     data = ("evaluate", "--data", shared / "town", "--weights", weights, "--batch-size", 2)
     fails(capfd, *data, "--plugin", plugin, "--quiet", words=(f"crisalad: {words}",))
 

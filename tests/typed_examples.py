@@ -47,7 +47,7 @@ def refused(preset: cj.ModelConfig, places: cj.Map) -> None:
     cj.ModelConfig(aggregater="gem")  # pyright: ignore[reportCallIssue]
     cj.TrainConfig(batch_order="random")  # pyright: ignore[reportArgumentType]
     cj.describe(preset, np.zeros((1, 28, 28, 3)), preset)  # pyright: ignore[reportArgumentType]
-    cj.query(places, preset, "frames")  # pyright: ignore[reportArgumentType]
+    cj.query(places, "frames", model=cj.Model(preset, places.config))  # pyright: ignore[reportArgumentType]
 
 
 def models(images: np.ndarray, file: pathlib.Path) -> None:
@@ -65,9 +65,9 @@ def models(images: np.ndarray, file: pathlib.Path) -> None:
     assert_type(cj.extract_features(params, images, config), cj.Features)
     picture = cj.prepare_image(cj.read_image("photo.jpg"), config)
     assert picture.dtype == np.uint8
-    assert cj.describe_files(params, config, ["photo.jpg"]).dtype == np.float32
-    assert cj.describe_images(params, config, [picture]).dtype == np.float32
-    assert_type(cj.save_weights(file, params, config), None)
+    assert cj.describe_files(cj.Model(params, config), ["photo.jpg"]).dtype == np.float32
+    assert cj.describe_images(cj.Model(params, config), [picture]).dtype == np.float32
+    assert_type(cj.save_weights(file, cj.Model(params, config)), None)
 
 
 def transport(scores: jax.Array) -> None:
@@ -100,12 +100,12 @@ def maps(folder: pathlib.Path, descriptors: np.ndarray) -> None:
     with cj.Map.open(folder) as places:
         assert_type(places, cj.Map)
         assert_type(places.locate("frame.jpg", k=5), list[Answer])
-        assert_type(cj.query(places, places.load_params(), "frames"), Answers)
+        assert_type(cj.query(places, "frames"), Answers)
     assert_type(cj.search(descriptors, descriptors[:3], k=5), Neighbours)
     params, config = cj.load("starter")
     benchmark = cj.open_benchmark(folder)
     assert_type(benchmark, cj.Benchmark)
-    results = cj.evaluate(params, config, benchmark)
+    results = cj.evaluate(cj.Model(params, config), benchmark)
     assert_type(results, list[GroupingResult])
     rows = ("gem: model.aggregator=gem", ("slow", {"optimiser.learning_rate": 1e-4}))
     compared = ComparisonConfig("ablate", ("crisalad",), test=("SET",), train="DIR", rows=rows)

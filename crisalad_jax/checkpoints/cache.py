@@ -18,6 +18,7 @@ from crisalad_jax.checkpoints.layouts import LAYOUTS
 from crisalad_jax.checkpoints.published import PUBLISHED, Published
 from crisalad_jax.checkpoints.torch_io import Checkpoint, read_checkpoint, read_vocabulary
 from crisalad_jax.checkpoints.weights import CACHE_RECORD, save_weights
+from crisalad_jax.nn.model import Model
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.download import MissingFileError, download
 from crisalad_jax.utils.errors import InputError
@@ -225,7 +226,8 @@ def _convert(
         if address is not None:
             published.unlink()
         raise InputError(f"{model.name}: {error}") from error
-    save_weights(_weights(model), checkpoint.params, checkpoint.config, extras=checkpoint.extras)
+    converted = Model(checkpoint.params, checkpoint.config)
+    save_weights(_weights(model), converted, extras=checkpoint.extras)
     known = {
         "url": address or (record or {}).get("url"),
         "file": model.file,

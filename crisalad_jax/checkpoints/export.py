@@ -43,6 +43,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import (
     Crisalad,
     Images,
+    Model,
     attend_across_images,
     check_params,
     describe,
@@ -225,8 +226,7 @@ def _without_sources() -> Iterator[None]:
 @takes(out=PATH)
 def write_export(
     out: str | os.PathLike[str],
-    params: Crisalad,
-    config: ModelConfig,
+    model: Model,
     how: ExportConfig = ExportConfig(),
     *,
     calibration: np.ndarray | None = None,
@@ -238,8 +238,7 @@ def write_export(
 
     Args:
         out: the folder.
-        params: the model's parameters.
-        config: the model.
+        model: parameters and configuration.
         how: format, platforms, batch size and grouping.
         calibration: prepared images that products are quantised to int8 with, in ONNX and OpenVINO,
             by onnxruntime; None keeps float32. Descriptors then differ, and by how much the
@@ -255,13 +254,14 @@ def write_export(
 
     Example:
         >>> import jax
-        >>> from crisalad_jax import PRESETS, init_crisalad
+        >>> from crisalad_jax import PRESETS, Model, init_crisalad
         >>> config = PRESETS["tiny"]
-        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> model = Model(init_crisalad(jax.random.key(0), config), config)
         >>> how = ExportConfig(batch_size=2)
-        >>> write_export(folder / "export", params, config, how)["descriptors"]["shape"]
+        >>> write_export(folder / "export", model, how)["descriptors"]["shape"]
         [2, 576]
     """
+    params, config = model
     check_new_folder(out)
     check_exportable(params, config, how)
     if calibration is not None:
@@ -313,7 +313,7 @@ def _write_stablehlo(
     exported = export_model(params, config, how)
     (folder / PROGRAM).write_bytes(exported.serialize(vjp_order=0))
     if not how.weights_inside:
-        save_weights(folder / WEIGHTS, params, config)
+        save_weights(folder / WEIGHTS, Model(params, config))
     images, (descriptors,) = exported.in_avals[-1], exported.out_avals
     called = "images" if how.weights_inside else "weights, images"
     weights = None

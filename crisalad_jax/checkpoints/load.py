@@ -3,29 +3,19 @@
 import os
 import pathlib
 import re
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.config.checks import PATH, takes
-from crisalad_jax.config.short_repr import brief
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 
 if TYPE_CHECKING:
-    from crisalad_jax.nn.config import ModelConfig
-    from crisalad_jax.nn.model import Crisalad
-
-
-@brief
-class Model(NamedTuple):
-    """A model's parameters and configuration."""
-
-    params: "Crisalad"
-    config: "ModelConfig"
+    from crisalad_jax.nn.model import Model
 
 
 @takes(path=PATH)
-def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
+def load(path: str | os.PathLike[str], *, verify: bool = True) -> "Model":
     """Load a model from a file of this package, a public checkpoint, or a published one by name.
 
     Args:
@@ -36,22 +26,23 @@ def load(path: str | os.PathLike[str], *, verify: bool = True) -> Model:
         verify: whether to check the bytes of a file of this package against its checksum.
 
     Returns:
-        (params, config).
+        The model: parameters and configuration.
 
     Raises:
         InputError: what `read_checkpoint` and `find_weights` raise.
 
     Example:
         >>> import jax
-        >>> from crisalad_jax import init_crisalad, load, recipe, save_weights
+        >>> from crisalad_jax import Model, init_crisalad, load, recipe, save_weights
         >>> config = recipe("tiny").model
-        >>> params = init_crisalad(jax.random.key(0), config)
-        >>> save_weights(folder / "weights.safetensors", params, config)
+        >>> model = Model(init_crisalad(jax.random.key(0), config), config)
+        >>> save_weights(folder / "weights.safetensors", model)
         >>> load(folder / "weights.safetensors").config == config
         True
     """
     # Imported here: the layouts of public checkpoints take a tenth of a second, and few need them.
     from crisalad_jax.checkpoints.torch_io import read_checkpoint
+    from crisalad_jax.nn.model import Model
 
     checkpoint = read_checkpoint(find_weights(path), verify=verify)
     return Model(checkpoint.params, checkpoint.config)

@@ -6,11 +6,12 @@ Of a file of weights the export is made once, and kept in the user's cache.
 import concurrent.futures
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from crisalad_jax.config.checks import choose
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.loader import ImageBatch
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
@@ -69,10 +71,60 @@ class Runtime:
     """Number of images of every call; None is any."""
     preparation: Preparation
     """How photographs are prepared."""
+    precision: Precision
+    """Type of the matrix products."""
     model: Mapping[str, Any]
-    """The model's configuration, as JSON values."""
+    """The configuration of the model that was exported, as JSON values."""
     _first: Program
     _second: Program | None
+
+    @functools.cached_property
+    def config(self) -> "ModelConfig":
+        """The model's configuration, at the size and in the type that this engine computes."""
+        from crisalad_jax.nn.config import ModelConfig
+
+        config = from_plain(ModelConfig, self.model, source=str(self.folder))
+        return dataclasses.replace(
+            config,
+            image_size=self.preparation.image_size,
+            preprocessing=self.preparation.preprocessing,
+            compute_dtype=self.precision,
+        )
+
+    @property
+    def row_length(self) -> int:
+        """Number of values in the row of an image's tokens."""
+        return self.dim if self._second is None else self.config.unprojected_dim
+
+    @property
+    def row_dtype(self) -> str:
+        """Type of the values in rows of tokens."""
+        return "float32"
+
+    def check_size(self, size: Size) -> None:
+        """Accept all sizes: `open_runtime` checked that images are prepared for the program."""
+
+    def check_groupings(self, groupings: Iterable[str]) -> None:
+        """Check that the program can describe images under these groupings.
+
+        Raises:
+            InputError: it is for images that are described alone, or for a whole call's together.
+        """
+        if not self.model["cross_image"]["layers"] or self.grouping == "any":
+            return
+        wanted = {kind for grouping in groupings for kind in grouping.split("/")}
+        if self.grouping == "batch" or wanted != {"single"}:
+            others = ", ".join(sorted(wanted))
+            raise InputError(
+                f"{self.folder}: found a program of grouping {self.grouping}, expected "
+                f"{'single or any' if wanted == {'single'} else 'any'}, for images of grouping "
+                f"{others} (`crisalad export --grouping`)"
+            )
+
+    def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[np.ndarray, ImageBatch]]:
+        """Yield each batch with a row of numbers for each of its images, which `attend` reads."""
+        for batch in batches:
+            yield self._rows(batch.images), batch
 
     def describe(self, images: np.ndarray) -> np.ndarray:
         """Describe prepared images, each as if it were alone (or all together: `grouping`).
@@ -86,15 +138,10 @@ class Runtime:
         Raises:
             InputError: images of another shape or type.
         """
-        rows = self.tokens(images)
-        return self.attend(rows, np.eye(len(rows), dtype=bool))
+        rows = self._rows(images)
+        return self.attend(rows[None], np.eye(len(rows), dtype=bool)[None])[0]
 
-    def tokens(self, images: np.ndarray) -> np.ndarray:
-        """Return a row of numbers for each image, of which `attend` makes descriptors.
-
-        Raises:
-            InputError: images of another shape or type.
-        """
+    def _rows(self, images: np.ndarray) -> np.ndarray:
         expected = (*self.input_size, 3)
         if images.shape[1:] != expected or images.dtype != self.preparation.dtype:
             raise InputError(
@@ -110,11 +157,19 @@ class Runtime:
         return np.concatenate([self._first(each) for each in filled])[: len(images)]
 
     def attend(self, rows: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Make descriptors of `tokens`; `mask[i, j]` allows image i to look at image j."""
+        """Make descriptors of the tokens of some groups of images.
+
+        Args:
+            rows: of `tokens`, (group, image, number).
+            mask: `mask[g, i, j]` allows image i of group g to attend to image j of it.
+
+        Returns:
+            Descriptors (group, image, dim).
+        """
         if self._second is None:
             return rows
-        lonely = ~mask.any(axis=1, keepdims=True)
-        return self._second(rows, mask | np.logical_and(np.eye(len(mask), dtype=bool), lonely))
+        lonely = ~mask.any(axis=2, keepdims=True) & np.eye(mask.shape[1], dtype=bool)
+        return np.stack([self._second(*group) for group in zip(rows, mask | lonely, strict=True)])
 
 
 def open_runtime(
@@ -153,11 +208,11 @@ def open_runtime(
 
     Example:
         >>> import jax, numpy as np
-        >>> from crisalad_jax import PRESETS, ExportConfig, init_crisalad, write_export
+        >>> from crisalad_jax import PRESETS, ExportConfig, Model, init_crisalad, write_export
         >>> config = PRESETS["tiny"]
         >>> params = init_crisalad(jax.random.key(0), config)
         >>> how = ExportConfig(format="onnx")
-        >>> _ = write_export(folder / "onnx", params, config, how)
+        >>> _ = write_export(folder / "onnx", Model(params, config), how)
         >>> runtime = open_runtime(folder / "onnx", "onnxruntime")
         >>> runtime.describe(np.zeros((2, 98, 98, 3), np.uint8)).shape
         (2, 576)
@@ -193,6 +248,7 @@ def open_runtime(
         input_size=(height, width),
         fixed_batch=count if isinstance(count, int) else None,
         preparation=wanted,
+        precision=precision,
         model=manifest["model"],
         _first=loaded[0],
         _second=loaded[1] if len(loaded) > 1 else None,
@@ -342,21 +398,25 @@ def read_header(weights: str | os.PathLike[str]) -> dict[str, Any]:
     raise AssertionError("no header")  # which `load_weights` has told of
 
 
-def read_model(weights: str | os.PathLike[str]) -> "ModelConfig":
-    """Read the configuration in a file of weights, without its arrays.
+def read_model(source: str | os.PathLike[str]) -> "ModelConfig":
+    """Read the configuration in a file of weights or an exported folder, without its arrays.
 
     Raises:
-        InputError: what `read_header` raises, or of the configuration.
+        InputError: what `read_header` raises, or of the manifest or the configuration.
     """
-    from crisalad_jax.config.io import from_plain
     from crisalad_jax.nn.config import ModelConfig
 
-    return from_plain(ModelConfig, read_header(weights)["config"], source=f"{weights} (metadata)")
+    if os.path.isdir(source):
+        manifest = read_json(pathlib.Path(source) / MANIFEST, "the manifest of `crisalad export`")
+        plain = {**manifest["model"], "compute_dtype": "float32"}  # which its numbers are
+        return from_plain(ModelConfig, plain, source=str(source))
+    return from_plain(ModelConfig, read_header(source)["config"], source=f"{source} (metadata)")
 
 
 def _export(weights: pathlib.Path, settings: Mapping[str, Any], folder: pathlib.Path) -> None:
     from crisalad_jax.checkpoints.export import ExportConfig, write_export
     from crisalad_jax.checkpoints.weights import load_weights
+    from crisalad_jax.nn.model import Model
 
     params, config = load_weights(weights)
     config = dataclasses.replace(
@@ -374,4 +434,4 @@ def _export(weights: pathlib.Path, settings: Mapping[str, Any], folder: pathlib.
         if not (folder / MANIFEST).is_file():
             warn(f"{weights}: exporting it for --runtime, once; into {folder}")
             how = ExportConfig(settings["grouping"], format=settings["format"])
-            write_export(folder, params, config, how)
+            write_export(folder, Model(params, config), how)

@@ -45,7 +45,7 @@ from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc
 from crisalad_jax.nn.backbones import Backbone
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Crisalad, Model
 from crisalad_jax.utils.errors import InputError, few
 from crisalad_jax.utils.files import atomic_path, check_source, check_target, is_html
 
@@ -491,7 +491,7 @@ def convert(
         >>> from crisalad_jax import PRESETS, init_crisalad, load, save_weights
         >>> config = PRESETS["tiny"]
         >>> params = init_crisalad(jax.random.key(0), config)
-        >>> save_weights(folder / "ours.safetensors", params, config)
+        >>> save_weights(folder / "ours.safetensors", Model(params, config))
         >>> done = convert(folder / "ours.safetensors", folder / "public.pth", "reference")
         >>> load(folder / "public.pth").config == config
         True
@@ -528,7 +528,8 @@ def convert(
         )
     if suffix != ".safetensors":
         raise InputError(f"{target}: found suffix {suffix!r}, expected .safetensors")
-    save_weights(target, checkpoint.params, checkpoint.config, extras=checkpoint.extras, half=half)
+    model = Model(checkpoint.params, checkpoint.config)
+    save_weights(target, model, extras=checkpoint.extras, half=half)
     return Conversion(checkpoint.layout, None, checkpoint.config)
 
 
@@ -556,7 +557,7 @@ def read_backbone(path: str | os.PathLike[str], config: Backbone, fresh: Any) ->
         >>> from crisalad_jax import PRESETS, init_crisalad, save_weights
         >>> config = PRESETS["tiny"]
         >>> params = init_crisalad(jax.random.key(0), config)
-        >>> save_weights(folder / "model.safetensors", params, config)
+        >>> save_weights(folder / "model.safetensors", Model(params, config))
         >>> fresh = config.backbone.init(jax.random.key(1))
         >>> backbone = read_backbone(folder / "model.safetensors", config.backbone, fresh)
         >>> bool((backbone.cls_token == params.backbone.cls_token).all())

@@ -18,7 +18,7 @@ from crisalad_jax.config.part import fingerprint_fields, with_non_semantic_field
 from crisalad_jax.config.plugins import changed_sources, sources_of
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.misfits import misfits, not_finite
-from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
+from crisalad_jax.nn.model import Crisalad, Model, check_params, parameter_shapes
 from crisalad_jax.utils.checksums import ChangedFileError, checked_safetensors
 from crisalad_jax.utils.errors import InputError, few
 from crisalad_jax.utils.files import check_source, is_html
@@ -42,8 +42,7 @@ EXTRA = "extra."
 
 def save_weights(
     path: str | os.PathLike[str],
-    params: Crisalad,
-    config: ModelConfig,
+    model: Model,
     *,
     extras: Mapping[str, np.ndarray] | None = None,
     half: bool = False,
@@ -52,8 +51,7 @@ def save_weights(
 
     Args:
         path: the file, a .safetensors.
-        params: all parameters of the model.
-        config: the model.
+        model: all parameters, and the configuration.
         extras: arrays of a public checkpoint that no descriptor needs (see `convert`).
         half: whether to keep float32 parameters as float16, in half the room. They are rounded, and
             are float32 again when they are read.
@@ -64,14 +62,18 @@ def save_weights(
 
     Example:
         >>> import jax, tempfile
-        >>> from crisalad_jax import PRESETS, init_crisalad, load
-        >>> params = init_crisalad(jax.random.key(0), PRESETS["tiny"])
+        >>> from crisalad_jax import PRESETS, Model, init_crisalad, load
+        >>> config = PRESETS["tiny"]
+        >>> model = Model(init_crisalad(jax.random.key(0), config), config)
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     save_weights(f"{folder}/w.safetensors", params, PRESETS["tiny"])
-        ...     loaded, config = load(f"{folder}/w.safetensors")
-        >>> config == PRESETS["tiny"]
+        ...     save_weights(f"{folder}/w.safetensors", model)
+        ...     loaded = load(f"{folder}/w.safetensors")
+        >>> loaded.config == config
         True
     """
+    if not isinstance(model, tuple):
+        raise InputError(f"model: found {type(model).__name__}, expected a Model(params, config)")
+    params, config = model
     check_params(params, config, stored=True)
     stored = params
     if half:
@@ -122,8 +124,8 @@ def load_extras(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
 
 def load_weights(
     path: str | os.PathLike[str], expected: ModelConfig | None = None, *, verify: bool = True
-) -> tuple[Crisalad, ModelConfig]:
-    """Read the parameters and configuration that `save_weights` wrote.
+) -> Model:
+    """Read the model that `save_weights` wrote.
 
     A note tells if a part's source has changed since the weights were written.
 
@@ -134,7 +136,7 @@ def load_weights(
         verify: whether to check that the file's bytes are those that were written.
 
     Returns:
-        (params, config).
+        The model.
 
     Raises:
         InputError: the file is missing, changed, cut short or no such file; it needs a part that is
@@ -149,7 +151,7 @@ def load_weights(
         crisalad_jax.utils.errors.InputError: none.safetensors: found no such file, expected ...
     """
     params, config, _ = _loaded(path, expected, verify=verify)
-    return params, config
+    return Model(params, config)
 
 
 def load_with_hash(path: str | os.PathLike[str]) -> tuple[Crisalad, ModelConfig, str]:

@@ -13,7 +13,7 @@ import re
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from crisalad_jax.config.checks import require
@@ -51,22 +51,19 @@ def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
     import tyro
 
     from crisalad_jax.cli import help as helping
-    from crisalad_jax.cli.quick_types import quicken
     from crisalad_jax.config.flags import refusals
 
     program = f"crisalad {name}"
     asked = helping.asked_for(given)
     try:
         if asked == helping.SHORT:
-            kind = helping.class_of(name, module, given)
-            print(helping.short_help(name, module, kind))
+            print(helping.short_help(name, module, helping.class_of(name, module, given)))
             raise SystemExit(0)
         given = [helping.SHORT if each == helping.ALL else each for each in given]
         with refusals(given, wide=asked is None):
             if hasattr(module, "parse"):
                 return module.parse(program, given)
-            kind = quicken(helping.class_of(name, module, given))
-            return tyro.cli(kind, prog=program, args=given)
+            return tyro.cli(helping.class_of(name, module, given), prog=program, args=given)
     except InputError as error:
         several = getattr(module, "SEVERAL", "")
         hint = f" ({several})" if re.match("--images: .* expected one value$", str(error)) else ""
@@ -80,24 +77,15 @@ def _usage() -> str:
     return "\n".join(lines)
 
 
-def _load_plugins(given: Sequence[str]) -> None:
-    """Register the parts of installed packages and of the plug-ins after --plugin."""
-    load_entry_points()
-    named = False
-    for argument, following in itertools.pairwise([*given, "--"]):
+def _plugins(given: Sequence[str]) -> Iterator[str]:
+    """Yield the plug-ins after each --plugin."""
+    for place, argument in enumerate(given):
         flag, equals, value = argument.partition("=")
         if flag == "--plugin":
-            named = not equals
-            require(
-                not named or not following.startswith("--"),
-                "--plugin: found no value, expected FILE.py or MODULE",
-            )
-            if equals:
-                load_plugin(value)
-        elif argument.startswith("--"):
-            named = False
-        elif named:
-            load_plugin(argument)
+            after = itertools.takewhile(lambda each: not each.startswith("--"), given[place + 1 :])
+            names = [value] if equals else list(after)
+            require(bool(names), "--plugin: found no value, expected FILE.py or MODULE")
+            yield from names
 
 
 def _limit_pixels(given: Sequence[str]) -> None:
@@ -116,44 +104,39 @@ def _limit_pixels(given: Sequence[str]) -> None:
 def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
     require("" not in arguments, "arguments: found an empty one, expected a value")
     _limit_pixels(arguments)
-    _load_plugins(arguments)
+    load_entry_points()
+    for plugin in _plugins(arguments):
+        load_plugin(plugin)
     module = importlib.import_module(f"{__name__}.{name.replace('-', '_')}")
     if hasattr(module, "prepare"):
         arguments = module.prepare(arguments)
     chosen = _parse(name, module, arguments)
-    _check_numbers(chosen)
+    for flag, number in _numbers("", chosen):
+        # Arrays take no larger one, and no count or size comes near.
+        require(
+            abs(number) <= 2**40, f"--{flag}: found {number}, expected a number of at most 2**40"
+        )
     if not hasattr(module, "needs_jax") or module.needs_jax(chosen):
-        _set_up_jax(keep_programs)
+        from crisalad_jax.utils import compiler, executable_cache
+
+        compiler.configure()
+        if keep_programs and not has_plugins():
+            executable_cache.cache_executables()
     module.run(chosen)
 
 
-def _set_up_jax(keep_programs: bool) -> None:
-    from crisalad_jax.utils import compiler, executable_cache
-
-    compiler.configure()
-    if keep_programs and not has_plugins():
-        executable_cache.cache_executables()
-
-
-_LARGEST = 2**40
-"""Largest whole number of a flag: no count or size that any of them sets comes near."""
-
-
-def _check_numbers(value: Any, flag: str = "--") -> None:
-    """Check that no flag has a whole number beyond `_LARGEST`, which arrays would not take."""
-    if dataclasses.is_dataclass(value):
-        for field in dataclasses.fields(value):
-            # The fields of a configuration are flags without a prefix.
-            name = "" if field.name == "settings" else field.name.replace("_", "-")
-            dot = "." if name and not flag.endswith("--") else ""
-            _check_numbers(getattr(value, field.name), f"{flag}{dot}{name}")
+def _numbers(flag: str, value: Any) -> Iterator[tuple[str, int]]:
+    """Yield the flag and the value of each whole number in a command's arguments."""
+    if isinstance(value, int):
+        yield flag, value
     elif isinstance(value, tuple):
         for each in value:
-            _check_numbers(each, flag)
-    elif isinstance(value, int):
-        require(
-            abs(value) <= _LARGEST, f"{flag}: found {value}, expected a number of at most 2**40"
-        )
+            yield from _numbers(flag, each)
+    elif dataclasses.is_dataclass(value):
+        for name, each in vars(value).items():
+            # The fields of a configuration are flags without a prefix.
+            path = "" if name == "settings" else f"{flag}.{name}".strip(".").replace("_", "-")
+            yield from _numbers(path, each)
 
 
 def _show_note(message: Any, category: type[Warning], *rest: Any, **more: Any) -> None:
@@ -192,32 +175,19 @@ def _exit_code(given: list[str], keep_programs: bool) -> int:
     try:
         _check_command(given[0])
         _run(given[0], given[1:], keep_programs)
-    except ModuleNotFoundError as error:
-        print(f"crisalad: {missing_extra(error, f'crisalad {given[0]}')}", file=sys.stderr)
-        return 2
-    except (InputError, OSError) as error:  # OSError: a full disk, or a fault that no check foresaw
-        print("crisalad:", one_line(error), file=sys.stderr)
-        return 2
-    except MemoryError:
-        print(f"crisalad: {_OUT_OF_MEMORY}", file=sys.stderr)
-        return 2
-    except SystemExit as stop:  # from tyro, after --help
-        return _tell_of_plugin(stop) or 0
+        return 0
     except Interrupted as stopped:
-        print(f"crisalad: {stopped}", file=sys.stderr)
-        return 128 + stopped.number
+        reason, code = str(stopped), 128 + stopped.number
     except KeyboardInterrupt:
-        print(f"crisalad: {how_ended(signal.SIGINT)}", file=sys.stderr)
-        return 128 + signal.SIGINT
-    except Exception as error:
-        if (code := _tell_of_plugin(error)) is not None:
-            return code
-        reason = _OUT_OF_MEMORY if _is_out_of_memory(error) else _absent_platforms(error)
+        reason, code = how_ended(signal.SIGINT), 128 + signal.SIGINT
+    except BaseException as error:
+        reason, code = _reason(error, given[0]), 2
+        if reason is None and isinstance(error, SystemExit):  # from tyro, after --help
+            return 0
         if reason is None:
             raise
-        print(f"crisalad: {reason}", file=sys.stderr)
-        return 2
-    return 0
+    print(f"crisalad: {reason}", file=sys.stderr)
+    return code
 
 
 def _check_command(name: str) -> None:
@@ -225,16 +195,6 @@ def _check_command(name: str) -> None:
     near = difflib.get_close_matches(name, _COMMANDS)
     words = f"did you mean {' or '.join(near)}?" if near else f"expected {', '.join(_COMMANDS)}"
     require(name in _COMMANDS, f"found no command {name!r}; {words} (see crisalad --help)")
-
-
-_OUT_OF_MEMORY = (
-    "found not enough memory, expected more, or a smaller --batch-size, --image-size or model"
-)
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    """Return whether the system or a device had no memory left: libraries say it in words."""
-    return any(words in str(error) for words in _WORDS_OF_MEMORY)
 
 
 _WORDS_OF_MEMORY = (
@@ -245,19 +205,19 @@ _WORDS_OF_MEMORY = (
 """What XLA, OpenCV, C++, the system, its linker, Python's threads, numpy and code in C say."""
 
 
-def _absent_platforms(error: Exception) -> str | None:
-    """Describe what `JAX_PLATFORMS` names and is not there; None where that is not the fault."""
-    if "jax" not in sys.modules:
-        return None
-    from crisalad_jax.utils.target import absent_platforms
+def _reason(error: BaseException, name: str) -> str | None:
+    """Describe in one line an error of a command whose cause is known; None for others."""
+    if isinstance(error, ModuleNotFoundError):
+        return missing_extra(error, f"crisalad {name}")
+    if isinstance(error, InputError | OSError):  # OSError: a full disk, or what no check foresaw
+        return one_line(error)
+    if (failure := plugin_failure(error)) is not None:
+        return f"{printable(failure)} (from Python you see the traceback)"
+    if isinstance(error, MemoryError) or any(each in str(error) for each in _WORDS_OF_MEMORY):
+        advice = "expected more, or a smaller --batch-size, --image-size or model"
+        return f"found not enough memory, {advice}"
+    if isinstance(error, Exception) and "jax" in sys.modules:
+        from crisalad_jax.utils.target import absent_platforms
 
-    return absent_platforms(error)
-
-
-def _tell_of_plugin(error: BaseException) -> int | None:
-    """Print what a plug-in raised in one line, and return the exit code; None for other errors."""
-    failure = plugin_failure(error)
-    if failure is None:
-        return None
-    print(f"crisalad: {printable(failure)} (from Python you see the traceback)", file=sys.stderr)
-    return 2
+        return absent_platforms(error)
+    return None

@@ -13,6 +13,7 @@ import rich.table
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.config.checks import check_seed
+from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_format, check_target, write_json
 from crisalad_jax.utils.output import printable
@@ -21,7 +22,7 @@ if TYPE_CHECKING:  # commands that load no model of a file start without these
     from crisalad_jax.checkpoints.runtime import Runtime
     from crisalad_jax.data.benchmarks import Benchmark
     from crisalad_jax.nn.config import ModelConfig
-    from crisalad_jax.nn.model import Crisalad
+    from crisalad_jax.nn.model import Model
 
 RuntimeName = Literal["jax", "onnxruntime", "openvino"]
 """What computes a model: JAX, or another engine (`checkpoints.engines.EngineName`)."""
@@ -179,114 +180,77 @@ def open_set(arguments: Any) -> "Benchmark":
 
 def open_model(
     weights: pathlib.Path,
-    runtime: RuntimeName,
+    flags: Any,
     *,
-    image_size: tuple[int, int] | None = None,
-    resize: Sequence[str] = (),
-    compute_dtype: Literal["float32", "bfloat16"] | None = None,
-    any_grouping: bool = False,
-    verify: bool = True,
-    quiet: bool = False,
-) -> "tuple[Crisalad | Runtime, ModelConfig, str]":
+    groupings: Sequence[str] = ("single",),
+    like: "ModelConfig | None" = None,
+) -> "tuple[Model | Runtime, str]":
     """Load a model for JAX, or open it in another engine.
 
     Args:
         weights: the file, a published model's name, or for other engines an exported folder.
-        runtime: what computes it.
-        image_size: as `load_model`.
-        resize: as `load_model`.
-        compute_dtype: as `load_model`.
-        any_grouping: whether images look at each other.
-        verify: as `load_model`.
-        quiet: as `load_model`.
+        flags: has those of `flags.ModelFlags` and `flags.ReadFlags`.
+        groupings: the groupings that images will be described in.
+        like: configuration of a map, whose image size and types the flags then change.
 
     Returns:
-        (params, config, name), as `load_model`.
+        The model, and its name for tables and titles.
 
     Raises:
-        InputError: what `load_model` and `open_runtime` raise.
+        InputError: what `find_weights`, `load_weights`, `ModelConfig.resized` and `open_runtime`
+            raise.
     """
-    options: dict[str, Any] = {"image_size": image_size, "resize": resize}
-    if runtime == "jax":
-        options |= {"compute_dtype": compute_dtype, "verify": verify, "quiet": quiet}
-        return load_model(weights, **options)
     from crisalad_jax.checkpoints.runtime import open_runtime, read_model
-    from crisalad_jax.config.io import from_plain
-    from crisalad_jax.nn.config import ModelConfig
 
-    if weights.is_dir():
-        model = open_runtime(weights, runtime, precision=compute_dtype or "float32", verify=verify)
-        config = from_plain(ModelConfig, model.model, source=str(weights))
-        config = dataclasses.replace(config, compute_dtype=compute_dtype or "float32")
-        return model, config.resized(image_size, resize), str(weights)
-    file = find_weights(weights, quiet=quiet)
-    name, config = _name(file), read_model(file).resized(image_size, resize)
-    config = dataclasses.replace(config, compute_dtype=compute_dtype or config.compute_dtype)
+    file = find_given(weights, runtime=flags.runtime, quiet=flags.quiet) or weights
+    if flags.runtime == "jax":
+        return load_model(file, flags, like=like, verify=flags.verify)
+    config = _changed(read_model(file), flags, like)
     if config.compute_dtype == "float64":
-        raise InputError(f"--runtime: found {runtime} with a model of float64, expected jax")
+        raise InputError(f"--runtime: found {flags.runtime} with a model of float64, expected jax")
+    attends = bool(config.cross_image.layers)
     model = open_runtime(
         file,
-        runtime,
+        flags.runtime,
         image_size=config.image_size,
         preprocessing=config.preprocessing,
         precision=config.compute_dtype,
-        any_grouping=any_grouping and config.cross_image.layers > 0,
-        verify=verify,
+        any_grouping=attends and set("/".join(groupings).split("/")) != {"single"},
+        verify=flags.verify,
     )
-    return model, config, f"{name}, {runtime}"
+    return model, f"{_name(file)}, {flags.runtime}"
 
 
 def load_model(
-    weights: pathlib.Path | None,
-    *,
-    preset: str | None = None,
-    seed: int = 0,
-    image_size: tuple[int, int] | None = None,
-    resize: Sequence[str] = (),
-    compute_dtype: Literal["float32", "bfloat16"] | None = None,
-    verify: bool = True,
-    quiet: bool = False,
-) -> "tuple[Crisalad, ModelConfig, str]":
-    """Load a model from a file, or initialise an untrained preset without one.
+    file: pathlib.Path, flags: Any, *, like: "ModelConfig | None" = None, verify: bool = True
+) -> "tuple[Model, str]":
+    """Load a model of JAX's, changed by flags; see `open_model`."""
+    from crisalad_jax.checkpoints.weights import load_weights
 
-    Args:
-        weights: the file, or a published model's name.
-        preset: the size of the untrained model, where there is no file.
-        seed: draws the parameters of the untrained model.
-        image_size: height and width in pixels; None is the model's.
-        resize: words that change how images are resized; see `ModelConfig.resized`.
-        compute_dtype: type of the matrix products; None is the model's.
-        verify: whether to check the file's bytes against its checksum.
-        quiet: no progress bar of a download.
+    model = load_weights(file, verify=verify)
+    return model._replace(config=_changed(model.config, flags, like)), _name(file)
 
-    Returns:
-        (params, config, name); the name stands in tables and titles.
 
-    Raises:
-        InputError: what `find_weights`, `load_weights`, `recipe` and `ModelConfig.resized` raise;
-            or both weights and a preset are given.
-    """
-    check_one_model(weights, preset)
-    if weights is None:
-        import jax
+def untrained(preset: str, flags: Any) -> "tuple[Model, str]":
+    """Make an untrained model of a preset, with the flags of `evaluate`."""
+    import jax
 
-        from crisalad_jax.nn.model import init_crisalad
-        from crisalad_jax.training.recipes import recipe
+    from crisalad_jax.nn.model import Model, init_crisalad
+    from crisalad_jax.training.recipes import recipe
 
-        assert preset is not None  # `evaluate` takes starter where neither is given
-        config = recipe(preset).model
-        check_seed("seed", seed)
-        params = init_crisalad(jax.random.key(seed), config)
-        name = f"untrained {preset}, seed {seed}"
-    else:
-        from crisalad_jax.checkpoints.weights import load_weights
+    check_seed("seed", flags.seed)
+    config = recipe(preset).model
+    params = init_crisalad(jax.random.key(flags.seed), config)
+    return Model(params, _changed(config, flags)), f"untrained {preset}, seed {flags.seed}"
 
-        weights = find_weights(weights, quiet=quiet)
-        params, config = load_weights(weights, verify=verify)
-        name = _name(weights)
-    if compute_dtype is not None:
-        config = dataclasses.replace(config, compute_dtype=compute_dtype)
-    return params, config.resized(image_size, resize), name
+
+def _changed(config: "ModelConfig", flags: Any, like: "ModelConfig | None" = None) -> "ModelConfig":
+    """Change how images are resized and computed to what the map and the flags say."""
+    if like is not None:
+        config = with_non_semantic_fields_of(like, config)
+    if flags.compute_dtype is not None:
+        config = dataclasses.replace(config, compute_dtype=flags.compute_dtype)
+    return config.resized(flags.image_size, flags.resize)
 
 
 def _name(weights: pathlib.Path) -> str:

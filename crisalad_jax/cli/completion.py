@@ -58,10 +58,15 @@ def completion_script(shell: Shell) -> str:
 
 def _parser(name: str) -> argparse.ArgumentParser:
     """Make a command's parser, with the choices that its flags take by name."""
-    module = importlib.import_module(f"crisalad_jax.cli.{name.replace('-', '_')}")
+    from crisalad_jax.nn.config import PRESETS
+    from crisalad_jax.training.recipes import RECIPES
+
+    module = importlib.import_module(f"crisalad_jax.cli.{name}")
     parser = helping.flags_parser(helping.class_of(name, module, ()), f"crisalad {name}")
+    names = {"preset": PRESETS, "recipe": RECIPES, "name": (*starter.FILES, *PUBLISHED)}
     for action in parser._actions:
-        action.choices = _choices(name, action)
+        choices = names.get(action.dest, action.choices or ())
+        action.choices = tuple(each for each in choices if each != "None") or None
         if action.dest in ("weights", "rerank-weights", "backbone"):
             action.complete = _models_and_files()  # pyright: ignore
         action.help = " ".join((action.help or "").partition(". ")[0].split())
@@ -81,17 +86,3 @@ def _models_and_files() -> dict[str, Any]:
             "zsh": f"{function}() {{ _alternative 'models:model:({names})' 'files:file:_files'; }}",
         },
     }
-
-
-def _choices(command: str, action: argparse.Action) -> Any:
-    """Return the values that a flag takes, or None where they are not a few names."""
-    from crisalad_jax.nn.config import PRESETS
-    from crisalad_jax.training.recipes import RECIPES
-
-    if action.dest == "preset":
-        return tuple(PRESETS)
-    if action.dest == "recipe":
-        return tuple(RECIPES)
-    if (command, action.dest) == ("models", "name"):
-        return (*starter.FILES, *PUBLISHED)
-    return action.choices and tuple(each for each in action.choices if each != "None")

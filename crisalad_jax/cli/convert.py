@@ -1,7 +1,6 @@
 """`crisalad convert`."""
 
 import dataclasses
-import os
 import pathlib
 from typing import Annotated
 
@@ -28,13 +27,7 @@ def _layouts() -> str:
     )
 
 
-COMMON = (
-    "source",
-    "target",
-    "layout",
-    "backbone",
-    "json",
-)
+COMMON = ("source", "target", "layout", "backbone", "json")
 EXAMPLE = "crisalad convert dino_salad.ckpt salad.safetensors"
 
 
@@ -70,16 +63,14 @@ class Convert:
 def run(arguments: Convert) -> None:
     """Convert the file, and print both layouts and the model."""
     prepare_json(arguments.json)
-    names = ("layer", "facet", "assignment")
-    fields = {name: getattr(arguments, name) for name in names}
-    fields = {name: value for name, value in fields.items() if value is not None}
+    given = {name: getattr(arguments, name) for name in ("layer", "facet", "assignment")}
+    fields = {name: value for name, value in given.items() if value is not None}
     if fields and arguments.backbone is None:
         raise InputError(f"--{next(iter(fields))}: found without --backbone, expected both")
-    source = os.fspath(arguments.source)
-    if source in PUBLISHED and not arguments.source.exists():
+    if str(arguments.source) in PUBLISHED and not arguments.source.exists():
         raise InputError(
-            f"{source}: found the name of a published model, expected a file; --weights {source} "
-            "takes it by its name, and converts it by itself"
+            f"{arguments.source}: found the name of a published model, expected a file; --weights "
+            f"{arguments.source} converts it by itself"
         )
     backbone = None if arguments.backbone is None else find_weights(arguments.backbone)
     done = convert(

@@ -4,10 +4,9 @@ import dataclasses
 import pathlib
 from typing import TYPE_CHECKING, Literal
 
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.cli.common import give_json, load_model, prepare_json, say
-from crisalad_jax.config.preprocessing import WORDS
-from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_new_folder
+from crisalad_jax.config.checks import require
 
 if TYPE_CHECKING:
     import numpy as np
@@ -63,15 +62,10 @@ def run(arguments: Export) -> None:
     from crisalad_jax.checkpoints.export import ExportConfig, write_export
 
     prepare_json(arguments.json)
-    check_new_folder(arguments.out)
-    if arguments.platforms is not None and arguments.format != "stablehlo":
-        raise InputError(
-            f"--platforms: found with --format {arguments.format}, expected without it, or with "
-            "stablehlo"
-        )
-    for word in arguments.resize:
-        if WORDS.get(word, {}).get("size_rule", "fixed") != "fixed":
-            raise InputError(f"--resize: found {word}, expected fixed: a program takes one size")
+    require(
+        arguments.platforms is None or arguments.format == "stablehlo",
+        f"--platforms: found with --format {arguments.format}, expected --format stablehlo",
+    )
     how = ExportConfig(
         grouping=arguments.grouping,
         batch_size=None if arguments.batch_size == "symbolic" else arguments.batch_size,
@@ -80,14 +74,11 @@ def run(arguments: Export) -> None:
         format=arguments.format,
         pixels=arguments.pixels,
     )
-    params, config, _ = load_model(
-        arguments.weights,
-        image_size=arguments.image_size,
-        resize=arguments.resize,
-        compute_dtype=arguments.compute_dtype,
-    )
-    calibration = None if arguments.int8 is None else read_calibration(arguments.int8, config)
-    manifest = write_export(arguments.out, params, config, how, calibration=calibration)
+    model, _ = load_model(find_weights(arguments.weights), arguments)
+    calibration = None
+    if arguments.int8 is not None:
+        calibration = read_calibration(arguments.int8, model.config)
+    manifest = write_export(arguments.out, model, how, calibration=calibration)
     shapes = (
         f"{manifest[name]['dtype']} ({', '.join(map(str, manifest[name]['shape']))})"
         for name in ("images", "descriptors")
@@ -100,10 +91,10 @@ def run(arguments: Export) -> None:
             f"{how.format}, {manifest['products']}; {checked['engine']} differs by at most "
             f"{checked['largest_difference']:.1g} from this package"
         )
+    inside = "inside" if how.weights_inside else "beside"
     say(
         f"{arguments.out}: images {' -> descriptors '.join(shapes)}; "
-        f"{manifest['grouping_means']}; weights {'inside' if how.weights_inside else 'beside'}; "
-        f"{last}"
+        f"{manifest['grouping_means']}; weights {inside}; {last}"
     )
     give_json(arguments.json, {"out": str(arguments.out), "manifest": manifest})
 
@@ -118,14 +109,10 @@ def read_calibration(images: pathlib.Path, config: "ModelConfig") -> "np.ndarray
 
     from crisalad_jax.data.images import read_pixels
     from crisalad_jax.data.sources import open_source
-    from crisalad_jax.retrieval.photographs import prepare_image
-    from crisalad_jax.utils.errors import InputError
+    from crisalad_jax.retrieval.describe import prepare_image
 
-    if config.preprocessing.size_rule != "fixed":
-        raise InputError(
-            f"int8: found images of size rule {config.preprocessing.size_rule}, expected fixed "
-            "(--resize fixed)"
-        )
+    rule = config.preprocessing.size_rule
+    require(rule == "fixed", f"int8: found images of size rule {rule}, expected --resize fixed")
     paths = open_source(images, fps=1.0).paths
     chosen = paths[:: -(-len(paths) // _MOST)]
     return np.stack([prepare_image(read_pixels(path), config, str(path)) for path in chosen])

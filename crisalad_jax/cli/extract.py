@@ -2,10 +2,10 @@
 
 import dataclasses
 import pathlib
-from typing import Literal
 
 from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.cli.common import RuntimeName, give_json, open_model, prepare_json, say
+from crisalad_jax.cli.common import give_json, open_model, prepare_json, say
+from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
 from crisalad_jax.utils.output import counted
@@ -34,8 +34,8 @@ SEVERAL = "quote a pattern, or list the images in a .txt"
 """What to do in place of several values of --images."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Extract:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Extract(ReadFlags, ModelFlags, JsonFlag):
     """Write a descriptor of every image in a folder, in sorted path order."""
 
     images: pathlib.Path
@@ -43,28 +43,11 @@ class Extract:
     (docs/how-to/image-sources.md)."""
     out: pathlib.Path
     """descriptors.npy (names beside it in .names.txt) or features.h5 (hloc)."""
-    weights: pathlib.Path | None = None
-    """By default starter, the small model in this package; or a .safetensors file, or a published
-    model's name (`crisalad models`)."""
     fps: float | None = None
     """Frames a second taken of a video, by default 1."""
-    image_size: tuple[int, int] | None = None
-    """Height and width, multiples of the patch size; by default the model's."""
-    resize: tuple[str, ...] = ()
-    """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
-    bicubic or area; antialias or no-antialias; bytes or floats; round;
-    high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
     grouping: str = "single"
     """single, shuffled, sequential, or window (an image with those just before it, --batch-size in
     all): a cross-image model's descriptors depend on it."""
-    batch_size: int = 16
-    """Images described together."""
-    runtime: RuntimeName = "jax"
-    """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
-    for it once; --weights may be an exported folder."""
-    compute_dtype: Literal["float32", "bfloat16"] | None = None
-    """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
-    gains and loses."""
     seed: int = 0
     """Draws the shuffled order."""
     root: pathlib.Path | None = None
@@ -80,28 +63,15 @@ class Extract:
     share: str | None = None
     """INDEX/COUNT: describe one share; other processes and hosts take the others, the last one
     joins all. Of the grouping single."""
-    on_bad_image: Literal["stop", "skip"] = "stop"
-    """Stop at an unreadable image, or leave it out and say so."""
-    verify: bool = True
-    """Check weights, components and --database against their checksums; --no-verify skips that,
-    where files are huge."""
-    max_pixels: int = 2**28
-    """Pixels that an image file may have; larger ones are not decoded."""
-    json: pathlib.Path | None = None
-    """File for the result as JSON; - prints it."""
-    plugin: tuple[str, ...] = ()
-    """Files FILE.py or modules that register parts of your own; their code is run."""
-    quiet: bool = False
-    """No progress bars."""
 
 
 def run(arguments: Extract) -> None:
     """Describe the images, and print what was written."""
     prepare_json(arguments.json)
+    reading = arguments.reading
     check_extraction(
         arguments.out,
         grouping=arguments.grouping,
-        batch_size=arguments.batch_size,
         seed=arguments.seed,
         pairs=arguments.pairs,
         database=arguments.database,
@@ -109,24 +79,14 @@ def run(arguments: Extract) -> None:
         share=arguments.share,
     )
     weights = find_weights(arguments.weights, quiet=arguments.quiet)
-    params, config, _ = open_model(
-        weights,
-        arguments.runtime,
-        image_size=arguments.image_size,
-        resize=arguments.resize,
-        compute_dtype=arguments.compute_dtype,
-        any_grouping=arguments.grouping != "single",
-        verify=arguments.verify,
-    )
+    model, _ = open_model(weights, arguments, groupings=[arguments.grouping])
     result = extract(
-        params,
-        config,
+        model,
         arguments.images,
         arguments.out,
         fps=arguments.fps,
         weights=weights,
         grouping=arguments.grouping,
-        batch_size=arguments.batch_size,
         seed=arguments.seed,
         root=arguments.root,
         pairs=arguments.pairs,
@@ -134,9 +94,8 @@ def run(arguments: Extract) -> None:
         k=arguments.k,
         pca=arguments.pca,
         share=arguments.share,
-        on_bad_image=arguments.on_bad_image,
         verify=arguments.verify,
-        quiet=arguments.quiet,
+        reading=reading,
     )
     described = counted(len(result.names), "descriptor")
     if result.shares_left or result.joined_elsewhere:
@@ -153,7 +112,7 @@ def run(arguments: Extract) -> None:
     say(
         f"{arguments.out}: {described} of {result.descriptors.shape[1]} "
         f"numbers, grouping {arguments.grouping} ({GROUPINGS[arguments.grouping]}), images at "
-        f"{config.images_in_words}{skipped}"
+        f"{model.config.images_in_words}{skipped}"
     )
     pairs = {"file": str(arguments.pairs), "count": len(result.pairs or ())}
     give_json(
@@ -163,7 +122,7 @@ def run(arguments: Extract) -> None:
             "descriptors": len(result.names),
             "length": result.descriptors.shape[1],
             "grouping": arguments.grouping,
-            "images": config.images_in_words,
+            "images": model.config.images_in_words,
             "skipped": result.skipped,
             "pairs": None if result.pairs is None else pairs,
         },

@@ -15,16 +15,15 @@ from typing import Any
 from crisalad_jax.config.flags import plain_metavar
 
 SHORT, ALL = "--help", "--help-all"
-_WIDTH = 100
-_COLUMN = 28
-"""Widest column of flags; what is wider has its text on the next line."""
+_WIDTH, _COLUMN = 100, 30
+"""Most columns of the help, and of its flags; what is wider has its text on the next line."""
+_RAGGED = 12
+"""Columns that a line may leave empty where a long word follows."""
 _CHOICES = 6
-"""Most choices that stand beside a flag; more stand in its text."""
-_SHORT = 24
-"""Fewest letters of clauses that tell enough without the rest."""
-_ON = {"True": "on"}
-_LINES = 2
-"""Most lines of a flag's text."""
+"""Most choices that are shown as a flag's value; more are listed in its text."""
+
+_ENDS = re.compile(r"[.;](?= )|$")
+"""Ends of clauses."""
 
 
 def asked_for(arguments: Sequence[str]) -> str | None:
@@ -42,11 +41,11 @@ def class_of(name: str, module: Any, arguments: Sequence[str]) -> type:
 
 
 def flags_parser(kind: type, program: str) -> argparse.ArgumentParser:
-    """Make the parser of a command's class, whose actions tell of each flag."""
+    """Make the parser of a command's class, whose actions describe its flags."""
     import tyro
 
     with warnings.catch_warnings():
-        # Tyro has no other function that tells of the flags.
+        # Tyro has no other function that describes the flags.
         warnings.simplefilter("ignore", DeprecationWarning)
         parser: Any = tyro.extras.get_parser(kind, prog=program, add_help=False)
     return parser
@@ -61,96 +60,60 @@ def short_help(name: str, module: Any, kind: type) -> str:
         kind: the class that its flags are parsed into.
     """
     actions = flags_parser(kind, f"crisalad {name}")._actions
-    named = {_name(action): action for action in actions}
-    common = [named[flag] for flag in getattr(module, "COMMON", tuple(named))]
-    required = [action for action in actions if action.required or not action.option_strings]
-    usage = " ".join(["usage: crisalad", name, *map(_usage, required), "[FLAGS]"])
+    named = {(each.option_strings or [each.dest])[0].removeprefix("--"): each for each in actions}
     width = min(_WIDTH, shutil.get_terminal_size((_WIDTH, 24)).columns)
-    summary = (kind.__doc__ or "").partition("\n\n")[0]
-    lines = [usage, "", *textwrap.wrap(summary, width), ""]
-    column = 2 + min(_COLUMN, max(len(_heading(action)) for action in common)) + 2
-    for action in common:
-        lines += _entry(action, column, width)
-    lines += ["", f"example: {module.EXAMPLE}", f"all flags: crisalad {name} {ALL}"]
-    return "\n".join(lines)
-
-
-def _name(action: argparse.Action) -> str:
-    """Return a flag's name without hyphens before it, or a positional argument's."""
-    return (action.option_strings or [action.dest])[0].removeprefix("--")
-
-
-def _usage(action: argparse.Action) -> str:
-    words = _heading(action)
-    return (
-        words
-        if action.required or (not action.option_strings and action.nargs != "?")
-        else f"[{words}]"
+    for action in actions:
+        _shorten(action, width - _COLUMN)
+    required = [each for each in actions if each.required or not each.option_strings]
+    shown = argparse.ArgumentParser(
+        usage=" ".join(["crisalad", name, *map(_heading, required), "[FLAGS]"]),
+        description=(kind.__doc__ or "").partition("\n\n")[0],
+        epilog=f"example: {module.EXAMPLE}\nall flags: crisalad {name} {ALL}",
+        add_help=False,
+        formatter_class=lambda prog: _Formatter(prog, max_help_position=_COLUMN, width=width),
     )
+    group = shown.add_argument_group()
+    for flag in getattr(module, "COMMON", named):
+        group._add_action(named[flag])
+    return shown.format_help().rstrip()
+
+
+class _Formatter(argparse.RawDescriptionHelpFormatter):
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return textwrap.wrap(text, width, break_on_hyphens=False)
 
 
 def _heading(action: argparse.Action) -> str:
     """Return a flag and its value as they are typed."""
-    value = _value(action)
-    if not action.option_strings:
-        return value
-    flag = action.option_strings[0]
-    if _default(action) == "True":
-        flag = flag.replace("--", "--[no-]", 1)
-    return f"{flag} {value}".rstrip()
-
-
-def _value(action: argparse.Action) -> str:
-    """Return what stands for a flag's value, without what means no value."""
-    if _has_many_choices(action):
-        return "NAME"
-    return plain_metavar(action.metavar if isinstance(action.metavar, str) else "")
-
-
-def _has_many_choices(action: argparse.Action) -> bool:
-    return action.choices is not None and len(tuple(action.choices)) > _CHOICES
+    heading = " ".join([*action.option_strings[:1], str(action.metavar or "")]).rstrip()
+    return f"[{heading}]" if action.nargs == "?" else heading
 
 
 _DEFAULT = re.compile(r"\s*\((?:default: (.*?)|required)\)\s*$", re.DOTALL)
+"""What tyro adds to a flag's text."""
 
 
-def _default(action: argparse.Action) -> str:
-    """Return a flag's default as tyro's text tells it; nothing where there is none."""
-    match = _DEFAULT.search(action.help or "")
-    return (match[1] or "") if match else ""
-
-
-def _entry(action: argparse.Action, column: int, width: int) -> list[str]:
-    """Write a flag and its text in one line or two."""
-    heading = f"  {_heading(action)}"
-    default = _default(action)
-    tail = "" if default in ("", "None", "False") else f" ({_ON.get(default, default)})"
+def _shorten(action: argparse.Action, width: int) -> None:
+    """Shorten a flag's text to whole clauses of two lines of this width, and its value."""
+    text, metavar = action.help or "", str(action.metavar or "")
+    default = _DEFAULT.search(text)
+    text = " ".join(_DEFAULT.sub("", text).split()).rstrip(".")
+    if action.choices is not None and len(choices := tuple(action.choices)) > _CHOICES:
+        metavar, text = "NAME", f"{', '.join(sorted(choices))}. {text}"
+    action.metavar = plain_metavar(metavar)
+    tail = ""
     if action.required and action.option_strings:
         tail = " (required)"
-    text = " ".join(_DEFAULT.sub("", action.help or "").replace("%%", "%").split())
-    if _has_many_choices(action):
-        text = f"{', '.join(sorted(action.choices or ()))}. {text}"
-    beside = len(heading) + 2 <= column
-    texts = _fitted(text, tail, width - column, _LINES if beside else _LINES - 1)
-    first = heading.ljust(column) + texts.pop(0) if beside else heading
-    return [first, *(" " * column + line for line in texts)]
-
-
-_ENDS = re.compile(r"[.;](?= )|, (?=by default)|$")
-
-
-def _fitted(text: str, tail: str, width: int, most: int) -> list[str]:
-    """Wrap as many whole clauses of a text as fit into so many lines, or else its beginning."""
-    ends = [match.start() for match in _ENDS.finditer(text.rstrip("."))]
-    for end in reversed(ends):
-        clauses = text[:end]
-        lines = textwrap.wrap(clauses + tail, width, break_on_hyphens=False)
-        is_whole = clauses.count("(") == clauses.count(")")
-        if len(lines) <= most and is_whole and (end == ends[-1] or end > _SHORT):
-            return lines
-    for room in range(width * most - len(tail), 0, -4):
-        short = textwrap.shorten(text, room, placeholder=" ...", break_on_hyphens=False)
-        lines = textwrap.wrap(short + tail, width, break_on_hyphens=False)
-        if len(lines) <= most:
-            return lines
-    return []
+    elif default is not None and default[1] not in (None, "", "None", "False"):
+        tail = f" ({default[1].replace('True', 'on')})"
+    if action.option_strings:
+        flag = action.option_strings[0]
+        action.option_strings = [flag.replace("--", "--[no-]", 1) if tail == " (on)" else flag]
+    lines = 1 if len(_heading(action)) > _COLUMN - 4 else 2
+    room = lines * width - len(tail) - (lines - 1) * _RAGGED
+    clauses = [text[: match.start()] for match in _ENDS.finditer(text)]
+    whole = [each for each in clauses if len(each) <= room and each.count("(") == each.count(")")]
+    short = whole[-1] if whole else textwrap.shorten(text, room, placeholder=" ...")
+    action.help = short + tail
+    if action.nargs not in (0, "?"):
+        action.nargs = None  # the metavar says how many

@@ -2,20 +2,18 @@
 
 import dataclasses
 import pathlib
-from collections.abc import Iterator
 from typing import Any
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
-    check_json,
     check_one_model,
+    give_json,
+    prepare_json,
     say,
     show,
-    talk_beside,
-    write_or_print_json,
 )
-from crisalad_jax.cli.tables import summary_table
+from crisalad_jax.cli.tables import fact_lines, summary_table
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.training.summary import (
@@ -24,7 +22,6 @@ from crisalad_jax.training.summary import (
     summary_lines,
 )
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.output import counted
 
 EXAMPLE = "crisalad info --preset b14"
 
@@ -62,11 +59,9 @@ def run(arguments: Info) -> None:
     """Print the table of a model or a map, and write it as JSON where that is asked for."""
     if arguments.verify and arguments.map is None:
         raise InputError("--verify: found without --map, expected both")
-    check_json(arguments.json)
-    talk_beside(arguments.json)
+    prepare_json(arguments.json)
     values = _model(arguments) if arguments.map is None else _map(arguments.map, arguments)
-    if arguments.json is not None:
-        write_or_print_json(arguments.json, values)
+    give_json(arguments.json, values)
 
 
 def _model(arguments: Info) -> dict[str, Any]:
@@ -95,51 +90,9 @@ def _map(folder: pathlib.Path, arguments: Info) -> dict[str, Any]:
             )
     with Map.open(folder, verify=False) as places:
         summary = places.summary(verify=arguments.verify)
-    before = ""
-    for name, line in _map_lines(summary):
-        say(f"{name if name != before else '':<{_WIDTH}}{line}")
-        before = name
+    extent = summary["extent"] or {}
+    ends = {axis: f"{low:.9g} to {high:.9g}" for axis, (low, high) in extent.items()}
+    known = {name: value for name, value in summary.items() if value not in (None, "none")}
+    for line in fact_lines(known | ({"extent": ends} if ends else {})):
+        say(line)
     return summary
-
-
-_WIDTH = 13
-"""Characters for the names of a map's values."""
-_MOST = 10
-"""Number of folders, and of additions, that are listed."""
-
-
-def _map_lines(summary: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Write what is in a map: a name and a line each; what it does not have takes none."""
-    yield "images", f"{summary['images']}, at {summary['resize']}"
-    for name in ("folders", "additions"):
-        rows = summary[name]
-        for each in rows[:_MOST]:
-            yield name, _folder_line(**each) if name == "folders" else _addition_line(**each)
-        if len(rows) > _MOST:
-            yield name, f"and {len(rows) - _MOST} more"
-    if (extent := summary["extent"]) is not None:
-        ends = (f"{axis} {low:.9g} to {high:.9g}" for axis, (low, high) in extent.items())
-        yield "positions", f"{summary['positions']}, {', '.join(ends)}"
-    yield "descriptors", f"{summary['descriptor']}; store {summary['store']}"
-    stale = summary["stale_search"]
-    yield "search", summary["search"] + ("" if stale == "none" else f"; {stale} lacks images")
-    if summary["components"] != "none":
-        yield "components", summary["components"][:12]
-    yield "model", f"{summary['weights']} ({summary['model'][:12]})"
-    if (measured := summary["calibration"]) is not None:
-        yield "calibration", ", ".join(f"{name} {value}" for name, value in measured.items())
-    yield "created", summary["created"]
-    if summary.get("verified"):
-        yield "verified", "no descriptor has changed"
-
-
-def _addition_line(day: str | None, root: str, images: int) -> str:
-    return f"{day or 'day unknown'}: {counted(images, 'image')} of {root}"
-
-
-def _folder_line(
-    folder: str, images: int, first: float | str | None = None, last: float | str | None = None
-) -> str:
-    unit = " s" if isinstance(first, float) else ""
-    times = "" if first is None else f", {first} to {last}{unit}"
-    return f"{'top folder' if folder == '.' else folder}: {counted(images, 'image')}{times}"

@@ -16,7 +16,7 @@ from crisalad_jax.utils.signals import defer_signals
 if TYPE_CHECKING:
     from crisalad_jax.checkpoints.runtime import Runtime
     from crisalad_jax.cli.query import Query
-    from crisalad_jax.nn.model import Crisalad
+    from crisalad_jax.nn.model import Model
 
 
 def run(arguments: "Query") -> None:
@@ -53,7 +53,7 @@ def run(arguments: "Query") -> None:
             arguments.map, verify=arguments.verify, calibrated=arguments.min_similarity is None
         )
         places = stack.enter_context(opened)
-        params = model_of(places, arguments)
+        model = model_of(places, arguments)
         latencies: list[float] = []
         state = stack.enter_context(defer_signals())
 
@@ -63,8 +63,8 @@ def run(arguments: "Query") -> None:
 
         answers = query_live(
             places,
-            params,
             source,
+            model=model,
             k=arguments.k,
             window=arguments.window,
             min_similarity=arguments.min_similarity,
@@ -81,16 +81,13 @@ def run(arguments: "Query") -> None:
             _say(f"{latency_words(latencies)}{dropped}")
 
 
-def model_of(places: Map, arguments: "Query") -> "Crisalad | Runtime":
+def model_of(places: Map, arguments: "Query") -> "Model | Runtime":
     """Load the map's model, or open it in the engine that the flags ask for."""
     runtime = arguments.runtime
-    weights = find_given(arguments.weights, runtime=runtime, quiet=arguments.quiet)
-    if runtime == "jax":
-        return places.load_params(weights)
-    return places.load_runtime(
-        runtime,
-        weights,
-        any_grouping=arguments.window > 1,
+    return places.load_model(
+        find_given(arguments.weights, runtime=runtime, quiet=arguments.quiet),
+        engine=runtime,
+        groupings=["single" if arguments.window == 1 else "window"],
         verify=arguments.verify,
     )
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import pathlib
-import sys
 from typing import Annotated, Any
 
 import jax
@@ -12,8 +11,8 @@ from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.cache import is_cached
 from crisalad_jax.checkpoints.published import PUBLISHED, Published, published_model
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import check_json, console, say, talk_beside, write_or_print_json
-from crisalad_jax.cli.tables import MODEL_COLUMNS, models_table
+from crisalad_jax.cli.common import give_json, prepare_json, say, show
+from crisalad_jax.cli.tables import fact_lines, models_table
 from crisalad_jax.utils.files import user_cache
 
 EXAMPLE = "crisalad models salad"
@@ -31,16 +30,10 @@ class Models:
 
 def run(arguments: Models) -> None:
     """Print the table of models or the facts of one, and write them as JSON if asked for."""
-    check_json(arguments.json)
-    talk_beside(arguments.json)
+    prepare_json(arguments.json)
     if arguments.name is None:
         models = tuple(PUBLISHED.values())
-        width = console.width if sys.stdout.isatty() else None
-        table = models_table(models, width)
-        console.print(table, crop=False)
-        hidden = MODEL_COLUMNS[len(table.columns) :]
-        if hidden:
-            say(f"left out in {width} columns: {', '.join(hidden)} (crisalad models | less -S)")
+        show(models_table(models))
         say(f"{len(models)} models; * in the cache, {user_cache()}")
         say(
             f"{starter.NAME}: the small model in this package, which extract, index and evaluate "
@@ -53,10 +46,9 @@ def run(arguments: Models) -> None:
         name = arguments.name
         own = name in starter.FILES
         values = _own_facts(name) if own else _facts(published_model(name))
-        width = max(map(len, values))
-        say("\n".join(f"{key:<{width}}  {_cell(value)}" for key, value in values.items()))
-    if arguments.json is not None:
-        write_or_print_json(arguments.json, values)
+        for line in fact_lines(values):
+            say(line)
+    give_json(arguments.json, values)
 
 
 def _facts(model: Published) -> dict[str, Any]:
@@ -91,11 +83,3 @@ def _own_facts(name: str) -> dict[str, Any]:
         "commercial": True,
         "cached": True,
     }
-
-
-def _cell(value: Any) -> str:
-    if value is None:
-        return "not said"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return f"{value:,}" if isinstance(value, int) else value or "-"

@@ -3,10 +3,11 @@
 import dataclasses
 import pathlib
 
-from crisalad_jax.checkpoints.load import Model, find_weights, load
+from crisalad_jax.checkpoints.load import find_weights, load
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.cli.common import give_json, prepare_json, say
 from crisalad_jax.config.checks import require
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.descriptor_files import open_npy
 from crisalad_jax.retrieval.pca import SAMPLES, PcaConfig, fit_pca, save_pca
 from crisalad_jax.utils.files import check_target
@@ -42,27 +43,16 @@ class Pca:
     """No progress bar."""
 
 
-def _model(arguments: Pca) -> Model:
-    """Load the model that the components become a part of.
-
-    Raises:
-        InputError: it has a projection already.
-    """
-    weights = find_weights(str(arguments.weights), quiet=arguments.quiet)
-    model = load(weights, verify=arguments.verify)
-    require(
-        not model.config.projection.dim,
-        f"{weights}: found a model with a projection to {model.config.projection.dim} numbers, "
-        "expected one without",
-    )
-    return model
-
-
 def run(arguments: Pca) -> None:
     """Fit components, write them, and print their share of the variance."""
     prepare_json(arguments.json)
     check_target(arguments.out, ".safetensors")
-    model = None if arguments.weights is None else _model(arguments)
+    model = None
+    if arguments.weights is not None:
+        weights = find_weights(arguments.weights, quiet=arguments.quiet)
+        model = load(weights, verify=arguments.verify)
+        dim = model.config.projection.dim
+        require(not dim, f"{weights}: found a model with a projection to {dim} numbers already")
     descriptors = open_npy(arguments.descriptors, verify=arguments.verify)
     pca = fit_pca(
         descriptors,
@@ -80,7 +70,7 @@ def run(arguments: Pca) -> None:
         layer, projection = pca.projection()
         params = dataclasses.replace(model.params, projection=layer)
         config = dataclasses.replace(model.config, projection=projection)
-        save_weights(arguments.out, params, config)
+        save_weights(arguments.out, Model(params, config))
     fitted = min(arguments.samples, len(descriptors))
     say(
         f"{arguments.out}: {arguments.dim} of {descriptors.shape[1]} components, "

@@ -11,6 +11,7 @@ import tyro
 from crisalad_jax.cli import live
 from crisalad_jax.cli.answers import answer_lines
 from crisalad_jax.cli.common import STDOUT, RuntimeName, check_json, say, talk_beside
+from crisalad_jax.cli.flags import ReadFlags
 from crisalad_jax.retrieval.maps.calibration import Calibration
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
@@ -45,8 +46,8 @@ COMMON = (
 EXAMPLE = "crisalad query new.jpg --map map --json -"
 
 
-@dataclasses.dataclass(frozen=True)
-class Query:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Query(ReadFlags):
     """Find the images of a map that are most similar to others, and say where they were taken."""
 
     images: Annotated[
@@ -89,19 +90,9 @@ class Query:
     """PNG of up to 24 queries beside up to 8 answers each."""
     map_images: pathlib.Path | None = None
     """Folder of the map's images, for the gallery, if they are not where they were."""
-    batch_size: int = 16
-    """Images described at once, each as if it were alone."""
-    on_bad_image: Literal["stop", "skip"] = "stop"
-    """Stop at an unreadable image, or leave it out and say so."""
     verify: bool = True
     """Check the map's descriptors, and an exported model, against their checksums; --no-verify
     skips that, where files are huge."""
-    max_pixels: int = 2**28
-    """Pixels that an image file may have; larger ones are not decoded."""
-    plugin: tuple[str, ...] = ()
-    """Files FILE.py or modules that register parts of your own; their code is run."""
-    quiet: bool = False
-    """No progress bars."""
 
 
 def needs_jax(arguments: Query) -> bool:
@@ -124,17 +115,15 @@ def run(arguments: Query) -> None:
     with opened as places:
         answers = query(
             places,
-            live.model_of(places, arguments),
             arguments.images,
+            model=live.model_of(places, arguments),
             k=arguments.k,
             fps=arguments.fps,
             window=arguments.window,
             exact=arguments.exact,
-            batch_size=arguments.batch_size,
-            on_bad_image=arguments.on_bad_image,
             min_similarity=arguments.min_similarity,
             sequence=sequence,
-            quiet=arguments.quiet,
+            reading=arguments.reading,
         )
     unknown = _unknown(answers, places.calibration)
     if answers.unreadable:

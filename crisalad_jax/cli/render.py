@@ -4,8 +4,15 @@ import dataclasses
 import pathlib
 
 from crisalad_jax.cli.common import give_json, prepare_json, say
-from crisalad_jax.experiments.synthetic import SCENERIES, Scenery, WorldConfig, write_world
-from crisalad_jax.experiments.synthetic.world import VARIATIONS, Variation, has_world
+from crisalad_jax.synthetic import (
+    SCENERIES,
+    VARIATIONS,
+    Scenery,
+    Variation,
+    WorldConfig,
+    has_world,
+    write_world,
+)
 from crisalad_jax.utils.output import counted
 from crisalad_jax.utils.progress import progress_bar
 
@@ -51,11 +58,12 @@ def run(arguments: Render) -> None:
     given = {name: value for name, value in vars(arguments).items() if name in fields}
     config = WorldConfig(**given)
     places = config.scenes * config.stations
-    total = places + config.test_scenes * config.stations
     is_there = has_world(arguments.out, config)  # a wrong folder is told before there is a bar
     if not is_there:
-        with progress_bar("rendering the world", total, "places", quiet=arguments.quiet) as bar:
-            write_world(arguments.out, config, progress=lambda done, total: bar.advance(1))
+        with progress_bar(
+            "rendering the world", config.images, "images", quiet=arguments.quiet
+        ) as bar:
+            write_world(arguments.out, config, progress=bar.advance)
     tests = config.test_scenes * config.stations
     say(
         f"{arguments.out}: {'there already, ' * is_there}{counted(places, 'place')} with "

@@ -1,11 +1,12 @@
 """`crisalad serve`."""
 
 import dataclasses
+import os
 import pathlib
 
 from crisalad_jax.cli.common import find_given, say
 from crisalad_jax.serve import serve_map
-from crisalad_jax.serve.access import read_token
+from crisalad_jax.utils.files import read_text
 
 EXAMPLE = "crisalad serve --map corridor.map --port 8000"
 
@@ -47,25 +48,18 @@ class Serve:
 
 def run(arguments: Serve) -> None:
     """Serve the map until a signal ends it."""
-    token = read_token(arguments.token_file)
+    if arguments.token_file is None:
+        token = os.environ.get("CRISALAD_TOKEN")
+    else:
+        token = read_text(arguments.token_file, "a token in one line").strip()
 
     def ready(address: str) -> None:
         needs = " with the token" if token else ""
         appends = ", and adds images to it" if arguments.append else ""
         say(f"{address}{needs}: answers for {arguments.map}{appends}; Ctrl-C ends it")
 
-    serve_map(
-        arguments.map,
-        weights=find_given(arguments.weights, quiet=arguments.quiet),
-        host=arguments.host,
-        port=arguments.port,
-        token=token,
-        k=arguments.k,
-        append=arguments.append,
-        map_images=arguments.map_images,
-        max_bytes=arguments.max_bytes,
-        batch_size=arguments.batch_size,
-        verify=arguments.verify,
-        quiet=arguments.quiet,
-        ready=ready,
-    )
+    given = vars(arguments) | {"token": token, "ready": ready}
+    given["weights"] = find_given(arguments.weights, quiet=arguments.quiet)
+    for name in ("token_file", "max_pixels", "plugin"):
+        del given[name]
+    serve_map(given.pop("map"), **given)

@@ -1,10 +1,9 @@
 """Tables that the commands print."""
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
-import rich.box
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from crisalad_jax.checkpoints.cache import is_cached
@@ -20,11 +19,9 @@ def grouping_table(results: Sequence[GroupingResult]) -> Table:
 
     Each recall stands above its interval, and a mean over shuffles before their spread.
     """
-    table = Table(show_lines=True)
-    table.add_column("queries/\ndatabase", no_wrap=True)
     recall_names = [f"R@{k}\n95 %" for k in results[0].recalls]
-    for name in ("same place\nq / db", *recall_names, "AP", "R at\n100 % P"):
-        table.add_column(name, justify="right", overflow="fold")
+    names = ("same place\nq / db", *recall_names, "AP", "R at\n100 % P")
+    table = Table("queries/\ndatabase", *map(_right, names), show_lines=True)
     for result in results:
         spread = result.spread or _NO_SPREAD
         recall_cells = (
@@ -46,16 +43,14 @@ def grouping_table(results: Sequence[GroupingResult]) -> Table:
 
 def points_table(points: Mapping[str, OperatingPoint]) -> Table:
     """Make a table of operating points by name: the similarity to ask for, and what that leaves."""
-    table = Table()
-    table.add_column("queries/\ndatabase", no_wrap=True)
-    for name in (
+    names = (
         "similarity\nto ask for",
         "precision\n95 % sure of",
         "recall left,\nof all queries",
         "right of\nanswered",
         "unknown places\nanswered",
-    ):
-        table.add_column(name, justify="right")
+    )
+    table = Table("queries/\ndatabase", *map(_right, names))
     for name, point in points.items():
         cells = (
             f"{point.min_similarity:.9g}" if point.reached else "none",
@@ -82,9 +77,8 @@ def _spread(fraction: float | None) -> str:
 def summary_table(summary: ModelSummary, name: str) -> Table:
     """Make a table of a model's parts for the terminal; `name` is the model's."""
     height, width = summary.image_size
-    table = Table("part", title=printable(f"{name} at {height} x {width}"))
-    table.add_column("parameters", justify="right")
-    table.add_column("multiply-accumulates an image", justify="right")
+    columns = map(_right, ("parameters", "multiply-accumulates an image"))
+    table = Table("part", *columns, title=printable(f"{name} at {height} x {width}"))
     for cost in summary.parts:
         table.add_row(cost.part, f"{cost.parameters:,}", f"{cost.macs:,}")
     table.add_section()
@@ -93,42 +87,49 @@ def summary_table(summary: ModelSummary, name: str) -> Table:
     return table
 
 
-def models_table(models: Sequence[Published], width: int | None) -> Table:
-    """Make a table of published models for the terminal; those in the cache have a star.
-
-    Args:
-        models: its rows.
-        width: the terminal's. Columns at the right that it has no room for are left out. None
-            leaves out none, for a file or a pipe.
-
-    Returns:
-        A table that is printed without wrapping.
-    """
-    rows = [_model_cells(model) for model in models]
-    lengths = (max(map(len, cells)) for cells in zip(MODEL_COLUMNS, *rows, strict=True))
-    # One space before the first column, and two after each.
-    ends = list(itertools.accumulate((length + 2 for length in lengths), initial=1))
-    shown = max(1, sum(width is None or end <= width for end in ends[1:]))
-    # Without lines between the columns, longer names fit.
-    table = Table(box=rich.box.SIMPLE_HEAD, padding=(0, 1, 0, 0), width=ends[shown])
-    for name in MODEL_COLUMNS[:shown]:
-        right = name in ("descriptor", "parameters")
-        table.add_column(name, no_wrap=True, justify="right" if right else "left")
-    for cells in rows:
-        table.add_row(*cells[:shown])
+def models_table(models: Sequence[Published]) -> Table:
+    """Make a table of published models for the terminal; those in the cache have a star."""
+    table = Table("name", _right("descriptor"), _right("parameters"), "licence", "images", "GitHub")
+    for model in models:
+        table.add_row(
+            f"{model.name} *" if is_cached(model) else model.name,
+            f"{model.descriptor:,}",
+            f"{model.parameters / 1e6:,.1f} M",
+            model.licence.name,
+            model.images,
+            model.repository.removeprefix(GITHUB),
+        )
     return table
 
 
-MODEL_COLUMNS = ("name", "descriptor", "parameters", "licence", "images", "on GitHub")
+def _right(header: str) -> Column:
+    return Column(header, justify="right")
 
 
-def _model_cells(model: Published) -> tuple[str, ...]:
-    """Return what is told of a model, a text for each of `MODEL_COLUMNS`."""
-    return (
-        f"{model.name} *" if is_cached(model) else model.name,
-        f"{model.descriptor:,}",
-        f"{model.parameters / 1e6:,.1f} M",
-        model.licence.name,
-        model.images,
-        model.repository.removeprefix(GITHUB),
-    )
+_MOST = 10
+"""Most rows of a fact that are listed."""
+
+
+def fact_lines(facts: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line for each fact, and one for each of the first rows of a list of objects."""
+    width = max(map(len, facts))
+    for name, value in facts.items():
+        is_table = isinstance(value, list) and all(isinstance(each, dict) for each in value)
+        rows = value if is_table else [value]
+        more = [f"and {len(rows) - _MOST} more"] if len(rows) > _MOST else []
+        for number, row in enumerate([*rows[:_MOST], *more]):
+            yield f"{'' if number else name:<{width}}  {_words(row)}"
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_words(each)}" for name, each in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_words, value))
+    if value is None:
+        return "not said"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    return f"{value:,}" if isinstance(value, int) else value or "-"

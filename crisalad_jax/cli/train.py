@@ -191,17 +191,10 @@ def run(arguments: Train) -> None:
     from crisalad_jax.experiments.train import train
     from crisalad_jax.utils import distributed
 
+    which = arguments.num_processes, arguments.process_id, arguments.local_device_ids
     if arguments.coordinator_address is not None:
-        distributed.join_processes(
-            arguments.coordinator_address,
-            arguments.num_processes,
-            arguments.process_id,
-            arguments.local_device_ids,
-        )
-    elif any(
-        given is not None
-        for given in (arguments.num_processes, arguments.process_id, arguments.local_device_ids)
-    ):
+        distributed.join_processes(arguments.coordinator_address, *which)
+    elif which != (None, None, None):
         raise InputError(
             "--num-processes, --process-id, --local-device-ids: found no --coordinator-address, "
             "expected it beside them"
@@ -233,7 +226,7 @@ def run(arguments: Train) -> None:
         words += ", stopped early"
     if result.best_recall is not None:
         best = f"{100 * result.best_recall:.1f}"
-        words += f", best {config.select_by} {best} in best.safetensors"
+        words += f", best {config.monitor} {best} in best.safetensors"
     if result.skipped_images:
         words += f", {result.skipped_images} unreadable images skipped"
     picture = arguments.out / "curves.png"
@@ -247,7 +240,7 @@ def _as_json(out: pathlib.Path, config: TrainConfig, result: "FitResult") -> dic
     best = None
     if result.best_recall is not None:
         file = str(out / "best.safetensors")
-        best = {"name": config.select_by, "recall": result.best_recall, "file": file}
+        best = {"name": config.monitor, "recall": result.best_recall, "file": file}
     return {
         "out": str(out),
         "epochs": config.epochs,

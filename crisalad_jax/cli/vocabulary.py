@@ -7,15 +7,12 @@ from typing import Literal
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import find_given, give_json, prepare_json, say
-from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.training.vocabulary import (
     IMAGES,
     build_vocabulary,
-    needs_vocabulary,
     start_vocabulary,
-    vocabulary_aggregators,
     vocabulary_words,
 )
 from crisalad_jax.utils.errors import InputError
@@ -104,15 +101,13 @@ def run(arguments: Vocabulary) -> None:
     """Build the vocabulary, write the model, and print its size."""
     prepare_json(arguments.json)
     check_target(arguments.out, ".safetensors")
-    # Now already, because drawing parameters takes seconds.
-    source = open_source(arguments.images, fps=arguments.fps, on_bad_image=arguments.on_bad_image)
-    check_rate_used(arguments.fps, source.paths)
     params, config = _model(arguments)
     built = build_vocabulary(
         params,
         config,
-        source.paths,
+        arguments.images,
         arguments.out,
+        fps=arguments.fps,
         max_images=arguments.max_images,
         seed=arguments.seed,
         batch_size=arguments.batch_size,
@@ -155,12 +150,5 @@ def _model(arguments: Vocabulary) -> tuple[Crisalad, ModelConfig]:
     for name in ("backbone", "preset", "aggregator", *fields):
         if getattr(arguments, name) is not None:
             raise InputError(f"--{name}: found beside --weights, expected only one of the two")
-    weights = find_weights(arguments.weights, quiet=arguments.quiet)
-    params, config = load_weights(weights)
-    if not needs_vocabulary(config):
-        raise InputError(
-            f"{arguments.weights}: found aggregator {config.aggregator.part_name}, expected one "
-            f"with a vocabulary ({', '.join(vocabulary_aggregators())}); --backbone takes the "
-            "backbone of any model"
-        )
+    params, config = load_weights(find_weights(arguments.weights, quiet=arguments.quiet))
     return params, config.resized(arguments.image_size, arguments.resize)

@@ -3,7 +3,6 @@
 import functools
 import hashlib
 import importlib
-import importlib.metadata
 import importlib.util
 import os
 import pathlib
@@ -165,6 +164,8 @@ def load_entry_points() -> None:
     Raises:
         InputError: what `load_plugin` raises.
     """
+    import importlib.metadata  # a fifth of the time of `crisalad --help`
+
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
         load_plugin(entry.module)
 

@@ -394,7 +394,7 @@ def _batches(
 
     def batches() -> Generator[ImageBatch, None, None]:
         ahead = max(-(-BATCHES_AHEAD * batch_size // size), threads)
-        read = _read_ahead(load_all, tasks, ahead=ahead, threads=threads)
+        read = read_ahead(load_all, tasks, ahead=ahead, threads=threads)
         with ONE_THREAD, contextlib.closing(read):
             start = 0
             for run in _same_size_runs(itertools.chain.from_iterable(read), batch_size):
@@ -408,7 +408,7 @@ def _batches(
     return batches()
 
 
-def _read_ahead(
+def read_ahead(
     work: Callable[[_Item], _Result], items: Iterable[_Item], *, ahead: int, threads: int
 ) -> Generator[_Result, None, None]:
     """Yield the result of `work` for each item, in the order of the items.

@@ -4,7 +4,7 @@ import datetime
 
 from crisalad_jax.config.checks import takes
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.loader import ImageCache, OnBadImage
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.operating_point import (
     OperatingPoint,
@@ -12,7 +12,7 @@ from crisalad_jax.evaluation.operating_point import (
     check_precision,
     check_supported,
 )
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.calibration import Calibration, write_calibration
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.utils.errors import InputError
@@ -22,14 +22,11 @@ from crisalad_jax.utils.locks import lock
 @takes(places=Map, benchmark=Benchmark)
 def calibrate(
     places: Map,
-    params: Crisalad,
     benchmark: Benchmark,
     precision: float = 0.99,
     *,
-    batch_size: int = 16,
-    on_bad_image: OnBadImage = "stop",
-    cache: ImageCache | None = None,
-    quiet: bool = False,
+    model: Model | None = None,
+    reading: Reading = Reading(),
 ) -> Calibration:
     """Measure from which similarity on answers are right, and let a map remember it.
 
@@ -41,13 +38,10 @@ def calibrate(
 
     Args:
         places: the map, open. It remembers the result in its folder, in place of an earlier one.
-        params: parameters of the model that made the map (`Map.load_params`).
         benchmark: the set, such as `open_benchmark` makes.
         precision: share of the answers that must be right, above 0 to 1.
-        batch_size: images described at once, each as if it were alone.
-        on_bad_image: "stop" at an unreadable image, or "skip" it.
-        cache: of decoded images.
-        quiet: no progress bars.
+        model: the model that made the map; None loads it from where it was (`Map.load_model`).
+        reading: how images are read.
 
     Returns:
         What the map remembers from now on.
@@ -59,35 +53,33 @@ def calibrate(
 
     Example:
         >>> import jax, shutil
-        >>> from crisalad_jax import PRESETS, index, init_crisalad, open_benchmark, save_weights
+        >>> from crisalad_jax import (
+        ...     PRESETS, Model, index, init_crisalad, open_benchmark, save_weights
+        ... )
         >>> for side in ("queries", "database"):
         ...     _ = shutil.copytree(pictures, folder / "set" / side)
         >>> lines = ["query,database", *(f"{number}.png,{number}.png" for number in range(4))]
         >>> _ = (folder / "set" / "ground_truth.csv").write_text("\\n".join(lines))
         >>> benchmark = open_benchmark(folder / "set", layout="folders")
         >>> config = PRESETS["tiny"]
-        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> model = Model(init_crisalad(jax.random.key(0), config), config)
         >>> weights = folder / "weights.safetensors"
-        >>> save_weights(weights, params, config)
-        >>> _ = index(params, config, pictures, folder / "map", weights=weights, quiet=True)
+        >>> save_weights(weights, model)
+        >>> quiet = Reading(quiet=True)
+        >>> _ = index(model, pictures, folder / "map", weights=weights, reading=quiet)
         >>> with Map.open(folder / "map") as places:
-        ...     found = calibrate(places, params, benchmark, precision=0.4, quiet=True)
+        ...     found = calibrate(places, benchmark, precision=0.4, reading=quiet)
         >>> found.right, found.answered
         (4, 4)
     """
     check_precision(precision)
-    places.check_params(params)
     (result,) = evaluate(
-        params,
-        places.description.config,
+        places.describer(model),
         benchmark,
         groupings=["single"],
         pca=places.components,
-        batch_size=batch_size,
-        on_bad_image=on_bad_image,
-        cache=cache,
         precision=precision,
-        quiet=quiet,
+        reading=reading,
     )
     point = result.operating_point
     assert point is not None  # asked for above
@@ -105,7 +97,7 @@ def calibrate(
         database=len(benchmark.database),
         benchmark=benchmark.name,
         rule=benchmark.rule,
-        model=places.description.model,
+        model=places.metadata.model,
         created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     )
     with lock(

@@ -2,37 +2,33 @@
 
 import contextlib
 import functools
-import pathlib
 import statistics
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64
 
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.checks import takes
+from crisalad_jax.config.checks import check_count, check_seed, takes
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.loader import ImageCache, OnBadImage
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.leakage import SamePlace, by_truth, near, same_place_share
 from crisalad_jax.evaluation.operating_point import check_precision
 from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, summarise
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.retrieval.describe import FolderTokens, group, read_tokens
-from crisalad_jax.retrieval.euclidean import to_unit_vectors
+from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.retrieval.describer import Describer, Rows, describer_of
 from crisalad_jax.retrieval.grouping import (
     DEFAULT_GROUPINGS,
     Grouping,
     batches_of,
-    check_grouping,
     parse_groupings,
-    useful_batch_size,
 )
-from crisalad_jax.retrieval.model import Model, check_groupings, check_params
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.retrieval.reranking import Reranker, Reranking
-from crisalad_jax.retrieval.search import search
+from crisalad_jax.retrieval.search import search, to_unit_vectors
 from crisalad_jax.utils.errors import InputError
 
 KS = (1, 5, 10, 20)
@@ -43,23 +39,19 @@ Observe = Callable[
 """Takes the name of a grouping, the database's descriptors, and the queries' descriptors."""
 
 
-@takes(config=ModelConfig, benchmark=Benchmark)
+@takes(benchmark=Benchmark)
 def evaluate(
-    params: Model,
-    config: ModelConfig,
+    model: Model | Runtime | Describer,
     benchmark: Benchmark,
     *,
     groupings: Sequence[str] = DEFAULT_GROUPINGS,
-    batch_size: int = 16,
     seed: int = 0,
     seeds: int = 3,
     pca: Pca | None = None,
-    cache: ImageCache | None = None,
     observe: Observe | None = None,
     rerank: Reranking | None = None,
-    on_bad_image: OnBadImage = "stop",
     precision: float | None = None,
-    quiet: bool = False,
+    reading: Reading = Reading(),
 ) -> list[GroupingResult]:
     r"""Measure Recall@1/5/10/20 and more under each grouping; images are read and tokenised once.
 
@@ -70,22 +62,19 @@ def evaluate(
     Memory holds the tokens of all images, and the descriptors of one grouping and seed at a time.
 
     Args:
-        params: of the model.
-        config: of the model, static.
+        model: parameters and configuration, as `load` returns them, or a `Runtime`.
         benchmark: what to evaluate on.
         groupings: each as `Grouping.parse` reads it.
-        batch_size: images that look at each other.
         seed: draws the first shuffle: the database's, and with the next seed the queries'.
         seeds: shuffles, each from the second seed after the one before.
         pca: shortens the descriptors, fitted to images of other places.
-        cache: of decoded images.
-        observe: is given the descriptors of each grouping, of its first seed, while they are there.
+        observe: is given the descriptors of each grouping, of its first seed.
         rerank: a second stage; each grouping has a result without and then one with it.
-        on_bad_image: "stop" at an unreadable image, or "skip" it: the results are then of the set
-            without it (`GroupingResult.skipped`).
         precision: asks each result for its `operating_point`: the similarity from which first
-            retrievals are right with this precision, and the recall that is left.
-        quiet: no progress bars.
+            retrievals are correct with this precision, and the recall that is left.
+        reading: how images are read; its batch size is the number of images that attend to each
+            other. Under "skip" the results are of the set without unreadable images
+            (`GroupingResult.skipped`).
 
     Returns:
         A result for each grouping, and with `rerank` a second one.
@@ -93,80 +82,72 @@ def evaluate(
     Raises:
         InputError: parameters of another configuration, no ground truth, an image cannot be read
             or none of a side, components that are not for this model or make no unit vectors, such
-            a precision, or what `parse_groupings`, `check_grouping`, `Reranking.check` and
-            `Reranker` raise.
+            a precision, or what `parse_groupings`, `Reranking.check` and `Reranker` raise.
 
     Example:
         >>> import jax, shutil
-        >>> from crisalad_jax import PRESETS, init_crisalad, open_benchmark
+        >>> from crisalad_jax import PRESETS, Model, init_crisalad, open_benchmark
         >>> for side in ("queries", "database"):
         ...     _ = shutil.copytree(pictures, folder / "set" / side)
         >>> lines = ["query,database", *(f"{number}.png,{number}.png" for number in range(4))]
         >>> _ = (folder / "set" / "ground_truth.csv").write_text("\n".join(lines))
         >>> benchmark = open_benchmark(folder / "set", layout="folders")
         >>> config = PRESETS["tiny"]
-        >>> params = init_crisalad(jax.random.key(0), config)
-        >>> result, *_ = evaluate(params, config, benchmark, groupings=["single"], quiet=True)
+        >>> model = Model(init_crisalad(jax.random.key(0), config), config)
+        >>> quiet = Reading(quiet=True)
+        >>> result, *_ = evaluate(model, benchmark, groupings=["single"], reading=quiet)
         >>> result.recalls[1]
         1.0
     """
     parsed = parse_groupings(groupings)
-    check_grouping((), batch_size, seed, seeds)
+    check_seed("seed", seed)
+    check_count("seeds", seeds)
     if precision is not None:
         check_precision(precision)
+    describer = describer_of(model, groupings)
+    config = describer.config
     if pca is not None:
         pca.check(config.descriptor_dim, "model")
     if rerank is not None:
         rerank.check(config, len(benchmark.database))
-    check_params(params, config)
-    check_groupings(params, config, groupings)
-    if rerank is not None and rerank.params is None and isinstance(params, Runtime):
-        raise InputError(
-            f"rerank: found with a model in {params.engine}, expected weights of its own beside it "
-            "(--rerank-weights)"
-        )
+        if rerank.params is None:
+            if not isinstance(model, tuple):
+                raise InputError(
+                    "rerank: found with a model in another engine, expected weights of its own "
+                    "(--rerank-weights)"
+                )
+            rerank = rerank.over(*model)
     unit = config.unit_length if pca is None else pca.config.renormalise
     benchmark.ground_truth()
-    images = max(len(benchmark.database), len(benchmark.queries))
-    batch_size = useful_batch_size(batch_size, images)
-
-    def read(name: str, paths: Sequence[pathlib.Path]) -> FolderTokens:
-        return read_tokens(
-            params,
-            config,
-            paths,
-            batch_size=batch_size,
-            label=name,
-            on_bad_image=on_bad_image,
-            cache=cache,
-            quiet=quiet,
-        )
-
-    tokens_there = read("database", benchmark.database)
-    tokens_asked = read("queries", benchmark.queries)
-    skipped = Skipped(*map(_unreadable, (tokens_asked, tokens_there)))
+    reading = reading.fitted(max(len(benchmark.database), len(benchmark.queries)))
+    tokens_there = read_tokens(describer, benchmark.database, reading, "database")
+    tokens_asked = read_tokens(describer, benchmark.queries, reading, "queries")
+    skipped = Skipped(*(tuple(t.unreadable.tolist()) for t in (tokens_asked, tokens_there)))
     benchmark = skipped.rest_of(benchmark)
     positives = benchmark.ground_truth()
     same_queries, same_database = _same_place(benchmark, positives)
-    database = _Side("database", _readable(tokens_there), same_database, 0)
-    queries = _Side("queries", _readable(tokens_asked), same_queries, 1)
+    database = _Side("database", tokens_there.descriptors, same_database, 0)
+    queries = _Side("queries", tokens_asked.descriptors, same_queries, 1)
+    batch_size = reading.batch_size
 
-    def describe(*side: Any, **options: Any) -> Float[np.ndarray, "image descriptor"]:
-        full = group(params, config, *side, batch_size=batch_size, quiet=quiet, **options)
+    def describe(side: _Side, kind: str, seed: int) -> Float[np.ndarray, "image descriptor"]:
+        full = group(
+            describer,
+            side.tokens,
+            len(side.tokens),
+            kind,
+            batch_size=batch_size,
+            seed=seed + side.offset,
+            label=side.name,
+            quiet=reading.quiet,
+        )
         return full if pca is None else pca.apply(full)
 
     stages: dict[str | None, Callable[[Neighbours], Neighbours]] = {None: lambda ranked: ranked}
     with contextlib.ExitStack() as stack:
         if rerank is not None:
             stages[rerank.label] = stack.enter_context(
-                Reranker(
-                    rerank if isinstance(params, Runtime) else rerank.over(params, config),
-                    benchmark.database,
-                    benchmark.queries,
-                    batch_size=batch_size,
-                    cache=cache,
-                    quiet=quiet,
-                )
+                Reranker(rerank, benchmark.database, benchmark.queries, reading)
             )
         k = min(max(*KS, rerank.top if rerank else 0), len(benchmark.database))
         results = []
@@ -199,17 +180,6 @@ def evaluate(
     return results
 
 
-def _unreadable(tokens: FolderTokens) -> tuple[int, ...]:
-    return tuple(np.flatnonzero(~tokens.readable).tolist())
-
-
-def _readable(tokens: FolderTokens) -> FolderTokens:
-    """Return the tokens of the images that could be read."""
-    if tokens.readable.all():
-        return tokens
-    return FolderTokens(*(leaf[tokens.readable] for leaf in tokens))
-
-
 def _first(neighbours: Neighbours, count: int) -> Neighbours:
     """Return the best `count` neighbours of each query."""
     return Neighbours(*(part[:, :count] for part in neighbours))
@@ -219,7 +189,7 @@ class _Side(NamedTuple):
     """One side, database or queries: its tokens and its test of same-place images."""
 
     name: str
-    tokens: FolderTokens
+    tokens: Rows
     same: SamePlace
     offset: int
     """Added to the seed of a shuffle, so that the two sides are never shuffled alike."""
@@ -244,7 +214,7 @@ def _same_place(
 
 def _mean_share(side: _Side, kind: str, seeds: Sequence[int], batch_size: int) -> float | None:
     """Average the share of same-place images over seeds; see `GroupingResult`."""
-    count = len(side.tokens.readable)
+    count = len(side.tokens)
     shares = [
         same_place_share(batches_of(count, kind, batch_size, seed + side.offset), side.same)
         for seed in (seeds if kind == "shuffled" else seeds[:1])
@@ -268,16 +238,13 @@ def _rank(
     ranked by Euclidean distance.
     """
 
-    def descriptors(side: _Side, kind: str, seed: int) -> Float[np.ndarray, "image descriptor"]:
-        return describe(side.tokens, kind, seed=seed + side.offset, label=side.name)
-
     fixed = {
-        side.name: descriptors(side, kind, seeds[0]) for side, kind in sides if kind != "shuffled"
+        side.name: describe(side, kind, seeds[0]) for side, kind in sides if kind != "shuffled"
     }
 
     def ranking(seed: int) -> Neighbours:
         database, queries = (
-            fixed[side.name] if side.name in fixed else descriptors(side, kind, seed)
+            fixed[side.name] if side.name in fixed else describe(side, kind, seed)
             for side, kind in sides
         )
         if observe is not None and seed == seeds[0]:

@@ -61,13 +61,11 @@ def same_place_share(batches: Batches, same: SamePlace) -> float | None:
     """
     if not batches.mutual:
         return None
-    count = int(batches.kept.sum())
     share, looking = 0.0, 0
-    readable = np.ones(count, bool)
     step = max(1, _CHUNK // batches.images.shape[1] ** 2)
     for start in range(0, len(batches.images), step):
         part = batches.part(start, start + step)
-        others = part.looks(readable) & part.kept[:, :, None]
+        others = part.attention_mask & part.kept[:, :, None]
         others &= ~np.eye(others.shape[1], dtype=bool)
         batch, i, j = np.nonzero(others)
         image, other = part.images[batch, i], part.images[batch, j]

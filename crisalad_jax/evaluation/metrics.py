@@ -23,23 +23,17 @@ def right_retrievals(
         positives: the database indices that are right for each query, possibly none.
 
     Raises:
-        InputError: no queries; positives for another number of queries; a negative positive (some
-            ground truths write -1 for "no match": leave it out).
+        InputError: no queries; positives for another number of queries; a negative positive, which
+            some ground truths write for "no match" (leave it out).
     """
-    if len(indices) == 0:
-        raise InputError("indices: found no queries, expected at least one")
-    if len(positives) != len(indices):
+    fits = 0 < len(indices) == len(positives)
+    if not fits or any(np.min(wanted, initial=0) < 0 for wanted in positives):
         raise InputError(
-            f"positives: found {len(positives)} lists, expected {len(indices)}, one for each query"
+            f"positives: found {len(positives)} lists for {len(indices)} queries, expected one for "
+            "each query, of database indices from 0, and at least one query"
         )
-    right = np.zeros(indices.shape, bool)
-    for query, wanted in enumerate(positives):
-        if np.size(wanted) and np.min(wanted) < 0:
-            raise InputError(
-                f"positives: query {query} has {np.min(wanted)}, expected database indices"
-            )
-        right[query] = np.isin(indices[query], wanted)
-    return right
+    pairs = zip(indices, positives, strict=True)
+    return np.array([np.isin(found, wanted) for found, wanted in pairs])
 
 
 def recalls(
@@ -93,17 +87,15 @@ def bootstrap_interval(
     Args:
         hits: in how many of the trials each query was a hit.
         trials: for instance the seeds of a shuffle; the interval does not hold their spread.
-        confidence: of the interval, 0 to 1.
+        confidence: of the interval, above 0 and below 1.
 
     Raises:
-        InputError: no queries, hits outside 0 to `trials`, or no such confidence.
+        InputError: no queries, or hits outside 0 to `trials`.
     """
     if not len(hits) or hits.min() < 0 or hits.max() > trials:
         raise InputError(
             f"hits: found {np.unique(hits).tolist()}, expected numbers from 0 to {trials}"
         )
-    if not 0 < confidence < 1:
-        raise InputError(f"confidence: found {confidence}, expected a fraction between 0 and 1")
     queries = len(hits)
     size = queries * trials + 1
     frequencies = np.bincount(hits, minlength=trials + 1) / queries

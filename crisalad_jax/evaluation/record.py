@@ -9,7 +9,7 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.evaluate import same_place_rule
 from crisalad_jax.evaluation.operating_point import caveats
-from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, to_json
+from crisalad_jax.evaluation.results import ANY, GroupingResult, to_json
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import Grouping, grouping_words
 
@@ -84,18 +84,14 @@ def results_json(
     Returns:
         The values by name.
     """
-    skipped = {}
-    if benchmark is not None:
-        skipped = {"skipped": _skipped_names(results[0].skipped, benchmark)}
     names = {"benchmark": settings["benchmark"], "model": model_name}
-    return settings | skipped | {"results": [names | to_json(result) for result in results]}
-
-
-def _skipped_names(skipped: Skipped, benchmark: Benchmark) -> dict[str, list[str]]:
+    values = settings | {"results": [names | to_json(result) for result in results]}
+    if benchmark is None:
+        return values
     sides = {"queries": benchmark.queries, "database": benchmark.database}
-    return {
-        side: [str(paths[index]) for index in getattr(skipped, side)]
-        for side, paths in sides.items()
+    skipped = results[0].skipped._asdict()
+    return values | {
+        "skipped": {side: [str(paths[i]) for i in skipped[side]] for side, paths in sides.items()}
     }
 
 

@@ -1,11 +1,9 @@
 """The similarities of all queries and a whole database, reduced to the size of a picture."""
 
-import itertools
-
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
-from crisalad_jax.retrieval.chunks import WIDE, Block, aligned, as_sides, blocks
+from crisalad_jax.retrieval.chunks import Block, as_sides, blocks
 
 # Queries and database rows compared at a time: their similarities are 32 MiB.
 _QUERY_CHUNK, _DATABASE_CHUNK = 1024, 8192
@@ -25,11 +23,9 @@ def similarity_map(
     database, queries = as_sides(database, queries)
     rows, columns = cells_of(len(queries), most), cells_of(len(database), most)
     picture = np.full((rows[-1] + 1, columns[-1] + 1), -np.inf, np.float32)
-    sizes = min(_DATABASE_CHUNK, len(database)), min(_QUERY_CHUNK, len(queries))
-    there, asked = (itertools.repeat(aligned((size, database.shape[1]), WIDE)) for size in sizes)
-    for block in blocks(database, "database", there):
-        for part in blocks(queries, "queries", asked):
-            products = part.rows[: part.valid] @ block.rows[: block.valid].T
+    for block in blocks(database, "database", _DATABASE_CHUNK):
+        for part in blocks(queries, "queries", _QUERY_CHUNK):
+            products = part.rows @ block.rows.T
             row, tops = _cells(rows, part)
             column, lefts = _cells(columns, block)
             products = np.maximum.reduceat(products, tops, axis=0)
@@ -48,7 +44,7 @@ def _cells(
     cells: Int64[np.ndarray, " count"], block: Block
 ) -> tuple[Int64[np.ndarray, " cell"], Int64[np.ndarray, " cell"]]:
     """Find the cells that a block's images fall into, and the first image of each."""
-    return np.unique(cells[block.start : block.start + block.valid], return_index=True)
+    return np.unique(cells[block.start : block.start + len(block.rows)], return_index=True)
 
 
 class FirstSimilarities:

@@ -1,1 +1,1 @@
-"""Whole experiments: the demo and its city, comparisons of methods, reports."""
+"""Whole experiments: the demo, comparisons of methods, reports."""

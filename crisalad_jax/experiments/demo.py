@@ -14,6 +14,7 @@ from crisalad_jax.config.checks import check_types
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import read_places
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.experiments.report import (
@@ -23,8 +24,8 @@ from crisalad_jax.experiments.report import (
     recall_markdown,
     training_curves,
 )
-from crisalad_jax.experiments.synthetic import SyntheticCityConfig, write_synthetic_city
-from crisalad_jax.nn.model import init_crisalad
+from crisalad_jax.nn.model import Model, init_crisalad
+from crisalad_jax.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
@@ -86,26 +87,28 @@ def _demo(config: DemoConfig, out: pathlib.Path, quiet: bool, started: float) ->
     city = SyntheticCityConfig(
         train_places=config.train_places, test_places=config.test_places, seed=config.seed
     )
-    images = city.train_places * city.images_per_place
-    images += city.test_places * (city.database_per_place + city.queries_per_place)
-    with progress_bar("rendering the city", images, "images", quiet=quiet) as bar:
-        write_synthetic_city(out / "city", city, progress=lambda done, total: bar.advance(1))
+    with progress_bar("rendering the city", city.images, "images", quiet=quiet) as bar:
+        write_synthetic_city(out / "city", city, progress=bar.advance)
     benchmark = open_benchmark(out / "city" / "test")
     places = read_places(out / "city" / "train")
 
     settings = demo_recipe(config)
     untrained = init_crisalad(jax.random.key(config.seed), settings.model)
     measure = functools.partial(
-        evaluate, benchmark=benchmark, groupings=GROUPINGS, seed=config.seed, seeds=1, quiet=quiet
+        evaluate,
+        benchmark=benchmark,
+        groupings=GROUPINGS,
+        seed=config.seed,
+        seeds=1,
+        reading=Reading(quiet=quiet),
     )
-    before = measure(untrained, settings.model)
+    before = measure(Model(untrained, settings.model))
     training_started = time.monotonic()
     fit(settings, places, out / "run", quiet=quiet)
     training_seconds = time.monotonic() - training_started
-    trained, model = load_weights(out / "run" / "last.safetensors")
-    after = measure(trained, model)
+    after = measure(load_weights(out / "run" / "last.safetensors"))
 
-    rows = _rows(benchmark, "HOG, no learning", measure(*load("hog")))
+    rows = _rows(benchmark, "HOG, no learning", measure(load("hog")))
     rows += _rows(benchmark, "untrained", before)
     rows += _rows(benchmark, "trained", after)
     pictures = [out / name for name in ("recall.png", "training.png", "gallery.png")]

@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import re
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, UInt8
 
 from crisalad_jax.config.checks import takes
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn import draw
 from crisalad_jax.nn.aggregators.base import check_tokens, to_descriptor
 from crisalad_jax.nn.backbones.base import Features
@@ -58,6 +59,14 @@ class Crisalad:
     """Parameters of the cross-image encoder; None without one."""
     projection: Linear | None = None
     """Parameters of `ModelConfig.projection`; None without one."""
+
+
+@brief
+class Model(NamedTuple):
+    """A model: its parameters and its configuration, which go together through the library."""
+
+    params: Crisalad
+    config: ModelConfig
 
 
 @takes(config=ModelConfig, key=jax.Array)

@@ -1,8 +1,7 @@
 """Descriptors in any number, in memory or on disk, some rows at a time."""
 
-import math
 import mmap
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import ml_dtypes
@@ -14,12 +13,9 @@ from crisalad_jax.utils.shapes import Float, Float32, Int
 # Descriptors may arrive as float16, whose unit vectors are off by up to 1e-3.
 UNIT_TOLERANCE = 1e-2
 WIDE = np.dtype(np.float32)
-KEPT = (WIDE, np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
-"""Types of descriptors that are not converted; float32 holds all their values."""
-_CHECKED = 64
-"""Number of rows whose lengths are computed at a time."""
-_ALIGNMENT = 64
-"""Alignment of XLA's arrays in bytes."""
+_NARROW = (np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
+_CHECKED = 4096
+"""Number of rows that are checked at a time."""
 _NEIGHBOURS = 2**21
 """Bytes around a page that is read which Linux maps with it, at most."""
 _SCATTERED = 4
@@ -29,11 +25,10 @@ _SCATTERED = 4
 def as_rows(array: np.ndarray, name: str) -> Float[np.ndarray, "n d"]:
     """Check that an array is a matrix of descriptors, and view it as one.
 
-    Numpy has no name for bfloat16: a .npy file holds it as two bytes without a type ("V2"). Types
-    that are not in `KEPT` become float32 when their rows are read.
+    Numpy has no name for bfloat16: a .npy file holds it as two bytes without a type ("V2").
 
     Raises:
-        InputError: the array is no matrix, or is empty.
+        InputError: the array is not a matrix, or is empty.
     """
     array = np.asanyarray(array)
     if array.dtype == np.dtype("V2"):
@@ -51,7 +46,7 @@ def as_sides(
     """Check that database and queries are matrices of descriptors of one length.
 
     Raises:
-        InputError: one is no matrix, or empty; or their lengths differ.
+        InputError: one is not a matrix, or is empty; or their lengths differ.
     """
     database, queries = as_rows(database, "database"), as_rows(queries, "queries")
     if database.shape[1] != queries.shape[1]:
@@ -63,113 +58,92 @@ def as_sides(
 
 
 class Block(NamedTuple):
-    """A run of consecutive rows."""
+    """Some rows of an array."""
 
     start: int
-    """Index of the first row in the whole array."""
+    """Number of rows in the blocks before it."""
     rows: Float[np.ndarray, "size d"]
-    """The rows; zeros follow the valid ones as padding."""
-    valid: int
-    """Number of valid rows."""
+    """In float32, unless asked for otherwise."""
 
 
 def blocks(
     array: Float[np.ndarray, "n d"],
     name: str,
-    buffers: Iterator[Float[np.ndarray, "size d"]],
+    size: int,
+    *,
+    unit: bool = True,
+    places: Int[np.ndarray, " m"] | None = None,
+    narrow: bool = False,
 ) -> Generator[Block, None, None]:
-    """Copy an array's rows into the given buffers, one block after the other.
+    """Yield an array's rows in order, `size` at a time, checked, and without a copy if possible.
+
+    Pages of a memory map are released after the block behind theirs is taken, so that a stream may
+    be read one block ahead.
+
+    Args:
+        array: descriptors in memory or on disk.
+        name: what messages call it.
+        size: number of rows in a block; the last may have fewer.
+        unit: whether rows have to be of unit length, or only finite.
+        places: the rows to yield, in ascending order; None for all.
+        narrow: whether to leave float16 and bfloat16 as they are; other types become float32.
 
     Raises:
-        InputError: a row is not finite, or not of unit length.
+        InputError: a row is not finite, or not of unit length where that is asked for.
     """
-    start = 0
-    while start < len(array):
-        buffer = next(buffers)
-        rows = array[start : start + len(buffer)]
-        with np.errstate(over="ignore"):  # what overflows is reported
-            np.copyto(buffer[: len(rows)], rows, casting="unsafe")
-        buffer[len(rows) :] = 0
-        _let_go(rows)
-        check_rows(buffer[: len(rows)], name, range(start, len(array)), unit=True)
-        yield Block(start, buffer, len(rows))
-        start += len(buffer)
+    numbers = range(len(array)) if places is None else places
+    before = array[:0]
+    for start in range(0, len(numbers), size):
+        some = numbers[start : start + size]
+        span = array[some[0] : some[-1] + 1]
+        rows = span if places is None else array[some]
+        wide = _widened(rows)
+        check_rows(wide, name, some, unit=unit)
+        yield Block(start, rows if narrow and rows.dtype in _NARROW else wide)
+        _let_go(before)
+        before = span
+    _let_go(before)
 
 
-def views(array: Float32[np.ndarray, "n d"], name: str, size: int) -> Generator[Block, None, None]:
-    """Yield an array's rows without a copy, `size` at a time; the last block may have fewer.
+def joined(stream: Iterable[Block], size: int) -> Generator[Block, None, None]:
+    """Join consecutive blocks to blocks of about `size` rows, at most twice as many.
 
-    Raises:
-        InputError: a row is not finite, or not of unit length.
+    Args:
+        stream: blocks of at most `size` rows.
+        size: number of rows.
     """
-    for start in range(0, len(array), size):
-        rows = array[start : start + size]
-        check_rows(rows, name, range(start, len(array)), unit=True)
-        yield Block(start, rows, len(rows))
-
-
-def is_mapped(array: np.ndarray) -> bool:
-    """Return whether an array is part of a memory-mapped file."""
-    return isinstance(_owner(array), np.memmap)
-
-
-def _owner(array: np.ndarray) -> np.ndarray:
-    while isinstance(array.base, np.ndarray):
-        array = array.base
-    return array
+    parts: list[Float[np.ndarray, "rows d"]] = []
+    start = count = 0
+    for block in stream:
+        parts.append(block.rows)
+        count += len(block.rows)
+        if count >= size:
+            yield Block(start, np.concatenate(parts) if len(parts) > 1 else parts[0])
+            parts, start, count = [], start + count, 0
+    if parts:
+        yield Block(start, np.concatenate(parts))
 
 
 def gathered(
     array: Float[np.ndarray, "n d"], places: Int[np.ndarray, " m"]
 ) -> Float[np.ndarray, "m d"]:
-    """Read the rows at some places in ascending order, in their own type or in float32."""
-    rows = np.empty((len(places), array.shape[1]), array.dtype if array.dtype in KEPT else WIDE)
+    """Read the rows at some places in ascending order as float32, and release their pages."""
+    parts = []
     for start in range(0, len(places), _SCATTERED):
         some = places[start : start + _SCATTERED]
-        rows[start : start + _SCATTERED] = array[some]
+        parts.append(_widened(array[some]))
         _let_go(array[some[0] : some[-1] + 1])
-    return rows
+    return np.concatenate(parts)
+
+
+def _widened(rows: np.ndarray) -> Float32[np.ndarray, "rows d"]:
+    with np.errstate(over="ignore"):  # what overflows is reported
+        return rows.astype(WIDE, copy=False)
 
 
 def sample(total: int, count: int, seed: int) -> Int[np.ndarray, " count"]:
     """Draw `count` of `total` places at random, sorted so that a disk is read in order."""
     return np.sort(np.random.default_rng(seed).choice(total, count, replace=False))
-
-
-def pieces(
-    array: Float[np.ndarray, "n d"],
-    name: str,
-    size: int,
-    places: Int[np.ndarray, " m"] | None = None,
-) -> Generator[Float32[np.ndarray, "rows d"], None, None]:
-    """Yield rows as float32, `size` at a time: all of them, or those at ascending places.
-
-    Raises:
-        InputError: a row is not finite.
-    """
-    for start in range(0, len(array) if places is None else len(places), size):
-        some = slice(start, start + size) if places is None else places[start : start + size]
-        with np.errstate(over="ignore"):  # what overflows is reported
-            rows = np.array(array[some], np.float32)
-        if places is None:
-            _let_go(array[some])
-            check_rows(rows, name, range(start, len(array)), unit=False)
-        else:
-            _let_go(array[places[start] : places[start + len(rows) - 1] + 1])
-            check_rows(rows, name, places[start:], unit=False)
-        yield rows
-
-
-def check_all_rows(array: Float[np.ndarray, "n d"], name: str, *, unit: bool) -> None:
-    """Check all rows of an array in memory or on disk, as `check_rows`, before they are used.
-
-    Raises:
-        InputError: a row is not finite, or no unit vector where that is asked for.
-    """
-    for start in range(0, len(array), _CHECKED):
-        rows = array[start : start + _CHECKED]
-        check_rows(rows, name, range(start, len(array)), unit=unit)
-        _let_go(rows)
 
 
 def check_rows(
@@ -186,20 +160,15 @@ def check_rows(
     Raises:
         InputError: a row is not; the message names the first.
     """
+    wide = _widened(rows)
     with np.errstate(over="ignore", invalid="ignore"):
-        squares = [
-            np.einsum("nd,nd->n", wide, wide)
-            for i in range(0, len(rows), _CHECKED)
-            for wide in [rows[i : i + _CHECKED].astype(np.float32, copy=False)]
-        ]
-        norms = np.sqrt(np.concatenate(squares))
+        norms = np.sqrt(np.einsum("nd,nd->n", wide, wide))
     # "Not within" rather than "beyond", so that NaN and infinity count as wrong.
     right = np.abs(norms - 1) <= UNIT_TOLERANCE if unit else np.isfinite(norms)
     wrong = np.flatnonzero(~right)
     if wrong.size:
         row = wrong[0]
-        finite = np.isfinite(rows[row].astype(np.float32)).all()
-        fault = f"of length {norms[row]:.4g}" if finite else "not finite"
+        fault = f"of length {norms[row]:.4g}" if np.isfinite(wide[row]).all() else "not finite"
         expected = "finite unit vectors" if unit else "finite vectors"
         raise InputError(
             f"{name}: row {places[row]} is {fault}, expected {expected} "
@@ -207,19 +176,24 @@ def check_rows(
         )
 
 
-def aligned(shape: tuple[int, int], dtype: np.dtype) -> np.ndarray:
-    """Allocate an array that a CPU's devices use in place, without a copy."""
-    size = math.prod(shape) * dtype.itemsize
-    memory = np.empty(size + _ALIGNMENT, np.uint8)
-    offset = -memory.ctypes.data % _ALIGNMENT
-    return memory[offset : offset + size].view(dtype).reshape(shape)
+def check_all_rows(array: Float[np.ndarray, "n d"], name: str, *, unit: bool) -> None:
+    """Check all rows of an array in memory or on disk, as `check_rows`, before they are used.
+
+    Raises:
+        InputError: a row is not finite, or not of unit length where that is asked for.
+    """
+    for _ in blocks(array, name, _CHECKED, unit=unit):
+        pass
 
 
 def _let_go(rows: np.ndarray) -> None:
     """Release a memory map's pages; otherwise every page that was read stays in memory."""
-    owner: Any = _owner(rows)
+    owner: Any = rows
+    while isinstance(owner.base, np.ndarray):
+        owner = owner.base
     # Pages written in a copy-on-write map exist in memory alone: releasing them would lose them.
-    if not isinstance(owner, np.memmap) or owner.mode == "c" or not hasattr(mmap, "MADV_DONTNEED"):
+    is_file = isinstance(owner, np.memmap) and owner.mode != "c"
+    if not is_file or not len(rows) or not hasattr(mmap, "MADV_DONTNEED"):
         return
     mapping: Any = owner.base
     origin = np.frombuffer(mapping, np.uint8).ctypes.data

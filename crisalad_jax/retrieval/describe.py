@@ -1,141 +1,293 @@
-"""Descriptors of whole folders: of each image alone, or of images that attend to each other."""
+"""Descriptors of images: each independently, with the frames before it, or in groups.
 
-import functools
+Nothing here imports JAX: what computes is a `Describer`.
+"""
+
+import collections
+import itertools
+import os
 import pathlib
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Int64
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.loader import ImageBatch, ImageCache, OnBadImage
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
-from crisalad_jax.nn.tokens import Tokens
-from crisalad_jax.retrieval.grouping import (
-    Batches,
-    batches_of,
-)
-from crisalad_jax.retrieval.model import (
-    Model,
-    attend_across_images,
-    cast_params,
-    check_groupings,
-    extract_tokens,
-)
-from crisalad_jax.retrieval.photographs import photograph_batches
-from crisalad_jax.utils import compiler
-from crisalad_jax.utils.devices import devices_for
+from crisalad_jax.data.loader import ImageBatch
+from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.data.resize import Pixels
+from crisalad_jax.retrieval.describer import Describer, Rows, describer_of
+from crisalad_jax.retrieval.grouping import batches_of
+from crisalad_jax.retrieval.pca import Pca
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.shapes import Float, Float32, Int64
+
+if TYPE_CHECKING:  # an engine describes images without JAX
+    from crisalad_jax.nn.config import ModelConfig
+    from crisalad_jax.nn.model import Model
 
 
 @brief
-class FolderTokens(NamedTuple):
-    """Tokens of many images on the host (see `Tokens`), and which images could be read."""
+class Described(NamedTuple):
+    """Descriptors of a few images."""
 
-    global_tokens: Float[np.ndarray, "image global_dim"]
-    local: Float[np.ndarray, "image token dim"]
-    readable: Bool[np.ndarray, " image"]
-
-    def of(self, images: Int64[np.ndarray, " n"]) -> Tokens:
-        """Return the tokens of some images, by number."""
-        return Tokens(jnp.asarray(self.global_tokens[images]), jnp.asarray(self.local[images]))
+    indices: Int64[np.ndarray, " n"]
+    """Indices of the readable images in the list of paths."""
+    descriptors: Float32[np.ndarray, "n d"]
+    unreadable: Int64[np.ndarray, " _"]
+    """Indices of the images that could not be read."""
 
 
-class HeldTokens(Protocol):
-    """The tokens of many images, in memory or in files."""
+class RowSource(Protocol):
+    """Rows that are read by number: an array in memory, or a folder of files."""
 
-    @property
-    def readable(self) -> Bool[np.ndarray, " image"]:
-        """Whether each image could be read."""
+    def __getitem__(self, numbers: Int64[np.ndarray, " n"], /) -> Rows:
+        """Return rows by number."""
         ...
 
-    def of(self, images: Int64[np.ndarray, " n"]) -> Tokens:
-        """Return the tokens of some images, by number."""
-        ...
+
+def prepare_image(image: np.ndarray, config: "ModelConfig", name: str | None = None) -> Pixels:
+    """Resize an image as a model's configuration says, and normalise floats.
+
+    Args:
+        image: 8-bit RGB, of `read_image`; or grey (height, width) or (height, width, 1), which is
+            repeated over the channels; or uint16, of which the configuration makes 8 bits.
+        config: the model's configuration.
+        name: name of the image, for messages.
+
+    Returns:
+        What `describe` takes, in a batch: 8-bit pixels, or normalised float32.
+
+    Raises:
+        InputError: the image is not such an array, or the model cannot describe one of its size.
+
+    Example:
+        >>> import numpy as np
+        >>> from crisalad_jax import PRESETS
+        >>> prepare_image(np.zeros((60, 80, 3), np.uint8), PRESETS["b14"]).shape
+        (224, 224, 3)
+    """
+    if not hasattr(config, "side_multiple"):
+        raise InputError(f"config: found {type(config).__name__}, expected ModelConfig")
+    how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
+    return how.prepare(image, config.check_image_size, name)
+
+
+def describe_files(
+    model: "Model | Runtime | Describer",
+    files: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    reading: Reading = Reading(quiet=True),
+) -> Float32[np.ndarray, "image descriptor"]:
+    """Describe image files, each independently of the others.
+
+    Files are decoded upright and resized as the model's configuration says, which is all that a
+    descriptor depends on. `extract` does the same for folders, and writes files.
+
+    Args:
+        model: parameters and configuration, as `load` returns them, or a `Runtime`.
+        files: an image file, or a list of them.
+        reading: how the files are read.
+
+    Returns:
+        A descriptor of each readable file, in order.
+
+    Raises:
+        InputError: no files, one that cannot be read, or parameters that are not of the
+            configuration.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, Model, init_crisalad
+        >>> config = PRESETS["tiny"]
+        >>> model = Model(init_crisalad(jax.random.key(0), config), config)
+        >>> describe_files(model, pictures / "0.png").shape
+        (1, 576)
+    """
+    describer = describer_of(model)
+    given = [files] if isinstance(files, str | os.PathLike) else files
+    paths = [pathlib.Path(file) for file in given]
+    if not paths:
+        raise InputError("files: found none, expected at least one image file")
+    parts = []
+    with progress_bar("images", len(paths), "images", quiet=reading.quiet) as bar:
+        for part in described(describer, paths, reading.fitted(len(paths))):
+            parts.append(part.descriptors)
+            bar.advance(len(part.indices) + len(part.unreadable))
+    return np.concatenate(parts)
+
+
+def describe_images(
+    model: "Model | Runtime | Describer", images: Sequence[np.ndarray], batch_size: int = 16
+) -> Float32[np.ndarray, "image descriptor"]:
+    """Describe images in memory, each independently of the others.
+
+    A batch is padded to a power of two, so that few programs are compiled, and a single image costs
+    one. The values differ from those of `describe_files` by the rounding of other batch sizes.
+
+    Args:
+        model: parameters and configuration, as `load` returns them, or a `Runtime`.
+        images: 8-bit RGB, of any sizes, as `read_image` returns them, or grey; see
+            `prepare_image`.
+        batch_size: largest number of images described together.
+
+    Returns:
+        A descriptor of each image, in order.
+
+    Raises:
+        InputError: no images, or one that `prepare_image` does not take or that the model cannot
+            describe.
+
+    Example:
+        >>> import jax, numpy as np
+        >>> from crisalad_jax import PRESETS, Model, init_crisalad
+        >>> config = PRESETS["tiny"]
+        >>> model = Model(init_crisalad(jax.random.key(0), config), config)
+        >>> describe_images(model, [np.zeros((60, 80, 3), np.uint8)]).shape
+        (1, 576)
+    """
+    describer, reading = describer_of(model), Reading(batch_size=batch_size)
+    if isinstance(images, np.ndarray) and images.ndim in (2, 3):
+        raise InputError(
+            f"images: found one array of shape {images.shape}, expected a list of images"
+        )
+    if not len(images):
+        raise InputError("images: found none, expected at least one image")
+    how = describer.preparation
+    prepared = [how.prepare(image, describer.check_size) for image in images]
+    return describe_prepared(describer, prepared, reading.batch_size)
+
+
+def describe_prepared(
+    describer: Describer, prepared: Sequence[Pixels], batch_size: int
+) -> Float32[np.ndarray, "image descriptor"]:
+    """Describe images of `prepare_image`, each independently; see `describe_images`."""
+    by_shape: dict[tuple[int, ...], list[int]] = {}
+    for number, image in enumerate(prepared):
+        by_shape.setdefault(image.shape, []).append(number)
+
+    def batches() -> Iterator[ImageBatch]:
+        for numbers in by_shape.values():
+            for start in range(0, len(numbers), batch_size):
+                part = np.array(numbers[start : start + batch_size])
+                count = min(batch_size, 1 << (len(part) - 1).bit_length())
+                images = np.stack([prepared[part[i % len(part)]] for i in range(count)])
+                yield ImageBatch(images, part, np.ones(len(part), bool), part)
+
+    found = {
+        int(number): descriptor
+        for rows, batch in describer.tokens(batches())
+        for number, descriptor in zip(batch.indices, _alone(describer, rows), strict=False)
+    }
+    return np.stack([found[number] for number in range(len(prepared))])
+
+
+def _alone(describer: Describer, rows: Rows) -> Float[np.ndarray, "image descriptor"]:
+    """Make the descriptors of images that attend to themselves alone."""
+    return describer.attend(rows[None], np.eye(len(rows), dtype=bool)[None])[0]
+
+
+def described(
+    describer: Describer,
+    paths: Sequence[pathlib.Path],
+    reading: Reading,
+    *,
+    window: int = 1,
+    components: Pca | None = None,
+) -> Iterator[Described]:
+    """Describe images in order, each with the `window - 1` before it, and yield batch by batch.
+
+    The descriptors are those of the grouping `window`, or `single` where the window is 1, of the
+    images that could be read. Two batches are in memory, and the images that are read ahead.
+    Components shorten whole batches, so that the bits of a descriptor do not depend on which others
+    could be read.
+
+    Raises:
+        InputError: an image cannot be read and `reading` says "stop".
+    """
+    before: Rows | None = None
+    for rows, batch in describer.tokens(_batches(describer, paths, reading)):
+        if window == 1:
+            descriptors = _shortened(_alone(describer, rows), components)[batch.valid]
+        else:
+            new = rows[batch.valid]
+            held = new if before is None else np.concatenate([before, new])
+            every = group(describer, held, len(held), "window", batch_size=window)
+            descriptors = _shortened(every[len(held) - len(new) :], components)
+            before = held[1 - window :]
+        yield Described(batch.indices[batch.valid], descriptors, _unreadable(batch))
+
+
+def _batches(
+    describer: Describer, paths: Sequence[pathlib.Path], reading: Reading
+) -> Iterator[ImageBatch]:
+    return reading.batches(paths, describer.preparation, describer.check_size)
+
+
+def _unreadable(batch: ImageBatch) -> Int64[np.ndarray, " _"]:
+    return batch.indices[(batch.indices >= 0) & ~batch.valid]
+
+
+def _shortened(descriptors: np.ndarray, components: Pca | None) -> np.ndarray:
+    return (
+        descriptors if components is None or not len(descriptors) else components.apply(descriptors)
+    )
+
+
+def described_sources(
+    describer: Describer,
+    sources: Sequence[list[pathlib.Path]],
+    reading: Reading,
+    *,
+    window: int,
+    components: Pca | None = None,
+) -> Iterator[Described]:
+    """Describe the images of all sources in order; a window holds images of one source only.
+
+    Indices count the images of all sources.
+
+    Raises:
+        InputError: what `described` raises.
+    """
+    if window == 1:
+        sources = [list(itertools.chain(*sources))]
+    first = 0
+    for source in sources:
+        for part in described(describer, source, reading, window=window, components=components):
+            yield Described(part.indices + first, part.descriptors, part.unreadable + first)
+        first += len(source)
+
+
+def token_rows(
+    describer: Describer, paths: Sequence[pathlib.Path], reading: Reading
+) -> Iterator[Described]:
+    """Yield the tokens of images in order, batch by batch, in the place of descriptors.
+
+    Raises:
+        InputError: an image cannot be read and `reading` says "stop".
+    """
+    for rows, batch in describer.tokens(_batches(describer, paths, reading)):
+        yield Described(batch.indices[batch.valid], rows[batch.valid], _unreadable(batch))
 
 
 def read_tokens(
-    params: Model,
-    config: ModelConfig,
-    paths: Sequence[pathlib.Path],
-    *,
-    batch_size: int,
-    label: str,
-    on_bad_image: OnBadImage = "stop",
-    cache: ImageCache | None = None,
-    quiet: bool = False,
-) -> FolderTokens:
-    """Read images, resized as `config` says, and extract their tokens in order.
-
-    Raises:
-        InputError: an image cannot be read, and `on_bad_image` is "stop".
-    """
-    parts: list[tuple[np.ndarray, ...]] = []
-    stream = tokens_in_batches(
-        params, config, paths, batch_size=batch_size, on_bad_image=on_bad_image, cache=cache
-    )
-    with progress_bar(label, len(paths), "images", quiet=quiet) as bar:
-        for tokens, batch in stream:
-            used = int((batch.indices >= 0).sum())
-            parts.append(tuple(leaf[:used] for leaf in tokens))
-            bar.advance(used)
-    return FolderTokens(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
-
-
-def tokens_in_batches(
-    params: Model,
-    config: ModelConfig,
-    paths: Sequence[pathlib.Path],
-    *,
-    batch_size: int,
-    on_bad_image: OnBadImage = "stop",
-    cache: ImageCache | None = None,
-) -> Iterator[tuple[FolderTokens, ImageBatch]]:
-    """Yield the tokens of images in order, batch by batch; the last batch is padded, and so
-    is each before a change of size.
-
-    Each comes with the batch of images it was made of. Two batches are in memory, and the images
-    that are read ahead.
-
-    Raises:
-        InputError: an image cannot be read and `on_bad_image` is "stop"; a batch of none.
-    """
-    batches = photograph_batches(
-        config, paths, batch_size=batch_size, on_bad_image=on_bad_image, cache=cache
-    )
-    if isinstance(params, Runtime):
-        for batch in batches:
-            rows = params.tokens(batch.images)
-            none = np.empty((len(rows), 0, 0), np.float32)
-            yield FolderTokens(rows, none, batch.valid), batch
-        return
-    devices = devices_for(batch_size)
-    params = devices.replicate(cast_params(params, config))
-
-    def back(tokens: Tokens, batch: ImageBatch) -> tuple[FolderTokens, ImageBatch]:
-        global_tokens, local = jax.device_get((tokens.global_token, tokens.local))
-        return FolderTokens(global_tokens, local, batch.valid), batch
-
-    ahead = None
-    for batch in batches:
-        tokens = extract_tokens(params, devices.shard_batch(batch.images), config)
-        # The previous batch is fetched while the device computes this one.
-        if ahead is not None:
-            yield back(*ahead)
-        ahead = (tokens, batch)
-    if ahead is not None:
-        yield back(*ahead)
+    describer: Describer, paths: Sequence[pathlib.Path], reading: Reading, label: str = "images"
+) -> Described:
+    """Read the tokens of all images into memory, as `token_rows` yields them."""
+    parts: list[Described] = []
+    with progress_bar(label, len(paths), "images", quiet=reading.quiet) as bar:
+        for part in token_rows(describer, paths, reading):
+            parts.append(part)
+            bar.advance(len(part.indices) + len(part.unreadable))
+    return Described(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def group(
-    params: Model,
-    config: ModelConfig,
-    folder: HeldTokens,
+    describer: Describer,
+    rows: RowSource,
+    count: int,
     grouping: str,
     *,
     batch_size: int,
@@ -143,24 +295,18 @@ def group(
     label: str = "images",
     quiet: bool = True,
 ) -> Float[np.ndarray, "image descriptor"]:
-    """Describe all images, in their order, under one of `GROUPINGS`.
-
-    No image attends to one that could not be read; the rows of such images are meaningless.
-
-    Raises:
-        InputError: what `check_grouping` raises.
-    """
-    descriptors = np.empty((len(folder.readable), config.descriptor_dim), np.float32)
-    options = {"batch_size": batch_size, "seed": seed, "label": label, "quiet": quiet}
-    for images, rows in described(params, config, folder, grouping, **options):
-        descriptors[images] = rows
+    """Describe images, in their order, under one of `GROUPINGS`; see `grouped`."""
+    descriptors = np.empty((count, describer.config.descriptor_dim), np.float32)
+    options: dict[str, Any] = {"batch_size": batch_size, "seed": seed, "quiet": quiet}
+    for images, found in grouped(describer, rows, count, grouping, label=label, **options):
+        descriptors[images] = found
     return descriptors
 
 
-def described(
-    params: Model,
-    config: ModelConfig,
-    folder: HeldTokens,
+def grouped(
+    describer: Describer,
+    rows: RowSource,
+    count: int,
     grouping: str,
     *,
     batch_size: int,
@@ -168,13 +314,18 @@ def described(
     label: str = "images",
     quiet: bool = True,
 ) -> Iterator[tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n descriptor"]]]:
-    """Yield the descriptors of `group` some at a time, each lot with its images' numbers.
+    """Yield the descriptors of images under a grouping, some at a time, with the images' numbers.
 
-    Raises:
-        InputError: what `check_grouping` raises.
+    Args:
+        describer: the model.
+        rows: the images' tokens, by number.
+        count: number of images.
+        grouping: one of `GROUPINGS`.
+        batch_size: number of images that attend to each other.
+        seed: draws the order of `shuffled`.
+        label: label of the progress bar.
+        quiet: whether to show no progress bar.
     """
-    check_groupings(params, config, [grouping])
-    count = len(folder.readable)
     batches = batches_of(count, grouping, batch_size, seed)
     # A window gives one descriptor, so `batch_size` windows are computed at a time.
     step = batch_size if grouping == "window" else 1
@@ -183,58 +334,60 @@ def described(
     with progress_bar(f"{label}, {grouping}", count, "images", quiet=silent) as bar:
         for start in range(0, len(batches.images), step):
             part = batches.part(start, start + step)
-            relate_part = _relate_windows if grouping == "window" else _relate_batch
-            images = part.images[part.kept]
-            yield images, relate_part(params, config, folder, part)
-            bar.advance(len(images))
+            # The last groups are repeated, so that all steps run one program.
+            groups = np.resize(np.arange(len(part.images)), step)
+            distinct, places = np.unique(part.images, return_inverse=True)
+            tokens = rows[distinct][places.reshape(part.images.shape)[groups]]
+            found = describer.attend(tokens, part.attention_mask[groups])[: len(part.images)]
+            yield part.images[part.kept], found[part.kept]
+            bar.advance(int(part.kept.sum()))
 
 
-def _relate_batch(
-    params: Model, config: ModelConfig, folder: HeldTokens, batch: Batches
-) -> Float[np.ndarray, "image descriptor"]:
-    """Describe the images of one batch."""
-    (images,), (kept_places,), (mask,) = batch.images, batch.kept, batch.looks(folder.readable)
-    tokens = folder.of(images)
-    return np.asarray(attend_across_images(params, tokens, config, mask=mask))[kept_places]
+def check_window(config: "ModelConfig", window: int) -> None:
+    """Check a number of frames that are described together.
+
+    Raises:
+        InputError: it is below 1, or above with a model whose images do not attend to each other.
+    """
+    if window < 1:
+        raise InputError(f"window: found {window}, expected at least 1")
+    if window > 1 and not config.cross_image.layers:
+        raise InputError(
+            f"window: found {window} with a model without a cross-image encoder, expected 1: it "
+            "describes every image independently"
+        )
 
 
-def _relate_windows(
-    params: Model, config: ModelConfig, folder: HeldTokens, windows: Batches
-) -> Float[np.ndarray, "window descriptor"]:
-    """Describe the last image of each of some windows."""
-    if isinstance(params, Runtime):
-        pairs = zip(windows.images, windows.looks(folder.readable), strict=True)
-        lasts = [
-            attend_across_images(params, folder.of(images), config, mask=mask)[-1]
-            for images, mask in pairs
-        ]
-        return np.stack(lasts)
-    width = windows.images.shape[1]
-    # Windows overlap, so each image goes to the device once. Shapes are always those of `width`
-    # windows, for one compilation.
-    images, places = np.unique(windows.images, return_inverse=True)
-    images = np.resize(images, 2 * width - 1)
-    rows = np.arange(width) % len(windows.images)
-    descriptors = _relate_last(
-        params,
-        folder.of(images),
-        jnp.asarray(places.reshape(windows.images.shape)[rows]),
-        jnp.asarray(windows.looks(folder.readable)[rows]),
-        config,
-    )
-    return np.asarray(descriptors)[: len(windows.images)]
+class FrameDescriber:
+    """Describe images as they come, each with the `window - 1` before it."""
 
+    def __init__(self, describer: Describer, window: int = 1) -> None:
+        """Start without an image.
 
-@functools.partial(compiler.jit, static_argnames="config")
-def _relate_last(
-    params: Crisalad,
-    tokens: Tokens,
-    places: Int[Array, "window place"],
-    masks: Bool[Array, "window place place"],
-    config: ModelConfig,
-) -> Float[Array, "window descriptor"]:
-    def last(places: Int[Array, " place"], mask: Bool[Array, "place place"]) -> Array:
-        window = jax.tree.map(lambda leaf: leaf[places], tokens)
-        return attend_across_images(params, window, config, mask=mask)[-1]
+        Raises:
+            InputError: what `check_window` raises.
+        """
+        check_window(describer.config, window)
+        self._describer, self._window = describer, window
+        self._rows: collections.deque[Rows] = collections.deque(maxlen=window)
 
-    return jax.vmap(last)(places, masks)
+    def __call__(self, image: np.ndarray) -> Float32[np.ndarray, "1 d"]:
+        """Describe the next image: 8-bit RGB or grey, of any size.
+
+        Raises:
+            InputError: what `prepare_image` raises.
+        """
+        one = self._describer.preparation.prepare(image, self._describer.check_size)[None]
+        number, valid = np.zeros(1, int), np.ones(1, bool)
+        ((rows, _),) = self._describer.tokens([ImageBatch(one, number, valid, number)])
+        self._rows.append(rows)
+        # The first images have fewer before them: one of these is repeated, and not attended to.
+        missing = self._window - len(self._rows)
+        held = np.concatenate([*[self._rows[0]] * missing, *self._rows])
+        filled = np.arange(self._window) >= missing
+        mask = filled[:, None] & filled | np.eye(self._window, dtype=bool)
+        return self._describer.attend(held[None], mask[None])[0, -1:]
+
+    def forget(self) -> None:
+        """Start again without an image."""
+        self._rows.clear()

@@ -1,57 +1,94 @@
 """Descriptors of a folder or a list of images, in files or in memory."""
 
 import contextlib
+import dataclasses
+import hashlib
+import json
 import os
 import pathlib
-from collections.abc import Mapping, Sequence
-from typing import Any
+import tempfile
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from crisalad_jax.checkpoints import starter
-from crisalad_jax.config.checks import check_count
+from crisalad_jax.checkpoints.runtime import Runtime
+from crisalad_jax.config.checks import check_count, check_seed, choose
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.data.images import check_lines
-from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.images import check_lines, read_pixels
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
-from crisalad_jax.data.video import frame_time, name_frame
-from crisalad_jax.nn.config import ModelConfig, check_unit_length
-from crisalad_jax.retrieval.chunks import check_all_rows
+from crisalad_jax.data.video import file_of, frame_time, name_frame
+from crisalad_jax.retrieval.chunks import check_all_rows, check_rows
+from crisalad_jax.retrieval.describe import Described, described, grouped, token_rows
+from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.descriptor_files import (
     Descriptors,
+    RowFile,
     check_suffix,
+    open_npy,
     read_descriptors,
+    record_of,
     targets,
     write_descriptors,
 )
-from crisalad_jax.retrieval.grouping import check_grouping, useful_batch_size
+from crisalad_jax.retrieval.grouping import GROUPINGS
 from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_pairs
-from crisalad_jax.retrieval.model import Model, check_groupings, check_params
+from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
-from crisalad_jax.retrieval.sets import (
-    DescribedSet,
-    Extracted,
-    SharedSet,
-    Work,
-    describe_set,
-    extract_share,
-    open_work,
-)
-from crisalad_jax.retrieval.shares import Share, digest_of
+from crisalad_jax.retrieval.segments import SEGMENT, Segments, Share, Shares, digest_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path, check_format, check_target, real_path
+from crisalad_jax.utils.files import (
+    atomic_path,
+    check_format,
+    check_target,
+    read_json,
+    real_path,
+    wrap_os_errors,
+    write_json,
+)
+from crisalad_jax.utils.locks import lock
+from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.temporaries import in_use, remove_temporaries, temporary_beside
+
+if TYPE_CHECKING:
+    from crisalad_jax.nn.model import Model
 
 StrPath = str | os.PathLike[str]
+_PLAN = "plan.json"
+_SHARES = "shares"
+"""Key of the shares' digest in a set's record."""
+
+
+@brief
+class Extracted(NamedTuple):
+    """The descriptors of a set of images."""
+
+    names: list[str]
+    """Names of the images that could be read, in order."""
+    descriptors: Descriptors
+    """Their descriptors, float32; a memory map where they are in a file."""
+    skipped: list[str]
+    """Names of the images that could not be read."""
+    pairs: list[tuple[str, str]] | None = None
+    """Each image with those most similar to it, best first; None where no pairs were asked for."""
+    shares_left: int = 0
+    """Number of shares that are not there yet; until then this holds the images of one share."""
+    joined_elsewhere: bool = False
+    """Whether another process joins the shares, so that this holds the images of one share."""
 
 
 def extract(
-    params: Model,
-    config: ModelConfig,
+    model: "Model | Runtime",
     images: StrPath | Sequence[StrPath],
     out: StrPath | None = None,
     *,
     fps: float | None = None,
     weights: StrPath | None = None,
     grouping: str = "single",
-    batch_size: int = 16,
     seed: int = 0,
     root: StrPath | None = None,
     pairs: StrPath | None = None,
@@ -59,26 +96,23 @@ def extract(
     k: int = 20,
     pca: StrPath | Pca | None = None,
     share: str | None = None,
-    on_bad_image: OnBadImage = "stop",
     verify: bool = True,
-    quiet: bool = False,
+    reading: Reading = Reading(),
 ) -> Extracted:
     """Describe images, and write the descriptors where they are asked for.
 
     With `out`, the same call resumes after a kill, and one process at a time may write there.
-    Tokens and descriptors are then in files, and a few hundred images' in memory.
+    Tokens and descriptors are in files meanwhile, and a few hundred images' in memory.
 
     Args:
-        params: the model's parameters, or a `Runtime` that has them.
-        config: the model; images are resized as it says.
+        model: parameters and configuration, as `load` returns them, or a `Runtime`.
         images: a folder, searched with its subfolders in sorted order, another source of images
             (docs/how-to/image-sources.md), or a list of files.
-        out: a file .npy, with the names beside it, or .h5, as hloc reads it. How it was made is
-            written beside it too, as JSON. None writes nothing.
+        out: a file .npy, with the names in another, or .h5, as hloc reads it. How it was made is
+            written next to it, as JSON. None writes nothing.
         fps: frames a second taken of a video, which is then expected; None is one.
         weights: the file that the parameters are from, for that JSON and for messages.
-        grouping: one of `GROUPINGS`: which images look at each other.
-        batch_size: number of images described together.
+        grouping: one of `GROUPINGS`: which images attend to each other.
         seed: draws the order of the grouping "shuffled".
         root: folder that names are relative to. By default it is the folder `images`, or that of
             another source; files of a list keep their names.
@@ -88,110 +122,104 @@ def extract(
         pca: components that shorten the descriptors, or a file of them.
         share: INDEX/COUNT, to describe one share of the images; processes on any hosts that see the
             same folders take the others, and the last one to end joins all.
-        on_bad_image: "stop" at an unreadable image, or "skip" it.
         verify: whether to check the bytes of `database` and `pca` against their checksums.
-        quiet: whether to show no progress bar.
+        reading: how images are read.
 
     Returns:
         Names and descriptors of the images that could be read.
 
     Raises:
-        InputError: what `check_params` and `check_extraction` raise; components or a database of
+        InputError: what `describer_of` and `check_extraction` raise; components or a database of
             another length; no image, an image that cannot be read, or none that can; a name that is
-            no line of text or does not lie under `root`; or a file that cannot be read or
+            not a line of text or does not lie under `root`; or a file that cannot be read or
             written.
 
     Example:
         >>> import jax
-        >>> from crisalad_jax import PRESETS, init_crisalad
+        >>> from crisalad_jax import PRESETS, Model, init_crisalad
         >>> config = PRESETS["tiny"]
-        >>> params = init_crisalad(jax.random.key(0), config)
-        >>> extract(params, config, pictures, quiet=True).descriptors.shape
+        >>> model = Model(init_crisalad(jax.random.key(0), config), config)
+        >>> extract(model, pictures, reading=Reading(quiet=True)).descriptors.shape
         (4, 576)
     """
-    check_params(params, config)
-    check_groupings(params, config, [grouping])
+    describer = describer_of(model, [grouping])
     check_extraction(
         out,
         grouping=grouping,
-        batch_size=batch_size,
         seed=seed,
         pairs=pairs,
         database=database,
         k=k,
         share=share,
     )
-    components = _components(pca, config, weights, unit=pairs is not None, verify=verify)
-    paths, names = _listed(images, root, fps, on_bad_image)
+    components = _components(pca, describer, weights, unit=pairs is not None, verify=verify)
+    paths, names = _listed(images, root, fps, reading)
     check_rate_used(fps, paths)
-    length = config.descriptor_dim if components is None else len(components.components)
+    length = describer.config.descriptor_dim if components is None else len(components.components)
     others = None if pairs is None else _others(pairs, names, database, length, verify=verify)
-    batch_size = useful_batch_size(batch_size, len(paths))
+    reading = reading.fitted(len(paths))
+    source = str(images) if isinstance(images, str | os.PathLike) else "images"
     record = {
         "weights": None if weights is None else starter.named(weights),
-        "images": _source(images),
+        "images": source,
         "grouping": grouping,
-        "batch_size": batch_size,
+        "batch_size": reading.batch_size,
         "seed": seed,
         "pca": _words(pca),
-        "model": to_plain(config),
+        "model": to_plain(describer.config),
     }
     if any(frame_time(path) is not None for path in paths):
         record["fps"] = 1.0 if fps is None else fps
+    work = _Work(describer, components, grouping, seed, reading, source)
 
-    def describe(paths: Sequence[pathlib.Path], names: Sequence[str], work: Work) -> DescribedSet:
-        return describe_set(
-            params,
-            config,
-            paths,
-            names,
-            work,
-            source=_source(images),
-            components=components,
-            grouping=grouping,
-            batch_size=batch_size,
-            seed=seed,
-            on_bad_image=on_bad_image,
-            quiet=quiet,
-        )
-
-    def finish(found: DescribedSet, work: Work, more: Mapping[str, Any]) -> Extracted:
-        nearest = None
-        with contextlib.ExitStack() as staged:  # so that pairs and descriptors appear, or none
-            if pairs is not None:
+    def finish(parts: Sequence[Segments], folder: pathlib.Path, **more: Any) -> Extracted:
+        with work.written(parts, names, folder) as (found, file), contextlib.ExitStack() as staged:
+            nearest = None
+            if pairs is not None:  # staged, so that pairs and descriptors appear, or none
                 between = others or (found.names, found.descriptors)
                 nearest = nearest_pairs(found.names, found.descriptors, *between, k=k)
                 write_pairs(staged.enter_context(atomic_path(pairs)), nearest)
-            if out is not None:
-                whole = record | {"skipped": found.skipped, **more}
-                write_descriptors(
-                    out,
-                    found.descriptors,
-                    found.names,
-                    whole,
-                    within=work.folder,
-                    written=found.written,
-                )
-        return Extracted(found.names, found.descriptors, found.skipped, nearest)
+            if out is None:
+                return found._replace(descriptors=np.array(found.descriptors), pairs=nearest)
+            whole = record | {"skipped": found.skipped, **more}
+            write_descriptors(
+                out, found.descriptors, found.names, whole, within=folder, written=file
+            )
+            return found._replace(pairs=nearest)
 
     if share is None or out is None:
-        with open_work(out) as work:
-            return finish(describe(paths, names, work), work, {})
-    settings = record | {"pca": None if components is None else pca_hash(components)}
-    del settings["weights"], settings["images"]  # hosts may call them by other names
-    shared = SharedSet(
-        pathlib.Path(out), Share.parse(share), digest_of(params, config, names, settings)
-    )
-    return extract_share(
-        shared, paths, names, batch_size=batch_size, record=record, describe=describe, finish=finish
-    )
+        with _work_folder(out) as folder:
+            # A single batch is nothing to resume: it needs no digest of the model.
+            resumes = out is not None and len(paths) > reading.batch_size
+            return finish([work.resume(folder, paths, names, resumes=resumes)], folder)
+    out = pathlib.Path(out)
+    common = {name: value for name, value in record.items() if name not in ("weights", "images")}
+    common |= {"pca": components and pca_hash(components), "digest": describer.digest}
+    folder = out.with_name(f"{out.name}.shares")
+    shares = Shares(folder, Share.parse(share), digest_of(names, common))
+    if _is_joined(out, shares.digest):
+        listed, descriptors = read_descriptors(out)
+        skipped = read_json(record_of(out), "a record of descriptors")["skipped"]
+        return Extracted(listed, descriptors, skipped)
+    mine = shares.share.of(len(paths), reading.batch_size)
+    with lock(shares.own):
+        own = work.resume(shares.own, paths[mine], names[mine])
+        listed, skipped = _names_of([own], names[mine])
+        found = Extracted(listed, np.empty((0, length), np.float32), skipped)
+        shares.finish({})
+    if left := shares.left():
+        return found._replace(shares_left=left)
+    with shares.joining() as results:
+        if results is None:
+            return found._replace(joined_elsewhere=True)
+        parts = [work.opened(shares.path(index)) for index in range(shares.share.count)]
+        return finish(parts, folder, **{_SHARES: shares.digest})
 
 
 def check_extraction(
     out: StrPath | None,
     *,
     grouping: str = "single",
-    batch_size: int = 16,
     seed: int = 0,
     pairs: StrPath | None = None,
     database: StrPath | None = None,
@@ -202,8 +230,7 @@ def check_extraction(
 
     Args:
         out: as `extract` takes it, and so are the others.
-        grouping: which images look at each other.
-        batch_size: number of images described together.
+        grouping: which images attend to each other.
         seed: draws the order of the grouping "shuffled".
         pairs: a file for hloc's pairs.
         database: descriptors of the images to pair these with.
@@ -224,27 +251,290 @@ def check_extraction(
         files = targets(pathlib.Path(out))
     for target in (*files, *([] if pairs is None else [pairs])):
         check_target(target)
-    if pairs is not None and pathlib.Path(pairs) in files:
-        raise InputError(f"--pairs: found {pairs}, which --out writes, expected another")
+    choose("grouping", grouping, GROUPINGS)
+    check_seed("seed", seed)
     if pairs is not None:
+        if pathlib.Path(pairs) in files:
+            raise InputError(f"--pairs: found {pairs}, which --out writes, expected another")
         check_format("--pairs", pairs, ".txt")
-    if database is not None and pairs is None:
-        raise InputError("--database: found without --pairs, expected both")
-    check_grouping([grouping], batch_size, seed)
-    if pairs is not None:
         check_count("k", k)
+    elif database is not None:
+        raise InputError("--database: found without --pairs, expected both")
     if share is not None:
         Share.parse(share)
         if grouping != "single" or out is None:
             found = f"grouping {grouping}" if out is not None else "no file to write"
             raise InputError(
-                f"share: found {found}, expected images that are described alone, into a file"
+                f"share: found {found}, expected images of grouping single, into a file"
             )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Work:
+    """What describes the images of an extraction, and stores their rows as it goes.
+
+    The rows are descriptors where every image is described independently, else tokens.
+    """
+
+    describer: Describer
+    components: Pca | None
+    grouping: str
+    seed: int
+    reading: Reading
+    source: str
+
+    @property
+    def _length(self) -> int:
+        """Number of dimensions of the descriptors that are written."""
+        if self.components is not None:
+            return len(self.components.components)
+        return self.describer.config.descriptor_dim
+
+    def opened(self, folder: pathlib.Path) -> Segments:
+        """Open the rows in a folder."""
+        if self.grouping == "single":
+            length, dtype = self._length, "float32"
+        else:
+            length, dtype = self.describer.row_length, self.describer.row_dtype
+        return Segments(folder, FileStore(folder, length, dtype), dtype)
+
+    def resume(
+        self,
+        folder: pathlib.Path,
+        paths: Sequence[pathlib.Path],
+        names: Sequence[str],
+        *,
+        resumes: bool = True,
+    ) -> Segments:
+        """Describe the images whose rows are not in the folder yet, and store them there."""
+        plan = {} if not resumes else self._plan()
+        done = _reusable(folder, plan, paths, complete=self.reading.on_bad_image == "stop")
+        try:
+            segments = self.opened(folder)
+            segments.verify()
+        except InputError as error:
+            warn(f"{error}; the work in this folder starts again")
+            _remove_work(folder)
+            done, segments = 0, self.opened(folder)
+        write_json(folder / _PLAN, plan)
+        if self.grouping == "single":
+            stream = described(
+                self.describer, paths[done:], self.reading, components=self.components
+            )
+        else:
+            stream = token_rows(self.describer, paths[done:], self.reading)
+        waiting: list[Described] = []
+        count, first = 0, done
+
+        def append() -> None:
+            rows = np.concatenate([part.descriptors for part in waiting])
+            numbers = np.concatenate([part.indices for part in waiting])
+            if self.grouping == "single":
+                self._check(rows, numbers)
+            record = {
+                "names": [names[done + int(number)] for number in numbers],
+                "count": count - first,
+                "images": _digest(paths[first:count]),
+            }
+            segments.append(record, rows)
+            waiting.clear()
+
+        count = done
+        with progress_bar(
+            "images", len(paths), "images", quiet=self.reading.quiet, done=done
+        ) as bar:
+            for part in stream:
+                waiting.append(part)
+                tried = len(part.indices) + len(part.unreadable)
+                count += tried
+                bar.advance(tried)
+                if sum(len(each.indices) for each in waiting) >= SEGMENT:
+                    append()
+                    first = count
+            if any(len(each.indices) for each in waiting):
+                append()
+        return segments
+
+    def _plan(self) -> dict[str, Any]:
+        """Return what all rows depend on."""
+        plan = {
+            "model": self.describer.digest,
+            "config": to_plain(self.describer.config),
+            "batch_size": self.reading.batch_size,
+            "rows": "descriptors" if self.grouping == "single" else "tokens",
+            "pca": self.components and pca_hash(self.components),
+        }
+        return json.loads(json.dumps(plan))
+
+    def _check(self, rows: np.ndarray, numbers: np.ndarray) -> None:
+        unit = (
+            self.describer.config.unit_length
+            if self.components is None
+            else self.components.config.renormalise
+        )
+        check_rows(rows, f"{self.source}: descriptors", numbers, unit=unit)
+
+    @contextlib.contextmanager
+    def written(
+        self, parts: Sequence[Segments], names: Sequence[str], folder: pathlib.Path
+    ) -> Iterator[tuple[Extracted, pathlib.Path]]:
+        """Write the descriptors of stored rows to a temporary .npy file, and yield both.
+
+        Raises:
+            InputError: there are no rows, or the disk is full.
+        """
+        stored, skipped = _names_of(parts, names)
+        if not stored:
+            raise InputError(f"{self.source}: found {len(names)} images, none of them readable")
+        file = temporary_beside(folder / "rows.npy")
+        with in_use(file):
+            with wrap_os_errors(folder), RowFile(file, len(stored), self._length) as target:
+                for numbers, rows in self._descriptors(parts, len(stored)):
+                    target.write(numbers, rows)
+            yield Extracted(stored, open_npy(file, verify=False), skipped), file
+
+    def _descriptors(
+        self, parts: Sequence[Segments], count: int
+    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield descriptors, some at a time, with their numbers."""
+        if self.grouping == "single":
+            start = 0
+            for part in parts:
+                for block in part.blocks():
+                    yield np.arange(start, start + len(block)), block
+                    start += len(block)
+            return
+        (tokens,) = parts
+        for numbers, rows in grouped(
+            self.describer,
+            tokens,
+            count,
+            self.grouping,
+            batch_size=self.reading.batch_size,
+            seed=self.seed,
+            quiet=self.reading.quiet,
+        ):
+            short = rows if self.components is None else self.components.apply(rows)
+            self._check(short, numbers)
+            yield numbers, short
+
+
+def _names_of(parts: Sequence[Segments], names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the names whose rows are stored, and the others, which could not be read."""
+    stored = [name for part in parts for record in part.records for name in record["names"]]
+    skipped, waiting = [], iter([*stored, None])
+    expected = next(waiting)
+    for name in names:
+        if name == expected:
+            expected = next(waiting)
+        else:
+            skipped.append(name)
+    return stored, skipped
+
+
+@contextlib.contextmanager
+def _work_folder(out: StrPath | None) -> Iterator[pathlib.Path]:
+    """Hold the folder of what is done of the descriptors in `out`; remove it after success.
+
+    An error leaves it only if it holds work: the message then says so. Without `out` the folder is
+    a temporary one.
+
+    Raises:
+        InputError: another process writes these descriptors, or the folder cannot be made.
+    """
+    if out is None:
+        with tempfile.TemporaryDirectory(prefix="crisalad-") as temporary:
+            yield pathlib.Path(temporary)
+        return
+    folder = pathlib.Path(out).with_name(f"{pathlib.Path(out).name}.partial")
+    with lock(folder):
+        remove_temporaries(folder)
+        try:
+            yield folder
+        except BaseException as error:
+            if not any(folder.glob("[0-9]*.json")):
+                _remove_work(folder)
+            elif isinstance(error, InputError):
+                raise InputError(
+                    f"{error} (what is done is stored in {folder}: the same command resumes)"
+                ) from error
+            raise
+        _remove_work(folder)
+    with contextlib.suppress(OSError):  # another process has begun here, or a user's file is there
+        folder.rmdir()
+
+
+def _remove_work(folder: pathlib.Path) -> None:
+    """Remove the rows in a folder, their records first."""
+    for path in (*sorted(folder.glob("[0-9]*.json")), *folder.glob("[0-9]*.npy"), folder / _PLAN):
+        path.unlink(missing_ok=True)
+
+
+def _reusable(
+    folder: pathlib.Path, plan: dict[str, Any], paths: Sequence[pathlib.Path], *, complete: bool
+) -> int:
+    """Count the images whose stored rows can be used again; remove the rows of all others.
+
+    Args:
+        folder: the folder of work.
+        plan: what all rows depend on; empty where no work is resumed.
+        paths: the images.
+        complete: whether an image that was skipped is an error now.
+
+    Raises:
+        InputError: an image was skipped and is an error now.
+    """
+    try:
+        if not plan or read_json(folder / _PLAN, "the plan of an extraction") != plan:
+            raise InputError("another plan")
+    except InputError:
+        if any(folder.glob("[0-9]*.json")):
+            warn(f"{folder}: found work of another model or batch size; it starts again")
+        _remove_work(folder)
+    done, broken = 0, False
+    for record in sorted(folder.glob("[0-9]*.json")):
+        try:
+            value = read_json(record, "a record of images")
+            images = paths[done : done + value["count"]]
+            unusable = value["images"] != _digest(images)
+            skipped = value["count"] > len(value["names"])
+        except (InputError, LookupError, TypeError):
+            unusable, skipped = True, False
+        if unusable and not broken:
+            warn(f"{record}: found work on other images, or damaged; from there on it starts again")
+        broken = broken or unusable
+        if broken:
+            record.unlink()
+            record.with_suffix(".npy").unlink(missing_ok=True)
+            continue
+        if skipped and complete:
+            for path in images:
+                read_pixels(path)  # raises for the image that was skipped
+        done += len(images)
+    return done
+
+
+def _digest(paths: Sequence[pathlib.Path]) -> str:
+    """Compute a digest of the names, sizes and times of image files."""
+    files = hashlib.sha256()
+    for path in paths:
+        with contextlib.suppress(OSError):  # reported when it is read
+            there = file_of(path).stat()
+            line = f"{os.fspath(path)} {there.st_size} {there.st_mtime_ns}\n"
+            files.update(line.encode(errors="surrogateescape"))
+    return files.hexdigest()
+
+
+def _is_joined(out: pathlib.Path, digest: str) -> bool:
+    """Return whether the set is there, joined from shares of these images and settings."""
+    if not all(file.exists() for file in targets(out)):
+        return False
+    return read_json(record_of(out), "a record of descriptors").get(_SHARES) == digest
 
 
 def _components(
     pca: StrPath | Pca | None,
-    config: ModelConfig,
+    describer: Describer,
     weights: StrPath | None,
     *,
     unit: bool,
@@ -253,10 +543,12 @@ def _components(
     """Load components, and check that they fit the model and, for pairs, give unit vectors."""
     if pca is None:
         if unit:
-            check_unit_length(config, "--pairs")
+            from crisalad_jax.nn.config import check_unit_length
+
+            check_unit_length(describer.config, "--pairs")
         return None
     components = pca if isinstance(pca, Pca) else load_pca(pca, verify=verify)
-    components.check(config.descriptor_dim, "model" if weights is None else str(weights))
+    components.check(describer.config.descriptor_dim, "model" if weights is None else str(weights))
     if unit and not components.config.renormalise:
         raise InputError(
             f"--pairs: found {'components' if isinstance(pca, Pca) else pca}, which leaves lengths "
@@ -271,19 +563,15 @@ def _words(pca: StrPath | Pca | None) -> str | None:
     return f"{len(pca.components)} components" if isinstance(pca, Pca) else str(pca)
 
 
-def _source(images: StrPath | Sequence[StrPath]) -> str:
-    return str(images) if isinstance(images, str | os.PathLike) else "images"
-
-
 def _listed(
     images: StrPath | Sequence[StrPath],
     root: StrPath | None,
     fps: float | None,
-    on_bad_image: OnBadImage,
+    reading: Reading,
 ) -> tuple[list[pathlib.Path], list[str]]:
     """List the images, and their names relative to the root."""
     if isinstance(images, str | os.PathLike):
-        source = open_source(images, fps=fps, on_bad_image=on_bad_image)
+        source = open_source(images, fps=fps, on_bad_image=reading.on_bad_image)
         inside = _inside(source.root, root) if root is not None else pathlib.PurePath()
         return source.paths, [(inside / name).as_posix() for name in source.names]
     paths = [name_frame(pathlib.Path(path)) for path in images]

@@ -6,24 +6,23 @@ part of them. What either misses is measured against the exact search: `recall_a
 Descriptors of thousands of numbers are reduced first (`pca`).
 """
 
-import itertools
 import math
 import os
 import pathlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any, Literal, NamedTuple
 
 import faiss as _faiss
 import numpy as np
 
 from crisalad_jax.config.checks import choose
-from crisalad_jax.retrieval.chunks import WIDE, as_rows, blocks, check_rows, pieces, sample
+from crisalad_jax.retrieval.chunks import WIDE, as_rows, check_rows, sample
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.checksums import append_checksum, check_appended
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source
 from crisalad_jax.utils.progress import progress_bar
-from crisalad_jax.utils.shapes import Float, Float32, Int
+from crisalad_jax.utils.shapes import Float, Int
 
 faiss: Any = _faiss  # its classes are made when it is loaded
 Kind = Literal["hnsw", "ivf-pq"]
@@ -90,20 +89,24 @@ class Index(NamedTuple):
                 f"queries: found descriptors of length {queries.shape[1]}, expected "
                 f"{self.faiss_index.d} as in the index"
             )
+        check_rows(queries, "queries", range(len(queries)), unit=True)
+        queries = np.ascontiguousarray(queries, WIDE)
         k = min(k, self.size)
         if self.kind == "hnsw":
             chosen = faiss.SearchParametersHNSW(efSearch=effort or max(_LEAST_EFFORT, 2 * k))
         else:
             lists = self.faiss_index.nlist
             chosen = faiss.SearchParametersIVF(nprobe=min(effort or -(-lists // 16), lists))
-        whole = iter([np.empty(queries.shape, WIDE)])
-        (block,) = blocks(queries, "queries", whole)
-        similarities, indices = self.faiss_index.search(block.rows, k, params=chosen)
+        similarities, indices = self.faiss_index.search(queries, k, params=chosen)
         return Neighbours(indices, np.where(indices < 0, -np.inf, similarities).astype(np.float32))
 
 
+Parts = Callable[[], Iterable[Float[np.ndarray, "rows d"]]]
+"""Yields descriptors some rows at a time, each time that it is called."""
+
+
 def build(
-    kind: Kind, database: Float[np.ndarray, "n d"], *, seed: int = 0, quiet: bool = True
+    kind: Kind, database: Float[np.ndarray, "n d"] | Parts, *, seed: int = 0, quiet: bool = True
 ) -> Index:
     """Build an index of unit descriptors, which may be a memory map, reading some at a time.
 
@@ -117,91 +120,35 @@ def build(
 
     Args:
         kind: of `KINDS`.
-        database: unit descriptors, as `retrieval.search` takes them.
+        database: unit descriptors, as `retrieval.search` takes them; or a function that yields them
+            in parts, which is called for each of up to three passes.
         seed: of the clustering and its sample, or of the vectors' layers in the graph.
         quiet: no progress bar.
 
     Raises:
-        InputError: an unknown kind; an array that is empty or no matrix; rows that are not finite
-            or not of unit length; too few to train from.
+        InputError: an unknown kind; an array that is empty or not a matrix; rows that are not
+            finite or not of unit length; too few to train from.
     """
-    database = as_rows(database, "database")
-    count, length = database.shape
-    buffer = np.empty((min(_rows_at_once(length), count), length), WIDE)
-
-    def rows() -> Iterator[Float32[np.ndarray, "rows d"]]:
-        for block in blocks(database, "database", itertools.repeat(buffer)):
-            yield block.rows[: block.valid]
-
-    def some(places: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m d"]:
-        return np.concatenate(list(pieces(database, "database", _rows_at_once(length), places)))
-
-    return _built(kind, count, length, rows, some, seed, quiet)
-
-
-def build_from(
-    kind: Kind,
-    count: int,
-    length: int,
-    rows: Callable[[], Iterator[Float[np.ndarray, "rows d"]]],
-    *,
-    seed: int = 0,
-    quiet: bool = True,
-) -> Index:
-    """Build an index as `build` does, of descriptors that come in parts, from the first on.
-
-    Args:
-        kind: of `KINDS`.
-        count: number of descriptors.
-        length: numbers in each.
-        rows: yields unit descriptors; it is called twice where an index is trained.
-        seed: as of `build`.
-        quiet: no progress bar.
-
-    Raises:
-        InputError: what `build` raises.
-    """
-
-    def wide() -> Iterator[Float32[np.ndarray, "rows d"]]:
-        start = 0
-        for part in rows():
-            part = np.ascontiguousarray(part, WIDE)
-            check_rows(part, "database", range(start, start + len(part)), unit=True)
-            yield part
-            start += len(part)
-
-    def some(places: Int[np.ndarray, " m"]) -> Float32[np.ndarray, "m d"]:
-        start, chosen = 0, []
-        for part in rows():
-            first, end = np.searchsorted(places, [start, start + len(part)])
-            chosen.append(np.asarray(part[places[first:end] - start], WIDE))
-            start += len(part)
-        return np.concatenate(chosen)
-
-    return _built(kind, count, length, wide, some, seed, quiet)
-
-
-def _rows_at_once(length: int) -> int:
-    return max(1, _CHUNK_BYTES // (4 * length))
-
-
-def _built(
-    kind: Kind,
-    count: int,
-    length: int,
-    rows: Callable[[], Iterator[Float32[np.ndarray, "rows d"]]],
-    some: Callable[[Int[np.ndarray, " m"]], Float32[np.ndarray, "m d"]],
-    seed: int,
-    quiet: bool,
-) -> Index:
-    """Build an index from its rows, and from those at some places to train it."""
     choose("kind", kind, KINDS)
-    index = _graph(length, seed) if kind == "hnsw" else _trained_lists(count, length, some, seed)
+    parts = database if callable(database) else _parts_of(as_rows(database, "database"))
+    shapes = [part.shape for part in parts()]
+    count, length = sum(rows for rows, _ in shapes), shapes[0][1]
+    index = _graph(length, seed) if kind == "hnsw" else _trained_lists(count, length, parts, seed)
+    start = 0
     with progress_bar(kind, count, "rows", quiet=quiet) as bar:
-        for part in rows():
-            index.add(part)
-            bar.advance(len(part))
+        for part in parts():
+            with np.errstate(over="ignore"):  # what overflows is reported
+                wide = np.ascontiguousarray(part, WIDE)
+            check_rows(wide, "database", range(start, start + len(wide)), unit=True)
+            index.add(wide)
+            start += len(wide)
+            bar.advance(len(wide))
     return Index(kind, index)
+
+
+def _parts_of(database: Float[np.ndarray, "n d"]) -> Parts:
+    size = max(1, _CHUNK_BYTES // (4 * database.shape[1]))
+    return lambda: (database[start : start + size] for start in range(0, len(database), size))
 
 
 def _graph(length: int, seed: int) -> Any:
@@ -211,12 +158,7 @@ def _graph(length: int, seed: int) -> Any:
     return index
 
 
-def _trained_lists(
-    count: int,
-    length: int,
-    some: Callable[[Int[np.ndarray, " m"]], Float32[np.ndarray, "m d"]],
-    seed: int,
-) -> Any:
+def _trained_lists(count: int, length: int, database: Parts, seed: int) -> Any:
     if count < LEAST_ROWS:
         raise InputError(
             f"database: found {count} descriptors, expected at least {LEAST_ROWS} to train an "
@@ -233,7 +175,13 @@ def _trained_lists(
     # The centroids are unit vectors, for they are compared by inner products.
     index.cp.spherical = True
     index.cp.seed = index.pq.cp.seed = seed
-    index.train(some(sample(count, trained_from, seed)))
+    places = sample(count, trained_from, seed)
+    start, chosen = 0, []
+    for part in database():
+        first, end = np.searchsorted(places, [start, start + len(part)])
+        chosen.append(np.asarray(part[places[first:end] - start], WIDE))
+        start += len(part)
+    index.train(np.concatenate(chosen))
     return index
 
 
@@ -254,7 +202,7 @@ def save_index(path: str | os.PathLike[str], index: Index) -> None:
 
 
 def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
-    """Read an index that `save_index` wrote; a note tells of one without a checksum.
+    """Read an index that `save_index` wrote; a note says so of one without a checksum.
 
     Args:
         path: the file.

@@ -1,16 +1,16 @@
-"""Grouping protocols: which images look at each other in the cross-image encoder.
+"""Grouping protocols: which images attend to each other in the cross-image encoder.
 
-A descriptor of such a model depends on the images that its own image looked at. A recall therefore
-means nothing without its protocol, for queries and for the database.
+A descriptor of such a model depends on the images that its own image attended to. A recall
+therefore means nothing without its protocol, for queries and for the database.
 """
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.checks import check_seed, choose
+from crisalad_jax.config.checks import choose
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Bool, Int64
 
@@ -93,20 +93,6 @@ def parse_groupings(texts: Iterable[str]) -> list[Grouping]:
     return list(dict.fromkeys(map(Grouping.parse, texts)))
 
 
-def check_grouping(groupings: Sequence[str], batch_size: int, seed: int, seeds: int = 1) -> None:
-    """Check a side's groupings and the numbers that go with them, before images are described.
-
-    Raises:
-        InputError: one not among `GROUPINGS`, a batch of none, a seed out of range, or none.
-    """
-    for grouping in groupings:
-        choose("grouping", grouping, GROUPINGS)
-    check_seed("seed", seed)
-    for name, value, least in (("batch size", batch_size, 1), ("seeds", seeds, 1)):
-        if value < least:
-            raise InputError(f"{name}: found {value}, expected at least {least}")
-
-
 class Batches(NamedTuple):
     """All images of a side in batches, and whose descriptor each batch gives."""
 
@@ -117,7 +103,7 @@ class Batches(NamedTuple):
     kept: Bool[np.ndarray, "batch place"]
     """Whether a place's descriptor is kept; every image is kept in exactly one batch."""
     mutual: bool
-    """Whether the images of a batch look at each other, or each at itself alone."""
+    """Whether the images of a batch attend to each other, or each at itself alone."""
 
     def part(self, start: int, stop: int) -> "Batches":
         """Return batches `start` to `stop`."""
@@ -125,12 +111,13 @@ class Batches(NamedTuple):
             self.images[start:stop], self.filled[start:stop], self.kept[start:stop], self.mutual
         )
 
-    def looks(self, readable: Bool[np.ndarray, " image"]) -> Bool[np.ndarray, "batch place place"]:
-        """Return whether the image at place i of a batch attends to the one at place j.
+    @property
+    def attention_mask(self) -> Bool[np.ndarray, "batch place place"]:
+        """Whether the image at place i of a batch attends to the one at place j.
 
-        Each attends to itself. None attends to padding, nor to an image that could not be read.
+        Each attends to itself. None attends to padding.
         """
-        seen = self.filled & readable[self.images] & self.mutual
+        seen = self.filled & self.mutual
         return seen[:, :, None] & seen[:, None, :] | np.eye(self.images.shape[1], dtype=bool)
 
 
@@ -144,13 +131,10 @@ def batches_of(count: int, grouping: str, batch_size: int, seed: int = 0) -> Bat
     Args:
         count: images of the side.
         grouping: how they are grouped.
-        batch_size: images that look at each other.
+        batch_size: images that attend to each other.
         seed: draws the order of `shuffled`.
 
-    Raises:
-        InputError: what `check_grouping` raises.
     """
-    check_grouping([grouping], batch_size, seed)
     order = np.arange(count)
     if grouping == "window":
         images = order[:, None] + np.arange(1 - batch_size, 1)
@@ -168,18 +152,3 @@ def batches_of(count: int, grouping: str, batch_size: int, seed: int = 0) -> Bat
         starts[:, None] + np.arange(batch_size) % np.minimum(count - starts, batch_size)[:, None]
     )
     return Batches(order[wrapped], filled, filled, mutual=grouping != "single")
-
-
-_SMALL = 16
-"""Largest batch that is padded to a power of two, so that few sizes are compiled."""
-
-
-def useful_batch_size(batch_size: int, images: int) -> int:
-    """Return the batch size, or less where it would be padding for the most part.
-
-    Example:
-        >>> [useful_batch_size(32, images) for images in (1, 3, 12, 20, 50)]
-        [1, 4, 16, 20, 32]
-    """
-    padded = images if images > _SMALL else 1 << max(0, images - 1).bit_length()
-    return min(batch_size, padded)

@@ -1,16 +1,30 @@
-"""Nearest neighbours, and their similarities: what all searches have in common, without JAX."""
+"""Exact nearest neighbours in any number of descriptors, without JAX."""
 
+import itertools
 import math
+from collections.abc import Callable, Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.retrieval.chunks import UNIT_TOLERANCE
+from crisalad_jax.data.loader import one_ahead, read_ahead
+from crisalad_jax.retrieval.chunks import UNIT_TOLERANCE, Block
+from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.shapes import Float, Float32, Int, Int64
 
+QUERY_CHUNK = 1024
+"""Queries compared at a time: with 4,096 database rows their products are 16 MiB."""
+_SPARE = 16
+"""Candidates kept beyond k, for products that float32 cannot tell apart."""
 _PIECE = 2**17
 """Size of a piece that is multiplied in float64, in numbers: 1 MiB, which fits a core's cache."""
+_READ = 2**22
+"""Size of the candidates that are read from a database at a time, in numbers: 16 MiB."""
+_PARTITIONED = 1024
+"""Number of rows whose products set the first limit to candidates."""
+_LEAST = -2.0
+"""Less than any product of unit vectors."""
 
 
 @brief
@@ -19,6 +33,30 @@ class Neighbours(NamedTuple):
 
     indices: Int64[np.ndarray, "q k"]
     similarities: Float32[np.ndarray, "q k"]
+
+
+class Products(NamedTuple):
+    """Products in float32 of database rows and some queries."""
+
+    first: int
+    """Number of the first query."""
+    values: Float32[np.ndarray, "row q"]
+    indices: Int64[np.ndarray, "row _"]
+    """Database index of each row: (row, 1), or (row, q) where it differs from query to query."""
+
+
+class _Pairs(NamedTuple):
+    """Pairs of a query and a database row, with their products or exact similarities."""
+
+    query: Int64[np.ndarray, " pair"]
+    index: Int64[np.ndarray, " pair"]
+    value: Float32[np.ndarray, " pair"]
+
+
+Stream = Callable[[], Generator[Block, None, None]]
+"""Yields all blocks of a database, each time that it is called."""
+ReadRows = Callable[[Int64[np.ndarray, " m"]], Float[np.ndarray, "m d"]]
+"""Reads the rows of a database at some indices, in ascending order."""
 
 
 def rounding(length: int) -> float:
@@ -45,3 +83,155 @@ def exact_similarities(
         products *= queries[query[piece]]
         similarities[piece] = products.sum(axis=1)
     return similarities + np.float32(0)  # turns -0.0 into 0.0, so that both sort alike
+
+
+def similarities_of(
+    queries: Float32[np.ndarray, "q d"],
+    query: Int[np.ndarray, " pair"],
+    index: Int[np.ndarray, " pair"],
+    read_rows: ReadRows,
+) -> Float32[np.ndarray, " pair"]:
+    """Compute `exact_similarities` of rows anywhere in a database, read in its order."""
+    similarities = np.empty(len(query), np.float32)
+    order = np.argsort(index, kind="stable")
+    size = max(1, _READ // queries.shape[1])
+
+    def fill(start: int) -> None:
+        piece = order[start : start + size]
+        numbers = index[piece]
+        # Not `np.unique`, which would import masked arrays into every query.
+        is_new = np.append(True, numbers[1:] != numbers[:-1])
+        rows = read_rows(numbers[is_new])
+        row = np.cumsum(is_new) - 1
+        similarities[piece] = exact_similarities(queries, rows, query[piece], row)
+
+    starts = range(0, len(order), size)
+    cores = usable_cores() if len(starts) > 1 else 0
+    for _ in read_ahead(fill, starts, ahead=2 * cores, threads=cores):
+        pass
+    return similarities
+
+
+def multiply(
+    stream: Generator[Block, None, None], queries: Float32[np.ndarray, "q d"], size: int
+) -> Generator[Products, None, None]:
+    """Multiply all queries and all blocks, of at most `size` rows, by numpy."""
+    # Allocating new memory takes longer than writing the products. Two, for `one_ahead`.
+    shape = size, min(QUERY_CHUNK, len(queries))
+    memory = itertools.cycle([np.empty(shape, np.float32) for _ in range(2)])
+    for block in one_ahead(stream):
+        indices = block.start + np.arange(len(block.rows))[:, None]
+        for first in range(0, len(queries), QUERY_CHUNK):
+            some = queries[first : first + QUERY_CHUNK]
+            # The queries are the right factor: the product then takes a tenth less time.
+            out = next(memory)[: len(block.rows), : len(some)]
+            yield Products(first, np.matmul(block.rows, some.T, out=out), indices)
+
+
+def nearest(
+    stream: Stream,
+    queries: Float32[np.ndarray, "q d"],
+    k: int,
+    read_rows: ReadRows,
+    size: int,
+    products: Callable[[int], Generator[Products, None, None]] | None = None,
+) -> Neighbours:
+    """Find the k most similar rows of each query, exactly; of equal ones the lower indices.
+
+    The largest float32 products of each query are its candidates, some more than k. Those that may
+    be among the k best, whatever the rounding, are compared by `exact_similarities`. Where rows
+    that are not candidates may be, as of many copies of an image, the database is read again. Then
+    all rows are compared exactly whose products come near the k-th similarity.
+
+    Args:
+        stream: of a database of at least k rows.
+        queries: unit descriptors.
+        k: neighbours per query.
+        read_rows: reads rows of the database.
+        size: number of rows in a block, at most.
+        products: yields products of all queries and blocks, at least the given number of largest
+            ones of each block; None multiplies by numpy.
+    """
+    margin = np.float32(2 * rounding(queries.shape[1]))
+    width = k + _SPARE
+    found, left_out = _largest(
+        multiply(stream(), queries, size) if products is None else products(width),
+        np.full(len(queries), _LEAST, np.float32),
+        width,
+    )
+    floor = _first(found, k).value[k - 1 :: k] - margin
+    query, index, value = (column[found.value >= floor[found.query]] for column in found)
+    value = similarities_of(queries, query, index, read_rows)
+    best = _first(_Pairs(query, index, value), k)
+    indices, similarities = best.index.reshape(-1, k), best.value.reshape(-1, k)
+    unsure = np.flatnonzero(similarities[:, -1] <= left_out + margin)
+    if unsure.size:
+        some = queries[unsure]
+        best, _ = _largest(
+            multiply(stream(), some, size),
+            similarities[unsure, -1] - margin,
+            k,
+            lambda query, index: similarities_of(some, query, index, read_rows),
+            float(margin),
+        )
+        indices[unsure], similarities[unsure] = (column.reshape(-1, k) for column in best[1:])
+    return Neighbours(indices, similarities)
+
+
+def _largest(
+    products: Generator[Products, None, None],
+    least: Float32[np.ndarray, " q"],
+    count: int,
+    score: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    margin: float = 0.0,
+) -> tuple[_Pairs, Float32[np.ndarray, " q"]]:
+    """Find the pairs of the `count` largest values of each query; see `_first`.
+
+    Args:
+        products: of all queries and blocks.
+        least: products up to these are left out; they rise to the `count`-th value, less `margin`.
+        count: how many pairs of each query.
+        score: computes the values of pairs; None takes their products.
+        margin: by how much a product may be below its value.
+
+    Returns:
+        The pairs, and the products up to which others were left out.
+    """
+    empty = np.empty(0, np.int64)
+    waiting = [_Pairs(empty, empty, np.empty(0, np.float32))]
+    for first, values, indices in one_ahead(products):
+        part = least[first : first + values.shape[1]]
+        if len(values) >= count and part.min() == _LEAST:
+            # Of some rows, since partitioning takes longer than multiplying.
+            some = np.partition(values[: max(count, _PARTITIONED)], -count, axis=0)[-count]
+            np.maximum(part, np.nextafter(some, np.float32(_LEAST)), out=part)
+        row, query = np.nonzero(values > part)
+        index = np.broadcast_to(indices, values.shape)[row, query]
+        value = values[row, query] if score is None else score(query + first, index)
+        waiting.append(_Pairs(query + first, index, value))
+        if sum(len(pairs.query) for pairs in waiting) > 2 * count * len(least):
+            waiting = [_raised(waiting, least, count, margin)]
+    return _raised(waiting, least, count, margin), least
+
+
+def _raised(
+    waiting: Sequence[_Pairs], least: Float32[np.ndarray, " q"], count: int, margin: float
+) -> _Pairs:
+    """Return the `_first` of some pairs, and raise `least` to the last where there are `count`."""
+    pairs = _first(_Pairs(*map(np.concatenate, zip(*waiting, strict=True))), count)
+    is_full = np.bincount(pairs.query, minlength=len(least)) == count
+    last = np.flatnonzero(_rank(pairs.query) == count - 1)
+    least[is_full] = np.maximum(least[is_full], pairs.value[last] - np.float32(margin))
+    return pairs
+
+
+def _first(pairs: _Pairs, count: int) -> _Pairs:
+    """Sort pairs by query, then falling value, then index; keep `count` of each query at most."""
+    order = np.lexsort((pairs.index, -pairs.value, pairs.query))
+    order = order[_rank(pairs.query[order]) < count]
+    return _Pairs(*(column[order] for column in pairs))
+
+
+def _rank(query: Int64[np.ndarray, " pair"]) -> Int64[np.ndarray, " pair"]:
+    """Count the pairs of the same query before each; queries are in ascending order."""
+    return np.arange(len(query)) - np.searchsorted(query, query)

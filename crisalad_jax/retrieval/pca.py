@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import itertools
 import json
 import os
 import pathlib
@@ -15,10 +14,10 @@ from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.config.checks import PATH, check_seed, check_types, takes
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.retrieval.chunks import WIDE, as_rows, pieces, sample
+from crisalad_jax.retrieval.chunks import WIDE, as_rows, blocks, sample
 from crisalad_jax.utils.checksums import checked_safetensors
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.progress import Bar, progress_bar
+from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Float, Float32, Float64
 
 if TYPE_CHECKING:
@@ -93,11 +92,9 @@ class Pca(NamedTuple):
         """
         descriptors = as_rows(descriptors, "descriptors")
         self.check(descriptors.shape[1], "descriptors")
-        scale = np.sqrt(self.variances) if self.config.whiten else np.float32(1)
-        start = 0
-        for rows in pieces(descriptors, "descriptors", _rows_at_a_time(len(self.mean))):
-            rows -= self.mean
-            part = rows @ self.components.T / scale
+        size = _rows_at_a_time(len(self.mean))
+        for start, rows in blocks(descriptors, "descriptors", size, unit=False):
+            part = (rows - self.mean) @ self.components.T / self._scale
             if self.config.renormalise:
                 lengths = np.linalg.norm(part, axis=1, keepdims=True)
                 if not lengths.all():
@@ -107,7 +104,11 @@ class Pca(NamedTuple):
                     )
                 part /= lengths
             yield part
-            start += len(rows)
+
+    @property
+    def _scale(self) -> Float32[np.ndarray, "*dim"]:
+        """What components are divided by."""
+        return np.sqrt(self.variances) if self.config.whiten else np.ones((), np.float32)
 
     def projection(self) -> "tuple[Linear, ProjectionConfig]":
         """Return the same components as a model's last layer.
@@ -121,8 +122,7 @@ class Pca(NamedTuple):
         from crisalad_jax.nn.layers import Linear
         from crisalad_jax.nn.projection import ProjectionConfig
 
-        scale = np.sqrt(self.variances) if self.config.whiten else np.float32(1)
-        weight = self.components.astype(np.float64).T / scale
+        weight = self.components.astype(np.float64).T / self._scale
         layer = Linear(jnp.asarray(weight, WIDE), jnp.asarray(-(self.mean @ weight), WIDE))
         return layer, ProjectionConfig(len(self.components), self.config.renormalise)
 
@@ -152,7 +152,8 @@ def fit_pca(
     """Fit `dim` principal components, in memory that depends on d alone.
 
     The d x d covariance is summed in float64 over some rows at a time, and its leading eigenvectors
-    computed. Fewer descriptors than d give the same components from their n x n Gram matrix.
+    computed. Fewer descriptors than d give the same components from their n x n Gram matrix. All
+    are read twice, first for their mean.
 
     Args:
         descriptors: n descriptors, as `retrieval.search` takes them, of any length.
@@ -189,71 +190,37 @@ def fit_pca(
             f"{count} descriptors of length {length} can have about their mean"
         )
     places = None if count == total else sample(total, count, seed)
-    chunks = pieces(descriptors, name, _rows_at_a_time(length), places)
-    with progress_bar("components", count, "rows", quiet=quiet) as bar:
+    with progress_bar("components", 2 * count, "rows", quiet=quiet) as bar:
+
+        def wide() -> Iterator[Float64[np.ndarray, "rows d"]]:
+            size = _rows_at_a_time(length)
+            for _, rows in blocks(descriptors, name, size, unit=False, places=places):
+                yield rows.astype(np.float64)
+                bar.advance(len(rows))
+
+        mean = np.sum([rows.sum(axis=0) for rows in wide()], axis=0) / count
+        centred = (rows - mean for rows in wide())
         if count <= length:
-            fitted = _by_gram(_told(chunks, bar), dim)
+            together = np.concatenate(list(centred))
+            covariance = together @ together.T / (count - 1)  # its Gram matrix: the same variances
         else:
-            fitted = _by_covariance(_told(chunks, bar), dim)
-    components = fitted.components
+            covariance = np.zeros((length, length))
+            for rows in centred:
+                covariance += rows.T @ rows / (count - 1)
+    whole = np.trace(covariance)
+    variances, components = _leading(covariance, dim, count, length)
+    if count <= length:
+        components = components @ together
+        components /= np.linalg.norm(components, axis=1, keepdims=True)
     # Fixes the sign of each component, which otherwise depends on the solver.
     largest = np.take_along_axis(components, np.abs(components).argmax(axis=1)[:, None], axis=1)
-    components *= np.sign(largest)
-    arrays = {name: np.asarray(array, np.float32) for name, array in fitted._asdict().items()}
-    return Pca(**arrays, config=PcaConfig() if config is None else config)
+    found = (mean, components * np.sign(largest), variances, whole)
+    mean, components, variances, whole = (np.asarray(array, np.float32) for array in found)
+    return Pca(mean, components, variances, whole, config or PcaConfig())
 
 
 def _rows_at_a_time(length: int) -> int:
     return max(1, _CHUNK_BYTES // (8 * length))
-
-
-def _told(chunks: Iterator[np.ndarray], bar: Bar) -> Iterator[np.ndarray]:
-    for rows in chunks:
-        yield rows
-        bar.advance(len(rows))
-
-
-class _Found(NamedTuple):
-    """The fields of `Pca`, in float64."""
-
-    mean: Float64[np.ndarray, " d"]
-    components: Float64[np.ndarray, "dim d"]
-    variances: Float64[np.ndarray, " dim"]
-    total: float
-
-
-def _by_gram(chunks: Iterator[Float32[np.ndarray, "rows d"]], dim: int) -> _Found:
-    """Fit descriptors that are fewer than their length, by their Gram matrix."""
-    rows = np.concatenate(list(chunks))
-    count, length = rows.shape
-    mean = rows.mean(axis=0, dtype=np.float64)
-    centred = rows - mean
-    gram = centred @ centred.T / (count - 1)
-    total = np.trace(gram)
-    variances, vectors = _leading(gram, dim, count, length)
-    components = vectors @ centred
-    components /= np.linalg.norm(components, axis=1, keepdims=True)
-    return _Found(mean, components, variances, total)
-
-
-def _by_covariance(chunks: Iterator[Float32[np.ndarray, "rows d"]], dim: int) -> _Found:
-    """Fit any number of descriptors, by their covariance matrix."""
-    first = next(chunks)
-    # Centred at the first rows' mean: with a mean far from zero the sums would lose digits.
-    origin = first.mean(axis=0, dtype=np.float64)
-    length = len(origin)
-    count, total, products = 0, np.zeros(length), np.zeros((length, length))
-    for rows in itertools.chain([first], chunks):
-        centred = rows - origin
-        count += len(rows)
-        total += centred.sum(axis=0)
-        products += centred.T @ centred
-    offset = total / count
-    products -= count * np.outer(offset, offset)
-    products /= count - 1
-    total = np.trace(products)
-    variances, components = _leading(products, dim, count, length)
-    return _Found(origin + offset, components, variances, total)
 
 
 def _leading(
@@ -322,26 +289,26 @@ def load_pca(path: str | os.PathLike[str], *, verify: bool = True) -> Pca:
     path = pathlib.Path(path)
     expected = f"a file of principal components ({FORMAT!r}), as `crisalad pca` writes it"
     with checked_safetensors(path, verify=verify):
-        return _load(path, expected)
-
-
-def _load(path: pathlib.Path, expected: str) -> Pca:
-    value, arrays = read_sealed(path, FORMAT, expected)
-    if arrays.keys() != set(_ARRAYS):
-        raise InputError(f"{path}: found arrays {sorted(arrays)[:3]}, expected {expected}")
-    # In memory of its own: the file may be written anew while a map uses them.
-    arrays = {name: arrays[name].copy() for name in _ARRAYS}
-    plain = value.get("config")
-    shape = arrays["components"].shape
-    dim, length = shape if len(shape) == 2 else (0, 0)
-    shapes = [array.shape for array in arrays.values()]
-    if shapes != [(length,), (dim, length), (dim,), ()] or 0 in (dim, length):
+        value, stored = read_sealed(path, FORMAT, expected)
+        # In memory of its own: the file may be replaced while a map uses them.
+        arrays = {name: array.copy() for name, array in stored.items()}
+    if not _fits(arrays):
+        shapes = {name: array.shape for name, array in arrays.items()}
         raise InputError(
-            f"{path}: found {', '.join(_ARRAYS)} of shapes {shapes}, expected (d,), (dim, d), "
-            "(dim,), ()"
+            f"{path}: found arrays {shapes}, expected mean (d,), components (dim, d), variances "
+            "(dim,) and total () of finite float32, the last two above zero"
         )
-    if not all(array.dtype == np.float32 and np.isfinite(array).all() for array in arrays.values()):
-        raise InputError(f"{path}: found numbers that are not finite, or not of float32")
-    if arrays["variances"].min() <= 0 or arrays["total"] <= 0:
-        raise InputError(f"{path}: found variances of zero or below, expected positive ones")
-    return Pca(**arrays, config=from_plain(PcaConfig, plain, source=str(path)))
+    return Pca(**arrays, config=from_plain(PcaConfig, value.get("config"), source=str(path)))
+
+
+def _fits(arrays: dict[str, np.ndarray]) -> bool:
+    """Return whether arrays are those of principal components."""
+    if arrays.keys() != set(_ARRAYS):
+        return False
+    dim, length = (*arrays["components"].shape, 0, 0)[:2]
+    shapes = {"mean": (length,), "components": (dim, length), "variances": (dim,), "total": ()}
+    return (
+        {name: array.shape for name, array in arrays.items()} == shapes
+        and all(array.dtype == WIDE and np.isfinite(array).all() for array in arrays.values())
+        and min(arrays["variances"].min(initial=1), arrays["total"].min()) > 0
+    )

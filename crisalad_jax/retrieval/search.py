@@ -4,49 +4,31 @@ The protocol is the public one of visual place recognition: exact nearest neighb
 """
 
 import functools
-import itertools
-import math
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Generator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float, Float32, Int, Int32
+from jaxtyping import Array, Float, Float32, Int32
 
 from crisalad_jax.config.checks import check_count
 from crisalad_jax.data.loader import one_ahead
 from crisalad_jax.retrieval.chunks import (
-    KEPT,
     WIDE,
     Block,
-    aligned,
     as_sides,
     blocks,
+    check_all_rows,
+    check_rows,
     gathered,
-    is_mapped,
-    views,
 )
-from crisalad_jax.retrieval.neighbours import Neighbours, exact_similarities, rounding
+from crisalad_jax.retrieval.neighbours import QUERY_CHUNK, Neighbours, Products, multiply, nearest
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
-from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.target import target
-
-# Queries compared at a time: with 4,096 database rows their similarities are 16 MiB.
-_QUERY_CHUNK = 1024
-_GROUP = 16
-"""Number of rows in a group. Groups are ranked by their best rows first, so top_k sees few rows.
-Of 8, 16, 32 and 64 this is the fastest on a CPU: half the time of one large top_k."""
-_SPARE = 16
-"""Candidates kept beyond k, for products that float32 cannot tell apart."""
-_READ = 2**22
-"""Size of the candidates that are read from a database at a time, in numbers: 16 MiB."""
-_Pairs = tuple[Int[np.ndarray, " pair"], Int[np.ndarray, " pair"], Float32[np.ndarray, " pair"]]
-"""Queries in rising order, rows of a block in rising order for each, and their products."""
 
 
 def search(
@@ -63,12 +45,12 @@ def search(
     The database may be a memory map, larger than memory. It is read once, `chunk` rows at a time,
     one chunk ahead; the best rows are read once more. Beyond the inputs, memory holds three chunks
     and their similarities to 1,024 queries, whatever the size of the database. Pages of a memory
-    map are released after use. (Many copies of one image may add the pairs of a whole chunk.)
+    map are released after use. Where some queries have many near copies in the database, it is read
+    a second time.
 
-    Products in float32 select candidates: all rows that may be among the best, whatever the
-    rounding. Numpy multiplies on a CPU, the devices elsewhere. A candidate's final similarity is
-    summed in float64 and rounded to float32: the same bits whatever the chunk and the devices.
-    Equal similarities are ordered by database index, lower first.
+    Products in float32 select candidates. Numpy multiplies on a CPU, the devices elsewhere. A
+    candidate's final similarity is summed in float64 and rounded to float32: the same bits whatever
+    the chunk and the devices. Equal similarities are ordered by database index, lower first.
 
     Args:
         database: unit descriptors of the n database images, in float32, float16 or bfloat16 (which
@@ -76,7 +58,7 @@ def search(
             float32.
         queries: unit descriptors of the q queries, alike.
         k: neighbours per query; a database of fewer images gives all of them, min(k, n).
-        chunk: database rows compared at a time, rounded so that chunks and devices share alike.
+        chunk: database rows compared at a time, rounded up so that devices share alike.
         label: of the progress bar.
         quiet: no progress bar.
 
@@ -95,13 +77,62 @@ def search(
     for name, value in (("k", k), ("chunk", chunk)):
         check_count(name, value)
     database, queries = as_sides(database, queries)
+    with np.errstate(over="ignore"):  # what overflows is reported
+        queries = np.ascontiguousarray(queries, WIDE)
+    check_rows(queries, "queries", range(len(queries)), unit=True)
     on_host = target().platform == "cpu"
     return _search(database, queries, k, chunk, on_host=on_host, label=label, quiet=quiet)
 
 
+def to_unit_vectors(
+    database: Float[np.ndarray, "n d"], queries: Float[np.ndarray, "q d"]
+) -> tuple[Float32[np.ndarray, "n d+3"], Float32[np.ndarray, "q d+3"]]:
+    r"""Embed descriptors so that their cosines rank as the Euclidean distances do.
+
+    With both sides divided by the largest length, x of the database and y of the queries become
+
+    $$\left(\sqrt{\tfrac23}\,x,\ \tfrac{|x|^2}{\sqrt3},\ a,\ 0\right) \quad\text{and}\quad
+    \left(\sqrt{\tfrac23}\,y,\ -\tfrac{1}{\sqrt3},\ 0,\ b\right),$$
+
+    where a and b fill the lengths up to 1. The cosine is then (|y|^2 - |x - y|^2) / 3.
+
+    Args:
+        database: descriptors of the n database images, of any lengths.
+        queries: descriptors of the q queries, of any lengths.
+
+    Returns:
+        Unit vectors of both sides, three numbers longer.
+
+    Raises:
+        InputError: a side is not a matrix, or is empty; the sides' widths differ; a number is not
+            finite.
+
+    Example:
+        >>> import numpy as np
+        >>> database = np.array([[9.0, 9.0], [1.0, 2.0]])
+        >>> search(*to_unit_vectors(database, np.array([[2.0, 2.0]])), 1).indices.tolist()
+        [[1]]
+    """
+    sides = as_sides(database, queries)
+    for name, side in zip(("database", "queries"), sides, strict=True):
+        check_all_rows(side, name, unit=False)
+    lengths = [np.linalg.norm(side.astype(np.float64), axis=1) for side in sides]
+    largest = max(1e-30, *(found.max() for found in lengths))
+    squares = [np.square(found / largest) for found in lengths]
+    last = np.sqrt(1 / 3) * squares[0], np.full_like(squares[1], -np.sqrt(1 / 3))
+    embedded = []
+    for number, (side, square, third) in enumerate(zip(sides, squares, last, strict=True)):
+        unit = np.zeros((len(side), side.shape[1] + 3), np.float32)
+        unit[:, :-3] = np.sqrt(2 / 3) / largest * side
+        unit[:, -3] = third
+        unit[:, -2 + number] = np.sqrt(np.maximum(0, 1 - 2 / 3 * square - third**2))
+        embedded.append(unit)
+    return embedded[0], embedded[1]
+
+
 def _search(
     database: Float[np.ndarray, "n d"],
-    queries: Float[np.ndarray, "q d"],
+    queries: Float32[np.ndarray, "q d"],
     k: int,
     chunk: int,
     *,
@@ -111,224 +142,70 @@ def _search(
 ) -> Neighbours:
     """Search with numpy (`on_host`) or with the devices; see `search`."""
     count, k = len(database), min(k, len(database))
-    chunk = _even(count, chunk, len(jax.local_devices()) * _GROUP)
-    size = min(_QUERY_CHUNK, len(queries))
-    fresh = (aligned((size, queries.shape[1]), WIDE) for _ in itertools.count())
-    parts = [_Part(block, k) for block in blocks(queries, "queries", fresh)]
-    if on_host and database.dtype == WIDE and not is_mapped(database):
-        stream = views(database, "database", chunk)
-    else:
-        # Three buffers: one is being read, one is with the devices, one is being ranked.
-        dtype = database.dtype if database.dtype in KEPT else WIDE
-        buffers = [aligned((chunk, database.shape[1]), dtype) for _ in range(3)]
-        stream = blocks(database, "database", itertools.cycle(buffers))
+    share = len(jax.local_devices())
+    size = -(-min(chunk, count) // share) * share
+    stream = functools.partial(blocks, database, "database", size)
+
     with progress_bar(label, count, "rows", quiet=quiet) as bar:
-        name = _on_host if on_host else _on_devices
-        for block, part, pairs in name(parts, one_ahead(stream), chunk):
-            part.take(block, pairs(), database)
-            if part is parts[-1]:
-                bar.advance(block.valid)
-        neighbours = [part.neighbours(database) for part in parts]
-    return Neighbours(*(np.concatenate(arrays) for arrays in zip(*neighbours, strict=True)))
+
+        def shown() -> Generator[Block, None, None]:
+            for block in blocks(database, "database", size, narrow=not on_host):
+                yield block
+                bar.advance(len(block.rows))
+
+        def products(width: int) -> Generator[Products, None, None]:
+            if on_host:
+                return multiply(shown(), queries, size)
+            return _by_devices(shown(), queries, size, width)
+
+        read_rows = functools.partial(gathered, database)
+        return nearest(stream, queries, k, read_rows, size, products)
 
 
-def _even(count: int, chunk: int, each: int) -> int:
-    """Round a chunk to a multiple of `each` that splits `count` rows evenly."""
-    return -(-count // (each * -(-count // chunk))) * each
+def _by_devices(
+    stream: Generator[Block, None, None], queries: Float32[np.ndarray, "q d"], size: int, width: int
+) -> Generator[Products, None, None]:
+    """Multiply on the devices, over which the rows of a block are sharded.
+
+    Each device names the `width` largest products of its rows with each query.
+    """
+    devices = devices_for(size)
+    program = _program(devices.mesh, min(width, size // devices.mesh.size))
+    together = min(QUERY_CHUNK, len(queries))
+    firsts = range(0, len(queries), together)
+    parts = [
+        devices.replicate(_padded(queries[first : first + together], together)) for first in firsts
+    ]
+
+    def dispatched() -> Generator[tuple[int, int, tuple[Array, Array]], None, None]:
+        for block in one_ahead(stream):
+            rows, valid = devices.shard_batch(_padded(block.rows, size)), np.int32(len(block.rows))
+            for first, part in zip(firsts, parts, strict=True):
+                yield first, block.start, program(rows, valid, part)
+
+    for first, start, arrays in one_ahead(dispatched()):
+        values, places = (np.asarray(array)[:, : len(queries) - first] for array in arrays)
+        yield Products(first, values, start + places.astype(np.int64))
+
+
+def _padded(rows: Float[np.ndarray, "n d"], size: int) -> Float[np.ndarray, "size d"]:
+    """Append rows of zeros."""
+    return np.pad(rows, ((0, size - len(rows)), (0, 0))) if len(rows) < size else rows
 
 
 @functools.cache
-def _program(mesh: Mesh, count: int) -> Any:
-    def best(
+def _program(mesh: Mesh, width: int) -> Any:
+    def largest(
         rows: Float[Array, "rows d"], valid: Int32[Array, ""], queries: Float32[Array, "q d"]
-    ) -> tuple[Float32[Array, "1 q m"], Int32[Array, "1 q m"]]:
-        # The queries are the right factor: on a CPU the product then takes a third less time.
-        products = jnp.matmul(
-            rows.astype(jnp.float32), queries.T, precision=jax.lax.Precision.HIGHEST
-        )
+    ) -> tuple[Float32[Array, "m q"], Int32[Array, "m q"]]:
+        wide = rows.astype(jnp.float32)
+        products = jnp.matmul(queries, wide.T, precision=jax.lax.Precision.HIGHEST)
         start = jax.lax.axis_index("image") * len(rows)
-        padding = start + jnp.arange(len(rows)) >= valid
-        products = jnp.where(padding[:, None], -jnp.inf, products)
-        if len(rows) // _GROUP <= count:  # as few rows as eight devices have of a chunk
-            values, places = jax.lax.top_k(products.T, count)
-            return values[None], start + places[None]
-        # The `count` largest products lie in the `count` groups with the largest maxima.
-        largest = products.reshape(-1, _GROUP, len(queries)).max(axis=1).T
-        _, groups = jax.lax.top_k(largest, min(count, largest.shape[1]))
-        places = (groups[:, :, None] * _GROUP + jnp.arange(_GROUP)).reshape(len(queries), -1)
-        inside = products[places, jnp.arange(len(queries))[:, None]]
-        values, chosen = jax.lax.top_k(inside, count)
-        return values[None], start + jnp.take_along_axis(places, chosen, axis=1)[None]
+        is_valid = start + jnp.arange(len(rows)) < valid
+        values, places = jax.lax.top_k(jnp.where(is_valid, products, -jnp.inf), width)
+        return values.T, start + places.T
 
     image, alike = PartitionSpec("image"), PartitionSpec()
     return compiler.jit(
-        jax.shard_map(best, mesh=mesh, in_specs=(image, alike, alike), out_specs=(image, image))
+        jax.shard_map(largest, mesh=mesh, in_specs=(image, alike, alike), out_specs=(image, image))
     )
-
-
-class _Part:
-    """A block of queries, and the candidates for the best of each."""
-
-    def __init__(self, block: Block, k: int) -> None:
-        """Start without candidates for a block of queries."""
-        self.block, self.k = block, k
-        self.queries = block.rows[: block.valid]
-        self.error = rounding(self.queries.shape[1])
-        shape = block.valid, k + _SPARE
-        self.values, self.indices = np.full(shape, -np.inf, np.float32), np.full(shape, -1)
-
-    def least(self) -> Float32[np.ndarray, " q"]:
-        """Return `least_of` the candidates' products."""
-        return self.least_of(self.values)
-
-    def least_of(self, values: Float32[np.ndarray, "line m"]) -> Float32[np.ndarray, " line"]:
-        """Return the product below which no row is among the k best, whatever the rounding."""
-        return np.partition(values, -self.k, axis=1)[:, -self.k] - np.float32(2 * self.error)
-
-    def take(self, block: Block, pairs: _Pairs, database: Float[np.ndarray, "n d"]) -> None:
-        """Add pairs of queries and a block's rows to the candidates."""
-        query, row, value = pairs
-        if not query.size:
-            return
-        width = self.values.shape[1]
-        touched, line, counts = np.unique(query, return_inverse=True, return_counts=True)
-        column = width + np.arange(len(query)) - np.repeat(np.cumsum(counts) - counts, counts)
-        shape = len(touched), width + counts.max()
-        values, indices = np.full(shape, -np.inf, np.float32), np.full(shape, -1)
-        values[:, :width], indices[:, :width] = self.values[touched], self.indices[touched]
-        values[line, column], indices[line, column] = value, block.start + row
-        least = self.least_of(values)
-        values[values < least[:, None]] = -np.inf
-        crowded = np.flatnonzero(np.isfinite(values).sum(axis=1) > width)
-        if crowded.size:
-            some = values[crowded], indices[crowded], self.queries[touched[crowded]]
-            best = self._ranked(*some, database)
-            values[crowded], indices[crowded] = -np.inf, -1
-            values[crowded, : self.k], indices[crowded, : self.k] = (
-                best.similarities,
-                best.indices,
-            )
-        order = np.argsort(-values, axis=1, kind="stable")[:, :width]
-        self.values[touched] = np.take_along_axis(values, order, axis=1)
-        self.indices[touched] = np.take_along_axis(indices, order, axis=1)
-
-    def neighbours(self, database: Float[np.ndarray, "n d"]) -> Neighbours:
-        """Return the k best of each query, once all blocks are taken."""
-        wanted = np.where(self.values >= self.least()[:, None], self.values, -np.inf)
-        return self._ranked(wanted, self.indices, self.queries, database)
-
-    def _ranked(
-        self,
-        values: Float32[np.ndarray, "line m"],
-        indices: Int[np.ndarray, "line m"],
-        queries: Float32[np.ndarray, "line d"],
-        database: Float[np.ndarray, "n d"],
-    ) -> Neighbours:
-        """Rank the candidates with finite values by their exact similarities; keep the k best."""
-        line, column = np.nonzero(np.isfinite(values))
-        similarities = np.full(values.shape, -np.inf, np.float32)
-        pairs = line, indices[line, column]
-        similarities[line, column] = _similarities_of(queries, database, *pairs)
-        order = np.lexsort((indices, -similarities))[:, : self.k]
-        return Neighbours(
-            np.take_along_axis(indices, order, axis=1),
-            np.take_along_axis(similarities, order, axis=1),
-        )
-
-
-_Named = Iterator[tuple[Block, _Part, Callable[[], _Pairs]]]
-"""Each block with each part of the queries, and a function that returns their pairs."""
-
-
-def _on_host(parts: Sequence[_Part], stream: Iterator[Block], chunk: int) -> _Named:
-    """Multiply by numpy, while the products before are sorted into the candidates."""
-    size = len(parts[0].queries)
-    # The buffers are reused: allocating new memory takes longer than writing the products.
-    memory = itertools.cycle([np.empty(chunk * size, np.float32) for _ in range(2)])
-
-    def multiply() -> Generator[tuple[Block, _Part, Float32[np.ndarray, "rows q"]], None, None]:
-        for block in stream:
-            rows = block.rows[: block.valid].astype(np.float32, copy=False)
-            for part in parts:
-                shape = len(rows), len(part.queries)
-                products = next(memory)[: math.prod(shape)].reshape(shape)
-                # The queries are the right factor: the product then takes a tenth less time.
-                yield block, part, np.matmul(rows, part.queries.T, out=products)
-
-    for block, part, products in one_ahead(multiply()):
-        yield block, part, functools.partial(_of_products, part, products)
-
-
-def _of_products(part: _Part, products: Float32[np.ndarray, "rows q"]) -> _Pairs:
-    least = part.least()
-    fresh = np.isneginf(least)
-    if fresh.any() and len(products) >= part.k:
-        least[fresh] = part.least_of(products.T[fresh])
-    row, query = np.nonzero(products >= least)
-    order = np.argsort(query, kind="stable")
-    row, query = row[order], query[order]
-    return query, row, products[row, query]
-
-
-def _on_devices(parts: Sequence[_Part], stream: Iterator[Block], chunk: int) -> _Named:
-    """Multiply on the devices, over which a block's rows are sharded, one block ahead."""
-    devices = devices_for(chunk)
-    queries = [devices.replicate(part.block.rows) for part in parts]
-    program = _program(devices.mesh, min(parts[0].k + _SPARE, chunk // devices.mesh.size))
-    before: list[tuple[Block, _Part, Callable[[], _Pairs]]] = []
-    for block in stream:
-        rows, valid = devices.shard_batch(block.rows), np.int32(block.valid)
-        candidates = [program(rows, valid, each) for each in queries]
-        yield from before
-        before = [
-            (block, part, functools.partial(_of_candidates, part, block, *arrays))
-            for part, arrays in zip(parts, candidates, strict=True)
-        ]
-    yield from before
-
-
-def _of_candidates(part: _Part, block: Block, *arrays: Array) -> _Pairs:
-    values, places = (np.asarray(array)[:, : len(part.queries)] for array in arrays)
-    least = part.least()
-    all_values = np.concatenate(values, axis=1)
-    if all_values.shape[1] >= part.k:
-        least = np.maximum(least, part.least_of(all_values))
-    wanted = (all_values >= least[:, None]) & np.isfinite(all_values)
-    # A device whose last candidate is still good enough may have left out others: the block's
-    # products with those queries are computed again.
-    last = values[:, :, -1]
-    crowded = ((last >= least) & np.isfinite(last)).any(axis=0)
-    wanted[crowded] = False
-    query, column = np.nonzero(wanted)
-    row, value = np.concatenate(places, axis=1)[query, column], all_values[query, column]
-    if crowded.any():
-        rows = block.rows[: block.valid].astype(np.float32, copy=False)
-        products = part.queries[crowded] @ rows.T
-        also, there = np.nonzero(products >= least[crowded, None])
-        query = np.concatenate([query, np.flatnonzero(crowded)[also]])
-        row = np.concatenate([row, there])
-        value = np.concatenate([value, products[also, there]])
-    order = np.lexsort((row, query))
-    return query[order], row[order], value[order]
-
-
-def _similarities_of(
-    queries: Float32[np.ndarray, "q d"],
-    database: Float[np.ndarray, "n d"],
-    query: Int[np.ndarray, " pair"],
-    index: Int[np.ndarray, " pair"],
-) -> Float32[np.ndarray, " pair"]:
-    """Compute `exact_similarities` of rows anywhere in the database, read in file order."""
-    similarities = np.empty(len(query), np.float32)
-    order = np.argsort(index, kind="stable")
-    size = max(1, _READ // queries.shape[1])
-
-    def fill(start: int) -> None:
-        piece = order[start : start + size]
-        rows, place = np.unique(index[piece], return_inverse=True)
-        read = gathered(database, rows)
-        similarities[piece] = exact_similarities(queries, read, query[piece], place)
-
-    with ThreadPoolExecutor(usable_cores()) as threads:
-        list(threads.map(fill, range(0, len(order), size)))
-    return similarities

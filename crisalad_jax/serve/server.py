@@ -1,26 +1,25 @@
 """The server: opens a map, compiles its model, and answers until a signal ends it."""
 
 import contextlib
+import ipaddress
 import os
 import pathlib
 import socket
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import uvicorn
+from starlette.types import ASGIApp
 
-from crisalad_jax.config.checks import require
-from crisalad_jax.retrieval.grouping import check_grouping
+from crisalad_jax.config.checks import check_count, require
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
-from crisalad_jax.serve.access import Access, check_host, check_token
-from crisalad_jax.serve.app import MOST_ANSWERS, make_app
-from crisalad_jax.serve.service import MapService
+from crisalad_jax.serve.app import HEADERS, MOST_ANSWERS, bracketed, make_app
 from crisalad_jax.serve.worker import MapWorker
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.signals import SignalState, defer_signals
 
 _GRACE = 30
 """Seconds that requests in flight have, after a signal, until they are dropped."""
+_SHORTEST_TOKEN = 16
 
 
 def serve_map(
@@ -61,7 +60,7 @@ def serve_map(
     Raises:
         InputError: a number out of range; an address that is not this machine's or in use; one that
             others can reach without a token; no such folder; or what `Map.open`,
-            `Map.load_params` and `open_for_appending` raise.
+            `Map.load_model` and `open_for_appending` raise.
 
     Example:
         >>> serve_map("city.map", host="0.0.0.0")
@@ -69,30 +68,42 @@ def serve_map(
         ...
         crisalad_jax.utils.errors.InputError: host: found '0.0.0.0', which other machines ...
     """
-    check_grouping((), batch_size, seed=0)
+    check_count("batch size", batch_size)
     require(1 <= k <= MOST_ANSWERS, f"k: found {k}, expected 1 to {MOST_ANSWERS}")
     require(0 <= port < 2**16, f"port: found {port}, expected 0 to 65535")
     require(max_bytes >= 1, f"max_bytes: found {max_bytes}, expected at least 1")
     if map_images is not None and not pathlib.Path(map_images).is_dir():
         raise InputError(f"map_images: found no folder {map_images}, expected one")
-    if token is not None:
-        check_token(token)
-    check_host(host, token)
+    _check_access(host, token)
     with contextlib.ExitStack() as stack:
         # The outermost, so that the map is closed before a signal ends the process.
         stop = stack.enter_context(defer_signals())
         listener = stack.enter_context(contextlib.closing(_bound(host, port)))
         places = stack.enter_context(_opened(folder, append=append, verify=verify))
-        worker = MapWorker(places, places.load_params(weights), batch_size=batch_size)
+        places.load_model(weights)
+        worker = MapWorker(places, places.describer(), batch_size=batch_size)
+        stack.enter_context(contextlib.closing(worker))
         worker.compile(quiet=quiet)
         stop.check()
         stop.has_work = True
-        stack.enter_context(worker)
-        service = MapService(
-            worker, appends=append, images=None if map_images is None else pathlib.Path(map_images)
+        app = make_app(
+            worker,
+            host=host,
+            token=token,
+            appends=append,
+            map_images=map_images,
+            k=k,
+            max_bytes=max_bytes,
         )
-        stack.enter_context(contextlib.closing(service))
-        app = make_app(service, Access(token), k=k, max_bytes=max_bytes)
+        address = f"http://{bracketed(host)}:{listener.getsockname()[1]}"
+        Server(app, stop, lambda: ready(address)).run([listener])
+
+
+class Server(uvicorn.Server):
+    """A server of HTTP that ends at a deferred signal."""
+
+    def __init__(self, app: ASGIApp, stop: SignalState, ready: Callable[[], object]) -> None:
+        """Take the application, the signals, and what to call once it answers."""
         config = uvicorn.Config(
             app,
             loop="asyncio",  # uvloop would take the signals that `defer_signals` handles
@@ -104,17 +115,8 @@ def serve_map(
             server_header=False,
             proxy_headers=False,
             timeout_graceful_shutdown=_GRACE,
+            headers=list(HEADERS.items()),
         )
-        address = _address(host, listener.getsockname()[1])
-        _Server(config, stop, lambda: ready(address)).run([listener])
-
-
-class _Server(uvicorn.Server):
-    """A server that ends at the signals of the house."""
-
-    def __init__(
-        self, config: uvicorn.Config, stop: SignalState, ready: Callable[[], object]
-    ) -> None:
         super().__init__(config)
         self._stop, self._ready = stop, ready
 
@@ -124,15 +126,13 @@ class _Server(uvicorn.Server):
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start, and tell so."""
+        """Start, and call `ready`."""
         await super().startup(sockets)
         self._ready()
 
     async def on_tick(self, counter: int) -> bool:
         """Look for a signal, ten times a second."""
-        if self._stop.number:
-            self.should_exit = True
-        return await super().on_tick(counter)
+        return await super().on_tick(counter) or bool(self._stop.number)
 
 
 @contextlib.contextmanager
@@ -142,10 +142,33 @@ def _opened(folder: str | os.PathLike[str], *, append: bool, verify: bool) -> It
         if not append:
             yield places
             return
-        description, calibration = places.description, places.calibration
-    with open_for_appending(folder, description) as places:
+        metadata, calibration = places.metadata, places.calibration
+    with open_for_appending(folder, metadata) as places:
         places.calibration = calibration
         yield places
+
+
+def _check_access(host: str, token: str | None) -> None:
+    """Check that what other machines can reach has a token, which is hard to guess."""
+    if token is not None:
+        if len(token) < _SHORTEST_TOKEN or not all("!" <= letter <= "~" for letter in token):
+            raise InputError(
+                f"token: found {len(token)} letters, expected at least {_SHORTEST_TOKEN} of ASCII "
+                "without spaces, as of `openssl rand -hex 16`"
+            )
+    elif not is_loopback(host):
+        raise InputError(
+            f"host: found {host!r}, which other machines can reach, and no token, expected "
+            "--token-file or CRISALAD_TOKEN, or --host 127.0.0.1"
+        )
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a name or an address is this machine's own, which no other can reach."""
+    try:
+        return host.lower() == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _bound(host: str, port: int) -> socket.socket:
@@ -158,18 +181,9 @@ def _bound(host: str, port: int) -> socket.socket:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
-    except (OSError, UnicodeError) as error:
-        raise InputError(f"host: found {host!r}, expected a name or address: {error}") from error
-    bound: Any = socket.socket(family, kind, protocol)
-    try:
+        bound = socket.socket(family, kind, protocol)
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         bound.bind(address)
-    except OSError as error:
-        bound.close()
-        reason = error.strerror or error
-        raise InputError(f"host and port: cannot listen at {host}:{port}: {reason}") from error
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"host and port: cannot listen at {host}:{port}: {error}") from error
     return bound
-
-
-def _address(host: str, port: int) -> str:
-    return f"http://{f'[{host}]' if ':' in host else host}:{port}"

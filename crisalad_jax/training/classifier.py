@@ -45,7 +45,7 @@ def init_classifiers(
         )
 
     weights = jax.tree.map(together, *groups)
-    return Classifiers(weights, jax.vmap(adam(loss.learning_rate).init)(weights))
+    return Classifiers(weights, jax.vmap(optax.adam(loss.learning_rate).init)(weights))
 
 
 def _filled(leaf: Array, count: int, largest: int) -> Array:
@@ -54,16 +54,11 @@ def _filled(leaf: Array, count: int, largest: int) -> Array:
     return jnp.pad(leaf, [(0, largest - count), *[(0, 0)] * (leaf.ndim - 1)])
 
 
-def adam(learning_rate: float) -> optax.GradientTransformation:
-    """Make torch's Adam with its defaults (Kingma and Ba 2015)."""
-    return optax.adam(learning_rate)
-
-
 def update_classifiers(
     classifiers: Classifiers, group: Int[Array, ""], gradient: PyTree, learning_rate: float
 ) -> Classifiers:
-    """Take a step of one group's optimiser; the others stay as they are."""
+    """Take a step of one group's Adam (Kingma and Ba 2015); the others stay as they are."""
     mine = jax.tree.map(lambda leaf: leaf[group], classifiers)
-    updates, optimiser = adam(learning_rate).update(gradient, mine.optimiser)
+    updates, optimiser = optax.adam(learning_rate).update(gradient, mine.optimiser)
     stepped = Classifiers(optax.apply_updates(mine.weights, updates), optimiser)
     return jax.tree.map(lambda all_, new: all_.at[group].set(new), classifiers, stepped)

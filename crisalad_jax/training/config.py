@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+import operator
 from typing import Literal
 
 from crisalad_jax.config.checks import (
@@ -19,6 +20,12 @@ from crisalad_jax.data.augmentations import AUGMENTATIONS, Augmentation
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.trainable import EXPECTED, TRAINABLE
+
+
+def _expect(config: object, name: str, fits: bool, expected: str) -> None:
+    """Check a field of a configuration."""
+    found = getattr(config, name)
+    require(fits, f"{type(config).__name__}.{name}: found {found!r}, expected {expected}")
 
 
 @short_repr()
@@ -71,39 +78,19 @@ class OptimiserConfig:
         """Check the ranges of the fields."""
         check_types(self)
         require_positive(self, "learning_rate", "step_epochs", "step_gamma", "accumulate")
-        if self.decay_steps is not None:
-            require(
-                self.decay_steps > 0,
-                f"OptimiserConfig.decay_steps: found {self.decay_steps}, expected more than 0, or "
-                "None",
-            )
-        for name in ("end_lr_fraction", "warmup_steps", "warmup_epochs", "weight_decay"):
-            value = getattr(self, name)
-            require(value >= 0, f"OptimiserConfig.{name}: found {value}, expected at least 0")
-        require(
-            not (self.warmup_steps and self.warmup_epochs),
-            f"OptimiserConfig.warmup_epochs: found {self.warmup_epochs} beside warmup_steps "
-            f"{self.warmup_steps}, expected only one of the two",
-        )
-        require(
-            self.schedule != "milestones"
-            or (bool(self.milestones) and _rises((0, *self.milestones))),
-            f"OptimiserConfig.milestones: found {self.milestones}, expected numbers of epochs that "
-            "rise",
-        )
-        require_fraction(self, "b1", "b2", "momentum")
-        require(
-            self.clip_norm is None or self.clip_value is None,
-            f"OptimiserConfig.clip_value: found {self.clip_value} beside clip_norm "
-            f"{self.clip_norm}, expected only one of the two",
-        )
-        for name in ("clip_norm", "clip_value"):
+        for name in ("decay_steps", "clip_norm", "clip_value"):
             if getattr(self, name) is not None:
                 require_positive(self, name)
-
-
-def _rises(numbers: tuple[int, ...]) -> bool:
-    return all(first < second for first, second in itertools.pairwise(numbers))
+        for name in ("end_lr_fraction", "warmup_steps", "warmup_epochs", "weight_decay"):
+            _expect(self, name, getattr(self, name) >= 0, "at least 0")
+        require_fraction(self, "b1", "b2", "momentum")
+        one = not (self.warmup_steps and self.warmup_epochs)
+        _expect(self, "warmup_epochs", one, f"0 with warmup_steps {self.warmup_steps}")
+        rises = all(itertools.starmap(operator.lt, itertools.pairwise((0, *self.milestones))))
+        fits = self.schedule != "milestones" or (bool(self.milestones) and rises)
+        _expect(self, "milestones", fits, "numbers of epochs that rise")
+        one = self.clip_norm is None or self.clip_value is None
+        _expect(self, "clip_value", one, f"None with clip_norm {self.clip_norm}")
 
 
 @short_repr(switch=("kind", "none"))
@@ -148,16 +135,11 @@ class MiningConfig:
         for name in ("queries_per_epoch", "margin"):
             if getattr(self, name) is not None:
                 require_positive(self, name)
-        require(
-            self.negatives <= self.candidates,
-            f"MiningConfig.candidates: found {self.candidates}, expected at least negatives "
-            f"({self.negatives})",
-        )
-        require(
-            0 < self.positive_radius <= self.negative_radius < math.inf,
-            f"MiningConfig.positive_radius: found {self.positive_radius} beside negative_radius "
-            f"{self.negative_radius}, expected metres above 0, and no more than the latter",
-        )
+        fits = self.negatives <= self.candidates
+        _expect(self, "candidates", fits, f"at least negatives ({self.negatives})")
+        fits = 0 < self.positive_radius <= self.negative_radius < math.inf
+        most = f"negative_radius ({self.negative_radius})"
+        _expect(self, "positive_radius", fits, f"metres above 0, and at most {most}")
 
 
 @short_repr("model", "loss")
@@ -210,11 +192,11 @@ class TrainConfig:
     validation_size: tuple[int, int] | None = None
     """Height and width that validations resize to; None is the model's. The model that is saved has
     its own."""
-    select_by: Literal["R@1", "R@5", "R@1+R@5"] = "R@5"
+    monitor: Literal["R@1", "R@5", "R@1+R@5"] = "R@5"
     """Recall of a validation that tells which weights are the best."""
     patience: int | None = 3
     """Validations without a better recall after which training stops; None never stops early."""
-    keep_best: int = 1
+    save_top_k: int = 1
     """So many validations' weights are kept, those of the best recall."""
     seed: int = 0
     """Draws weights, batches and augmentations."""
@@ -223,58 +205,35 @@ class TrainConfig:
         """Check the ranges of the fields."""
         resolve_names(self)
         require_positive(
-            self, "places_per_batch", "images_per_place", "epochs", "validate_every", "keep_best"
+            self, "places_per_batch", "images_per_place", "epochs", "validate_every", "save_top_k"
         )
-        require(
-            self.images_per_place >= 2 or self.loss.kind.grouping is not None,
-            f"TrainConfig.images_per_place: found {self.images_per_place}, expected at least 2: "
-            "the loss needs pairs of one place",
-        )
-        batch = self.places_per_batch * self.images_per_place
-        require(
-            self.micro_batch is None or (self.micro_batch > 0 and batch % self.micro_batch == 0),
-            f"TrainConfig.micro_batch: found {self.micro_batch}, expected a divisor of the batch's "
-            f"{batch} images, or None",
-        )
-        require(
-            self.optimiser.accumulate == 1 or self.loss.kind.grouping is None,
-            f"TrainConfig.optimiser.accumulate: found {self.optimiser.accumulate}, expected 1 for "
-            f"loss {self.loss.kind.part_name}, whose classifiers step with every batch",
-        )
-        mined = self.mines
-        require(
-            not mined or self.images_per_place == 2 + self.mining.negatives,
-            f"TrainConfig.images_per_place: found {self.images_per_place} with mined tuples, "
-            f"expected {2 + self.mining.negatives}: a query, a positive and mining.negatives",
-        )
-        require(
-            not mined or self.loss.kind.grouping is None,
-            f"TrainConfig.mining: found {self.mining.kind!r} for loss {self.loss.kind.part_name}, "
-            "which classifies, expected a loss of pairs",
-        )
-        require(
-            mined or not self.loss.kind.of_tuples,
-            f"TrainConfig.mining: found 'none' for loss {self.loss.kind.part_name}, expected "
-            "'whole' or 'sample': it takes mined tuples",
-        )
-        require(
-            mined or self.min_images >= self.images_per_place,
-            f"TrainConfig.min_images: found {self.min_images}, expected at least images_per_place "
-            f"({self.images_per_place})",
-        )
-        require(
-            TRAINABLE.fullmatch(self.trainable) is not None,
-            f"TrainConfig.trainable: found {self.trainable!r}, expected {EXPECTED}",
-        )
-        require(
-            self.trainable != "adapters+head" or has_adapters(self.model),
-            "TrainConfig.trainable: found adapters+head for a model without adapters, expected "
-            "head, last-N-blocks+head or all",
-        )
-        require(
-            self.patience is None or self.patience > 0,
-            f"TrainConfig.patience: found {self.patience}, expected more than 0, or None",
-        )
+        loss, images = self.loss.kind, self.images_per_place
+        classifies = loss.grouping is not None
+        pairs = images >= 2 or classifies
+        _expect(self, "images_per_place", pairs, "at least 2: the loss needs pairs of one place")
+        batch = self.places_per_batch * images
+        fits = self.micro_batch is None or (self.micro_batch > 0 and batch % self.micro_batch == 0)
+        _expect(self, "micro_batch", fits, f"a divisor of the batch's {batch} images, or None")
+        if classifies:
+            words = f"for loss {loss.part_name}, which classifies"
+            fits = self.optimiser.accumulate == 1
+            _expect(self.optimiser, "accumulate", fits, f"1 {words}")
+            _expect(self.mining, "kind", not self.mines, f"'none' {words}")
+        if self.mines:
+            expected = 2 + self.mining.negatives
+            words = f"{expected} with mined tuples: a query, a positive and mining.negatives"
+            _expect(self, "images_per_place", images == expected, words)
+        else:
+            words = f"'whole' or 'sample' for loss {loss.part_name}, which takes mined tuples"
+            _expect(self.mining, "kind", not loss.of_tuples, words)
+            fits = self.min_images >= images
+            _expect(self, "min_images", fits, f"at least images_per_place ({images})")
+        known = TRAINABLE.fullmatch(self.trainable) is not None
+        _expect(self, "trainable", known, EXPECTED)
+        fits = self.trainable != "adapters+head" or has_adapters(self.model)
+        _expect(self, "trainable", fits, f"{EXPECTED}: the model has no adapters")
+        if self.patience is not None:
+            require_positive(self, "patience")
         if self.validation_size is not None:
             self.model.check_image_size(self.validation_size)
         check_seed("TrainConfig.seed", self.seed)

@@ -1,25 +1,50 @@
 """The training loop: epochs, validation, early stop, and the files of a run (paper section 4.2)."""
 
 import contextlib
+import dataclasses
+import functools
+import json
 import os
 import pathlib
-from collections.abc import Callable, Generator
-from typing import NamedTuple
+import time
+import zlib
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.plugins import sources_of
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.loader import THREADS, OnBadImage
+from crisalad_jax.data.loader import THREADS, ImageCache, OnBadImage
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
-from crisalad_jax.training.run import Batch, Run, Told
+from crisalad_jax.training.mining import Miner
+from crisalad_jax.training.run_files import (
+    RunFiles,
+    RunRecord,
+    RunState,
+    checksum_of_benchmark,
+    checksum_of_places,
+)
 from crisalad_jax.training.trainable import count_trainable
+from crisalad_jax.training.trainer import LossNotFiniteError, Trainer
+from crisalad_jax.training.validation import Validator
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError, Interrupted
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.signals import SignalState, defer_signals
+
+STATUS_STEPS = 5
+"""Several processes exchange their status before every so many steps of a round."""
+_T = TypeVar("_T")
 
 
 @brief
@@ -30,7 +55,7 @@ class FitResult(NamedTuple):
     """Parameters after the last step."""
     steps: int
     best_recall: float | None
-    """Best recall of a validation, a fraction, by `TrainConfig.select_by`; None without one."""
+    """Best recall of a validation, a fraction, by `TrainConfig.monitor`; None without one."""
     stopped_early: bool
     skipped_images: int
     """Number of unreadable images that were masked out, counted each time they came up."""
@@ -54,7 +79,7 @@ def fit(
     The files are: `config.json`; `metrics.jsonl`, a line for each step and each validation, and the
     same for TensorBoard in `tensorboard/`; `state/`, the checkpoint that a later call resumes from;
     and `last.safetensors`. A validation adds `best.safetensors`, the weights of the best recall by
-    `config.select_by` (grouping `single`), and the best `config.keep_best` weights in `best/`.
+    `config.monitor` (grouping `single`), and the best `config.save_top_k` weights in `best/`.
 
     A run in `out` of fewer epochs is extended: it goes on to those of `config`, which may differ in
     nothing else. If the learning rate depends on the run's length, a note says how it jumps.
@@ -96,16 +121,49 @@ def fit(
     threads = THREADS if num_threads is None else num_threads
     if threads < 0:
         raise InputError(f"num_threads: found {threads}, expected at least 0")
-    if validation is not None:
-        # A missing ground truth raises now, not after the first epoch.
-        validation.ground_truth()
-    run = Run(config, places, pathlib.Path(out), initial, validation, shard_state=shard_state)
-    with contextlib.closing(run):
-        _train(run, lambda: run.rest_of_round(on_bad_image, threads), on_bad_image, quiet)
-        distributed.raise_together(run.save)
-    record = run.record
+    # What does not fit raises in all processes, before the first file is written.
+    checksums = {
+        "places": checksum_of_places(places),
+        "validation": 0 if validation is None else checksum_of_benchmark(validation),
+    }
+    configuration = zlib.crc32(json.dumps(to_plain(config)).encode())
+    arguments = {"configuration": configuration, "--shard-state": int(shard_state)}
+    for what, number in (checksums | arguments).items():
+        distributed.check_same(what, number)
+    cache = ImageCache()
+    validator = Validator(config, validation, on_bad_image=on_bad_image, cache=cache)
+    data = _open_data(
+        *(config, places),
+        part=(jax.process_index(), jax.process_count()),
+        on_bad_image=on_bad_image,
+        threads=threads,
+        cache=cache,
+    )
+    trainer = Trainer(config, data, initial, shard_state=shard_state)
+    checksums["weights"] = trainer.initial_checksum
+    distributed.check_same("weights", checksums["weights"])
+    record = RunRecord(checksums, {name: [*source] for name, source in sources_of(config).items()})
+    files = RunFiles(pathlib.Path(out), config, record)
+    steps = data.steps_per_epoch * config.epochs
+    silent = quiet or not distributed.is_primary()
+    with contextlib.closing(files):
+        state = files.load(RunState(trainer.state, data.mined))
+        trainer.resume(state.training)
+        data.mined = jax.tree.map(np.asarray, state.mined)
+        del state  # whose arrays the trainer has copied
+        record = files.record
+        if files.is_extended and record.step:
+            _warn_of_extension(config, record, files.out)
+        bar = progress_bar("training", steps, "steps", quiet=silent, done=record.step)
+        with defer_signals() as signals, bar as bar:
+            loop = _Loop(config, data, trainer, validator, files, signals, bar)
+            loop.train(steps)
+        loop.save()
+    record = files.record
     best = record.best[0][0] if record.best else None
-    return FitResult(run.params(), run.step, best, record.stopped_early, record.skipped_images)
+    return FitResult(
+        trainer.params(), record.step, best, record.stopped_early, record.skipped_images
+    )
 
 
 def check_learns(config: TrainConfig) -> None:
@@ -127,95 +185,196 @@ def check_learns(config: TrainConfig) -> None:
         )
 
 
-_Round = Callable[[], Generator[Batch, None, None]]
+def _open_data(
+    config: TrainConfig, places: Places | QuerySet, **reading: Any
+) -> PlaceBatches | Miner:
+    """Make the batches of a training set, of places or of mined tuples."""
+    if config.mines != isinstance(places, QuerySet):
+        found, expected = ("places", "a QuerySet") if config.mines else ("a QuerySet", "places")
+        raise InputError(
+            f"places: found {found} with mining {config.mining.kind!r}, expected {expected}"
+        )
+    if isinstance(places, QuerySet):
+        return Miner(config, places, **reading)
+    return PlaceBatches(config, places, **reading)
 
 
-def _train(run: Run, rest_of_round: _Round, on_bad_image: OnBadImage, quiet: bool) -> None:
-    silent = quiet or not distributed.is_primary()
-    bar = progress_bar("training", run.steps, "steps", quiet=silent, done=run.step)
-    with defer_signals() as signals, bar as bar:
-        if run.classes:
-            bar.say(
-                f"classes in {len(run.classes)} groups: {min(run.classes)} to {max(run.classes)}"
-            )
+def _warn_of_extension(config: TrainConfig, record: RunRecord, out: pathlib.Path) -> None:
+    """Warn if a run that is given more epochs differs from one that had them from the start."""
+    optimiser = config.optimiser
+    if record.stopped_early:
+        warn(
+            f"{out}: the run stopped early at step {record.step}, by patience {config.patience}, "
+            "which more epochs do not change"
+        )
+    elif optimiser.schedule == "linear" and optimiser.decay_steps is None:
+        warn(
+            f"{out}: the learning rate falls over the whole run, so that it jumps at step "
+            f"{record.step}: this is not the run of {config.epochs} epochs at once; "
+            "--optimiser.decay-steps keeps a fall's length"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Loop:
+    """The parts of a run, and the order in which they act."""
+
+    config: TrainConfig
+    data: PlaceBatches | Miner
+    trainer: Trainer
+    validator: Validator
+    files: RunFiles
+    signals: SignalState
+    bar: Bar
+
+    def train(self, steps: int) -> None:
+        """Take the steps that are left of so many, and save the state at an interruption."""
+        if self.data.classes:
+            sizes = f"{min(self.data.classes)} to {max(self.data.classes)}"
+            self.bar.say(f"classes in {len(self.data.classes)} groups: {sizes}")
         try:
             try:
-                while not run.is_done():
-                    if run.validation_is_due():
-                        bar.say(run.validate(signals, on_bad_image))
-                        distributed.raise_together(run.save)
-                    if run.mining_is_due():
-                        bar.say(run.mine(on_bad_image, signals))
-                    _train_round(run, rest_of_round, signals, bar)
-                _stop_together(signals)  # one that came while the last validation was saved
+                self._take_rounds(steps)
+                self._stop_together()  # a signal that came while the last validation was saved
+            except LossNotFiniteError:
+                self.save()
+                raise
             except InputError:
                 # A signal to the process group also ends the workers that read images.
-                _stop_together(signals)
+                self._stop_together()
                 raise
         except Interrupted as stopped:
-            run.save()
-            where = f"after step {run.step}; the same command goes on"
+            self.save()
+            where = f"after step {self.files.record.step}; the same command goes on"
             raise Interrupted(stopped.number, where) from None
 
+    def _take_rounds(self, steps: int) -> None:
+        """Take rounds, with a validation or a mining before each that needs it.
 
-def _stop_together(signals: SignalState) -> None:
-    """Raise `Interrupted` in all processes if one of them was signalled."""
-    (number,) = distributed.all_max(signals.number)
-    if number:
-        raise Interrupted(number)
+        A round is an epoch, or the part of one for which tuples are mined together.
+        """
+        while True:
+            record, per_epoch = self.files.record, self.data.steps_per_epoch
+            if self.validator.is_due(record.step, per_epoch, last=record.validated):
+                self._validate()
+                self.save()
+            if self.files.record.step == steps or self.files.record.stopped_early:
+                return
+            if isinstance(self.data, Miner) and self.data.is_due(record.step):
+                self._mine(self.data)
+            self._take_round()
 
+    def _take_round(self) -> None:
+        """Take the steps that are left of a round, each started before the last one is logged.
 
-def _train_round(run: Run, rest_of_round: _Round, signals: SignalState, bar: Bar) -> None:
-    """Take the steps of a round, which is an epoch where nothing is mined.
+        One process looks at its status before each step. Several exchange theirs every few steps,
+        and do not wait for each other in between: one that has failed goes on with batches of no
+        images until all know it.
+        """
+        step, per_round = self.files.record.step, self.data.steps_per_round
+        every = STATUS_STEPS if distributed.are_several() else 1
+        error: Exception | None = None
 
-    One process knows its errors, signals and clock before each step. Several tell them with the
-    step, and learn what was told when its metrics are read, while the next one is computed: no
-    process waits for the others before the end of the round. A process that has failed goes on
-    with steps that none takes, until all have learnt it.
-    """
-    error: Exception | None = None
+        def attempt(work: Callable[[], _T]) -> _T | None:
+            nonlocal error
+            if error is None:
+                try:
+                    return work()
+                except Exception as raised:
+                    error = raised
+            return None
 
-    def finish() -> None:
-        note = distributed.raise_together(run.finish_step)
-        if note is not None:
-            bar.advance(1, note=note)
+        batches = self.trainer.on_devices(self.data.batches(step))
+        with contextlib.closing(batches):
+            for number in range(per_round - step % per_round):
+                began = time.monotonic()
+                batch = attempt(lambda: next(batches))
+                waited = time.monotonic() - began
+                if number % every == 0:
+                    self._exchange_status(error)
+                self.signals.watch()
+                self.trainer.start_step(batch, waited)
+                self.signals.has_work = True  # before it, XLA compiles the step
+                attempt(lambda: self._log_steps(leave=1))
+            attempt(self._log_steps)
+            self._exchange_status(error)
 
-    def heed(told: Told) -> None:
-        if told.failed:
-            raise error or InputError(distributed.ANOTHER_FAILED)
-        if told.signal:
-            finish()
-            raise Interrupted(told.signal)
-        if told.save_is_due:
-            finish()
-            distributed.raise_together(run.save)
+    def _exchange_status(self, error: Exception | None) -> None:
+        """Act on what any process knows: raise an error or a signal, or save."""
+        own = 0 if error is None else 1 if isinstance(error, LossNotFiniteError) else 2
+        failed, number, save_is_due = distributed.all_max(
+            own, self.signals.number, self.files.save_is_due()
+        )
+        if failed:
+            # Where all have found that the loss is not finite, all raise that, and save together.
+            another = InputError(distributed.ANOTHER_FAILED)
+            raise error if error is not None and own == failed else another
+        if number or save_is_due:
+            distributed.raise_together(self._log_steps)
+        if number:
+            raise Interrupted(number)
+        if save_is_due:
+            self.save()
 
-    def own() -> Told:
-        return Told(error is not None, signals.number, run.save_is_due())
+    def _log_steps(self, *, leave: int = 0) -> None:
+        """Log the steps that were started but for the last ones; raises as `finish_steps`."""
+        record = self.files.record
+        for values in self.trainer.finish_steps(leave=leave):
+            epoch = record.step // self.data.steps_per_epoch + 1
+            record.step += 1
+            record.skipped_images += int(values["skipped_images"])
+            self.files.log({"step": record.step, "epoch": epoch, **values})
+            name = "accuracy" if "accuracy" in values else "easy_anchor_fraction"
+            note = f"loss {values['loss']:.3f}  {name.split('_')[0]} {values[name]:.2f}"
+            note += f"  {values['images_per_second']:.0f} images/s"
+            if record.best:
+                note += f"  best {self.config.monitor} {100 * record.best[0][0]:.1f}"
+            self.bar.advance(1, note=note)
 
-    with contextlib.closing(rest_of_round()) as batches:
-        for _ in range(run.steps_left_of_round()):
-            batch = None
-            try:
-                batch = None if error is not None else run.next_batch(batches)
-            except Exception as raised:
-                error = raised
-            told = own()
-            heed(run.told if distributed.are_several() else told)
-            signals.watch()
-            run.start_step(batch, told)
-            signals.has_work = True  # before it, XLA compiles the step
-            try:
-                note = run.finish_step_before()
-            except Exception as raised:  # told to the others with the next step
-                error, note = raised, None
-            if note is not None:
-                bar.advance(1, note=note)
-        note = None
-        try:
-            note = run.finish_step()
-        except Exception as raised:
-            error = raised if error is None else error
-        heed(Told(*distributed.all_max(*own())))
-        if note is not None:
-            bar.advance(1, note=note)
+    def _validate(self) -> None:
+        """Log the recalls, save the best weights, and decide on an early stop."""
+        record = self.files.record
+        epoch = record.step // self.data.steps_per_epoch
+        trainable = self.trainer.gather(self.trainer.state.trainable)
+
+        def validate() -> tuple[str, dict[str, Any]]:
+            params = self.trainer.params(trainable)
+            with self.signals.at_once():
+                found = self.validator.validate(params)
+            line = {"step": record.step, "epoch": epoch, **found.metrics}
+            self.files.log(line, of=self.validator.name)
+            record.add_validation(found.monitored, self.config)
+            self.files.save_if_best(params)
+            return found.words, dataclasses.asdict(record)
+
+        words, values = distributed.run_on_primary(validate)
+        self.files.record = RunRecord(**values)
+        self.bar.say(f"epoch {epoch}, step {record.step}: {words}")
+
+    def _mine(self, miner: Miner) -> None:
+        """Mine the tuples of the round that begins, by the model as it is."""
+        params = self.trainer.params()
+        describe = functools.partial(self.validator.describe, params)
+
+        def mine() -> str:
+            with self.signals.at_once():
+                return miner.mine(self.files.record.step, describe)
+
+        self.bar.say(distributed.run_on_primary(mine))
+        miner.mined = jax.tree.map(np.asarray, distributed.broadcast(miner.mined))
+
+    def save(self) -> None:
+        """Write the weights and the state to resume from."""
+
+        def save() -> None:
+            state = self.trainer.gather(self.trainer.state)
+            params = functools.partial(self.trainer.params, state.trainable)
+            self.files.save(RunState(state, self.data.mined), params)
+
+        distributed.raise_together(save)
+
+    def _stop_together(self) -> None:
+        """Raise `Interrupted` in all processes if one of them was signalled."""
+        (number,) = distributed.all_max(self.signals.number)
+        if number:
+            raise Interrupted(number)

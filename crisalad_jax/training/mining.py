@@ -4,15 +4,19 @@ NetVLAD's cached hard mining (Arandjelovic et al., CVPR 2016), and the partial m
 code and of Berton et al. (CVPR 2022), which Patch-NetVLAD and SelaVPR train with.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+import math
+import pathlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, Int32, Int64
 
+from crisalad_jax.data.loader import ImageBatch, batches_of_groups
 from crisalad_jax.data.query_set import QuerySet
-from crisalad_jax.losses.tuples import Role
-from crisalad_jax.training.config import MiningConfig
+from crisalad_jax.losses.tuples import Role, tuple_labels
+from crisalad_jax.training.config import MiningConfig, TrainConfig
+from crisalad_jax.utils.errors import InputError
 
 Describe = Callable[[Int[np.ndarray, " n"]], Float[np.ndarray, "n descriptor"]]
 """Takes image numbers; returns their descriptors, NaN for images that cannot be read."""
@@ -28,6 +32,111 @@ class Mined(NamedTuple):
     """See `losses.tuples.Role`."""
     hardest: Int32[np.ndarray, "query negative"]
     """Last negatives of each query, which are candidates again; -1 for none."""
+
+
+class Miner:
+    """Mines the tuples of each round of an epoch, and yields their batches."""
+
+    classes: tuple[int, ...] = ()
+
+    def __init__(self, config: TrainConfig, queries: QuerySet, **reading: Any) -> None:
+        """Divide an epoch into rounds; raises as `rounds_of`.
+
+        Args:
+            config: the run's.
+            queries: the training set.
+            **reading: how images are read; see `batches_of_groups`.
+        """
+        self._config, self._queries, self._reading = config, queries, reading
+        rounds, self.steps_per_round = rounds_of(config, queries)
+        self.steps_per_epoch = rounds * self.steps_per_round
+        self.mined = no_tuples(
+            config.mining, queries, self.steps_per_round * config.places_per_batch
+        )
+        """Tuples of the round that trains now, which a run saves with its state."""
+
+    def is_due(self, step: int) -> bool:
+        """Return whether a round begins with this step, whose tuples are not mined yet."""
+        return step % self.steps_per_round == 0 and int(self.mined.step) != step
+
+    def mine(self, step: int, describe: Callable[[Sequence[pathlib.Path]], np.ndarray]) -> str:
+        """Mine the tuples of the round that begins with a step.
+
+        Args:
+            step: the first step of the round.
+            describe: takes image files; returns their descriptors by the model as it is, NaN for
+                those that cannot be read.
+
+        Returns:
+            How hard the tuples are, for the user.
+        """
+        config, unreadable = self._config, 0
+        epoch, first = divmod(step, self.steps_per_epoch)
+        chosen = draw_queries(
+            config.mining,
+            len(self._queries.queries),
+            len(self.mined.images),
+            seed=config.seed,
+            epoch=epoch,
+            number=first // self.steps_per_round,
+        )
+
+        def described(images: np.ndarray) -> np.ndarray:
+            nonlocal unreadable
+            rows = describe([self._queries.path(image) for image in images])
+            unreadable += int(np.isnan(rows).any(axis=1).sum())
+            return rows
+
+        hardest, seed = self.mined.hardest, config.seed
+        self.mined = mine_tuples(
+            config.mining, self._queries, chosen, hardest, described, seed=seed, step=step
+        )
+        negatives = (self.mined.roles == Role.NEGATIVE).sum(axis=1)
+        left_out = f"; {unreadable} unreadable images left out" if unreadable else ""
+        return (
+            f"mined {len(negatives)} tuples: {100 * (negatives > 0).mean():.0f} % have hard "
+            f"negatives, {negatives.mean():.1f} in the mean{left_out}"
+        )
+
+    def batches(self, step: int) -> Iterator[ImageBatch]:
+        """Yield the batches from `step` to the end of its round; see `batches_of_groups`."""
+        config = self._config
+        shape = (-1, config.places_per_batch, config.images_per_place)
+        return batches_of_groups(
+            self._queries,
+            self.mined.images.reshape(shape),
+            tuple_labels(self.mined.roles).reshape(shape),
+            image_size=config.model.input_size,
+            preprocessing=config.model.preprocessing,
+            augmentation=config.augmentation,
+            seed=(config.seed, int(self.mined.step)),
+            start_step=step % self.steps_per_round,
+            **self._reading,
+        )
+
+
+def rounds_of(config: TrainConfig, queries: QuerySet) -> tuple[int, int]:
+    """Divide an epoch into rounds of whole batches.
+
+    Returns:
+        (rounds, steps of each).
+
+    Raises:
+        InputError: the queries make no batch.
+    """
+    mining = config.mining
+    queries_per_epoch = mining.queries_per_epoch or len(queries.queries)
+    rounds = math.ceil(queries_per_epoch / mining.queries_per_round)
+    size = min(queries_per_epoch // rounds, len(queries.queries))
+    steps = size // config.places_per_batch
+    if not steps:
+        raise InputError(
+            f"{queries.root}: found rounds of {size} queries, of {len(queries.queries)} with "
+            f"positives, mining.queries_per_epoch {mining.queries_per_epoch} and queries_per_round "
+            f"{mining.queries_per_round}, expected at least places_per_batch "
+            f"{config.places_per_batch}"
+        )
+    return rounds, steps
 
 
 def no_tuples(config: MiningConfig, queries: QuerySet, size: int) -> Mined:
@@ -138,12 +247,3 @@ def _distances(
 def _generator(*numbers: int, key: int = 2) -> np.random.Generator:
     # The spawn key makes these streams independent of the loader's from the same numbers.
     return np.random.default_rng(np.random.SeedSequence(numbers, spawn_key=(key,)))
-
-
-def describe_mined(mined: Mined) -> str:
-    """Tell in words how hard the tuples are."""
-    negatives = (mined.roles == Role.NEGATIVE).sum(axis=1)
-    return (
-        f"mined {len(negatives)} tuples: {100 * (negatives > 0).mean():.0f} % have hard negatives, "
-        f"{negatives.mean():.1f} in the mean"
-    )

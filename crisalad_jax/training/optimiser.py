@@ -97,14 +97,13 @@ def learning_rate_schedule(
         decay = optax.exponential_decay(
             peak, config.step_epochs * steps_per_epoch, config.step_gamma, staircase=True
         )
-    if not warmup_steps:
-        return _of_real_steps(decay)
-    # A warm-up of n steps starts at 1 / n of the peak: its first step would otherwise be 0.
-    return _of_real_steps(
-        optax.join_schedules(
+    if warmup_steps:
+        # A warm-up of n steps starts at 1 / n of the peak: its first step would otherwise be 0.
+        decay = optax.join_schedules(
             [lambda count: peak * (count + 1) / warmup_steps, decay], [warmup_steps]
         )
-    )
+    # Optax divides its int32 count in float32, also in JAX's 64-bit mode: the count is cast here.
+    return lambda count: decay(jnp.asarray(count, float))
 
 
 def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) -> OptimiserConfig:
@@ -128,26 +127,21 @@ def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int)
     return dataclasses.replace(config, warmup_steps=longest, warmup_epochs=0)
 
 
-def tell_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) -> None:
-    """Tell in a note if a warm-up takes more than its largest share of a run's steps."""
+def warn_of_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) -> None:
+    """Warn if a warm-up takes more than its largest share of a run's steps."""
     warmup = warmup_length(config, steps_per_epoch)
     steps = count_steps(config, steps, steps_per_epoch)
     longest = steps // WARMUP_SHARE
-    if warmup > longest:
-        flag, found = "steps", str(warmup)
-        if config.warmup_epochs:
-            flag, found = "epochs", f"{config.warmup_epochs}, which are {warmup} steps,"
-        left = max(steps - warmup, 0)
-        quarter = f"; at most {longest} steps would be a quarter" if longest else ""
-        warn(
-            f"--optimiser.warmup-{flag}: found {found} for a run of {steps} steps, which leaves "
-            f"{left} at the learning rate and its decay{quarter}"
-        )
-
-
-def _of_real_steps(schedule: optax.Schedule) -> optax.Schedule:
-    # Optax divides its int32 count in float32, also in JAX's 64-bit mode: the count is cast here.
-    return lambda count: schedule(jnp.asarray(count, float))
+    if warmup <= longest:
+        return
+    flag, found = "steps", str(warmup)
+    if config.warmup_epochs:
+        flag, found = "epochs", f"{config.warmup_epochs}, which are {warmup} steps,"
+    quarter = f"; at most {longest} steps would be a quarter" if longest else ""
+    warn(
+        f"--optimiser.warmup-{flag}: found {found} for a run of {steps} steps, which leaves "
+        f"{max(steps - warmup, 0)} at the learning rate and its decay{quarter}"
+    )
 
 
 def make_optimiser(

@@ -1,175 +1,213 @@
-"""The files of a run: what it writes, what it resumes from, and the claim on its folder."""
+"""The files of a run: what it writes, what it resumes from, and the lock on its folder."""
 
 import contextlib
 import copy
 import dataclasses
 import pathlib
+import time
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from crisalad_jax.checkpoints.train_state import SavedState, StateStore
+from crisalad_jax.checkpoints.train_state import StateStore
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config.io import differences, read_config, to_plain
+from crisalad_jax.config.plugins import changed_sources
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Crisalad, Model
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog
 from crisalad_jax.training.mining import Mined
 from crisalad_jax.training.step import TrainState
+from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json, write_json
+from crisalad_jax.utils.files import read_json, wrap_os_errors, write_json
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remove_temporaries
 
+SAVE_SECONDS = 300
+"""Longest time between saved states; validations and the end of a run save too."""
+
 
 class RunState(NamedTuple):
-    """The arrays of a run: those of `TrainState`, and the tuples of the round that it is in."""
+    """The arrays of a run."""
 
-    step: Any
-    trainable: Any
-    optimiser: Any
-    classifiers: Any
+    training: TrainState
     mined: Mined | None
-    """None where nothing is mined."""
-
-    @classmethod
-    def of(cls, state: TrainState, mined: Mined | None) -> "RunState":
-        """Join the two."""
-        return cls(*state, mined)
-
-    @property
-    def of_training(self) -> TrainState:
-        """The training state alone."""
-        return TrainState(*self[:-1])
+    """The tuples of the round that it is in; None where nothing is mined."""
 
 
 @dataclasses.dataclass
 class RunRecord:
     """The state of a run besides its arrays, as plain values saved with every checkpoint."""
 
-    weights_checksum: int
-    """Checksum of all parameters before the first step."""
-    places_checksum: int
-    """Checksum of the names of all training images and of their division into places."""
-    validation_checksum: int
-    """Checksum of the validation benchmark; 0 where there is none."""
+    checksums: dict[str, int]
+    """Checksums of the weights before the first step, of the names of all training images and their
+    division into places, and of the validation benchmark (0 where there is none)."""
+    sources: dict[str, list[Any]]
+    """Name and source's digest of every part of the configuration."""
+    step: int = 0
+    """Number of steps that are taken and logged."""
     validated: int = 0
     """Step of the last validation."""
     best: list[list[Any]] = dataclasses.field(default_factory=list)
-    """Recall, by `TrainConfig.select_by`, and step of the best validations, best first."""
+    """Recall, by `TrainConfig.monitor`, and step of the best validations, best first."""
     without_gain: int = 0
     """Number of validations since the best one."""
-    sources: dict[str, list[Any]] = dataclasses.field(default_factory=dict)
-    """Name and source's digest of every part of the configuration."""
     stopped_early: bool = False
     skipped_images: int = 0
+
+    def add_validation(self, recall: float, config: TrainConfig) -> None:
+        """Record a validation of this step, and decide on an early stop."""
+        newest = [recall, self.step]
+        # Of equal recalls the first counts as the best.
+        best = sorted([*self.best, newest], key=lambda each: (-each[0], each[1]))
+        self.best = best[: config.save_top_k]
+        self.without_gain = 0 if best[0] == newest else self.without_gain + 1
+        self.stopped_early = config.patience is not None and self.without_gain >= config.patience
+        self.validated = self.step
 
 
 class RunFiles:
     """The files in a run's folder; the primary process alone writes them."""
 
-    def __init__(self, out: pathlib.Path, config: TrainConfig) -> None:
-        """Claim the folder `out` for a run with this configuration, until it is closed.
+    def __init__(self, out: pathlib.Path, config: TrainConfig, record: RunRecord) -> None:
+        """Take the folder, which `load` acquires, and the record of a run before its first step."""
+        self.out, self.record, self._config = out, record, config
+        self.is_extended = False
+        """Whether the configuration gives more epochs than the run had before."""
+        self._opened = contextlib.ExitStack()
+        self._saved: RunRecord | None = None
+        self._saved_at = time.monotonic()
+
+    def load(self, state: RunState) -> RunState:
+        """Acquire the folder until `close`, and load the run there, if there is one.
+
+        All processes call it together.
+
+        Args:
+            state: that of a run before its first step.
+
+        Returns:
+            The state to resume from, which `record` is for.
 
         Raises:
-            InputError: what `claim_run` raises; or another process writes there.
+            InputError: what `acquire_run` raises; another process writes there; or the run started
+                from something else.
         """
+
+        def load() -> dict[str, Any]:
+            nonlocal state
+            state = self._load(state)
+            return dataclasses.asdict(self.record)
+
+        self.record = RunRecord(**distributed.run_on_primary(load))
+        return distributed.broadcast(state)
+
+    def _load(self, state: RunState) -> RunState:
+        out, config = self.out, self._config
         check_run(out, config)
         with contextlib.ExitStack() as opened:
             opened.enter_context(lock(out))
-            self.extends = claim_run(out, config)
-            """Epochs of the run before `config` gave it more; None where it gives none."""
+            self.is_extended = acquire_run(out, config)
             for folder in (out, out / "best"):
                 remove_temporaries(folder)
-            self._out, self._config = out, config
             # A signal, or an error, before the first state leaves no empty folder.
             opened.enter_context(made_folder(out / "state"))
             self._states = StateStore(out / "state")
-            self._log: MetricsLog | None = None
-            self._saved: tuple[int, RunRecord] | None = None
-            self._lock = opened.pop_all()
+            opened.callback(self._states.close)
+            saved = self._states.load(state)
+            if saved is not None:
+                _check_start(out, config, self.record, saved.record)
+                self.record, state = RunRecord(**saved.record), saved.state
+                self._saved = copy.deepcopy(self.record)
+            step, validated = self.record.step, self.record.validated
+            with wrap_os_errors(out):
+                if self.is_extended:
+                    extend_run(out, config, step)
+                self._drop_old_best()
+                # A validation after the saved state will be repeated, so its line is dropped.
+                self._log = MetricsLog(out, keep_up_to=step, validated=validated)
+                opened.callback(self._log.close)
+            self._opened = opened.pop_all()
+        return state
 
-    def load(self, like: RunState) -> SavedState | None:
-        """Load the saved state; see `StateStore.load`."""
-        return self._states.load(like)
-
-    def go_on(self, step: int, record: RunRecord, *, is_saved: bool) -> None:
-        """Resume the files at this step; `is_saved` tells whether they hold its state."""
-        self._saved = (step, record) if is_saved else None
-        with self._writing():
-            if self.extends is not None:
-                extend_run(self._out, self._config, step)
-            self._drop_old_best(record)
-            # A validation after the saved state will be repeated, so its line is dropped.
-            self._log = MetricsLog(self._out, keep_up_to=step, validated=record.validated)
-
-    def log_step(self, values: Mapping[str, int | float], *, of: str = "") -> None:
+    def log(self, values: Mapping[str, int | float], *, of: str = "") -> None:
         """Append a line to the log; see `MetricsLog.write`."""
-        assert self._log is not None
-        with self._writing():
-            self._log.write(values, of=of)
+        if distributed.is_primary():
+            with wrap_os_errors(self.out):
+                self._log.write(values, of=of)
 
-    def keep_if_best(self, step: int, record: RunRecord, params: Crisalad) -> None:
+    def save_if_best(self, params: Crisalad) -> None:
         """Write the weights of this step, if the record counts it among the best."""
-        steps = [best_step for _, best_step in record.best]
-        paths = [self._out / "best.safetensors"] if steps[0] == step else []
-        paths += [self._best_path(step)] if self._config.keep_best > 1 and step in steps else []
-        with self._writing():
+        steps = [step for _, step in self.record.best]
+        paths = [self.out / "best.safetensors"] if steps[0] == self.record.step else []
+        if self._config.save_top_k > 1 and self.record.step in steps:
+            paths.append(self._best_path(self.record.step))
+        with wrap_os_errors(self.out):
             for path in paths:
-                save_weights(path, params, self._config.model)
+                save_weights(path, Model(params, self._config.model))
 
-    def save(
-        self, step: int, record: RunRecord, state: RunState, params: Callable[[], Crisalad]
-    ) -> None:
-        """Write the weights and the state, unless they are saved already."""
-        record = copy.deepcopy(record)
-        if self._saved == (step, record):
-            return
-        with self._writing():
-            save_weights(self._out / "last.safetensors", params(), self._config.model)
-            self._states.save(step, state, dataclasses.asdict(record))
-            self._drop_old_best(record)
-        self._saved = step, record
+    def save_is_due(self) -> bool:
+        """Return whether the last saved state is old, by the primary process's clock."""
+        return distributed.is_primary() and time.monotonic() - self._saved_at > SAVE_SECONDS
+
+    def save(self, state: RunState, params: Callable[[], Crisalad]) -> None:
+        """Write the weights and the state, unless they are saved already.
+
+        The state is written while training goes on.
+        """
+        if distributed.is_primary() and self._saved != self.record:
+            with wrap_os_errors(self.out):
+                save_weights(self.out / "last.safetensors", Model(params(), self._config.model))
+                self._states.save(self.record.step, state, dataclasses.asdict(self.record))
+                self._drop_old_best()
+            self._saved = copy.deepcopy(self.record)
+        self._saved_at = time.monotonic()
 
     def close(self) -> None:
         """Wait for files that are being written, and close them."""
-        with self._lock, self._writing(), contextlib.ExitStack() as closed:
-            if self._log is not None:
-                closed.callback(self._log.close)
-            closed.callback(self._states.close)
-
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        """Turn a disk's errors in this block into an error of the run."""
-        try:
-            yield
-        except OSError as error:
-            raise InputError(
-                f"{self._out}: cannot write: {error.strerror or error}; the same command goes on "
-                "from the last state that was saved"
-            ) from error
+        with wrap_os_errors(self.out):
+            self._opened.close()
 
     def _best_path(self, step: int) -> pathlib.Path:
-        return self._out / "best" / f"step-{step:08}.safetensors"
+        return self.out / "best" / f"step-{step:08}.safetensors"
 
-    def _drop_old_best(self, record: RunRecord) -> None:
+    def _drop_old_best(self) -> None:
         """Remove weights that the record does not count among the best, or not yet."""
-        best_paths = {self._best_path(step) for _, step in record.best}
-        for path in set((self._out / "best").glob("step-*.safetensors")) - best_paths:
+        best_paths = {self._best_path(step) for _, step in self.record.best}
+        for path in set((self.out / "best").glob("step-*.safetensors")) - best_paths:
             self._states.wait()  # a kill before would leave a state that still lists them
             path.unlink()
 
 
-def claim_run(out: pathlib.Path, config: TrainConfig) -> int | None:
+def _check_start(
+    out: pathlib.Path, config: TrainConfig, started: RunRecord, saved: Mapping[str, Any]
+) -> None:
+    """Check that a saved run started from the same files and code as this one."""
+    for what, checksum in started.checksums.items():
+        if saved["checksums"][what] != checksum:
+            raise InputError(
+                f"{out}: the run started from other {what} than are given now; expected the same, "
+                "or another folder"
+            )
+    changed = changed_sources(config, saved["sources"])
+    if changed:
+        raise InputError(
+            f"{out}: found another source of {', '.join(changed)} than the run began with; "
+            "expected the same, or another folder"
+        )
+
+
+def acquire_run(out: pathlib.Path, config: TrainConfig) -> bool:
     """Make `out` the folder of a run with this configuration, or check that it is.
 
     Returns:
-        The epochs of the run there where the configuration has more; else None.
+        Whether there is a run of fewer epochs.
 
     Raises:
         InputError: what `check_run` raises.
@@ -178,20 +216,18 @@ def claim_run(out: pathlib.Path, config: TrainConfig) -> int | None:
     path = out / "config.json"
     if not path.exists():
         write_json(path, to_plain(config))
-        return None
-    epochs = read_config(TrainConfig, path).epochs
-    return epochs if epochs < config.epochs else None
+    return read_config(TrainConfig, path).epochs < config.epochs
 
 
 def extend_run(out: pathlib.Path, config: TrainConfig, step: int) -> None:
-    """Write the configuration of a run that goes on for more epochs, and how it came to them.
+    """Write the configuration of a run that resumes for more epochs, and how it came to them.
 
     `epochs.json` lists the epochs that the run had before, each with the step that it had come to.
 
     Args:
         out: the run's folder.
         config: its configuration, with more epochs than the one there.
-        step: the step that it goes on from.
+        step: the step that it resumes from.
     """
     path, history = out / "config.json", out / "epochs.json"
     before = read_config(TrainConfig, path).epochs
@@ -212,22 +248,18 @@ def check_run(out: pathlib.Path, config: TrainConfig) -> None:
     """
     path = out / "config.json"
     if path.exists():
-        there = read_config(TrainConfig, path)
-        epochs = max(there.epochs, config.epochs)
-        wrong = differences(config, dataclasses.replace(there, epochs=epochs))
+        existing = read_config(TrainConfig, path)
+        epochs = max(existing.epochs, config.epochs)
+        wrong = differences(config, dataclasses.replace(existing, epochs=epochs))
         if wrong:
             raise InputError(
                 f"{out}: holds a run of another configuration: {'; '.join(wrong)}; give the same "
-                "to go on with it, or another folder"
+                "to resume it, or another folder"
             )
     elif out.exists() and not out.is_dir():
         raise InputError(f"{out}: found a file, expected the folder of a run, or a new one")
     elif out.exists() and holds_other_files(out):
         raise InputError(f"{out}: found files but no run, expected a run or a new or empty folder")
-
-
-def _text(names: Iterable[Any]) -> np.ndarray:
-    return np.frombuffer("\n".join(map(str, names)).encode(), np.uint8)
 
 
 def checksum_of_places(places: Places | QuerySet) -> int:
@@ -244,9 +276,13 @@ def checksum_of_benchmark(benchmark: Benchmark) -> int:
     return checksum([_text((benchmark.name, *names))])
 
 
-def checksum(arrays: Sequence[Any]) -> int:
+def _text(names: Iterable[Any]) -> np.ndarray:
+    return np.frombuffer("\n".join(map(str, names)).encode(), np.uint8)
+
+
+def checksum(arrays: Iterable[Any]) -> int:
     """Compute the CRC of all arrays, which tells others from the same."""
     value = 0
-    for leaf in arrays:
-        value = zlib.crc32(np.asarray(leaf).tobytes(), value)
+    for each in arrays:
+        value = zlib.crc32(np.asarray(each).tobytes(), value)
     return value

@@ -1,5 +1,6 @@
 """The parameters that a run starts from: a whole model, a backbone, or random numbers."""
 
+import functools
 import os
 
 import jax
@@ -15,7 +16,6 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
 from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_source
 from crisalad_jax.utils.output import warn
 
 
@@ -56,7 +56,6 @@ def read_start(
     if backbone is None:
         return None
     backbone = find_weights(backbone, quiet=quiet)
-    check_source(backbone, "a checkpoint")  # drawing parameters takes seconds
     fresh = init_crisalad(jax.random.key(config.seed), config.model)
     return with_backbone_of(fresh, config.model, backbone)
 
@@ -91,19 +90,13 @@ def with_vocabulary_of(
         return initial
     if initial is None:
         initial = init_crisalad(jax.random.key(config.seed), config.model)
-    start = initial
     count = places.database if isinstance(places, QuerySet) else len(places.files)
-    paths = [places.path(image) for image in range(count)]
-
-    def build() -> Crisalad:
-        return with_vocabulary(
-            start,
-            config.model,
-            paths,
-            images=config.model.aggregator.centroid_images,
-            seed=config.seed,
-            on_bad_image=on_bad_image,
-            quiet=quiet or not distributed.is_primary(),
-        )
-
+    build = functools.partial(
+        with_vocabulary,
+        *(initial, config.model, [places.path(image) for image in range(count)]),
+        images=config.model.aggregator.centroid_images,
+        seed=config.seed,
+        on_bad_image=on_bad_image,
+        quiet=quiet or not distributed.is_primary(),
+    )
     return distributed.broadcast(distributed.raise_together(build))

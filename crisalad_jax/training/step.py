@@ -13,7 +13,7 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
-from crisalad_jax.config.checks import require, takes
+from crisalad_jax.config.checks import takes
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.losses import (
     Loss,
@@ -29,7 +29,6 @@ from crisalad_jax.nn.layers import split_key, split_statistics
 from crisalad_jax.nn.model import (
     Crisalad,
     attend_across_images,
-    check_params,
     extract_tokens,
     train_tokens,
     valid_mask,
@@ -42,7 +41,7 @@ from crisalad_jax.training.optimiser import (
     count_steps,
     learning_rate_schedule,
     make_optimiser,
-    tell_long_warmup,
+    warn_of_long_warmup,
 )
 from crisalad_jax.training.trainable import split_params
 from crisalad_jax.utils import compiler, devices, distributed
@@ -86,8 +85,17 @@ class Metrics(NamedTuple):
     """Means over the valid images, with dropout; None if the aggregator has no transport."""
     updated: Bool[Array, ""]
     """Whether the step was taken, and not skipped."""
-    told: Int[Array, " number"] | None = None
-    """Largest of what the devices' processes told; None where nothing was."""
+
+
+def named_scalars(values: Metrics | TransportStatistics) -> dict[str, float]:
+    """List scalars by name, those of the transport among them; None is left out."""
+    numbers: dict[str, float] = {}
+    for name, value in values._asdict().items():
+        if isinstance(value, TransportStatistics):
+            numbers |= named_scalars(value)
+        elif value is not None:
+            numbers[name] = float(value)
+    return numbers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,6 +148,7 @@ class StepConfig:
         return self.model.precision
 
 
+@takes(config=StepConfig)
 def init_train_state(
     params: Crisalad,
     trainable: str,
@@ -149,20 +158,19 @@ def init_train_state(
 ) -> tuple[TrainState, PyTree]:
     """Make the state before the first step, and the frozen parameters, which no step changes.
 
-    A note tells if the warm-up takes more than a quarter of the run.
+    A warning says if the warm-up takes more than a quarter of the run.
 
     Args:
         params: the model to start from.
         trainable: see `split_params`.
-        config: the step's.
+        config: the step's, of `step_config`.
         key: draws the parameters of a loss that has some.
 
     Returns:
         (state, frozen). The state is a copy, so `params` stay of use.
 
     Raises:
-        InputError: what `check_params` and `split_params` raise; or the loss needs a key, or
-            classes.
+        InputError: what `split_params` raises; or the loss needs a key, or classes.
 
     Example:
         >>> import jax
@@ -174,55 +182,39 @@ def init_train_state(
         >>> int(state.step)
         0
     """
-    require(
-        isinstance(config, StepConfig),
-        f"config: found {type(config).__name__}, expected the StepConfig of `step_config`",
-    )
-    check_params(params, config.model)
     with compiler.number_types([config]):
-        return _init_state(params, trainable, config, key)
-
-
-def _init_state(
-    params: Crisalad, trainable: str, config: StepConfig, key: PRNGKeyArray | None
-) -> tuple[TrainState, PyTree]:
-    if isinstance(config.optimiser, OptimiserConfig) and distributed.is_primary():
-        tell_long_warmup(config.optimiser, config.steps, config.steps_per_epoch)
-    chosen, frozen = split_params(params, config.model, trainable)
-    statistics = None
-    if config.batch_norm == "batch":
-        statistics, frozen = split_statistics(frozen)
-    # Copied, because a step uses up the buffers of its state, and `params` are the caller's.
-    chosen, statistics = jax.tree.map(jnp.copy, (chosen, statistics))
-    optimiser = config.make_optimiser().init(chosen)
-    classifiers = None
-    if isinstance(config.loss, LossConfig):
-        classifiers = _init_loss(key, config.loss.kind, config)
-    if statistics is not None:
-        chosen = eqx.combine(chosen, statistics)
-    return TrainState(jnp.zeros((), jnp.int32), chosen, optimiser, classifiers), frozen
+        if isinstance(config.optimiser, OptimiserConfig) and distributed.is_primary():
+            warn_of_long_warmup(config.optimiser, config.steps, config.steps_per_epoch)
+        chosen, frozen = split_params(params, config.model, trainable)
+        statistics = None
+        if config.batch_norm == "batch":
+            statistics, frozen = split_statistics(frozen)
+        # Copied, because a step uses up the buffers of its state, and `params` are the caller's.
+        chosen, statistics = jax.tree.map(jnp.copy, (chosen, statistics))
+        optimiser = config.make_optimiser().init(chosen)
+        classifiers = None
+        if isinstance(config.loss, LossConfig):
+            classifiers = _init_loss(key, config.loss.kind, config)
+        if statistics is not None:
+            chosen = eqx.combine(chosen, statistics)
+        return TrainState(jnp.zeros((), jnp.int32), chosen, optimiser, classifiers), frozen
 
 
 def _init_loss(key: PRNGKeyArray | None, loss: Loss, config: StepConfig) -> Classifiers | None:
     """Draw the parameters of a loss, if it has any."""
     name = loss.part_name
-    require(
-        loss.grouping is None or bool(config.classes),
-        f"classes: found none for loss {name}, which classifies, expected the number of classes of "
-        "each group (step_config(..., classes=))",
-    )
-    make = functools.partial(
-        init_classifiers,
-        loss=loss,
-        classes=config.classes or (0,),
-        dim=config.model.descriptor_dim,
-    )
+    if loss.grouping is not None and not config.classes:
+        raise InputError(
+            f"classes: found none for loss {name}, which classifies, expected the number of "
+            "classes of each group (step_config(..., classes=))"
+        )
+    classes, dim = config.classes or (0,), config.model.descriptor_dim
     if key is not None:
-        return make(key)
-    require(
-        jax.eval_shape(make, jax.random.key(0)) is None,
-        f"key: found None for loss {name}, which has parameters, expected a jax.random.key",
-    )
+        return init_classifiers(key, loss, classes, dim)
+    if jax.eval_shape(lambda key: init_classifiers(key, loss, classes, dim), jax.random.key(0)):
+        raise InputError(
+            f"key: found None for loss {name}, which has parameters, expected a jax.random.key"
+        )
     return None
 
 
@@ -258,11 +250,11 @@ def step_config(
         >>> step_config(recipe("tiny"), steps=100).steps
         100
     """
-    require(
-        loss is None or callable(loss),
-        f"loss: found {loss!r}, expected a function of (descriptors, labels); a registered loss is "
-        "named in the configuration's",
-    )
+    if loss is not None and not callable(loss):
+        raise InputError(
+            f"loss: found {loss!r}, expected a function of (descriptors, labels); a registered "
+            "loss is named in the configuration's"
+        )
     return StepConfig(
         model=config.model,
         loss=config.loss if loss is None else loss,
@@ -276,55 +268,31 @@ def step_config(
     )
 
 
-@takes(config=TrainConfig)
-def make_train_step(
-    config: TrainConfig,
-    *,
-    steps: int,
-    steps_per_epoch: int = 1,
-    optimiser: optax.GradientTransformation | None = None,
-    loss: LossFunction | None = None,
-    classes: tuple[int, ...] = (),
-) -> Callable[..., tuple[TrainState, Metrics]]:
+@takes(config=StepConfig)
+def make_train_step(config: StepConfig) -> Callable[..., tuple[TrainState, Metrics]]:
     """Make a compiled step of training.
 
     Args:
-        config: the run's.
-        steps: see `step_config`.
-        steps_per_epoch: see `step_config`.
-        optimiser: see `step_config`.
-        loss: see `step_config`.
-        classes: see `step_config`.
+        config: of `step_config`, as `init_train_state` takes it.
 
     Returns:
         `step(state, frozen, images, labels, key, valid=None) -> (state, metrics)`; see
-        `train_step`. The state that goes in is used up.
-
-    Raises:
-        InputError: what `step_config` raises; and from `step`, labels of 2^31 or more, a state of
-            another configuration, or images that are no array of pixels.
+        `train_step`. The state that goes in is used up. It raises InputError for labels of 2^31 or
+        more, a state of another configuration, or images that are no array of pixels.
 
     Example:
         >>> import jax, numpy as np, optax
         >>> from crisalad_jax import init_crisalad, init_train_state, recipe, step_config
         >>> config = recipe("tiny")
-        >>> options = {"steps": 10, "optimiser": optax.sgd(0.1)}
-        >>> step = make_train_step(config, **options)
+        >>> static = step_config(config, steps=10, optimiser=optax.sgd(0.1))
+        >>> step = make_train_step(static)
         >>> params = init_crisalad(jax.random.key(0), config.model)
-        >>> state, frozen = init_train_state(params, "head", step_config(config, **options))
+        >>> state, frozen = init_train_state(params, "head", static)
         >>> images, labels = np.zeros((4, 98, 98, 3), np.uint8), np.array([0, 0, 1, 1])
         >>> state, metrics = step(state, frozen, images, labels, jax.random.key(1))
         >>> int(state.step), metrics.loss.shape
         (1, ())
     """
-    static = step_config(
-        config,
-        steps=steps,
-        steps_per_epoch=steps_per_epoch,
-        optimiser=optimiser,
-        loss=loss,
-        classes=classes,
-    )
 
     def step(
         state: TrainState,
@@ -341,7 +309,7 @@ def make_train_step(
             raise InputError(f"labels: found up to {np.max(labels)}, expected numbers below 2^31")
         mask = jnp.ones(len(labels), bool) if valid is None else jnp.asarray(valid)
         return train_step(
-            state, frozen, jnp.asarray(images), jnp.asarray(labels, jnp.int32), mask, key, static
+            state, frozen, jnp.asarray(images), jnp.asarray(labels, jnp.int32), mask, key, config
         )
 
     return step
@@ -358,7 +326,6 @@ def train_step(
     key: PRNGKeyArray,
     config: StepConfig,
     proceed: Bool[Array, ""] | bool = True,
-    told: Int[Array, "device number"] | None = None,
 ) -> tuple[TrainState, Metrics]:
     """Take one step of the optimiser on the loss of a batch, or add its gradient up for one.
 
@@ -372,10 +339,6 @@ def train_step(
     If the loss or the gradient is not finite, or no image is valid, the state is returned as it was
     and `Metrics.updated` is False. Passed to the next step as `proceed`, it skips that step too. So
     a loop may read metrics one step late, and still have the state before the failed step.
-
-    With `told` the processes of a run tell each other some numbers at the cost of no collective of
-    its own: each device has a row of its process's, and `Metrics.told` is the largest of each. If
-    the first is not 0, a process has failed and the step is skipped.
     """
     tokens_key, cross_key = split_key(jax.random.fold_in(key, state.step), 2)
     group = state.step // config.steps_per_epoch % max(len(config.classes), 1)
@@ -385,7 +348,7 @@ def train_step(
 
     statistics, learnt = split_statistics(state.trainable)
     # A few numbers that the loss, the mask and the metrics read for all images.
-    all_labels, all_valid, all_told = _gathered(labels, valid, told)
+    all_labels, all_valid = _gathered(labels, valid)
 
     def loss_of(trained: tuple[PyTree, Any]) -> tuple[Float[Array, ""], tuple[Any, ...]]:
         learnt, classifier = trained
@@ -407,24 +370,9 @@ def train_step(
         result = loss(descriptors, dense, all_labels, all_valid, classifier, group)
         return result.loss, (result, tokens.transport, measured)
 
-    def placed(tree: PyTree, *, whole: bool = False) -> PyTree:
-        mesh = config.shard_over
-        if mesh is None:
-            return tree
-
-        def place(leaf: Array) -> Array:
-            where = (
-                NamedSharding(mesh, PartitionSpec())
-                if whole
-                else devices.shard_spec(mesh, leaf.shape)
-            )
-            return jax.lax.with_sharding_constraint(leaf, where)
-
-        return jax.tree.map(place, tree)
-
     (loss, (result, transport, statistics)), (gradient, classifier_gradient) = jax.value_and_grad(
         loss_of, has_aux=True
-    )((placed(learnt, whole=True), placed(classifier, whole=True)))
+    )(_replicated((learnt, classifier), config.shard_over))
     transport = jax.tree.map(
         lambda each: jnp.where(valid, each, 0).sum() / all_valid.sum(), transport
     )
@@ -440,10 +388,8 @@ def train_step(
     trainable = eqx.combine(optax.apply_updates(learnt, updates), statistics)
     new = TrainState(state.step + 1, trainable, new_optimiser, classifiers)
     updated = proceed & jnp.isfinite(loss) & jnp.isfinite(norm) & all_valid.any()
-    if all_told is not None:
-        updated &= all_told[0] == 0
     state = jax.tree.map(lambda after, before: jnp.where(updated, after, before), new, state)
-    return placed(state), Metrics(
+    return _sharded(state, config.shard_over), Metrics(
         loss=loss,
         easy_anchor_fraction=result.easy_anchor_fraction,
         accuracy=result.accuracy,
@@ -452,27 +398,34 @@ def train_step(
         images=all_valid.sum(),
         transport=transport,
         updated=updated,
-        told=all_told,
     )
 
 
+def _replicated(tree: PyTree, mesh: Mesh | None) -> PyTree:
+    """Constrain arrays to be whole on every device, where the state is sharded."""
+    if mesh is None:
+        return tree
+    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+def _sharded(tree: PyTree, mesh: Mesh | None) -> PyTree:
+    """Constrain arrays to the shards of `devices.shard_spec`, where the state is sharded."""
+    if mesh is None:
+        return tree
+    shards = jax.tree.map(lambda leaf: devices.shard_spec(mesh, leaf.shape), tree)
+    return jax.lax.with_sharding_constraint(tree, shards)
+
+
 def _gathered(
-    labels: Int[Array, " image"],
-    valid: Bool[Array, " image"],
-    told: Int[Array, "device number"] | None,
-) -> tuple[Int[Array, " image"], Bool[Array, " image"], Int[Array, " number"] | None]:
-    """Gather the labels, what is valid and what was told on all devices, as one array."""
+    labels: Int[Array, " image"], valid: Bool[Array, " image"]
+) -> tuple[Int[Array, " image"], Bool[Array, " image"]]:
+    """Gather the labels of all devices and what is valid, as one array."""
     mesh = devices.image_mesh()
     if mesh is None:
-        return labels, valid, None if told is None else told.max(axis=0)
+        return labels, valid
     own = [each.reshape(mesh.size, -1) for each in (labels, valid.astype(labels.dtype))]
-    if told is not None:
-        own.append(told.astype(labels.dtype))
-    every = devices.gather_images(jnp.concatenate(own, axis=1))
-    count = len(labels) // mesh.size
-    labels, valid = every[:, :count].ravel(), every[:, count : 2 * count].ravel() != 0
-    told = None if told is None else every[:, 2 * count :].max(axis=0)
-    return devices.gather_images((labels, valid, told))
+    labels, valid = jnp.split(devices.gather_images(jnp.concatenate(own, axis=1)), 2, axis=1)
+    return devices.gather_images((labels.ravel(), valid.ravel() != 0))
 
 
 def _reads_dense(config: StepConfig) -> bool:

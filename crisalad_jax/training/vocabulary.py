@@ -18,17 +18,17 @@ from jaxtyping import Float, Float32
 
 from crisalad_jax.checkpoints.torch_io import with_backbone_of
 from crisalad_jax.checkpoints.weights import save_weights
-from crisalad_jax.config.checks import check_seed
+from crisalad_jax.config.checks import check_count, check_seed
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
-from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
+from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.backbones import FeatureRequest
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, cast_params, init_crisalad, unit_features
+from crisalad_jax.nn.model import Crisalad, Model, cast_params, init_crisalad, unit_features
 from crisalad_jax.retrieval.chunks import sample
-from crisalad_jax.retrieval.grouping import useful_batch_size
-from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.training.recipes import RECIPES, mines_tuples, recipe
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
@@ -89,11 +89,13 @@ def with_vocabulary(
             read, or none that can; fewer features than clusters or than VLAD-BuFF's components,
             or features that are not finite or all alike.
     """
-    _check_vocabulary(config, "aggregator: found")
+    _check_vocabulary(config)
+    check_seed("seed", seed)
+    if images is not None:
+        check_count("images", images)
+        if images < len(paths):
+            paths = [paths[i] for i in sample(len(paths), images, seed)]
     clusters = config.aggregator.count_centroids(config.backbone.dim)
-    _check_counts(config, clusters, len(paths), images, seed)
-    if images is not None and images < len(paths):
-        paths = [paths[i] for i in sample(len(paths), images, seed)]
     features = _read_features(
         params, config, paths, seed, batch_size, on_bad_image=on_bad_image, quiet=quiet
     )
@@ -159,7 +161,7 @@ def start_vocabulary(
     own = aggregator in RECIPES and not is_head
     config = recipe(preset, aggregator if own else f"crisalad+{aggregator}").model
     part = config.aggregator
-    _check_vocabulary(config, "--aggregator: found")
+    _check_vocabulary(config)
     known = [field.name for field in dataclasses.fields(part)]
     for name in fields or {}:
         if name not in known:
@@ -223,12 +225,10 @@ def build_vocabulary(
         True
     """
     check_target(out, ".safetensors")
-    one = isinstance(images, str | os.PathLike)
-    paths = (
-        open_source(images, fps=fps, on_bad_image=on_bad_image).paths
-        if one
-        else [pathlib.Path(each) for each in images]
-    )
+    if isinstance(images, str | os.PathLike):
+        paths = open_source(images, fps=fps, on_bad_image=on_bad_image).paths
+    else:
+        paths = [pathlib.Path(each) for each in images]
     check_rate_used(fps, paths)
     params = with_vocabulary(
         params,
@@ -240,7 +240,7 @@ def build_vocabulary(
         on_bad_image=on_bad_image,
         quiet=quiet,
     )
-    save_weights(out, params, config)
+    save_weights(out, Model(params, config))
     words = config.aggregator.count_centroids(config.backbone.dim)
     return Vocabulary(params, words, min(max_images, len(paths)))
 
@@ -266,35 +266,12 @@ def vocabulary_words(config: ModelConfig) -> str:
     return f"{name} ({request.facet} of block {blocks})"
 
 
-def _check_vocabulary(config: ModelConfig, prefix: str) -> None:
+def _check_vocabulary(config: ModelConfig) -> None:
     if not needs_vocabulary(config):
-        base = Aggregator.from_centroids
-        fit = [n for n in AGGREGATORS if AGGREGATORS.find(n).from_centroids is not base]
         raise InputError(
-            f"{prefix} {config.aggregator.part_name}, which has no vocabulary, expected one that "
-            f"starts from centroids: {', '.join(fit)}"
+            f"aggregator: found {config.aggregator.part_name}, which has no vocabulary, expected "
+            f"one that starts from centroids: {', '.join(vocabulary_aggregators())}"
         )
-
-
-def _check_counts(
-    config: ModelConfig, clusters: int, available: int, images: int | None, seed: int
-) -> None:
-    """Check the numbers of images and features before an image is read."""
-    check_seed("seed", seed)
-    if images is not None and images < 1:
-        raise InputError(f"images: found {images}, expected at least 1")
-    used = available if images is None else min(images, available)
-    most = used * _taken(config)
-    if most < clusters:
-        raise InputError(
-            f"images: found {used}, which is {most} features, expected at least {clusters}, one "
-            "for each cluster"
-        )
-
-
-def _taken(config: ModelConfig) -> int:
-    """Count the features that are taken of an image of the model's size."""
-    return min(PATCHES, config.patches)
 
 
 def _read_features(
@@ -307,9 +284,10 @@ def _read_features(
     on_bad_image: OnBadImage,
     quiet: bool,
 ) -> Float32[np.ndarray, "feature dim"]:
-    batch_size = useful_batch_size(batch_size, len(paths))
-    batches = photograph_batches(config, paths, batch_size=batch_size, on_bad_image=on_bad_image)
-    devices = devices_for(batch_size)
+    reading = Reading(batch_size=batch_size, on_bad_image=on_bad_image).fitted(len(paths))
+    how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
+    batches = reading.batches(paths, how, config.check_image_size)
+    devices = devices_for(reading.batch_size)
     params = devices.replicate(cast_params(params, config))
     generator = np.random.default_rng(seed)
     parts: list[np.ndarray] = []
@@ -353,7 +331,7 @@ def _k_means(
         return kmeans.centroids
     # faiss makes the means unit vectors, which moves no feature to another cluster.
     nearest = kmeans.index.search(features, 1)[1][:, 0]
-    sums = np.zeros_like(kmeans.centroids)
-    np.add.at(sums, nearest, features)
-    counts = np.bincount(nearest, minlength=clusters)[:, None].astype(np.float32)
-    return np.where(counts > 0, sums / np.maximum(counts, 1), kmeans.centroids)
+    means = kmeans.centroids.copy()
+    for cluster in np.unique(nearest):
+        means[cluster] = features[nearest == cluster].mean(axis=0)
+    return means

@@ -22,6 +22,8 @@ import numpy as np
 from safetensors.numpy import load_file
 
 from crisalad_jax import PRESETS, extract, init_crisalad, load, save_weights
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.nn.model import Model
 
 
 def main() -> None:
@@ -34,7 +36,7 @@ def main() -> None:
         folder = pathlib.Path(name)
         weights = folder / "weights.safetensors"
         config = PRESETS[given.preset]
-        save_weights(weights, init_crisalad(jax.random.key(0), config), config)
+        save_weights(weights, Model(init_crisalad(jax.random.key(0), config), config))
         size = f"load {given.preset}, {weights.stat().st_size / 1e6:.0f} MB"
         others = {
             "load(verify=False)": lambda: load(weights, verify=False),
@@ -59,13 +61,15 @@ def extraction(folder: pathlib.Path, count: int, rounds: int) -> None:
     params = init_crisalad(jax.random.key(0), config)
 
     def plain() -> None:
-        done = extract(params, config, images, quiet=True)
+        done = extract(Model(params, config), images, reading=Reading(quiet=True))
         np.save(folder / "plain.npy", done.descriptors)
         (folder / "plain.txt").write_text("\n".join(done.names))
 
     ratio(
         f"extract {count} images",
-        lambda: extract(params, config, images, folder / "d.npy", quiet=True),
+        lambda: extract(
+            Model(params, config), images, folder / "d.npy", reading=Reading(quiet=True)
+        ),
         plain,
         rounds,
     )

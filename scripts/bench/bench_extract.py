@@ -48,16 +48,19 @@ from usual import widened
 import jax  # isort: skip
 import torch  # isort: skip
 
+from crisalad_jax import synthetic
 from crisalad_jax.config.preprocessing import IMAGENET_DEVIATION, IMAGENET_MEAN
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.loader import image_batches
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import resize_image
-from crisalad_jax.experiments import synthetic
 from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.nn.model import Model
 from crisalad_jax.nn.pixels import LOCAL_NOISE, LOCAL_WINDOW
-from crisalad_jax.retrieval import describe as describing
+from crisalad_jax.retrieval import jax_describer
+from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.descriptor_files import write_descriptors
-from crisalad_jax.retrieval.photographs import photograph_batches
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.host import usable_cores
 
@@ -246,18 +249,16 @@ def by_engines(both: Sides, batch: int) -> list[Contender]:
 def by_us(both: Sides, batch: int) -> list[Contender]:
     def extract(folder: pathlib.Path, out: pathlib.Path, watch: Watch) -> None:
         paths = list_images(folder)
-        model = both.ours, both.config
-        with mock.patch.multiple(
-            describing,
-            photograph_batches=lambda *args, **kwargs: watch.each(
-                photograph_batches(*args, **kwargs)
+        describer, batches = describer_of(Model(both.ours, both.config)), Reading.batches
+        reading = Reading(batch_size=batch, quiet=True)
+        with (
+            mock.patch.object(Reading, "batches", lambda *given: watch.each(batches(*given))),
+            mock.patch.object(
+                jax_describer, "_token_rows", watch.program(jax_describer._token_rows)
             ),
-            extract_tokens=watch.program(describing.extract_tokens),
         ):
-            tokens = describing.read_tokens(
-                *model, paths, batch_size=batch, label="images", quiet=True
-            )
-        found = describing.group(*model, tokens, "single", batch_size=batch)
+            rows = read_tokens(describer, paths, reading).descriptors
+        found = group(describer, rows, len(paths), "single", batch_size=batch)
         write_descriptors(out, found, names(folder, paths))
 
     def load(folder: pathlib.Path, out: pathlib.Path, watch: Watch) -> None:

@@ -31,10 +31,11 @@ from timing import measured, race, ratio, times
 # After timing, which says how many devices there are.
 import faiss  # isort: skip
 
+from crisalad_jax.config.io import to_plain
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.faiss_index import recall_against_exact
-from crisalad_jax.retrieval.maps.manifest import MapDescription
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.metadata import MapMetadata
 from crisalad_jax.utils.progress import progress_bar
 
 K = 10
@@ -68,16 +69,16 @@ def questions(rows: int, length: int, number: int) -> np.ndarray:
 
 def make(folder: pathlib.Path, arguments: argparse.Namespace) -> float:
     """Append all descriptors to a map; the seconds that this took."""
-    description = MapDescription(
+    metadata = MapMetadata(
         model="0" * 64,
         weights="none",
-        config=ModelConfig(),
+        config=to_plain(ModelConfig()),
         descriptor_length=arguments.length,
         dtype=arguments.dtype,
     )
     started = time.perf_counter()
     with (
-        open_for_appending(folder, description) as target,
+        open_for_appending(folder, metadata) as target,
         progress_bar("appending", arguments.rows, "rows", quiet=False) as bar,
     ):
         for part in parts(arguments.rows, arguments.length):
@@ -131,7 +132,7 @@ def study(arguments: argparse.Namespace, folder: pathlib.Path) -> Study:
     indexes = {}
     for kind in arguments.searches:
         started = time.perf_counter()
-        with open_for_appending(folder, places.description) as target:
+        with open_for_appending(folder, places.metadata) as target:
             target.build_search(kind, quiet=False)
         built = time.perf_counter() - started
         opened = Map.open(folder)

@@ -29,10 +29,11 @@ import jax.numpy as jnp  # isort: skip
 
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.config import PRESETS, ModelConfig
-from crisalad_jax.nn.model import Crisalad, describe
-from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.nn.model import Crisalad, Model, describe
+from crisalad_jax.retrieval.describe import describe_files
 from crisalad_jax.utils.devices import devices_for
 from parity.cases.case import build, convert, random
 
@@ -120,19 +121,14 @@ def recall(arguments: argparse.Namespace) -> Study:
     values, rows, descriptors = [], [], {}
     for dtype in ("float32", "bfloat16"):
         typed = in_type(config, dtype)
-        tokens = read_tokens(
-            params, typed, benchmark.queries, batch_size=16, label=dtype, on_bad_image="stop"
-        )
-        descriptors[dtype] = group(params, typed, tokens, "single", batch_size=16)
+        descriptors[dtype] = describe_files(Model(params, typed), benchmark.queries, Reading())
         alike = cosines(descriptors[dtype], descriptors["float32"])
         results = evaluate(
-            params,
-            typed,
+            Model(params, typed),
             benchmark,
             groupings=("single", "shuffled", "sequential"),
-            batch_size=16,
             seeds=1,
-            quiet=True,
+            reading=Reading(batch_size=16, quiet=True),
         )
         for result in results:
             values.append(

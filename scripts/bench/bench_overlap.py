@@ -24,7 +24,7 @@ from tables import Study, Table, count, flags, leave, read
 
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.nn.config import PRESETS
-from crisalad_jax.training.batches import batches_of
+from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
@@ -46,7 +46,7 @@ def steps_of(config: TrainConfig, places: Places, out: pathlib.Path) -> tuple[li
 def loader_alone(config: TrainConfig, places: Places) -> list[float]:
     """Seconds of each batch."""
     seconds, started = [], time.perf_counter()
-    for _ in batches_of(config, places, epoch=0):
+    for _ in PlaceBatches(config, places).batches(0):
         seconds.append(time.perf_counter() - started)
         started = time.perf_counter()
     return seconds[LEFT_OUT:]

@@ -25,7 +25,7 @@ from timing import Timed, measured, ratio, run_program, times
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.nn.config import PRESETS
-from crisalad_jax.nn.model import init_crisalad
+from crisalad_jax.nn.model import Model, init_crisalad
 
 SCRIPT = """
 import sys
@@ -68,8 +68,8 @@ def programs(
     photographs, weights, places = (folder / name for name in ("images", "w.safetensors", "map"))
     write_photographs(photographs)
     params = init_crisalad(jax.random.key(0), config)
-    save_weights(weights, params, config)
-    write_export(folder / "export", params, config, ExportConfig(format="onnx"))
+    save_weights(weights, Model(params, config))
+    write_export(folder / "export", Model(params, config), ExportConfig(format="onnx"))
     crisalad, cache = [sys.executable, "-m", "crisalad_jax"], folder / "cache"
     model = ["--weights", str(weights)]
     shown = ["--images", str(photographs), "--out", str(places), "--quiet"]

@@ -26,6 +26,7 @@ import numpy as np
 from tables import Study, Table, count, flags, leave, read
 from timing import machine
 
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import answer_fields, query
 
@@ -54,7 +55,7 @@ class Load(NamedTuple):
 def expected_answers(folder: pathlib.Path, images: pathlib.Path) -> dict[pathlib.Path, Any]:
     """What `crisalad query` says of each image."""
     with Map.open(folder) as places:
-        answers = query(places, places.load_params(), images, k=K, quiet=True)
+        answers = query(places, images, k=K, reading=Reading(quiet=True))
     return {
         path: [answer_fields(answer, answers.axes) for answer in row]
         for path, row in answers.rows()
@@ -131,7 +132,7 @@ def load(address: str, clients: int, seconds: float, expected: dict[pathlib.Path
 
 def table(loads: list[Load], folder: pathlib.Path) -> Table:
     with Map.open(folder) as places:
-        config, images = places.description.config, len(places)
+        config, images = places.config, len(places)
         what = f"a map of {images} images, {config.descriptor_dim} numbers each"
         size = f"images at {config.images_in_words}"
     caption = (

@@ -25,7 +25,7 @@ from timing import Timed, measured, ratio, run_program, times
 
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.nn.config import PRESETS
-from crisalad_jax.nn.model import init_crisalad
+from crisalad_jax.nn.model import Model, init_crisalad
 from parity.cases.case import build, random
 
 THEIRS = """
@@ -60,7 +60,7 @@ def programs(folder: pathlib.Path, preset: str) -> dict[str, Callable[[], float]
     image.parent.mkdir()
     pixels = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
     cv2.imwrite(str(image), cv2.resize(pixels, (640, 480), interpolation=cv2.INTER_CUBIC))
-    save_weights(ours, init_crisalad(jax.random.key(0), config), config)
+    save_weights(ours, Model(init_crisalad(jax.random.key(0), config), config))
     torch.save(build(config, "float32", random(preset, 0)).state_dict(), theirs)
     numbers = itertools.count()
 

@@ -20,7 +20,7 @@ import safetensors.numpy
 
 from crisalad_jax.checkpoints.export import FORMATS, ExportConfig, write_export
 from crisalad_jax.nn.config import PRESETS, ModelConfig
-from crisalad_jax.nn.model import Crisalad, describe, init_crisalad, self_mask
+from crisalad_jax.nn.model import Crisalad, Model, describe, init_crisalad, self_mask
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import split_markers
 
@@ -52,7 +52,7 @@ def difference(
     folder: pathlib.Path, params: Crisalad, config: ModelConfig, how: ExportConfig
 ) -> float:
     """The largest difference of a format's descriptors, or InputError where it cannot hold it."""
-    manifest = write_export(folder, params, config, how)
+    manifest = write_export(folder, Model(params, config), how)
     if how.format != "stablehlo":
         return manifest["checked"]["largest_difference"]
     program = jax.export.deserialize(bytearray((folder / "describe.jax_export").read_bytes()))

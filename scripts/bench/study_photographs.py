@@ -18,10 +18,11 @@ import jax
 from crisalad_jax.checkpoints.load import load
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import read_places
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.report import RecallRow, recall_markdown
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.model import Crisalad, init_crisalad
+from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.recipes import recipe
@@ -61,7 +62,7 @@ def train(
 
 
 def hog_recalls(benchmark: Benchmark) -> Mapping[int, float]:
-    return evaluate(*load("hog"), benchmark, quiet=True)[0].recalls
+    return evaluate(load("hog"), benchmark, reading=Reading(quiet=True))[0].recalls
 
 
 def main() -> None:
@@ -79,13 +80,12 @@ def main() -> None:
     def measure(model_name: str, params: Crisalad, config: TrainConfig) -> None:
         for benchmark in benchmarks:
             results = evaluate(
-                params,
-                config.model,
+                Model(params, config.model),
                 benchmark,
                 groupings=("single", "shuffled", "sequential"),
                 seed=config.seed,
                 seeds=1,
-                quiet=True,
+                reading=Reading(quiet=True),
             )
             for result in results:
                 rows.append(RecallRow(benchmark.name, model_name, result.grouping, result.recalls))

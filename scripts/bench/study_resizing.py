@@ -11,14 +11,15 @@ import pathlib
 from collections.abc import Callable, Mapping
 
 import cv2
+import jax
 import numpy as np
 from PIL import Image
 
-from crisalad_jax.cli.common import load_model
+from crisalad_jax.checkpoints.load import load
 from crisalad_jax.data.images import list_images, read_image
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
-from crisalad_jax.retrieval.alone import describe_images
+from crisalad_jax.nn.config import PRESETS
+from crisalad_jax.nn.model import Model, init_crisalad
+from crisalad_jax.retrieval.describe import describe_images
 
 Resize = Callable[[pathlib.Path, int, int], np.ndarray]
 
@@ -44,13 +45,13 @@ WAYS: Mapping[str, Resize] = {
 }
 
 
-def rows(params: Crisalad, config: ModelConfig, paths: list[pathlib.Path]) -> list[tuple[str, ...]]:
+def rows(model: Model, paths: list[pathlib.Path]) -> list[tuple[str, ...]]:
     """Return a line for each of `WAYS`: cosines (median, least) and distances (median, most)."""
-    ours = describe_images(params, config, [read_image(path) for path in paths])
+    ours = describe_images(model, [read_image(path) for path in paths])
     lines = []
     for name, way in WAYS.items():
-        resized = [np.ascontiguousarray(way(path, *config.image_size)) for path in paths]
-        theirs = describe_images(params, config, resized)
+        resized = [np.ascontiguousarray(way(path, *model.config.image_size)) for path in paths]
+        theirs = describe_images(model, resized)
         cosines = np.sum(ours * theirs, axis=1)
         distances = np.linalg.norm(ours - theirs, axis=1)
         words = (f"{np.median(cosines):.4f}", f"{cosines.min():.4f}")
@@ -62,14 +63,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--images", type=pathlib.Path, required=True)
     parser.add_argument("--weights", type=pathlib.Path)
-    parser.add_argument("--preset", default=None)
+    parser.add_argument("--preset", default="b14")
     parser.add_argument("--most", type=int, default=64)
     given = parser.parse_args()
-    params, config, name = load_model(given.weights, preset=given.preset)
+    if given.weights is None:
+        config = PRESETS[given.preset]
+        model, name = Model(init_crisalad(jax.random.key(0), config), config), given.preset
+    else:
+        model, name = load(given.weights), given.weights
     paths = list_images(given.images)[: given.most]
-    print(f"{name}: {len(paths)} photographs, resized to {config.image_size}\n")
+    print(f"{name}: {len(paths)} photographs, resized to {model.config.image_size}\n")
     header = ("resized by", "cosine, median", "least", "distance, median", "most")
-    for cells in (header, ("---", *["---:"] * 4), *rows(params, config, paths)):
+    for cells in (header, ("---", *["---:"] * 4), *rows(model, paths)):
         print(f"| {' | '.join(cells)} |")
 
 

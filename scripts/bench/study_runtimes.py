@@ -17,13 +17,13 @@ import numpy as np
 
 from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
-from crisalad_jax.checkpoints.runtime import open_runtime
+from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.export import read_calibration
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.extract import extract
-from crisalad_jax.retrieval.model import Model
 from crisalad_jax.utils.files import split_markers
 
 KS = (1, 5, 10)
@@ -35,26 +35,29 @@ ENGINES: tuple[tuple[EngineName, ExportConfig], ...] = (
 
 def models(
     weights: pathlib.Path, photographs: pathlib.Path, folder: pathlib.Path
-) -> Iterator[tuple[str, Model, ModelConfig]]:
+) -> Iterator[tuple[str, Model | Runtime]]:
     """The model by each runtime, with its name in the table; JAX's in float32 is the first."""
-    params, config = load_weights(weights)
-    yield "JAX, float32", params, config
-    yield "JAX, bfloat16", params, dataclasses.replace(config, compute_dtype="bfloat16")
-    some = read_calibration(photographs, config)
+    model = load_weights(weights)
+    yield "JAX, float32", model
+    bfloat16 = dataclasses.replace(model.config, compute_dtype="bfloat16")
+    yield "JAX, bfloat16", model._replace(config=bfloat16)
+    some = read_calibration(photographs, model.config)
     for engine, how in ENGINES:
         format = how.format
-        write_export(folder / format, params, config, how)
-        write_export(folder / f"{format}-int8", params, config, how, calibration=some)
-        yield f"{engine}, float32", open_runtime(folder / format, engine), config
-        yield f"{engine}, int8", open_runtime(folder / f"{format}-int8", engine), config
-    fewer = open_runtime(folder / "openvino", "openvino", precision="bfloat16")
-    yield "openvino, bfloat16", fewer, config
+        write_export(folder / format, model, how)
+        write_export(folder / f"{format}-int8", model, how, calibration=some)
+        yield f"{engine}, float32", open_runtime(folder / format, engine)
+        yield f"{engine}, int8", open_runtime(folder / f"{format}-int8", engine)
+    yield (
+        "openvino, bfloat16",
+        open_runtime(folder / "openvino", "openvino", precision="bfloat16"),
+    )
 
 
-def first_answers(model: Model, config: ModelConfig, data: Benchmark) -> np.ndarray:
+def first_answers(model: Model | Runtime, data: Benchmark) -> np.ndarray:
     """The numbers of the images most similar to each query, best first."""
     there, asked = (
-        np.asarray(extract(model, config, paths, quiet=True).descriptors)
+        np.asarray(extract(model, paths, reading=Reading(quiet=True)).descriptors)
         for paths in (data.database, data.queries)
     )
     return np.argsort(-(asked @ there.T), axis=1, kind="stable")[:, : max(KS)]
@@ -78,8 +81,8 @@ def main() -> None:
     lines = [f"| runtime | {' | '.join(heads)} |", f"|{' --- |' * (1 + 2 * len(sets))}"]
     exact: list[np.ndarray] = []
     with tempfile.TemporaryDirectory() as folder:
-        for name, model, config in models(given.weights, given.int8, pathlib.Path(folder)):
-            answers = [first_answers(model, config, data) for data in sets]
+        for name, model in models(given.weights, given.int8, pathlib.Path(folder)):
+            answers = [first_answers(model, data) for data in sets]
             exact = exact or answers
             cells = [name]
             for found, first, data in zip(answers, exact, sets, strict=True):

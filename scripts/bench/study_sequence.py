@@ -21,8 +21,9 @@ from crisalad_jax.checkpoints.load import load
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.metrics import recalls
-from crisalad_jax.experiments.synthetic import View, render
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.sequence import BayesFilter
+from crisalad_jax.synthetic import View, render
 
 FILTERS = {
     "filter, no adapt": BayesFilter(adapt=False),
@@ -71,8 +72,7 @@ def descriptors(benchmark: Benchmark, weights: list[pathlib.Path]) -> Iterator[t
         params, config = load(file)
         found: list[Sides] = []
         evaluate(
-            params,
-            config,
+            Model(params, config),
             benchmark,
             groupings=["single"],
             observe=lambda _, database, queries, to=found: to.append((database, queries)),

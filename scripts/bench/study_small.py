@@ -27,10 +27,11 @@ from crisalad_jax.config.io import read_config, to_plain
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import read_places
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.experiments.synthetic import SCENERIES, WorldConfig, write_world
-from crisalad_jax.experiments.synthetic.world import VARIATIONS
 from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import Model
+from crisalad_jax.synthetic import SCENERIES, VARIATIONS, WorldConfig, write_world
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
@@ -165,7 +166,9 @@ def run(arm: Arm, seed: int, asked: Mapping[str, Asked], runs: pathlib.Path) -> 
     alone = config.model.cross_image.layers == 0
     groupings = ("single",) if alone else ("single", "shuffled", "sequential")
     for name, one in left.items():
-        results = evaluate(params, config.model, one.data, groupings=groupings, quiet=True)
+        results = evaluate(
+            Model(params, config.model), one.data, groupings=groupings, reading=Reading(quiet=True)
+        )
         there[name] = one.contents
         found[name] = {
             grouping: {f"R@{k}": 100 * each.recalls[k] for k in (1, 5)}

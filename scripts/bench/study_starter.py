@@ -17,10 +17,11 @@ from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import load
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.metrics import Interval
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, init_crisalad
+from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.utils.files import split_markers
 
 KS = (1, 5, 10)
@@ -31,7 +32,9 @@ def by_model(
     params: Crisalad, config: ModelConfig, data: Benchmark
 ) -> tuple[Mapping[int, float], Interval]:
     """Recalls of a model, and the interval of the first."""
-    (result,) = evaluate(params, config, data, groupings=["single"], quiet=True)
+    (result,) = evaluate(
+        Model(params, config), data, groupings=["single"], reading=Reading(quiet=True)
+    )
     return result.recalls, result.intervals[1]
 
 

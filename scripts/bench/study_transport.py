@@ -17,10 +17,12 @@ from tables import COLOURS, INK, Study, Table, count, flags, leave, panels, read
 
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import Places, read_places
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.demo import DemoConfig, demo_recipe
-from crisalad_jax.experiments.synthetic import SyntheticCityConfig, write_synthetic_city
+from crisalad_jax.nn.model import Model
 from crisalad_jax.sinkhorn import SinkhornConfig
+from crisalad_jax.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
@@ -67,7 +69,9 @@ def run(
 ) -> dict[str, float]:
     """Recalls of the trained model, every image described alone, and its transport's statistics."""
     params = fit(config, places, folder, validation=benchmark, quiet=True).params
-    (result,) = evaluate(params, config.model, benchmark, groupings=("single",), quiet=True)
+    (result,) = evaluate(
+        Model(params, config.model), benchmark, groupings=("single",), reading=Reading(quiet=True)
+    )
     last = [line for line in read_metrics(folder / "metrics.jsonl") if "R@5" in line][-1]
     return {f"R@{k}": 100 * result.recalls[k] for k in KS} | {name: last[name] for name in WATCHED}
 

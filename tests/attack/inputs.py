@@ -403,7 +403,7 @@ VALUES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("train", "--images-per-place", ("0", "-1", HUGE)),
     ("train", "--min-images", ("0", "-1", HUGE)),
     ("train", "--patience", ("-1", "x")),
-    ("train", "--keep-best", ("-1",)),
+    ("train", "--save-top-k", ("-1",)),
     ("train", "--num-threads", ("-1", "x")),
     ("train", "--optimiser.learning-rate", ("-1", "nan", "inf", "x")),
     ("train", "--model.aggregator", ("x",)),
@@ -1495,7 +1495,7 @@ def judge(case: Case, done: Done, before: set[str], folder: pathlib.Path) -> str
         if case.named and not any(name and name in last[0] for name in case.named):
             wrong.append(f"names none of {case.named}")
         left = sorted(files_in(folder / "out") - before) if (folder / "out").is_dir() else ["gone"]
-        if left and not all(".partial" in n and "kept in" in done.err for n in left):
+        if left and not all(".partial" in n and "stored in" in done.err for n in left):
             wrong.append(f"left {left[:4]}")
     if any(
         letter in text for text in (done.out, done.err) for letter in ("\x1b", "\x07", "\u202e")

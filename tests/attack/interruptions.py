@@ -41,11 +41,11 @@ CALLS = Marks(
         "locking": "fcntl:flock",
         "renaming": "os:replace",
         "removing": "os:unlink",
-        "the loop of training": "crisalad_jax.training.loop:_train",
+        "the loop of training": "crisalad_jax.training.loop:_Loop.train",
         "saving": "crisalad_jax.training.run_files:RunFiles.save",
-        "validating": "crisalad_jax.training.run:Run._validate",
-        "keeping the best": "crisalad_jax.training.run_files:RunFiles.keep_if_best",
-        "logging": "crisalad_jax.training.run_files:RunFiles.log_step",
+        "validating": "crisalad_jax.training.validation:Validator.validate",
+        "keeping the best": "crisalad_jax.training.run_files:RunFiles.save_if_best",
+        "logging": "crisalad_jax.training.run_files:RunFiles.log",
     }
 )
 TRAINING_CALLS = ("the loop of training", "saving", "validating", "keeping the best")
@@ -87,9 +87,9 @@ class Verb:
     ) -> Done:
         """Run it in a fork, with smaller settings where the command has none."""
         import crisalad_jax.experiments.demo
+        import crisalad_jax.retrieval.extract
         import crisalad_jax.retrieval.maps.build
-        import crisalad_jax.retrieval.partial
-        import crisalad_jax.training.run
+        import crisalad_jax.training.trainer
 
         of_demo = crisalad_jax.experiments.demo.DemoConfig
         small = functools.partial(of_demo, train_places=48, test_places=12, epochs=2)
@@ -97,7 +97,7 @@ class Verb:
             *settings,
             (crisalad_jax.experiments.demo, "DemoConfig", small),
             (crisalad_jax.retrieval.maps.build, "SEGMENT", 4),
-            (crisalad_jax.retrieval.partial, "SEGMENT", 4),
+            (crisalad_jax.retrieval.extract, "SEGMENT", 4),
         ]
         out.mkdir(parents=True, exist_ok=True)
         CALLS.clear()
@@ -378,13 +378,13 @@ def _ignore(number: int) -> None:
 def attack_busy(bench: Bench, _: float) -> list[Row]:
     """Signal commands whose main thread is in a library, as XLA is for minutes when it compiles."""
     import crisalad_jax.retrieval.extract
-    import crisalad_jax.training.run
+    import crisalad_jax.training.trainer
 
     row = Row(
         "signals while a library works in the main thread",
         "it ends within 10 s; if training has work to save, at the second signal",
     )
-    step, busy_from = crisalad_jax.training.run.train_step, [0]
+    step, busy_from = crisalad_jax.training.trainer.train_step, [0]
 
     def busy(*arguments: Any, **options: Any) -> Any:
         busy_from[0] -= 1
@@ -410,7 +410,9 @@ def attack_busy(bench: Bench, _: float) -> list[Row]:
                 os.kill(process, number)
 
         busy_from[0] = steps
-        holder = crisalad_jax.training.run if name == "train" else crisalad_jax.retrieval.extract
+        holder = (
+            crisalad_jax.training.trainer if name == "train" else crisalad_jax.retrieval.extract
+        )
         function = "train_step" if name == "train" else "group"
         done = verb.go(out, send, settings=[(holder, function, busy)])
         wrong = wrong_end(signals[-1], done.code, done.err, time.monotonic() - last.sent)

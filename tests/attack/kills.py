@@ -233,12 +233,12 @@ def log_of(run: pathlib.Path) -> list[Any]:
 
 TRAINING = Marks(
     {
-        "opening the run": "crisalad_jax.training.run:Run.__init__",
+        "opening the run": "crisalad_jax.training.run_files:RunFiles.load",
         "loading a state": "crisalad_jax.checkpoints.train_state:StateStore.load",
-        "steps": "crisalad_jax.training.loop:_train_round",
+        "steps": "crisalad_jax.training.loop:_Loop._take_round",
         "saving": "crisalad_jax.training.run_files:RunFiles.save",
-        "validating": "crisalad_jax.training.run:Run._validate",
-        "keeping the best": "crisalad_jax.training.run_files:RunFiles.keep_if_best",
+        "validating": "crisalad_jax.training.validation:Validator.validate",
+        "keeping the best": "crisalad_jax.training.run_files:RunFiles.save_if_best",
         "closing": "crisalad_jax.training.run_files:RunFiles.close",
     }
 )
@@ -263,7 +263,7 @@ def recipe_of_chains(folder: pathlib.Path) -> pathlib.Path:
         cross_image=CrossImageConfig(heads=2, feedforward=16),
     )
     path = folder / "recipe.json"
-    config = dataclasses.replace(RECIPE, model=model, epochs=EPOCHS, patience=None, keep_best=2)
+    config = dataclasses.replace(RECIPE, model=model, epochs=EPOCHS, patience=None, save_top_k=2)
     write_json(path, to_plain(config))
     return path
 
@@ -278,12 +278,12 @@ def train_arguments(world: World, recipe: pathlib.Path, out: pathlib.Path) -> li
 
 def attack_training(bench: Bench, kills: int, chains: int, programs: int) -> list[Row]:
     """Kill runs of training, some as programs of their own while they start."""
-    import crisalad_jax.training.run
+    import crisalad_jax.training.run_files
 
     folder = bench.folder / "training"
     folder.mkdir()
     recipe = recipe_of_chains(folder)
-    often = (crisalad_jax.training.run, "SAVE_SECONDS", -1.0)
+    often = (crisalad_jax.training.run_files, "SAVE_SECONDS", -1.0)
 
     def go(out: pathlib.Path, during: Callable[[int], None] | None = None) -> Done:
         TRAINING.clear()
@@ -380,7 +380,7 @@ INDEXING = Marks(
         "opening the map": "crisalad_jax.retrieval.maps.build:open_for_appending",
         "appending": "crisalad_jax.retrieval.maps.map:Map.append",
         "a descriptors' file": "crisalad_jax.retrieval.maps.file_store:FileStore.add",
-        "a record": "crisalad_jax.retrieval.maps.map:write_record",
+        "a record": "crisalad_jax.retrieval.segments:write_record",
     }
 )
 IMAGES, TOGETHER = 24, 2
@@ -410,8 +410,8 @@ def map_files(folder: pathlib.Path) -> dict[str, bytes]:
 def attack_maps(bench: Bench, kills: int) -> list[Row]:
     """Kill `index`, read maps after each kill, and search a map while it grows."""
     import crisalad_jax.retrieval.maps.build
-    from crisalad_jax.retrieval.maps.head import has_images
     from crisalad_jax.retrieval.maps.map import Map
+    from crisalad_jax.retrieval.maps.metadata import has_images
 
     folder = bench.folder / "maps"
     images = folder / "images"
@@ -552,7 +552,7 @@ def attack_readers(
 
 EXTRACTING = Marks(
     {
-        "part of the tokens": "crisalad_jax.retrieval.partial:write_sealed",
+        "part of the tokens": "crisalad_jax.retrieval.segments:write_record",
         "writing descriptors": "crisalad_jax.retrieval.extract:write_descriptors",
     }
 )
@@ -560,13 +560,13 @@ EXTRACTING = Marks(
 
 def attack_extract(bench: Bench, suffix: str, kills: int) -> list[Row]:
     """Kill `extract`, half of the chains over an older set, and read the set after each kill."""
-    import crisalad_jax.retrieval.partial
+    import crisalad_jax.retrieval.extract
     from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
 
     folder = bench.folder / suffix[1:]
     images = folder / "images"
     write_images(images, 0, IMAGES)
-    small = (crisalad_jax.retrieval.partial, "SEGMENT", TOGETHER)
+    small = (crisalad_jax.retrieval.extract, "SEGMENT", TOGETHER)
 
     def go(out: pathlib.Path, during: Callable[[int], None] | None = None) -> Done:
         EXTRACTING.clear()

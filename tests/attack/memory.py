@@ -14,6 +14,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.nn.model import Model
 from tests.attack.kills import Bench, carry_out, part_of, recipe_of_chains
 from tests.attack.world import VERBS, Row, files_in, forked, make_products
 
@@ -47,7 +49,7 @@ def attack_training(bench: Bench, scale: float) -> list[Row]:
         most = OF_A_SAVE * (last - first) if often else MOST
 
         def work(last: int = last, often: bool = often, kind: str = kind) -> int:
-            import crisalad_jax.training.run
+            import crisalad_jax.training.run_files
             from crisalad_jax.config.io import read_config
             from crisalad_jax.data.benchmarks import open_benchmark
             from crisalad_jax.data.places import read_places
@@ -56,20 +58,20 @@ def attack_training(bench: Bench, scale: float) -> list[Row]:
             from crisalad_jax.training.run_files import RunFiles
 
             if often:
-                crisalad_jax.training.run.SAVE_SECONDS = -1.0
+                crisalad_jax.training.run_files.SAVE_SECONDS = -1.0
             config = dataclasses.replace(
-                read_config(TrainConfig, recipe), epochs=-(-last // 2), keep_best=1
+                read_config(TrainConfig, recipe), epochs=-(-last // 2), save_top_k=1
             )
             sizes: dict[int, float] = {}
-            real = RunFiles.log_step
+            real = RunFiles.log
 
-            def log_step(self: RunFiles, values: Mapping[str, int | float], **more: str) -> None:
+            def log(self: RunFiles, values: Mapping[str, int | float], **more: str) -> None:
                 real(self, values, **more)
                 step = int(values["step"])
                 if step % max(last // 12, 1) == 0:
                     sizes[step] = resident()
 
-            RunFiles.log_step = log_step
+            RunFiles.log = log
             fit(
                 config,
                 read_places(bench.world.city, min_images=2),
@@ -122,13 +124,19 @@ def attack_queries(bench: Bench, scale: float) -> list[Row]:
             sizes = {}
             image = next(path for path in bench.world.images.rglob("*.jpg"))
             with Map.open(bench.world.path("map")) as places:
-                params = places.load_params()
+                params = places.load_model()
                 rows = np.concatenate(list(places.descriptors))
                 for number in range(1, last + 1):
                     if kind == "searches":
                         places.search(rows[:1], 3)
                     else:
-                        query(places, params, [image], k=3, quiet=True)
+                        query(
+                            places,
+                            [image],
+                            model=Model(params, places.config),
+                            k=3,
+                            reading=Reading(quiet=True),
+                        )
                     if number % max(last // 10, 1) == 0:
                         gc.collect()
                         sizes[number] = resident()

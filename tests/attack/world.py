@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.nn.model import Model
 from crisalad_jax.utils.files import write_json
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -79,7 +80,7 @@ def make_world(root: pathlib.Path) -> World:
             conftest.write_picture(root / "images" / "sub" / f"{number}.jpg", number)
         write_json(root / "recipe.json", to_plain(conftest.RECIPE))
         model = conftest.MODEL
-        save_weights(root / "weights.safetensors", conftest.random_params(model), model)
+        save_weights(root / "weights.safetensors", Model(conftest.random_params(model), model))
         return 0
 
     root.mkdir(parents=True, exist_ok=True)

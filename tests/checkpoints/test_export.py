@@ -33,7 +33,7 @@ from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.cosplace import CosPlaceConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
-from crisalad_jax.nn.model import Crisalad, describe, init_crisalad, self_mask
+from crisalad_jax.nn.model import Crisalad, Model, describe, init_crisalad, self_mask
 from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils import target as targets
@@ -83,7 +83,7 @@ def run_script(*arguments: object, cwd: pathlib.Path) -> subprocess.CompletedPro
 def beside(params: Crisalad, tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """An export of any number of images, each alone, weights beside it."""
     out = tmp_path_factory.mktemp("exports") / "beside"
-    write_export(out, params, MODEL)
+    write_export(out, Model(params, MODEL))
     return out
 
 
@@ -103,7 +103,7 @@ def test_the_program_gives_our_descriptors_for_any_number_of_images(
 
 def test_a_batch_of_one_size_with_the_weights_inside(params: Crisalad, tmp_path: pathlib.Path):
     how = ExportConfig("batch", batch_size=BATCH, weights_inside=True, platforms=("cpu",))
-    manifest = write_export(tmp_path / "inside", params, MODEL, how)
+    manifest = write_export(tmp_path / "inside", Model(params, MODEL), how)
     program = export.deserialize(
         bytearray((tmp_path / "inside" / "describe.jax_export").read_bytes())
     )
@@ -319,5 +319,5 @@ def test_a_transport_that_must_converge(params: Crisalad):
 def test_a_folder_in_use_is_left_as_it_is(params: Crisalad, tmp_path: pathlib.Path):
     write_json(tmp_path / "out" / "other.json", {})
     with pytest.raises(InputError, match=f"^{tmp_path}/out: found a folder with files in it"):
-        write_export(tmp_path / "out", params, MODEL)
+        write_export(tmp_path / "out", Model(params, MODEL))
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["other.json"]

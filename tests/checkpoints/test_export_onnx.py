@@ -29,7 +29,7 @@ from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import Crisalad, describe, init_crisalad, self_mask
+from crisalad_jax.nn.model import Crisalad, Model, describe, init_crisalad, self_mask
 from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.utils.errors import InputError
 from tests.checkpoints.test_export import TOLERANCE, pictures
@@ -52,7 +52,7 @@ Transpose Where Xor
 def beside(params: Crisalad, tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """An ONNX export of any number of images, each alone, weights beside it."""
     out = tmp_path_factory.mktemp("exports") / "onnx"
-    write_export(out, params, MODEL, ExportConfig(format="onnx"))
+    write_export(out, Model(params, MODEL), ExportConfig(format="onnx"))
     return out
 
 
@@ -73,7 +73,7 @@ def test_onnx_gives_our_descriptors_for_any_number_of_images(
 def test_openvino_gives_our_descriptors_for_any_number_of_images(
     params: Crisalad, tmp_path: pathlib.Path
 ):
-    manifest = write_export(tmp_path / "out", params, MODEL, ExportConfig(format="openvino"))
+    manifest = write_export(tmp_path / "out", Model(params, MODEL), ExportConfig(format="openvino"))
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == ["describe.bin", "describe.xml", "manifest.json"]
     openvino = import_openvino()
@@ -103,7 +103,7 @@ def test_a_processor_without_bfloat16_is_told_of(
 
 def test_a_batch_of_one_size_with_the_weights_inside(params: Crisalad, tmp_path: pathlib.Path):
     how = ExportConfig("batch", batch_size=BATCH, weights_inside=True, format="onnx")
-    write_export(tmp_path / "out", params, MODEL, how)
+    write_export(tmp_path / "out", Model(params, MODEL), how)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "describe.onnx",
         "manifest.json",
@@ -118,7 +118,7 @@ def test_a_batch_of_one_size_with_the_weights_inside(params: Crisalad, tmp_path:
 
 def test_floats_that_are_normalised_already(params: Crisalad, tmp_path: pathlib.Path):
     how = ExportConfig(format="onnx", pixels="floats")
-    manifest = write_export(tmp_path / "out", params, MODEL, how)
+    manifest = write_export(tmp_path / "out", Model(params, MODEL), how)
     assert manifest["images"]["dtype"] == "float32"
     images = pictures(2)
     mean, deviation = (np.array(manifest["images"][name]) for name in ("mean", "deviation"))
@@ -186,7 +186,7 @@ def test_what_tensorrt_needs_of_a_program(beside: pathlib.Path):
 @pytest.mark.parametrize("format", ["onnx", "openvino"])
 def test_other_models(config: ModelConfig, format: Any, tmp_path: pathlib.Path):
     params = init_crisalad(jax.random.key(0), config)
-    manifest = write_export(tmp_path / "out", params, config, ExportConfig(format=format))
+    manifest = write_export(tmp_path / "out", Model(params, config), ExportConfig(format=format))
     assert manifest["checked"]["largest_difference"] < TOLERANCE
 
 
@@ -266,7 +266,7 @@ def refused(config: ModelConfig, how: ExportConfig, out: pathlib.Path) -> str:
     """What is said; nothing is left behind."""
     params = init_crisalad(jax.random.key(0), config)
     with pytest.raises(InputError) as caught:
-        write_export(out, params, config, how)
+        write_export(out, Model(params, config), how)
     assert list(out.parent.iterdir()) == []
     return str(caught.value)
 
@@ -349,7 +349,7 @@ def test_products_of_eight_bits(format: Any, params: Crisalad, tmp_path: pathlib
     """Quantisation is worth its name only if descriptors move, and stay near all the same."""
     images = pictures(8)
     how = ExportConfig(format=format)
-    manifest = write_export(tmp_path / "out", params, MODEL, how, calibration=images)
+    manifest = write_export(tmp_path / "out", Model(params, MODEL), how, calibration=images)
     assert manifest["products"] == "int8"
     names = {path.suffix for path in (tmp_path / "out").iterdir()}
     assert names == {".json", *({".xml", ".bin"} if format == "openvino" else {".onnx", ".data"})}
@@ -366,4 +366,4 @@ def test_eight_bits_of_a_program_that_takes_one_number_of_images(
 ):
     how = ExportConfig(format="onnx", batch_size=2)
     with pytest.raises(InputError, match=r"^int8: found with format stablehlo, grouping any"):
-        write_export(tmp_path / "out", params, MODEL, how, calibration=pictures(2))
+        write_export(tmp_path / "out", Model(params, MODEL), how, calibration=pictures(2))

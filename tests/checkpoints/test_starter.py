@@ -12,10 +12,11 @@ from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import find_weights, load
 from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.experiments.synthetic import WorldConfig, write_world
-from crisalad_jax.nn.model import describe
-from crisalad_jax.retrieval.photographs import prepare_image
+from crisalad_jax.nn.model import Model, describe
+from crisalad_jax.retrieval.describe import prepare_image
+from crisalad_jax.synthetic import WorldConfig, write_world
 from crisalad_jax.utils.output import Note
 
 GOLDEN = pathlib.Path(__file__).parents[2] / "parity" / "goldens" / "starter.npz"
@@ -74,6 +75,8 @@ def test_it_tells_places_apart_that_it_never_saw(tmp_path: pathlib.Path) -> None
     write_world(tmp_path / "world", world)
     benchmark = open_benchmark(tmp_path / "world" / "test")
     params, config = load("starter")
-    (result,) = evaluate(params, config, benchmark, groupings=["single"], quiet=True)
-    (hog,) = evaluate(*load("hog"), benchmark, quiet=True)
+    (result,) = evaluate(
+        Model(params, config), benchmark, groupings=["single"], reading=Reading(quiet=True)
+    )
+    (hog,) = evaluate(load("hog"), benchmark, reading=Reading(quiet=True))
     assert result.recalls[1] > hog.recalls[1]

@@ -29,7 +29,7 @@ from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import describe, init_crisalad, self_mask
+from crisalad_jax.nn.model import Model, describe, init_crisalad, self_mask
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 from parity import zoo
@@ -199,7 +199,7 @@ def test_what_a_layout_cannot_tell_goes_to_the_reference(
     for path, value in changed.items():
         config = replaced(config, path.split("."), value)
     ours, back = tmp_path / "ours.safetensors", tmp_path / "back.pth"
-    save_weights(ours, public.params, config, extras=public.extras)
+    save_weights(ours, Model(public.params, config), extras=public.extras)
     with pytest.raises(InputError, match=f"^{ours}: layout {layout}: cannot tell .*{words}"):
         convert(ours, back, layout)
     assert not back.exists()
@@ -236,7 +236,7 @@ def test_what_no_description_depends_on_comes_back(tmp_path: pathlib.Path, layou
     if layout == "dino-salad":
         config = replaced(config, ["aggregator", "dropout"], 0.1)
     ours, back = tmp_path / "ours.safetensors", tmp_path / f"back{suffix}"
-    save_weights(ours, public.params, config, extras=public.extras)
+    save_weights(ours, Model(public.params, config), extras=public.extras)
     assert convert(ours, back, layout).target == layout
     convert(back, tmp_path / "again.safetensors")
     params, again = load_weights(tmp_path / "again.safetensors")
@@ -260,7 +260,7 @@ def test_a_vocabulary_comes_back_with_its_backbones_digest(tmp_path: pathlib.Pat
     params = random_params(config)
     bound = config.aggregator.bind(params.aggregator, params.backbone)
     save_weights(
-        tmp_path / "ours.safetensors", dataclasses.replace(params, aggregator=bound), config
+        tmp_path / "ours.safetensors", Model(dataclasses.replace(params, aggregator=bound), config)
     )
     convert(tmp_path / "ours.safetensors", tmp_path / "back.pth", "reference")
     again = read_checkpoint(tmp_path / "back.pth")
@@ -291,7 +291,7 @@ def test_extras_that_do_not_fit_are_refused(tmp_path: pathlib.Path, extra, words
     public = read_checkpoint(written(tmp_path, "dinov2"))
     name = next(iter(public.extras))
     ours = tmp_path / "ours.safetensors"
-    save_weights(ours, public.params, public.config, extras={name: extra})
+    save_weights(ours, Model(public.params, public.config), extras={name: extra})
     with pytest.raises(InputError, match=f"^{ours}: extra.{name}: {words}"):
         convert(ours, tmp_path / "back.pth")
     assert files(tmp_path) == {"public.pth", "ours.safetensors"}
@@ -393,7 +393,7 @@ def test_a_backbone_of_any_file(tmp_path: pathlib.Path, kind: str) -> None:
     theirs = read_checkpoint(source)
     if kind == "ours":
         source = tmp_path / "ours.safetensors"
-        save_weights(source, theirs.params, theirs.config, extras=theirs.extras)
+        save_weights(source, Model(theirs.params, theirs.config), extras=theirs.extras)
     config, start = fresh("depthwise")
     wanted = named_leaves(theirs.params.backbone)
     for name, leaf in named_leaves(read_backbone(source, config.backbone, start)).items():

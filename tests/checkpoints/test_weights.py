@@ -32,7 +32,7 @@ from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
-from crisalad_jax.nn.model import parameter_shapes
+from crisalad_jax.nn.model import Model, parameter_shapes
 from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
@@ -50,7 +50,7 @@ REGISTERS = dataclasses.replace(
 @pytest.mark.parametrize("config", [MODEL, WITHOUT_ENCODER, REGISTERS])
 def test_weights_survive_a_file_bit_for_bit(tmp_path, config):
     params = random_params(config)
-    save_weights(tmp_path / "new" / "w.safetensors", params, config)
+    save_weights(tmp_path / "new" / "w.safetensors", Model(params, config))
     assert os.listdir(tmp_path / "new") == ["w.safetensors"]
     found, found_config = load_weights(tmp_path / "new" / "w.safetensors")
     assert found_config == config
@@ -58,7 +58,7 @@ def test_weights_survive_a_file_bit_for_bit(tmp_path, config):
 
 
 def test_the_package_offers_both(tmp_path, params):
-    crisalad_jax.save_weights(tmp_path / "w.safetensors", params, MODEL)
+    crisalad_jax.save_weights(tmp_path / "w.safetensors", crisalad_jax.Model(params, MODEL))
     found, config = crisalad_jax.load(str(tmp_path / "w.safetensors"))
     assert config == MODEL
     assert_equal(found, params)
@@ -95,13 +95,13 @@ def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
 
 def test_the_same_weights_give_the_same_bytes(tmp_path, params):
     for name in ("a", "b", "c", "d"):
-        save_weights(tmp_path / f"{name}.safetensors", params, MODEL)
+        save_weights(tmp_path / f"{name}.safetensors", Model(params, MODEL))
     assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
 
 
 def test_half_precision_is_half_the_room_and_every_number_rounded(tmp_path, shared, params):
     """Read again they are float32, and of these the digest is."""
-    save_weights(tmp_path / "half.safetensors", params, MODEL, half=True)
+    save_weights(tmp_path / "half.safetensors", Model(params, MODEL), half=True)
     with safetensors.safe_open(tmp_path / "half.safetensors", framework="numpy") as file:
         stored = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     assert {array.dtype for array in stored.values()} == {np.dtype(np.float16)}
@@ -112,7 +112,7 @@ def test_half_precision_is_half_the_room_and_every_number_rounded(tmp_path, shar
         assert leaf.dtype == np.float32
         np.testing.assert_array_equal(leaf, expected.astype(np.float16).astype(np.float32))
     assert digest == model_hash(found, MODEL) != model_hash(params, MODEL)
-    save_weights(tmp_path / "again.safetensors", found, MODEL, half=True)
+    save_weights(tmp_path / "again.safetensors", Model(found, MODEL), half=True)
     assert weights.load_with_hash(tmp_path / "again.safetensors")[2] == digest
     assert (tmp_path / "half.safetensors").stat().st_size < 0.6 * (
         shared / "weights.safetensors"
@@ -127,7 +127,7 @@ def test_what_half_precision_cannot_hold_is_named(tmp_path, params):
         params, aggregator=dataclasses.replace(params.aggregator, score=score)
     )
     with pytest.raises(InputError, match=r"aggregator\.score\.fc1\.weight"):
-        save_weights(tmp_path / "half.safetensors", wrong, MODEL, half=True)
+        save_weights(tmp_path / "half.safetensors", Model(wrong, MODEL), half=True)
     assert not list(tmp_path.iterdir())
 
 
@@ -153,7 +153,7 @@ def test_parameters_of_one_image_size_keep_it(tmp_path):
         WITHOUT_ENCODER, aggregator=MixVprConfig(channels=8, rows=2, depth=1)
     )
     params, path = random_params(config), tmp_path / "w.safetensors"
-    save_weights(path, params, config)
+    save_weights(path, Model(params, config))
     found, _ = load_weights(path, expected=dataclasses.replace(config, compute_dtype="bfloat16"))
     assert_equal(found, params)
     # As many patches, in another grid: every array would fit.
@@ -515,7 +515,7 @@ def brightest(features):
 def save_brightest(path: pathlib.Path) -> ModelConfig:
     """Write a model of the plug-in's aggregator."""
     config = dataclasses.replace(WITHOUT_ENCODER, aggregator="brightest")
-    save_weights(path, random_params(config), config)
+    save_weights(path, Model(random_params(config), config))
     return config
 
 

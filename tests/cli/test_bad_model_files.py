@@ -195,5 +195,5 @@ def test_training_from_another_size_or_kind(capfd: Capture, tmp_path: pathlib.Pa
 
 
 def test_a_published_name_is_no_file_to_convert(capfd: Capture, tmp_path: pathlib.Path) -> None:
-    words = ("salad: found the name of a published model, expected a file; --weights salad takes",)
+    words = ("salad: found the name of a published model, expected a file; --weights salad",)
     fails(capfd, "convert", "salad", tmp_path / "x.safetensors", words=words)

@@ -10,10 +10,11 @@ import pytest
 from crisalad_jax.checkpoints.load import load
 from crisalad_jax.cli import main
 from crisalad_jax.data.images import list_images, read_image
-from crisalad_jax.nn.model import describe
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.nn.model import Model, describe
+from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.retrieval.photographs import prepare_image
 from tests.cli.test_cli import Capture, fails
 
 NOTE = "crisalad: note: no --weights: taking starter"
@@ -129,10 +130,16 @@ def test_a_map_made_in_python_by_its_name_is_asked_without_weights(
 ) -> None:
     images = shared / "town" / "images" / "test" / "database"
     params, config = load("starter")
-    index(params, config, images, tmp_path / "map", weights="starter", quiet=True)
+    index(
+        Model(params, config),
+        images,
+        tmp_path / "map",
+        weights="starter",
+        reading=Reading(quiet=True),
+    )
     with Map.open(tmp_path / "map") as places:
-        assert places.head.weights == "starter"
-        assert places.load_params() is not None
+        assert places.metadata.weights == "starter"
+        assert places.load_model() is not None
 
 
 def test_a_map_of_it_is_calibrated_without_weights(

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from crisalad_jax.checkpoints.weights import save_weights
+from crisalad_jax.nn.model import Model
 from tests.cli.test_cli import fails, files_in, succeeds
 from tests.conftest import BATCH, random_params
 from tests.experiments.report.test_page import Page
@@ -15,7 +16,7 @@ from tests.retrieval.reranking.test_stage import TRANSVPR
 def weights(tmp_path):
     """Of a model that makes what TransVPR compares."""
     path = tmp_path / "transvpr.safetensors"
-    save_weights(path, random_params(TRANSVPR), TRANSVPR)
+    save_weights(path, Model(random_params(TRANSVPR), TRANSVPR))
     return path
 
 

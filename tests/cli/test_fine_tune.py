@@ -13,6 +13,7 @@ from crisalad_jax.cli import main, train
 from crisalad_jax.config.io import differences
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import Model
 from crisalad_jax.training.config import MiningConfig
 from crisalad_jax.training.start import read_start
 from crisalad_jax.utils.output import Note
@@ -66,7 +67,7 @@ def test_a_part_that_the_recipe_puts_in_place_is_told_not_ignored(shared, tmp_pa
 def test_what_is_saved_has_the_files_images(shared, tmp_path, capfd):
     model = dataclasses.replace(MODEL, image_size=(28, 42))
     params, _ = load_weights(shared / "weights.safetensors")
-    save_weights(tmp_path / "w.safetensors", params, model)
+    save_weights(tmp_path / "w.safetensors", Model(params, model))
     flags = ["--preset", "tiny", "--epochs", "1", "--places-per-batch", "3", "--quiet"]
     files = ("--data", shared / "city", "--out", tmp_path / "run")
     arguments = ["train", "--weights", tmp_path / "w.safetensors", *files, *flags]
@@ -81,14 +82,14 @@ def test_what_is_saved_has_the_files_images(shared, tmp_path, capfd):
 def test_python_tells_of_weights_for_other_images(shared, tmp_path):
     params, _ = load_weights(shared / "weights.safetensors")
     file, city = tmp_path / "w.safetensors", shared / "city"
-    save_weights(file, params, dataclasses.replace(MODEL, image_size=(28, 42)))
+    save_weights(file, Model(params, dataclasses.replace(MODEL, image_size=(28, 42))))
     config = dataclasses.replace(RECIPE, epochs=1)
     words = r"found weights for images at 28 x 42, .* this run trains and is saved with 42 x 56,"
     with pytest.warns(Note, match=words):
         cj.train(config, city, tmp_path / "a", weights=file, quiet=True)
     area = dataclasses.replace(MODEL.preprocessing, filter="area")
     save_weights(
-        tmp_path / "area.safetensors", params, dataclasses.replace(MODEL, preprocessing=area)
+        tmp_path / "area.safetensors", Model(params, dataclasses.replace(MODEL, preprocessing=area))
     )
     with pytest.warns(Note, match=r"images at 42 x 56, area.* saved with 42 x 56, b"):
         read_start(config, weights=tmp_path / "area.safetensors", backbone=None)

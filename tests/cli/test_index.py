@@ -14,14 +14,15 @@ import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.cli import main
-from crisalad_jax.cli.info import _map_lines
+from crisalad_jax.cli.tables import fact_lines
 from crisalad_jax.data.images import list_images
-from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
-from crisalad_jax.retrieval.maps.manifest import describe_map
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.metadata import new_metadata
 from tests.cli.test_cli import fails, files_in, succeeds
-from tests.conftest import BATCH, MODEL, random_params
+from tests.conftest import BATCH, MODEL, describe_single, random_params
 from tests.retrieval.maps.test_stores import ROUNDING, brute_force
 from tests.retrieval.test_hloc_pairs import brute_force as nearest
 from tests.retrieval.test_hloc_pairs import by_name, pairs_as_hloc_reads_them
@@ -59,11 +60,8 @@ def folder(shared, database, tmp_path, capfd) -> pathlib.Path:
 
 def expected_answers(shared, database, queries, k: int) -> list[list[bytes]]:
     """Pictures, by descriptors of the library and brute force."""
-    params, config = load_weights(shared / "weights.safetensors")
-    sides = []
-    for paths in (list_images(database), list_images(queries)):
-        tokens = read_tokens(params, config, paths, batch_size=BATCH, label="", quiet=True)
-        sides.append(group(params, config, tokens, "single", batch_size=BATCH))
+    model = load_weights(shared / "weights.safetensors")
+    sides = [describe_single(model, list_images(side)) for side in (database, queries)]
     names = [path.name for path in list_images(database)]
     return pictures(database, [[names[i] for i in row] for row in brute_force(*sides, k)])
 
@@ -196,13 +194,14 @@ def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd):
     day = json.loads((folder / "segments" / "0000000000.json").read_text())["added"][:10]
     root = (shared / "town" / "images" / "test" / "database").resolve()
     for words in (
-        "images 7, at 42 x 56, ",
-        "folders top folder: 7 images",
-        f"additions {day}: 7 images of {root}",
-        f"positions 7, east {east[0]:.9g} to {east[1]:.9g}, north {north[0]:.9g} to {north[1]:.9g}",
+        "images 7 positions 7 axes east, north",
+        "folders folder ., images 7",
+        f"additions day {day}, root {root}, images 7",
+        f"extent east {east[0]:.9g} to {east[1]:.9g}, north {north[0]:.9g} to {north[1]:.9g}",
+        "resize 42 x 56, ",
         "search exact",
-        f"model {shared / 'weights.safetensors'} (",
-        "verified no descriptor has changed",
+        f"weights {shared / 'weights.safetensors'}",
+        "verified yes",
     ):
         assert words in said
     assert "none" not in said
@@ -217,19 +216,22 @@ def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd):
     both = "info", "--map", folder, "--batch-size", 4
     fails(capfd, *both, words=("--batch-size: found beside --map",))
     fails(capfd, "info", "--map", folder, "--verify", words=("descriptors 0 to 6 have changed",))
-    # Of a large map with videos, of an older version.
-    days = ({"folder": str(day), "images": 2, "first": "1d", "last": "2d"} for day in range(11))
-    more = {"folders": [{"folder": "a.avi", "images": 1, "first": 0.5, "last": 12.25}, *days]}
-    more |= {"additions": [{"day": None, "root": "/r", "images": 23}], "extent": None}
-    lines = list(_map_lines(summary | more | {"stale_search": "faiss"}))
-    assert [line for name, line in lines if name in ("folders", "additions", "search")] == [
-        "a.avi: 1 image, 0.5 to 12.25 s",
-        *(f"{day}: 2 images, 1d to 2d" for day in range(9)),
-        "and 2 more",
-        "day unknown: 23 images of /r",
-        "exact; faiss lacks images",
+
+
+def test_a_long_fact_is_cut_after_ten_rows():
+    rows = [
+        {"folder": "a.avi", "images": 1200, "first": 0.5},
+        *({"folder": str(i)} for i in range(11)),
     ]
-    assert "positions" not in dict(lines)
+    lines = list(fact_lines({"map": None, "folders": rows, "axes": ("lat", "lon"), "ok": True}))
+    assert lines == [
+        "map      not said",
+        "folders  folder a.avi, images 1,200, first 0.5",
+        *(f"         folder {i}" for i in range(9)),
+        "         and 2 more",
+        "axes     lat, lon",
+        "ok       yes",
+    ]
 
 
 def test_positions_come_from_a_table(shared, database, tmp_path, capfd):
@@ -267,7 +269,7 @@ def test_a_map_of_another_model_is_refused(shared, folder, database, queries, tm
     )
     config = dataclasses.replace(MODEL, aggregator=salad)
     other = tmp_path / "other.safetensors"
-    save_weights(other, random_params(config), config)
+    save_weights(other, Model(random_params(config), config))
     before = files_in(folder)
     words = (f"{folder}: found a map made by model", "is model", other)
     made = ("index", "--weights", other, "--images", database, "--out", folder)
@@ -279,7 +281,7 @@ def test_a_map_of_another_model_is_refused(shared, folder, database, queries, tm
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (("--image-size", 56, 56), "found image size (56, 56), expected (42, 56) as in the map"),
+        (("--image-size", 56, 56), "found images at 56 x 56, bilinear"),
         (("--compute-dtype", "bfloat16"), "found compute dtype bfloat16, expected float32"),
         (("--dtype", "float16"), "found dtype float16, expected float32 as in the map"),
         (("--store", "milvus:x.db"), "expected files as in the map"),
@@ -330,14 +332,14 @@ def test_a_command_that_failed_binds_the_corrected_one_to_nothing(
     nowhere = ("--store", "milvus:http://127.0.0.1:9")
     fails(capfd, *index(shared, database, out, *nowhere), words=("Fail connecting",))
     assert not out.exists()
-    params, config = load_weights(shared / "weights.safetensors")
-    other = describe_map(params, config, tmp_path / "w", out, dtype="float16")
+    describer = describer_of(load_weights(shared / "weights.safetensors"))
+    other = new_metadata(describer, tmp_path / "w", out, dtype="float16")
     other = dataclasses.replace(other, model="0" * 64)
     with open_for_appending(out, other):
         pass
     succeeds(capfd, *index(shared, database, out, "--dtype", "float32"))
     with Map.open(out) as found:
-        assert (len(found), found.description.dtype) == (7, "float32")
+        assert (len(found), found.metadata.dtype) == (7, "float32")
 
 
 def test_positions_of_images_that_are_there_are_said_to_stay(
@@ -354,9 +356,7 @@ def test_positions_of_images_that_are_there_are_said_to_stay(
     images.mkdir()
     (images / "new.png").write_bytes(known[0].read_bytes())
     table.write_text("name,lat,lon\nnew.png,1,2\n")
-    monkeypatch.setattr(
-        "crisalad_jax.retrieval.maps.build.describe_alone", None
-    )  # nothing is described
+    monkeypatch.setattr("crisalad_jax.retrieval.maps.build.described", None)
     made = index(shared, images, folder, "--positions", table)
     fails(
         capfd, *made, words=("degrees of longitude from the middle of zone 10 south, whose metres",)

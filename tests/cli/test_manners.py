@@ -24,8 +24,10 @@ from crisalad_jax.cli.completion import completion_script
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.benchmarks.benchmark import leave_out_unreadable
 from crisalad_jax.data.places import read_places
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.results import to_json
+from crisalad_jax.nn.model import Model
 from crisalad_jax.training.loop import fit
 from crisalad_jax.utils.errors import InputError
 from tests.cli.test_cli import fails, files_in, spoil, succeeds, train
@@ -123,16 +125,11 @@ def test_a_flag_that_is_not_common_still_parses_and_stands_in_the_whole_help(cap
     assert "--model.aggregator.sinkhorn" not in succeeds(capfd, "train", *part, "--help-all")
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("One. Two.", ["One. Two (5)"]),
-        ("A first clause that is long enough; and one that does not fit", None),
-    ],
-)
-def test_a_text_is_cut_after_a_clause(text, expected):
-    lines = helping._fitted(text, " (5)", 44, 1)
-    assert lines == (expected or ["A first clause that is long enough (5)"])
+def test_a_text_is_cut_after_a_clause_and_keeps_its_default(capfd):
+    out = succeeds(capfd, "evaluate", "--help")
+    assert "or hog, a baseline that learns nothing" in " ".join(out.split())
+    assert "... (single,shuffled,sequential,window/single) --batch-size INT" in out
+    assert "--[no-]verify" in succeeds(capfd, "pca", "--help")
 
 
 # Completion
@@ -298,7 +295,7 @@ def test_a_run_prints_json(capfd, tmp_path, shared, run):
     found, words = printed(capfd, *given, "--json", "-")
     assert f"{STEPS} steps, best R@5" in words
     assert (found["steps"], found["epochs"], found["stopped_early"]) == (STEPS, 3, False)
-    best = json.loads((run / "config.json").read_text())["select_by"]
+    best = json.loads((run / "config.json").read_text())["monitor"]
     assert found["best"]["name"] == best
     assert f"best R@5 {100 * found['best']['recall']:.1f}" in words
 
@@ -328,12 +325,10 @@ def test_an_evaluation_that_skips_is_that_of_the_readable_set(
         capfd, *given, "--on-bad-image", "skip", "--json", "-", "--report", tmp_path / "page"
     )
     expected = evaluate(
-        params,
-        MODEL,
+        Model(params, MODEL),
         open_benchmark(whole),
         groupings=["single", "window"],
-        batch_size=BATCH,
-        quiet=True,
+        reading=Reading(batch_size=BATCH, quiet=True),
     )
     for row, result in zip(found["results"], expected, strict=True):
         values = json.loads(json.dumps(to_json(result)))
@@ -380,7 +375,12 @@ def test_a_comparison_that_skips(capfd, tmp_path, shared, params, spoilt):
     fails(capfd, *given, words=("found an image cut short",))
     shutil.rmtree(tmp_path / "out")
     found, _ = printed(capfd, *given, "--on-bad-image", "skip", "--json", "-")
-    (expected,) = evaluate(params, MODEL, open_benchmark(whole), groupings=["single"], quiet=True)
+    (expected,) = evaluate(
+        Model(params, MODEL),
+        open_benchmark(whole),
+        groupings=["single"],
+        reading=Reading(quiet=True),
+    )
     (row,) = found["rows"]
     recalls = next(iter(row["recalls"].values()))
     assert {name: each["mean"] for name, each in recalls.items()} == {

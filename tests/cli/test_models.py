@@ -1,20 +1,17 @@
 """`crisalad models`, and published models by name at the verbs that take weights."""
 
 import dataclasses
-import io
 import json
 import pathlib
 
 import numpy as np
 import pytest
-import rich.console
 
 from crisalad_jax.checkpoints.cache import cached_weights
 from crisalad_jax.checkpoints.layouts import LAYOUTS
 from crisalad_jax.checkpoints.published import PUBLISHED, Licence, Published
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli import main
-from crisalad_jax.cli.tables import models_table
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.training.start import read_start
 from tests.checkpoints.test_cache import CONFIG, DATA, FILE
@@ -53,7 +50,7 @@ def runs(capfd: pytest.CaptureFixture[str], *arguments: object) -> tuple[str, st
 
 def test_the_table_has_every_model_and_marks_those_in_the_cache(capfd, tmp_path):
     out, _ = runs(capfd, "models")
-    rows = {row.split()[0]: row for row in out.splitlines() if row[1:2].strip()}
+    rows = {row.split()[1]: row for row in out.splitlines() if row.startswith("│ ")}
     assert rows.keys() >= PUBLISHED.keys()
     for words in ("8,448", "228.6 M", "MIT", "gmberton/MegaLoc"):
         assert words in rows["megaloc"]
@@ -63,27 +60,6 @@ def test_the_table_has_every_model_and_marks_those_in_the_cache(capfd, tmp_path)
     out, _ = runs(capfd, "models")
     assert " tiny-model * " in out
     assert out.count(" * ") == 2  # with the line that explains it
-
-
-@pytest.mark.parametrize(
-    ("width", "last"), [(40, "name"), (80, "licence"), (120, "images"), (None, "on GitHub")]
-)
-def test_no_name_of_the_table_is_cut_or_wrapped(width: int | None, last: str) -> None:
-    """On a terminal the columns at the right are left out; into a pipe all are written."""
-    output = io.StringIO()
-    narrow = rich.console.Console(file=output, width=width or 120)
-    narrow.print(models_table(tuple(PUBLISHED.values()), width), crop=False)
-    lines = output.getvalue().splitlines()
-    head, rows = lines[1], lines[3:-1]
-    assert head.rstrip().endswith(last)
-    assert len(rows) == len(PUBLISHED)
-    assert all(len(line) <= (width or 300) for line in lines)
-    for row, model in zip(rows, PUBLISHED.values(), strict=True):
-        assert row.split()[0] == model.name
-        if last != "name":
-            assert model.licence.name in row
-        if width is None:
-            assert row.rstrip().endswith(model.repository.removeprefix("https://github.com/"))
 
 
 def test_one_model_is_told_with_all_that_is_known(capfd):
@@ -154,7 +130,7 @@ def test_weights_by_name(capfd, tmp_path):
     assert np.load(tmp_path / "d.npy").shape == (1, 64)
     runs(capfd, "index", *given, *size, "--out", tmp_path / "map")
     with Map.open(tmp_path / "map") as places:
-        assert places.description.weights == str(weights)
+        assert places.metadata.weights == str(weights)
     out, _ = runs(capfd, "query", tmp_path / "images", "--map", tmp_path / "map", *given[:2])
     assert "a.png" in out
 

@@ -8,6 +8,7 @@ import pytest
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.model import Model
 from tests.cli.test_cli import fails
 from tests.conftest import MODEL, random_params
 
@@ -22,7 +23,7 @@ def test_every_command_that_describes_refuses_it(
     shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     weights, out = tmp_path / "w.safetensors", tmp_path / "out.npy"
-    save_weights(weights, random_params(CONFIG), CONFIG)
+    save_weights(weights, Model(random_params(CONFIG), CONFIG))
     images = shared / "town" / "images" / "test" / "database"
     for command in (
         ("evaluate", "--data", shared / "town", "--out", out),

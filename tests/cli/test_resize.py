@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.extract import extract
 from tests.cli.test_cli import fails, succeeds
 
@@ -26,7 +28,9 @@ def test_words_change_what_is_extracted_and_are_told(
     assert record["model"]["preprocessing"]["filter"] == "bicubic"
     params, config = load_weights(weights)
     config = config.resized(None, ["bicubic", "floats"])
-    expected = extract(params, config, images, batch_size=4, quiet=True).descriptors
+    expected = extract(
+        Model(params, config), images, reading=Reading(batch_size=4, quiet=True)
+    ).descriptors
     # The same program on the same numbers.
     np.testing.assert_allclose(np.load(out), expected, atol=1e-6)
 

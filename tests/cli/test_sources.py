@@ -14,6 +14,7 @@ import pytest
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.cli import main
 from crisalad_jax.data.images import list_images
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.descriptor_files import read_descriptors
 from crisalad_jax.retrieval.maps.map import Map
 from tests.cli.test_cli import fails, succeeds
@@ -98,7 +99,7 @@ def test_one_image_is_one(shared, images, tmp_path, capfd):
 
 
 def test_a_folder_that_is_no_map_is_not_asked(images, capfd):
-    words = f"{images}: found a.jpg and no map.json, expected a map\n"
+    words = f"{images}: found a.jpg and no map.json, expected a map or an empty folder\n"
     assert fails(capfd, *query(images, images), words=()).endswith(words)
 
 
@@ -161,7 +162,7 @@ def test_the_default_rate_of_a_video_is_said(shared, folder, tmp_path, capfd):
     video = write_video(tmp_path / "walk.avi", 21)
     said = f"crisalad: note: {video}: 3 of 21 frames, 1 per second: --fps\n"
     weights = ("--weights", shared / "weights.safetensors")
-    save_weights(tmp_path / "start.safetensors", random_params(ANYLOC), ANYLOC)
+    save_weights(tmp_path / "start.safetensors", Model(random_params(ANYLOC), ANYLOC))
     out = ("--out", tmp_path / "d.npy")
     verbs = (
         ("extract", *weights, "--images", video, *out, "--quiet"),

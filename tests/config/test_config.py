@@ -18,7 +18,6 @@ from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.experiments.demo import DemoConfig
-from crisalad_jax.experiments.synthetic import SyntheticCityConfig
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.losses.circle import CircleConfig
 from crisalad_jax.losses.contrastive import ContrastiveConfig
@@ -44,6 +43,7 @@ from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.retrieval.pca import PcaConfig
 from crisalad_jax.sinkhorn import SinkhornConfig
+from crisalad_jax.synthetic import SyntheticCityConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.recipes import RECIPES, from_scratch, recipe
 from crisalad_jax.utils.errors import InputError
@@ -94,7 +94,7 @@ def test_the_recipes_are_their_papers():
     """serizba/salad and Lu-Feng/CricaVPR as published; Table 2's rows."""
     salad = recipe("b14", "salad")
     assert (salad.places_per_batch, salad.images_per_place, salad.epochs) == (60, 4, 4)
-    assert (salad.trainable, salad.select_by) == ("last-4-blocks+head", "R@1")
+    assert (salad.trainable, salad.monitor) == ("last-4-blocks+head", "R@1")
     assert (salad.model.backbone.adapter.kind, salad.model.cross_image.layers) == ("none", 0)
     optimiser = salad.optimiser
     assert (optimiser.kind, optimiser.learning_rate) == ("adamw", 6e-5)
@@ -111,7 +111,7 @@ def test_the_recipes_are_their_papers():
     optimiser = cricavpr.optimiser
     assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == ("adam", 1e-4, 0.0)
     assert (optimiser.schedule, optimiser.step_epochs, optimiser.step_gamma) == ("step", 3, 0.5)
-    assert (cricavpr.epochs, cricavpr.patience, cricavpr.select_by) == (10, 10, "R@5")
+    assert (cricavpr.epochs, cricavpr.patience, cricavpr.monitor) == (10, 10, "R@5")
     paper = recipe("b14")
     netvlad = recipe("b14", "crisalad+netvlad")
     assert (netvlad.places_per_batch, netvlad.images_per_place) == (48, 4)
@@ -178,7 +178,7 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
     assert boq.model.descriptor_dim == 12_288
     assert boq.model.preprocessing.filter == "bicubic"
     assert (boq.trainable, boq.places_per_batch, boq.epochs) == ("last-2-blocks+head", 128, 40)
-    assert (boq.augmentation, boq.select_by) == (RandAugmentConfig(3, 15), "R@1")
+    assert (boq.augmentation, boq.monitor) == (RandAugmentConfig(3, 15), "R@1")
     assert boq.optimiser == OptimiserConfig(
         kind="adamw",
         learning_rate=1e-4,
@@ -190,7 +190,7 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
     )
     mix = recipe("b14", "dino-mix")
     assert mix.model.aggregator == MixVprConfig(channels=1024, rows=4, depth=2, last_norm=False)
-    assert (mix.places_per_batch, mix.epochs, mix.select_by) == (80, 60, "R@1")
+    assert (mix.places_per_batch, mix.epochs, mix.monitor) == (80, 60, "R@1")
     assert mix.trainable == "last-4-blocks+positions+head"
     assert mix.optimiser == OptimiserConfig(
         kind="sgd",
@@ -208,7 +208,7 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
     assert vlad.model.descriptor_dim == 4 * 768
     assert vlad.trainable == "last-4-blocks+no-norm+head"
     assert (vlad.places_per_batch, vlad.epochs, vlad.patience) == (120, 20, 3)
-    assert vlad.select_by == "R@1+R@5"
+    assert vlad.monitor == "R@1+R@5"
     assert vlad.optimiser == OptimiserConfig(
         kind="adam",
         learning_rate=5e-5,
@@ -222,11 +222,11 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
     assert (image.model.backbone.registers, image.model.backbone.position_resize) == (4, "plain")
     assert (image.trainable, image.optimiser) == (vlad.trainable, vlad.optimiser)
     assert (image.places_per_batch, image.epochs, image.patience) == (120, 20, 20)
-    assert (image.model.descriptor_dim, image.select_by) == (6144, "R@1+R@5")
+    assert (image.model.descriptor_dim, image.monitor) == (6144, "R@1+R@5")
     buff, salad = recipe("b14", "vlad-buff"), recipe("b14", "salad")
     assert buff.model.aggregator == VladBuffConfig(clusters=64, reduced=192)
     assert dataclasses.replace(buff, model=salad.model) == salad
-    assert (buff.places_per_batch, buff.epochs, buff.select_by) == (60, 4, "R@1")
+    assert (buff.places_per_batch, buff.epochs, buff.monitor) == (60, 4, "R@1")
     assert buff.trainable == "last-4-blocks+head"
     assert buff.optimiser == OptimiserConfig(
         kind="adamw",
@@ -272,11 +272,11 @@ def test_the_recipes_over_resnet_are_as_published():
     assert boq.trainable == "last-2-blocks+head"
     assert boq.optimiser == recipe("b14", "boq").optimiser
     for config in (mix, conv, boq):
-        assert (config.batch_norm, config.select_by) == ("batch", "R@1")
+        assert (config.batch_norm, config.monitor) == ("batch", "R@1")
     cosplace = recipe("b14", "cosplace")
     assert cosplace.model.backbone == ResNetConfig(layers=18, stages=4)
     assert (cosplace.model.image_size, cosplace.model.descriptor_dim) == ((512, 512), 512)
-    assert (cosplace.trainable, cosplace.select_by) == ("last-2-blocks+head", "R@1")
+    assert (cosplace.trainable, cosplace.monitor) == ("last-2-blocks+head", "R@1")
     assert cosplace.augmentation == ColourCropConfig(0.7, 0.7, 0.7, 0.5, 0.5)
     classes = cosplace.loss.kind.classes
     assert (classes.kind, classes.groups, cosplace.min_images) == ("cells", 8, 10)
@@ -289,7 +289,7 @@ def test_the_recipes_over_resnet_are_as_published():
     edtformer = recipe("b14", "edtformer")
     assert edtformer.model.descriptor_dim == 4096
     assert edtformer.model.backbone.adapter_dim == 4
-    assert (edtformer.epochs, edtformer.patience, edtformer.select_by) == (15, 15, "R@5")
+    assert (edtformer.epochs, edtformer.patience, edtformer.monitor) == (15, 15, "R@5")
     assert edtformer.optimiser.step_gamma == 0.7
 
 

@@ -23,13 +23,13 @@ from crisalad_jax.data.places import Places
 from crisalad_jax.evaluation.metrics import PrecisionRecall
 from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.nn.model import parameter_shapes
+from crisalad_jax.retrieval.extract import Extracted
 from crisalad_jax.retrieval.maps.build import Indexed
 from crisalad_jax.retrieval.maps.live import LiveAnswer
 from crisalad_jax.retrieval.maps.map import Answer, MapImage
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca
-from crisalad_jax.retrieval.sets import Extracted
 from crisalad_jax.training.recipes import RECIPES
 from crisalad_jax.training.summary import ModelSummary
 from crisalad_jax.training.vocabulary import Vocabulary

@@ -10,12 +10,14 @@ import pytest
 
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.images import read_image
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.evaluation.evaluate import evaluate, same_place_rule
 from crisalad_jax.evaluation.leakage import near, same_place_share
 from crisalad_jax.evaluation.results import GroupingResult
-from crisalad_jax.nn.model import describe
-from crisalad_jax.retrieval.describe import FolderTokens, group, read_tokens
+from crisalad_jax.nn.model import Model, describe
+from crisalad_jax.retrieval.describe import Described, group, read_tokens
+from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.grouping import GROUPINGS, batches_of
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL, random_params
@@ -40,13 +42,19 @@ def images(benchmark: Benchmark) -> np.ndarray:
     return pictures(benchmark.database)
 
 
+def tokens_of(params, paths, config=MODEL, **options) -> Described:
+    reading = Reading(batch_size=BATCH, quiet=True, **options)
+    return read_tokens(describer_of(Model(params, config)), paths, reading)
+
+
 @pytest.fixture(scope="module")
-def folder(benchmark: Benchmark, params) -> FolderTokens:
-    return read_tokens(params, MODEL, benchmark.database, batch_size=BATCH, label="", quiet=True)
+def folder(benchmark: Benchmark, params) -> np.ndarray:
+    return tokens_of(params, benchmark.database).descriptors
 
 
-def grouped(params, folder: FolderTokens, grouping: str, **changes) -> np.ndarray:
-    return group(params, MODEL, folder, grouping, **({"batch_size": BATCH} | changes))
+def grouped(params, rows: np.ndarray, grouping: str, config=MODEL, **changes) -> np.ndarray:
+    describer = describer_of(Model(params, config))
+    return group(describer, rows, len(rows), grouping, **({"batch_size": BATCH} | changes))
 
 
 def alike(found: np.ndarray, expected: np.ndarray) -> None:
@@ -95,12 +103,9 @@ def test_window_is_each_image_with_those_just_before_it(params, folder, images):
 def test_a_window_owes_nothing_to_older_frames_nor_to_later_ones(params, folder, changed):
     """Through two layers of a strip with a mask, an older frame would come through."""
     assert MODEL.cross_image.layers == 2
-    local = folder.local.copy()
-    local[changed] = folder.local[(changed + 3) % 7]
-    global_tokens = folder.global_tokens.copy()
-    global_tokens[changed] = folder.global_tokens[(changed + 3) % 7]
-    before = grouped(params, folder, "window")
-    after = grouped(params, FolderTokens(global_tokens, local, folder.readable), "window")
+    rows = folder.copy()
+    rows[changed] = folder[(changed + 3) % 7]
+    before, after = (grouped(params, each, "window") for each in (folder, rows))
     moved = np.abs(after - before).max(axis=1)
     sees = np.arange(7) - changed
     # The same program on the same numbers: to the bit.
@@ -118,19 +123,22 @@ def test_an_unreadable_image_is_seen_by_none(params, benchmark, images, folder, 
     bad = tmp_path / "bad.jpg"
     bad.write_bytes(b"")
     paths = [*benchmark.database[:2], bad, *benchmark.database[2:4]]
-    found = read_tokens(
-        params, MODEL, paths, batch_size=BATCH, label="", on_bad_image="skip", quiet=True
-    )
-    np.testing.assert_array_equal(found.readable, [True, True, False, True, True])
-    descriptors = grouped(params, found, "sequential")
-    alike(descriptors[[0, 1, 3]], np.asarray(describe(params, images[:3], MODEL)))
-    alike(descriptors[4:], np.asarray(describe(params, images[3:4], MODEL)))
+    found = tokens_of(params, paths, on_bad_image="skip")
+    assert (found.indices.tolist(), found.unreadable.tolist()) == ([0, 1, 3, 4], [2])
+    descriptors = grouped(params, found.descriptors, "sequential")
+    alike(descriptors, np.asarray(describe(params, images[:4], MODEL)))
     with pytest.raises(InputError, match=f"^{bad}: "):
-        read_tokens(params, MODEL, paths, batch_size=BATCH, label="", quiet=True)
+        tokens_of(params, paths)
 
 
 def test_recalls_equal_brute_force(params, benchmark):
-    results = evaluate(params, MODEL, benchmark, batch_size=BATCH, seed=7, seeds=1, quiet=True)
+    results = evaluate(
+        Model(params, MODEL),
+        benchmark,
+        seed=7,
+        seeds=1,
+        reading=Reading(batch_size=BATCH, quiet=True),
+    )
     assert [result.grouping for result in results] == [
         *("single", "shuffled", "sequential", "window/single")
     ]
@@ -180,29 +188,25 @@ def test_recalls_equal_brute_force(params, benchmark):
 
 def test_only_the_groupings_asked_for_in_their_order(params, benchmark):
     results = evaluate(
-        params,
-        MODEL,
+        Model(params, MODEL),
         benchmark,
         groupings=("sequential", "single"),
-        batch_size=BATCH,
-        quiet=True,
+        reading=Reading(batch_size=BATCH, quiet=True),
     )
     assert [result.grouping for result in results] == ["sequential", "single"]
 
 
 def test_without_an_encoder_no_descriptor_depends_on_its_batch(benchmark):
     params = random_params(WITHOUT_ENCODER)
-    folder = read_tokens(
-        params, WITHOUT_ENCODER, benchmark.database, batch_size=BATCH, label="", quiet=True
-    )
-    single, *others = (
-        group(params, WITHOUT_ENCODER, folder, name, batch_size=BATCH) for name in GROUPINGS
-    )
+    rows = tokens_of(params, benchmark.database, WITHOUT_ENCODER).descriptors
+    single, *others = (grouped(params, rows, name, WITHOUT_ENCODER) for name in GROUPINGS)
     assert len(others) == 3
     for found in others:
         # A window's program is another one than a batch's.
         alike(found, single)
-    (result,) = evaluate(params, WITHOUT_ENCODER, benchmark, batch_size=BATCH, quiet=True)
+    (result,) = evaluate(
+        Model(params, WITHOUT_ENCODER), benchmark, reading=Reading(batch_size=BATCH, quiet=True)
+    )
     assert result.grouping == "any"
     assert (result.query_share, result.database_share, dict(result.by_seed)) == (None, None, {})
 
@@ -211,14 +215,14 @@ def test_an_image_that_cannot_be_read_stops_an_evaluation(params, town: pathlib.
     benchmark = open_benchmark(town)
     benchmark.queries[2].write_bytes(benchmark.queries[2].read_bytes()[:200])
     with pytest.raises(InputError, match=f"^{benchmark.queries[2]}: .*cut short"):
-        evaluate(params, MODEL, benchmark, batch_size=BATCH, quiet=True)
+        evaluate(Model(params, MODEL), benchmark, reading=Reading(batch_size=BATCH, quiet=True))
 
 
 def test_a_set_without_ground_truth_is_refused_before_anything_is_read(params, town):
     benchmark = dataclasses.replace(open_benchmark(town), positives=None)
     benchmark.database[0].write_bytes(b"")
     with pytest.raises(InputError, match=re.escape(f"{benchmark.name}: no ground truth")):
-        evaluate(params, MODEL, benchmark, batch_size=BATCH, quiet=True)
+        evaluate(Model(params, MODEL), benchmark, reading=Reading(batch_size=BATCH, quiet=True))
 
 
 # A shuffle's seeds
@@ -233,14 +237,12 @@ def shuffles(params, benchmark: Benchmark) -> tuple[GroupingResult, list[Groupin
 
     def shuffled(seed: int, seeds: int) -> GroupingResult:
         (result,) = evaluate(
-            params,
-            MODEL,
+            Model(params, MODEL),
             benchmark,
             groupings=("shuffled/single",),
-            batch_size=BATCH,
             seed=seed,
             seeds=seeds,
-            quiet=True,
+            reading=Reading(batch_size=BATCH, quiet=True),
         )
         return result
 
@@ -267,13 +269,11 @@ def test_mean_and_spread_are_those_of_the_seeds_alone(shuffles):
 
 def test_what_is_not_random_is_of_one_seed(params, benchmark):
     (result,) = evaluate(
-        params,
-        MODEL,
+        Model(params, MODEL),
         benchmark,
         groupings=("window/single",),
-        batch_size=BATCH,
         seeds=3,
-        quiet=True,
+        reading=Reading(batch_size=BATCH, quiet=True),
     )
     assert (result.spread, dict(result.by_seed)) == (None, {})
     assert result.precision_recall.average_precision == result.average_precision
@@ -292,12 +292,10 @@ def test_shares_are_told_by_positions_or_else_by_the_truth(params, benchmark):
 
     def shares(benchmark: Benchmark) -> tuple[float | None, ...]:
         (result,) = evaluate(
-            params,
-            MODEL,
+            Model(params, MODEL),
             benchmark,
             groupings=("window/sequential",),
-            batch_size=BATCH,
-            quiet=True,
+            reading=Reading(batch_size=BATCH, quiet=True),
         )
         return result.query_share, result.database_share
 
@@ -331,11 +329,7 @@ def test_recalls_are_those_of_a_flat_faiss_index_on_the_same_descriptors(params,
     benchmark = open_benchmark(town)
     assert len(benchmark.database) == 15
     database, queries = (
-        grouped(
-            params,
-            read_tokens(params, MODEL, paths, batch_size=BATCH, label="", quiet=True),
-            "single",
-        )
+        grouped(params, tokens_of(params, paths).descriptors, "single")
         for paths in (benchmark.database, benchmark.queries)
     )
     index = faiss.IndexFlatL2(database.shape[1])
@@ -346,7 +340,10 @@ def test_recalls_are_those_of_a_flat_faiss_index_on_the_same_descriptors(params,
     # Four images thrice; and those at 200 and 210 m are one picture.
     assert (np.diff(np.sort(distances, axis=1), axis=1) == 0).sum(axis=1).tolist() == [9] * 5
     (result,) = evaluate(
-        params, MODEL, benchmark, groupings=("single",), batch_size=BATCH, quiet=True
+        Model(params, MODEL),
+        benchmark,
+        groupings=("single",),
+        reading=Reading(batch_size=BATCH, quiet=True),
     )
     np.testing.assert_array_equal(result.neighbours.indices, ranking)
     for k, recall in result.recalls.items():
@@ -367,14 +364,12 @@ def test_an_observer_sees_the_descriptors_of_each_grouping(
         seen[grouping] = database, queries
 
     results = evaluate(
-        params,
-        MODEL,
+        Model(params, MODEL),
         benchmark,
         groupings=("single", "sequential", "shuffled"),
-        batch_size=BATCH,
         seeds=2,
         observe=observe,
-        quiet=True,
+        reading=Reading(batch_size=BATCH, quiet=True),
     )
     assert list(seen) == ["single", "sequential", "shuffled"]
     first = describe(params, images[:BATCH], MODEL)

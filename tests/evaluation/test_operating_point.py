@@ -17,8 +17,9 @@ from crisalad_jax.evaluation.operating_point import (
     operating_point,
     to_json,
 )
+from crisalad_jax.nn.model import Model
 from crisalad_jax.utils.errors import InputError
-from tests.conftest import BATCH, MODEL
+from tests.conftest import MODEL, read_options
 
 # Six queries of one database image: right, right, wrong, right, unknown place, right.
 SIMILARITIES = np.array([[0.91], [0.8], [0.75], [0.75], [0.6123], [0.6122]], np.float32)
@@ -129,7 +130,7 @@ def test_such_a_precision_is_refused(precision, params, benchmark):
     # Before any image is read.
     gone = dataclasses.replace(benchmark, queries=(pathlib.Path("gone.jpg"),))
     with pytest.raises(InputError, match=words):
-        evaluate(params, MODEL, gone, precision=precision)
+        evaluate(Model(params, MODEL), gone, precision=precision)
 
 
 def test_json_has_what_is_computed():
@@ -140,9 +141,9 @@ def test_json_has_what_is_computed():
 
 
 def test_evaluate_gives_each_result_its_point(params, benchmark):
-    options = {"groupings": ["single"], "batch_size": BATCH, "quiet": True}
-    plain = evaluate(params, MODEL, benchmark, **options)
-    results = evaluate(params, MODEL, benchmark, precision=0.5, **options)
+    options = {"groupings": ["single"]} | read_options({})
+    plain = evaluate(Model(params, MODEL), benchmark, **options)
+    results = evaluate(Model(params, MODEL), benchmark, precision=0.5, **options)
     truth = benchmark.ground_truth()
     for without, result in zip(plain, results, strict=True):
         assert without.operating_point is None

@@ -15,6 +15,7 @@ from crisalad_jax.checkpoints.export import ExportConfig, export_model, write_ex
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.aggregators.anyloc import AnyLoc
 from crisalad_jax.nn.config import ModelConfig, with_aggregator
@@ -22,6 +23,7 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.misfits import misfits
 from crisalad_jax.nn.model import (
     Crisalad,
+    Model,
     attend_across_images,
     cast_params,
     check_params,
@@ -67,7 +69,7 @@ def a_step(params: Crisalad, config: ModelConfig, out: pathlib.Path, shared: pat
         PARAMS, "head", step_config(RECIPE, **options), key=jax.random.key(0)
     )
     state = state._replace(trainable=params)
-    step = make_train_step(trained(config), **options)
+    step = make_train_step(step_config(trained(config), **options))
     step(state, jax.tree.map(lambda _: None, frozen), IMAGES, LABELS, jax.random.key(0))
 
 
@@ -102,22 +104,26 @@ DOORS: dict[str, Callable[..., Any]] = {
         quiet=True,
     ),
     "extract": lambda params, config, out, shared: extract(
-        params, config, shared / "town", out / "d.npy", quiet=True
+        Model(params, config), shared / "town", out / "d.npy", reading=Reading(quiet=True)
     ),
     "index": lambda params, config, out, shared: index(
-        params, config, shared / "town", out / "map", weights=out / "none", quiet=True
+        Model(params, config),
+        shared / "town",
+        out / "map",
+        weights=out / "none",
+        reading=Reading(quiet=True),
     ),
     "evaluate": lambda params, config, out, shared: evaluate(
-        params, config, open_benchmark(shared / "town"), quiet=True
+        Model(params, config), open_benchmark(shared / "town"), reading=Reading(quiet=True)
     ),
     "export_model": lambda params, config, out, shared: export_model(
         params, config, ExportConfig(platforms=("cpu",))
     ),
     "write_export": lambda params, config, out, shared: write_export(
-        out / "export", params, config, ExportConfig(platforms=("cpu",))
+        out / "export", Model(params, config), ExportConfig(platforms=("cpu",))
     ),
     "save_weights": lambda params, config, out, shared: save_weights(
-        out / "w.safetensors", params, config
+        out / "w.safetensors", Model(params, config)
     ),
 }
 MISFITS: dict[str, tuple[Any, ModelConfig, str]] = {
@@ -254,9 +260,9 @@ def test_no_file_of_weights_holds_what_cannot_be_loaded(value: float, tmp_path) 
     with pytest.raises(
         InputError, match=r"^params: .*: backbone\.cls_token holds NaN or infinity$"
     ):
-        save_weights(path, broken, MODEL)
+        save_weights(path, Model(broken, MODEL))
     assert not path.exists()
-    save_weights(path, PARAMS, MODEL)
+    save_weights(path, Model(PARAMS, MODEL))
     assert load_weights(path, expected=MODEL)[1] == MODEL
 
 
@@ -315,10 +321,10 @@ def test_every_door_refuses_images_of_another_kind(door: str, kind: str) -> None
 
 @pytest.mark.usefixtures("_unchecked")
 def test_a_step_refuses_pixels_as_floats() -> None:
-    options = {"steps": 2}
-    state, frozen = init_train_state(PARAMS, "head", step_config(RECIPE, **options))
+    static = step_config(RECIPE, steps=2)
+    state, frozen = init_train_state(PARAMS, "head", static)
     with pytest.raises(InputError, match=r"^images: found float64 from 0 to 1, which"):
-        make_train_step(RECIPE, **options)(state, frozen, IMAGES / 255, LABELS, jax.random.key(0))
+        make_train_step(static)(state, frozen, IMAGES / 255, LABELS, jax.random.key(0))
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def test_recall_on_photographs(name, expected):
     if not (PHOTOGRAPHS / name).is_dir():
         pytest.skip(f"no photographs in {PHOTOGRAPHS / name}")
     benchmark = benchmarks.open_benchmark(PHOTOGRAPHS / name)
-    (result,) = cj.evaluate(*cj.load("hog"), benchmark, quiet=True)
+    (result,) = cj.evaluate(cj.load("hog"), benchmark, reading=cj.Reading(quiet=True))
     for k, recall in zip((1, 5, 10), expected, strict=True):
         # 2 points, two or three queries: another JPEG decoder changes grey levels by one.
         assert 100 * result.recalls[k] == pytest.approx(recall, abs=2)
@@ -144,7 +144,7 @@ def test_a_set_is_ranked_as_by_its_definition(shared: pathlib.Path):
 
     database, queries = described(benchmark.database), described(benchmark.queries)
     expected = np.argsort(-(queries @ database.T), axis=1, kind="stable")
-    (result,) = cj.evaluate(*cj.load("hog"), benchmark, quiet=True)
+    (result,) = cj.evaluate(cj.load("hog"), benchmark, reading=cj.Reading(quiet=True))
     np.testing.assert_array_equal(result.neighbours.indices, expected)
     pairs = zip(expected, benchmark.ground_truth(), strict=True)
     assert result.recalls[1] == np.mean([np.isin(row[:1], truth).any() for row, truth in pairs])

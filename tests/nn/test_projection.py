@@ -12,6 +12,7 @@ from crisalad_jax import describe, init_crisalad, load, save_weights
 from crisalad_jax.checkpoints.layouts import check_holds
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.costs import part_costs
+from crisalad_jax.nn.model import Model
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.training.trainable import split_params
 from crisalad_jax.utils.errors import InputError
@@ -57,7 +58,7 @@ def test_it_counts_and_trains_with_the_head() -> None:
 
 
 def test_a_file_keeps_it(tmp_path) -> None:
-    save_weights(tmp_path / "w.safetensors", PARAMS, CONFIG)
+    save_weights(tmp_path / "w.safetensors", Model(PARAMS, CONFIG))
     loaded, config = load(tmp_path / "w.safetensors")
     assert config == CONFIG
     np.testing.assert_array_equal(loaded.projection.bias, PARAMS.projection.bias)

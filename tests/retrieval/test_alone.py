@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.images import read_image
-from crisalad_jax.nn.model import Crisalad, describe
-from crisalad_jax.retrieval.alone import describe_files, describe_images
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.nn.model import Crisalad, Model, describe
+from crisalad_jax.retrieval.describe import describe_files, describe_images, prepare_image
 from crisalad_jax.retrieval.extract import extract
-from crisalad_jax.retrieval.photographs import prepare_image
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL, random_params
 
@@ -33,7 +33,7 @@ def pixels() -> list[np.ndarray]:
 def test_each_picture_is_described_as_if_it_were_alone(
     params: Crisalad, pixels: list[np.ndarray]
 ) -> None:
-    found = describe_images(params, MODEL, pixels, batch_size=4)
+    found = describe_images(Model(params, MODEL), pixels, batch_size=4)
     # Batches of 4 and of 1: no picture looks at another, nor at padding.
     for row, picture in zip(found, pixels, strict=True):
         alone = describe(params, prepare_image(picture, MODEL)[None], MODEL)
@@ -46,9 +46,11 @@ def test_files_are_described_as_extract_describes_them(
     files = [tmp_path / f"{number}.png" for number in range(len(pixels))]
     for file, picture in zip(files, pixels, strict=True):
         cv2.imwrite(str(file), picture[..., ::-1])
-    found = describe_files(params, MODEL, files)
-    np.testing.assert_array_equal(found, extract(params, MODEL, tmp_path, quiet=True).descriptors)
-    np.testing.assert_allclose(describe_images(params, MODEL, pixels), found, atol=ROUNDING)
+    found = describe_files(Model(params, MODEL), files)
+    np.testing.assert_array_equal(
+        found, extract(Model(params, MODEL), tmp_path, reading=Reading(quiet=True)).descriptors
+    )
+    np.testing.assert_allclose(describe_images(Model(params, MODEL), pixels), found, atol=ROUNDING)
     np.testing.assert_array_equal(
         read_image(files[0], MODEL.image_size), prepare_image(pixels[0], MODEL)
     )
@@ -57,17 +59,17 @@ def test_files_are_described_as_extract_describes_them(
 @pytest.mark.parametrize("shape", [(42, 56), (42, 56, 1)])
 def test_grey_is_described_as_its_three_channels(params: Crisalad, shape: tuple[int, ...]) -> None:
     grey = np.random.default_rng(2).integers(0, 256, shape, dtype=np.uint8)
-    found = describe_images(params, MODEL, [grey])
+    found = describe_images(Model(params, MODEL), [grey])
     repeated = cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB)
-    np.testing.assert_array_equal(found, describe_images(params, MODEL, [repeated]))
+    np.testing.assert_array_equal(found, describe_images(Model(params, MODEL), [repeated]))
 
 
 def test_nothing_and_other_types_are_refused(params: Crisalad) -> None:
-    with pytest.raises(InputError, match="images: found none, expected at least one picture"):
-        describe_images(params, MODEL, [])
+    with pytest.raises(InputError, match="images: found none, expected at least one image"):
+        describe_images(Model(params, MODEL), [])
     with pytest.raises(InputError, match="files: found none, expected at least one image file"):
-        describe_files(params, MODEL, [])
+        describe_files(Model(params, MODEL), [])
     with pytest.raises(InputError, match="image: found float64 of shape"):
-        describe_images(params, MODEL, [np.zeros((9, 9, 3))])
+        describe_images(Model(params, MODEL), [np.zeros((9, 9, 3))])
     with pytest.raises(InputError, match=r"no-file\.png"):
-        describe_files(params, MODEL, "no-file.png")
+        describe_files(Model(params, MODEL), "no-file.png")

@@ -8,19 +8,17 @@ import jax
 import numpy as np
 import pytest
 
-import crisalad_jax.retrieval.sets
 from crisalad_jax.data.images import list_images
-from crisalad_jax.retrieval import partial
-from crisalad_jax.retrieval.chunks import is_mapped
-from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval import extract as extract_module
 from crisalad_jax.retrieval.descriptor_files import read_descriptors
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.pca import PcaConfig, fit_pca
-from crisalad_jax.retrieval.sets import open_work
+from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import BusyFolderError
 from crisalad_jax.utils.output import Note
-from tests.conftest import BATCH, MODEL
+from tests.conftest import BATCH, MODEL, describe_single, read_options
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +30,11 @@ def town(shared) -> pathlib.Path:
 def expected(params, town) -> np.ndarray:
     """Each alone, by the functions that other tests compare with batches of one."""
     paths = list_images(town)
-    tokens = read_tokens(params, MODEL, paths, batch_size=BATCH, label="", quiet=True)
-    return group(params, MODEL, tokens, "single", batch_size=BATCH)
+    return describe_single(Model(params, MODEL), paths)
 
 
 def run(params, images, *out, **options):
-    return extract(params, MODEL, images, *out, **{"batch_size": BATCH, "quiet": True} | options)
+    return extract(Model(params, MODEL), images, *out, **read_options(options))
 
 
 def test_into_memory(params, town, expected, tmp_path, monkeypatch):
@@ -114,7 +111,6 @@ def test_what_is_refused(params, images, options, words):
     ("options", "words"),
     [
         ({"out": "d.txt"}, "d.txt: suffix of the descriptors' file"),
-        ({"batch_size": 0}, "batch size: found 0"),
         ({"database": "d.h5"}, "--database: found without --pairs"),
         ({"pairs": "d.names.txt"}, "--pairs: found d.names.txt, which --out writes"),
         ({"pairs": "p.txt", "k": 0}, "k: found 0, expected at least 1"),
@@ -163,16 +159,14 @@ def test_shares_make_the_set_of_one_process(params, town, expected, tmp_path, su
 
 
 def test_a_share_that_another_process_joins_says_so(params, town, tmp_path, monkeypatch):
-    """The lock of the whole set is another's."""
+    """The lock of all shares is another's."""
     out = tmp_path / "d.npy"
     first = run(params, town, out, share="0/2")
 
     def busy(path):
-        if path == out:
-            raise BusyFolderError(f"{path}: busy")
-        return open_work(path)
+        raise BusyFolderError(f"{path}: busy")
 
-    monkeypatch.setattr(crisalad_jax.retrieval.sets, "open_work", busy)
+    monkeypatch.setattr("crisalad_jax.retrieval.segments.lock", busy)
     with pytest.warns(Note, match="another process joins the shares"):
         found = run(params, town, out, share="1/2")
     assert (found.shares_left, found.joined_elsewhere) == (0, True)
@@ -184,26 +178,31 @@ def test_a_share_that_another_process_joins_says_so(params, town, tmp_path, monk
 def test_a_share_of_other_images_is_not_joined(params, town, tmp_path):
     out, paths = tmp_path / "d.npy", list_images(town)
     run(params, paths, out, share="0/2")
-    with pytest.warns(Note, match=r"0-of-2\.npy: found a share of other images or settings"):
+    with pytest.warns(Note, match=r"0-of-2\.json: found a share of other images or settings"):
         assert run(params, paths[:-1], out, share="1/2").shares_left == 1
     assert not out.exists()
 
 
 def test_memory_does_not_grow_with_the_images(params, town, expected, tmp_path, monkeypatch):
-    """Of a set in a file no more than one file's tokens are held, and the rows are mapped."""
+    """Of a set in a file no more than one segment's rows are held, and the rest is mapped."""
     held = []
-    real = partial._joined
-    monkeypatch.setattr(partial, "SEGMENT", BATCH)
-    monkeypatch.setattr(partial, "_joined", lambda parts: held.append(len(parts)) or real(parts))
+    real = Segments.append
+
+    def append(self, record, rows):
+        held.append(len(rows))
+        real(self, record, rows)
+
+    monkeypatch.setattr(extract_module, "SEGMENT", 1)
+    monkeypatch.setattr(Segments, "append", append)
     found = run(params, town, tmp_path / "d.npy")
-    assert held == [1] * (len(expected) // BATCH)
-    assert is_mapped(found.descriptors)
+    assert held == [BATCH] * (len(expected) // BATCH)
+    assert isinstance(found.descriptors, np.memmap)
     np.testing.assert_array_equal(found.descriptors, expected)
 
 
 def test_a_part_without_a_readable_image_is_left_out(params, town, tmp_path, monkeypatch):
     """Its tokens are in no file; the others' descriptors are those of a set in memory."""
-    monkeypatch.setattr(partial, "SEGMENT", BATCH)
+    monkeypatch.setattr(extract_module, "SEGMENT", 1)
     bad = [tmp_path / f"{i}.jpg" for i in range(BATCH)]
     for path in bad:
         path.write_bytes(b"no image")

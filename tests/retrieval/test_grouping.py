@@ -8,7 +8,6 @@ from crisalad_jax.retrieval.grouping import (
     GROUPINGS,
     Grouping,
     batches_of,
-    check_grouping,
     parse_groupings,
 )
 from crisalad_jax.utils.errors import InputError
@@ -16,12 +15,10 @@ from crisalad_jax.utils.errors import InputError
 LAYERS = 2
 
 
-def influence(count, grouping, batch_size, seed=0, readable=None) -> np.ndarray:
+def influence(count, grouping, batch_size, seed=0) -> np.ndarray:
     """Whether image j can change the descriptor of image i, through any number of layers."""
-    readable = np.ones(count, bool) if readable is None else readable
     batches = batches_of(count, grouping, batch_size, seed)
-    looks = batches.looks(readable)
-    reach = np.linalg.matrix_power(looks.astype(int), LAYERS) > 0
+    reach = np.linalg.matrix_power(batches.attention_mask.astype(int), LAYERS) > 0
     changes = np.zeros((count, count), bool)
     given = np.zeros(count, int)
     for images, kept, reached in zip(batches.images, batches.kept, reach, strict=True):
@@ -51,14 +48,6 @@ def test_each_grouping_lets_exactly_these_look(count, size):
     assert expected.keys() == GROUPINGS.keys()
     for grouping, wanted in expected.items():
         np.testing.assert_array_equal(influence(count, grouping, size, seed=6), wanted, grouping)
-
-
-@pytest.mark.parametrize("grouping", GROUPINGS)
-def test_an_unreadable_image_is_seen_by_none(grouping):
-    readable = np.array([True, False, True, True, True, False, True])
-    found = influence(7, grouping, 3, readable=readable)
-    expected = influence(7, grouping, 3) & readable & readable[:, None]
-    np.testing.assert_array_equal(found, expected | np.eye(7, dtype=bool))
 
 
 def test_batches_keep_their_shape():
@@ -105,18 +94,3 @@ def test_groupings_come_once_and_in_their_order():
 def test_bad_groupings_are_named(text, words):
     with pytest.raises(InputError, match=words):
         Grouping.parse(text)
-
-
-@pytest.mark.parametrize(
-    ("groupings", "batch_size", "seed", "seeds", "words"),
-    [
-        (("single", "sorted"), 4, 0, 1, "grouping: found 'sorted', expected one of sequential"),
-        (("window/single",), 4, 0, 1, "grouping: found 'window/single', expected one of"),
-        (("single",), 0, 0, 1, "batch size: found 0, expected at least 1"),
-        (("single",), 4, -1, 1, "seed: found -1, expected at least 0"),
-        (("single",), 4, 0, 0, "seeds: found 0, expected at least 1"),
-    ],
-)
-def test_bad_numbers_are_named(groupings, batch_size, seed, seeds, words):
-    with pytest.raises(InputError, match=words):
-        check_grouping(groupings, batch_size, seed, seeds)

@@ -16,13 +16,15 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.images import list_images
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval import extract as extract_module
-from crisalad_jax.retrieval import partial
 from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
 from crisalad_jax.retrieval.extract import Extracted, extract
+from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.output import Note
-from tests.conftest import BATCH, MODEL, write_picture
+from tests.conftest import BATCH, MODEL, read_options, write_picture
 
 ROOT = pathlib.Path(__file__).parents[2]
 IMAGES = 12
@@ -31,22 +33,22 @@ PARTS = IMAGES // BATCH
 KILLED_EXTRACTION = """
 import os, pathlib, signal, sys
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.retrieval import extract, partial
-from tests.conftest import BATCH
+from crisalad_jax.retrieval import extract
+from crisalad_jax.retrieval.segments import Segments
+from tests.conftest import read_options
 
-write, left = partial.write_sealed, int(sys.argv[4])
+append, left = Segments.append, int(sys.argv[4])
 
 def killed(*arguments):
     global left
-    write(*arguments)
+    append(*arguments)
     left -= 1
     if not left:
         os.kill(os.getpid(), signal.SIGKILL)
 
-partial.SEGMENT, partial.write_sealed = BATCH, killed
+extract.SEGMENT, Segments.append = 1, killed
 weights, images, out = map(pathlib.Path, sys.argv[1:4])
-params, config = load_weights(weights)
-extract.extract(params, config, images, out, batch_size=BATCH, quiet=True)
+extract.extract(load_weights(weights), images, out, **read_options({}))
 """
 # A child for each rename, which dies before it; prints how many there are.
 KILLED_WRITES = """
@@ -86,7 +88,7 @@ print(step)
 
 
 def run(params, images, out, **options) -> Extracted:
-    return extract(params, MODEL, images, out, **{"batch_size": BATCH, "quiet": True} | options)
+    return extract(Model(params, MODEL), images, out, **read_options(options))
 
 
 def contents(folder: pathlib.Path) -> dict[str, bytes]:
@@ -116,14 +118,17 @@ def whole(params, town, tmp_path_factory) -> dict[str, bytes]:
 def described(monkeypatch) -> list[str]:
     """The names of the images that are computed from now on; a batch makes a segment."""
     names: list[str] = []
-    real = partial.tokens_in_batches
 
-    def spied(params, config, paths, **options):
-        names.extend(path.name for path in paths)
-        return real(params, config, paths, **options)
+    def spied(real):
+        def stream(describer, paths, *given, **options):
+            names.extend(path.name for path in paths)
+            return real(describer, paths, *given, **options)
 
-    monkeypatch.setattr(partial, "SEGMENT", BATCH)
-    monkeypatch.setattr(partial, "tokens_in_batches", spied)
+        return stream
+
+    monkeypatch.setattr(extract_module, "SEGMENT", 1)
+    for name in ("described", "token_rows"):
+        monkeypatch.setattr(extract_module, name, spied(getattr(extract_module, name)))
     return names
 
 
@@ -133,7 +138,7 @@ def names_from(town: pathlib.Path, first: int) -> list[str]:
 
 def cut_short(monkeypatch, params, images, out, *, after: int, error=KeyboardInterrupt, **options):
     """Run until so many segments are there, and then into an error."""
-    real, left = partial.write_sealed, after
+    real, left = Segments.append, after
 
     def failing(*arguments):
         nonlocal left
@@ -143,14 +148,14 @@ def cut_short(monkeypatch, params, images, out, *, after: int, error=KeyboardInt
             raise error("cut short")
 
     with monkeypatch.context() as patch:
-        patch.setattr(partial, "write_sealed", failing)
+        patch.setattr(Segments, "append", failing)
         with pytest.raises(error) as caught:
             run(params, images, out, **options)
     return caught.value
 
 
 def segments(out: pathlib.Path) -> list[str]:
-    return sorted(path.name for path in out.with_name(f"{out.name}.partial").glob("*.safetensors"))
+    return sorted(path.name for path in out.with_name(f"{out.name}.partial").glob("[0-9]*.json"))
 
 
 # What is done is kept
@@ -163,12 +168,15 @@ def test_the_same_call_does_the_rest_with_the_same_bits(
 ):
     out = tmp_path / "d.npy"
     found = cut_short(monkeypatch, params, town, out, after=after, error=error)
-    kept = [f"{BATCH * i:010d}.safetensors" for i in range(after)]
-    assert segments(out) == kept
+    kept = [f"{BATCH * i:010d}" for i in range(after)]
+    assert segments(out) == [f"{name}.json" for name in kept]
     assert os.listdir(tmp_path) == ["d.npy.partial"]
-    assert set(os.listdir(tmp_path / "d.npy.partial")) == {"plan.json", *kept}
+    assert set(os.listdir(tmp_path / "d.npy.partial")) == {
+        "plan.json",
+        *(f"{name}{suffix}" for name in kept for suffix in (".json", ".npy")),
+    }
     if error is InputError:
-        advice = f"what is done is kept in {out}.partial, and the same command goes on"
+        advice = f"what is done is stored in {out}.partial: the same command resumes"
         assert str(found) == f"cut short ({advice})"
     described.clear()
     with warnings.catch_warnings():
@@ -185,7 +193,7 @@ def test_a_killed_extraction_goes_on(shared, params, town, whole, described, tmp
     program = [sys.executable, "-c", KILLED_EXTRACTION, shared / "weights.safetensors", town, out]
     done = subprocess.run([*map(str, program), "2"], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == -signal.SIGKILL, done.stderr
-    assert segments(out) == ["0000000000.safetensors", f"{BATCH:010d}.safetensors"]
+    assert segments(out) == ["0000000000.json", f"{BATCH:010d}.json"]
     run(params, town, out)
     assert described == names_from(town, 2 * BATCH)
     assert contents(tmp_path) == whole
@@ -199,12 +207,12 @@ def test_what_a_kill_leaves_within_the_folder_does_no_harm(
     cut_short(monkeypatch, params, town, out, after=1)
     folder = tmp_path / "d.npy.partial"
     (folder / ".crisalad-lock").write_text("process 1 on elsewhere\n")
-    half = folder / ".crisalad-0123456789ab.safetensors"
+    half = folder / ".crisalad-0123456789ab.npy"
     half.write_bytes(b"half")
     described.clear()
-    real, there = partial.write_sealed, []
+    real, there = Segments.append, []
     monkeypatch.setattr(
-        partial, "write_sealed", lambda *given: (there.append(half.exists()), real(*given))
+        Segments, "append", lambda *given: (there.append(half.exists()), real(*given))
     )
     run(params, town, out)
     assert there == [False] * (PARTS - 1)  # its space is needed
@@ -216,9 +224,9 @@ def test_what_a_kill_leaves_within_the_folder_does_no_harm(
 def test_what_is_done_serves_other_groupings_too(
     params, town, described, tmp_path, monkeypatch, grouping
 ):
-    """Tokens do not depend on the grouping, the components or the name of the weights."""
+    """Tokens do not depend on which of these it is, nor on the name of the weights."""
     out = tmp_path / "d.npy"
-    cut_short(monkeypatch, params, town, out, after=2)
+    cut_short(monkeypatch, params, town, out, after=2, grouping="window")
     described.clear()
     found = run(params, town, out, grouping=grouping, weights="w.safetensors", seed=3)
     assert described == names_from(town, 2 * BATCH)
@@ -243,7 +251,9 @@ def test_an_image_that_is_skipped_is_skipped_again(params, town, described, tmp_
     assert found.names == expected.names
     # Where it is an error, it is one however much is done.
     cut_short(monkeypatch, params, images, out, after=2, on_bad_image="skip")
-    with pytest.raises(InputError, match=rf"{bad.name}.* \(what is done is kept in {out}\.partial"):
+    with pytest.raises(
+        InputError, match=rf"{bad.name}.* \(what is done is stored in {out}\.partial"
+    ):
         run(params, images, out)
 
 
@@ -277,9 +287,9 @@ def test_other_work_is_begun_anew_with_a_note(
     def again(out: pathlib.Path) -> Extracted:
         config = options.get("config", MODEL)
         size = options.get("batch_size", BATCH)
-        return extract(params, config, listed, out, batch_size=size, quiet=True)
+        return extract(Model(params, config), listed, out, **read_options({"batch_size": size}))
 
-    words = r"d\.npy\.partial: found work of another model or batch size; it is begun anew"
+    words = r"d\.npy\.partial: found work of another model or batch size; it starts again"
     with pytest.warns(Note, match=words) as told:
         found = again(out)
     assert len(told) == 1
@@ -289,22 +299,22 @@ def test_other_work_is_begun_anew_with_a_note(
     assert found.descriptors.tobytes() == expected.descriptors.tobytes()
 
 
-@pytest.mark.parametrize("how", ["flipped", "cut", "empty", "removed", "other", "weights", "plan"])
+@pytest.mark.parametrize("part", [".json", ".npy"])
+@pytest.mark.parametrize("how", ["flipped", "cut", "empty", "removed", "other", "plan"])
 def test_what_is_damaged_is_described_again(
-    shared, params, town, whole, described, tmp_path, monkeypatch, how
+    params, town, whole, described, tmp_path, monkeypatch, how, part
 ):
+    """A record as from there on; rows, and the plan, as from the beginning. A note says so."""
     out = tmp_path / "d.npy"
     cut_short(monkeypatch, params, town, out, after=PARTS)
     folder = tmp_path / "d.npy.partial"
-    path = folder / f"{BATCH:010d}.safetensors"
+    path = folder / f"{BATCH:010d}{part}"
     data = bytearray(path.read_bytes())
     if how == "flipped":
-        data[len(data) // 2] ^= 1  # in the numbers: at the end is whether images could be read
+        data[len(data) // 2] ^= 1
         path.write_bytes(data)
     elif how == "removed":
         path.unlink()
-    elif how == "weights":
-        shutil.copy(shared / "weights.safetensors", path)
     elif how == "plan":
         (folder / "plan.json").write_text((folder / "plan.json").read_text()[:-9])
     else:
@@ -313,8 +323,10 @@ def test_what_is_damaged_is_described_again(
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", Note)
         run(params, town, out)
-    assert described == names_from(town, 0 if how == "plan" else BATCH)
-    assert sum(issubclass(one.category, Note) for one in told) == (how == "plan")
+    assert described == names_from(town, BATCH if part == ".json" and how != "plan" else 0)
+    notes = [str(one.message) for one in told if issubclass(one.category, Note)]
+    assert notes
+    assert all("starts again" in note for note in notes)
     assert contents(tmp_path) == whole
 
 
@@ -324,10 +336,10 @@ def test_what_is_damaged_is_described_again(
 def test_a_second_extraction_to_the_same_file_is_refused(
     params, town, whole, described, tmp_path, monkeypatch
 ):
-    out, real, refused = tmp_path / "d.npy", partial.write_sealed, []
+    out, real, refused = tmp_path / "d.npy", Segments.append, []
 
     def meanwhile(*arguments):
-        monkeypatch.setattr(partial, "write_sealed", real)  # only after the first segment
+        monkeypatch.setattr(Segments, "append", real)  # only after the first segment
         real(*arguments)
         before = contents(tmp_path)
         with pytest.raises(InputError) as error:
@@ -336,7 +348,7 @@ def test_a_second_extraction_to_the_same_file_is_refused(
         assert contents(tmp_path) == before
         run(params, town, tmp_path / "other" / "d.npy")  # another file is another matter
 
-    monkeypatch.setattr(partial, "write_sealed", meanwhile)
+    monkeypatch.setattr(Segments, "append", meanwhile)
     run(params, town, out)
     assert refused == [
         f"{out}.partial: found another process that writes here (process {os.getpid()} on "
@@ -362,7 +374,7 @@ def test_a_failure_before_anything_is_done_leaves_nothing(params, town, tmp_path
     before = contents(tmp_path)
     with pytest.raises(InputError) as error:
         run(params, images, out)
-    assert "is kept" not in str(error.value)
+    assert "is stored" not in str(error.value)
     assert contents(tmp_path) == before
     assert (tmp_path / "new").exists() == there
     if there:
@@ -396,7 +408,7 @@ def test_batches_of_the_same_images_are_kept(
         warnings.simplefilter("always", Note)
         found = run(params, listed, out)
     assert described == [path.name for path in listed[kept:]]
-    assert len(told) == (kept < 2 * BATCH)
+    assert bool(told) == (kept < 2 * BATCH)
     assert all("found work on other images" in str(note.message) for note in told)
     alone = run(params, listed, tmp_path / "alone.npy")
     np.testing.assert_array_equal(found.descriptors, alone.descriptors)
@@ -410,7 +422,9 @@ def test_a_failure_to_write_keeps_the_work(params, town, whole, described, tmp_p
 
     with monkeypatch.context() as patch:
         patch.setattr(extract_module, "write_descriptors", full)
-        with pytest.raises(InputError, match=r"No space left on device \(what is done is kept in"):
+        with pytest.raises(
+            InputError, match=r"No space left on device \(what is done is stored in"
+        ):
             run(params, town, out)
     described.clear()
     run(params, town, out)
@@ -511,7 +525,7 @@ def test_the_record_holds_the_digests_of_the_files(tmp_path, suffix):
 def test_a_record_of_something_else_is_refused(tmp_path, record, words):
     out = tmp_path / "d.npy"
     write_descriptors(out, np.eye(2, dtype=np.float32), ["a", "b"])
-    partial.write_json(tmp_path / "d.npy.json", record)
+    write_json(tmp_path / "d.npy.json", record)
     with pytest.raises(InputError, match=rf"d\.npy\.json: {words}"):
         read_descriptors(out)
     assert read_descriptors(out, verify=False)[0] == ["a", "b"]

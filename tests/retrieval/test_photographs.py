@@ -13,15 +13,17 @@ from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.loader import ImageCache
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import describe
+from crisalad_jax.nn.model import Model, describe
+from crisalad_jax.retrieval.describe import prepare_image
+from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.extract import extract
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import query
-from crisalad_jax.retrieval.photographs import photograph_batches, prepare_image
 from crisalad_jax.retrieval.reranking.stage import Reranking
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL, random_params
@@ -48,6 +50,12 @@ def folder(tmp_path: pathlib.Path) -> pathlib.Path:
     return tmp_path / "images"
 
 
+def batches_of(config, paths, **options):
+    """Batches of files as a model of this configuration takes them."""
+    describer = describer_of(Model(random_params(config), config))
+    return Reading(**options).batches(paths, describer.preparation, describer.check_size)
+
+
 def paths_in(folder: pathlib.Path) -> list[pathlib.Path]:
     return sorted(folder.glob("*.png"))
 
@@ -67,7 +75,7 @@ def test_floats_are_those_of_a_wrapper_that_normalises_first(folder: pathlib.Pat
     config = ALONE.resized((28, 42), ["bicubic", "floats"])
     cache = ImageCache()
     for _ in range(2):
-        first, second = photograph_batches(config, paths_in(folder), batch_size=4, cache=cache)
+        first, second = batches_of(config, paths_in(folder), batch_size=4, cache=cache)
         assert first.images.dtype == np.float32
         assert second.valid.tolist() == [True, True, True, False]
         found = np.concatenate([first.images, second.images[:3]])
@@ -88,7 +96,7 @@ def test_a_size_between_patches_is_resized_again_as_megaloc_does(folder: pathlib
 def test_a_change_of_size_ends_a_batch(folder: pathlib.Path) -> None:
     paths = paths_in(folder)
     (folder / "3.png").write_bytes(b"no image")
-    batches = list(photograph_batches(NATIVE, paths, batch_size=2, on_bad_image="skip"))
+    batches = list(batches_of(NATIVE, paths, batch_size=2, on_bad_image="skip"))
     assert [batch.indices.tolist() for batch in batches] == [[0, 1], [2, 3], [4, -1], [5, 6]]
     sizes = [(42, 56), (56, 42), (56, 42), (42, 56)]
     assert [batch.images.shape for batch in batches] == [(2, *size, 3) for size in sizes]
@@ -100,13 +108,13 @@ def test_a_change_of_size_ends_a_batch(folder: pathlib.Path) -> None:
             if number in (0, 1, 2, 4, 6):
                 np.testing.assert_array_equal(image, read_image(paths[number]))
     with pytest.raises(InputError, match=f"^{paths[3]}: found 8 bytes"):
-        list(photograph_batches(NATIVE, paths, batch_size=2))
+        list(batches_of(NATIVE, paths, batch_size=2))
 
 
 def test_images_that_nobody_could_read_have_the_models_size(folder: pathlib.Path) -> None:
     for path in paths_in(folder)[:2]:
         path.write_bytes(b"no image")
-    first, *_ = photograph_batches(NATIVE, paths_in(folder), batch_size=2, on_bad_image="skip")
+    first, *_ = batches_of(NATIVE, paths_in(folder), batch_size=2, on_bad_image="skip")
     assert first.images.shape == (2, *MODEL.image_size, 3)
     assert not first.valid.any()
 
@@ -116,15 +124,15 @@ def test_an_image_that_the_model_cannot_describe_is_named(folder: pathlib.Path) 
     assert cv2.imwrite(str(folder / "9.png"), np.zeros((1, 4200, 3), np.uint8))
     salad = MODEL.resized(None, ["native"])
     with pytest.raises(InputError, match=rf"^{folder / '8.png'}: .* 1 patches for 4 clusters"):
-        list(photograph_batches(salad, [folder / "8.png"], batch_size=1))
+        list(batches_of(salad, [folder / "8.png"], batch_size=1))
     with pytest.raises(InputError, match=rf"^{folder / '9.png'}: image size: .* at most 4096"):
-        list(photograph_batches(NATIVE, [folder / "9.png"], batch_size=1))
+        list(batches_of(NATIVE, [folder / "9.png"], batch_size=1))
 
 
 def test_descriptors_of_all_sizes_in_order(folder: pathlib.Path, tmp_path: pathlib.Path) -> None:
     """Of a file that stores the rule: extracted, resumably too, and in a map."""
     params, weights = random_params(NATIVE), tmp_path / "w.safetensors"
-    save_weights(weights, params, NATIVE)
+    save_weights(weights, Model(params, NATIVE))
     params, config = load_weights(weights)
     assert config == NATIVE
     images = [prepare_image(read_image(path), config) for path in paths_in(folder)]
@@ -134,20 +142,44 @@ def test_descriptors_of_all_sizes_in_order(folder: pathlib.Path, tmp_path: pathl
     # Float32 rounding: other images stand beside each.
     close = {"atol": 2e-6}
     out = tmp_path / "out.npy"
-    found = extract(params, config, folder, out, batch_size=2, quiet=True)
+    found = extract(Model(params, config), folder, out, reading=Reading(batch_size=2, quiet=True))
     np.testing.assert_allclose(found.descriptors, expected, **close)
     np.testing.assert_allclose(np.load(out), expected, **close)
 
     place = tmp_path / "map"
-    index(params, config, folder, place, weights=weights, batch_size=2, quiet=True)
-    again = index(params, config, folder, place, weights=weights, resize=["native"], quiet=True)
+    index(
+        Model(params, config),
+        folder,
+        place,
+        weights=weights,
+        reading=Reading(batch_size=2, quiet=True),
+    )
+    again = index(
+        Model(params, config),
+        folder,
+        place,
+        weights=weights,
+        reading=Reading(quiet=True),
+    )
     assert (again.added, again.there) == (0, len(SHAPES))
     with pytest.raises(InputError, match=r"found images at 42 x 56, .* expected native size, "):
-        index(params, config, folder, place, weights=weights, resize=["fixed"], quiet=True)
+        index(
+            Model(params, config.resized(None, ["fixed"])),
+            folder,
+            place,
+            weights=weights,
+            reading=Reading(quiet=True),
+        )
     with Map.open(place) as places:
         assert places.summary()["resize"] == config.images_in_words
         np.testing.assert_allclose(np.concatenate(list(places.descriptors)), expected, **close)
-        answers = query(places, params, paths_in(folder)[2:4], k=1, batch_size=2, quiet=True)
+        answers = query(
+            places,
+            paths_in(folder)[2:4],
+            model=Model(params, places.config),
+            k=1,
+            reading=Reading(batch_size=2, quiet=True),
+        )
     assert answers.neighbours.indices.ravel().tolist() == [2, 3]
 
 
@@ -156,12 +188,18 @@ def test_a_map_of_another_way_than_its_weights(
 ) -> None:
     """The same parameters: the map keeps its way, and is asked by it."""
     params, weights, place = random_params(ALONE), tmp_path / "w.safetensors", tmp_path / "map"
-    save_weights(weights, params, ALONE)
+    save_weights(weights, Model(params, ALONE))
     words = ["bicubic", "floats"]
-    index(params, ALONE, folder, place, weights=weights, resize=words, quiet=True)
+    index(
+        Model(params, ALONE.resized(None, words)),
+        folder,
+        place,
+        weights=weights,
+        reading=Reading(quiet=True),
+    )
     with Map.open(place) as places:
-        assert places.description.config == ALONE.resized(None, words)
-        answers = query(places, places.load_params(), folder, k=1, quiet=True)
+        assert places.config == ALONE.resized(None, words)
+        answers = query(places, folder, k=1, reading=Reading(quiet=True))
     # In float32 a unit vector with itself.
     np.testing.assert_allclose(answers.neighbours.similarities, 1, atol=1e-5)
 

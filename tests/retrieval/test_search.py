@@ -1,5 +1,6 @@
 """Search against a float64 stable argsort, and against faiss."""
 
+import functools
 import sys
 
 import faiss
@@ -9,8 +10,9 @@ import ml_dtypes
 import numpy as np
 import pytest
 
+from crisalad_jax.retrieval import neighbours
 from crisalad_jax.retrieval import search as retrieval
-from crisalad_jax.retrieval.chunks import as_sides
+from crisalad_jax.retrieval.chunks import as_sides, blocks, gathered
 from crisalad_jax.utils.errors import InputError
 from tests.utils.test_compiler import in_a_program
 
@@ -70,17 +72,10 @@ def test_search_agrees_with_brute_force_for_any_chunk(search, chunk):
     _assert_ranked(found, database, queries, 10)
 
 
-def test_search_orders_as_the_l2_distance_does():
-    database, queries = _random_unit(2, 50, 8), _random_unit(3, 5, 8)
-    distances = np.linalg.norm(queries[:, None].astype(np.float64) - database[None], axis=2)
-    found = retrieval.search(database, queries, 50, chunk=16)
-    np.testing.assert_array_equal(found.indices, np.argsort(distances, axis=1))
-
-
 def test_search_walks_queries_in_chunks(monkeypatch):
     database, queries = _random_unit(4, 40, 16), _random_unit(5, 23, 16)
     whole = retrieval.search(database, queries, 5)
-    monkeypatch.setattr(retrieval, "_QUERY_CHUNK", 10)
+    monkeypatch.setattr(neighbours, "QUERY_CHUNK", 10)
     parts = retrieval.search(database, queries, 5)
     np.testing.assert_array_equal(parts.indices, whole.indices)
     _assert_ranked(parts, database, queries, 5)
@@ -190,33 +185,47 @@ def test_duplicates_and_their_order_are_those_of_faiss(seed):
         np.testing.assert_array_equal(2 - 2 * found.similarities, distances)
 
 
-def test_random_descriptors_with_copies_are_found_as_faiss_does():
-    """Recalls are functions of these indices."""
-    database, queries = _random_unit(12, 2000, 48), _random_unit(13, 60, 48)
-    database[1000:1100] = database[300:400]
-    database[1500:1540] = database[7]
-    queries[:40] = _unit(queries[:40] * 0.2 + database[300:340])
-    queries[40] = database[7]
-    index = faiss.IndexFlatL2(48)
-    index.add(database)
-    distances, indices = index.search(queries, 25)
-    # No distances closer than faiss can tell apart, other than those of copies.
-    gaps = np.diff(distances, axis=1)
-    assert gaps[gaps > 1e-6].size + (gaps == 0).sum() == gaps.size
-    found = retrieval.search(database, queries, 25, chunk=256)
-    np.testing.assert_array_equal(found.indices, indices)
-
-
 @BOTH_WAYS
-def test_rows_that_float32_products_cannot_tell_apart_are_ranked_exactly(search):
-    """Their products differ by less than a float32 product errs: a device names the wrong ones."""
-    generator = np.random.default_rng(3)
-    queries = _random_unit(17, 5, 4000)
-    noise = 1e-7 * generator.standard_normal((900, 4000))
-    database = (queries[0] + noise).astype(np.float32)
+@hypothesis.settings(max_examples=20, deadline=None)
+@hypothesis.given(
+    count=st.integers(1, 300), k=st.integers(1, 40), chunk=st.integers(1, 300), seed=st.integers(0)
+)
+@hypothesis.example(count=900, k=20, chunk=450, seed=3)
+def test_copies_and_rows_that_float32_cannot_tell_apart_are_ranked_exactly(
+    search, count, k, chunk, seed
+):
+    """Their products differ by less than a float32 product errs: candidates are the wrong ones."""
+    generator = np.random.default_rng(seed)
+    places = _random_unit(17, 3, 1000)
+    queries = np.concatenate([places, _random_unit(18, 2, 1000)])
+    database = places[generator.integers(0, generator.integers(1, 4), count)]
+    is_copy = generator.random((count, 1)) < generator.random()
+    noise = 1e-7 * generator.standard_normal(database.shape)
+    database = np.where(is_copy, database, database + noise).astype(np.float32)
     wanted = (queries.astype(np.float64) @ database.astype(np.float64).T).astype(np.float32)
-    found = search(database, queries, 20, chunk=450)
-    np.testing.assert_array_equal(found.indices, np.argsort(-wanted, axis=1, kind="stable")[:, :20])
+    found = search(database, queries, k, chunk=chunk)
+    indices = np.argsort(-wanted, axis=1, kind="stable")[:, :k]
+    np.testing.assert_array_equal(found.indices, indices)
+    np.testing.assert_array_equal(found.similarities, np.take_along_axis(wanted, indices, axis=1))
+
+
+def test_only_queries_of_many_near_copies_read_the_database_again():
+    database = _random_unit(19, 500, 64)
+    database[100:200] = database[0]
+    passes = []
+
+    def stream():
+        passes.append(True)
+        return blocks(database, "database", 100)
+
+    def ask(queries):
+        passes.clear()
+        found = neighbours.nearest(stream, queries, 1, functools.partial(gathered, database), 100)
+        np.testing.assert_array_equal(found.indices, _brute_force(database, queries, 1)[0])
+        return len(passes)
+
+    assert ask(database[1:40]) == 1
+    assert ask(database[:40]) == 2
 
 
 @BOTH_WAYS
@@ -341,3 +350,36 @@ def test_wrong_shapes_and_numbers_are_named():
             retrieval.search(*arguments)
     with pytest.raises(InputError, match=r"^chunk: found 0"):
         retrieval.search(rows, rows, 1, chunk=0)
+
+
+# Euclidean distance
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
+def test_cosines_rank_as_distances(kind: type) -> None:
+    rng = np.random.default_rng(0)
+    sides = [
+        (rng.normal(size=(count, 9)) * rng.uniform(0.1, 20, (count, 1))).astype(kind)
+        for count in (300, 40)
+    ]
+    found = retrieval.search(*retrieval.to_unit_vectors(*sides), 5)
+    database, queries = (side.astype(np.float64) for side in sides)
+    squares = np.square(queries[:, None] - database).sum(axis=2)
+    np.testing.assert_array_equal(found.indices, squares.argsort(axis=1, kind="stable")[:, :5])
+    largest = max(np.square(side).sum(axis=1).max() for side in (database, queries))
+    nearest = np.take_along_axis(squares, found.indices, axis=1)
+    expected = (np.square(queries).sum(axis=1, keepdims=True) - nearest) / largest / 3
+    # Float32 of a unit vector's numbers.
+    np.testing.assert_allclose(found.similarities, expected, atol=3e-7, rtol=0)
+
+
+def test_zeros_are_embedded() -> None:
+    found = retrieval.search(*retrieval.to_unit_vectors(np.zeros((2, 3)), np.zeros((1, 3))), 1)
+    assert found.indices.tolist() == [[0]]
+
+
+def test_bad_sides_are_named() -> None:
+    with pytest.raises(InputError, match=r"^queries: row 1 is not finite, expected finite"):
+        retrieval.to_unit_vectors(np.zeros((2, 2)), np.array([[0.0, 1.0], [np.nan, 0.0]]))
+    with pytest.raises(InputError, match=r"^queries: found descriptors of length 3"):
+        retrieval.to_unit_vectors(np.zeros((2, 2)), np.zeros((2, 3)))

@@ -7,58 +7,64 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.images import list_images, read_image
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.describe import (
+    FrameDescriber,
+    check_window,
+    described,
+    group,
+    read_tokens,
+)
+from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.pca import fit_pca
-from crisalad_jax.retrieval.windows import FrameDescriber, check_window, describe_windows
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL
 from tests.retrieval.maps.test_stores import ROUNDING
 
 WINDOW = 3
+READING = Reading(batch_size=BATCH, quiet=True)
 
 
 @pytest.fixture(scope="module")
 def town(shared, params):
     """Seven images, and their descriptors by the grouping `window`."""
     paths = list_images(shared / "town" / "images" / "test" / "database")
-    tokens = read_tokens(params, MODEL, paths, batch_size=BATCH, label="", quiet=True)
-    expected = group(params, MODEL, tokens, "window", batch_size=WINDOW)
-    alone = group(params, MODEL, tokens, "single", batch_size=BATCH)
+    describer = describer_of(Model(params, MODEL))
+    rows = read_tokens(describer, paths, READING).descriptors
+    expected = group(describer, rows, len(paths), "window", batch_size=WINDOW)
+    alone = group(describer, rows, len(paths), "single", batch_size=BATCH)
     # The test can fail: the frames before it change a descriptor.
     assert np.abs(expected - alone)[1:].max() > 1000 * ROUNDING
-    return types.SimpleNamespace(paths=paths, expected=expected)
+    return types.SimpleNamespace(paths=paths, expected=expected, describer=describer, rows=rows)
 
 
-def test_batch_by_batch(town, params):
+def test_batch_by_batch(town):
     """The first window of the second batch is of both."""
-    stream = describe_windows(params, MODEL, town.paths, window=WINDOW, batch_size=BATCH)
+    stream = described(town.describer, town.paths, READING, window=WINDOW)
     parts = [part.descriptors for part in stream]
     assert [len(part) for part in parts] == [4, 3]
     # float32 sums of other batches.
     np.testing.assert_allclose(np.concatenate(parts), town.expected, atol=ROUNDING)
 
 
-def test_an_unreadable_frame_is_left_out_and_not_looked_at(town, params, tmp_path):
+def test_an_unreadable_frame_is_left_out_and_not_looked_at(town, tmp_path):
     broken = tmp_path / "broken.png"
     broken.write_bytes(b"no picture")
     paths = [*town.paths[:2], broken, *town.paths[3:]]
-    stream = describe_windows(
-        params, MODEL, paths, window=WINDOW, batch_size=BATCH, on_bad_image="skip"
-    )
-    parts = list(stream)
+    skips = dataclasses.replace(READING, on_bad_image="skip")
+    parts = list(described(town.describer, paths, skips, window=WINDOW))
     assert [index for part in parts for index in part.indices] == [0, 1, 3, 4, 5, 6]
     assert [index for part in parts for index in part.unreadable] == [2]
     found = np.concatenate([part.descriptors for part in parts])
-    tokens = read_tokens(
-        params, MODEL, paths, batch_size=BATCH, label="", on_bad_image="skip", quiet=True
-    )
-    expected = group(params, MODEL, tokens, "window", batch_size=WINDOW)[tokens.readable]
+    rows = np.delete(town.rows, 2, axis=0)
+    expected = group(town.describer, rows, len(rows), "window", batch_size=WINDOW)
     np.testing.assert_allclose(found, expected, atol=ROUNDING)  # as above
 
 
-def test_one_by_one(town, params):
-    describer = FrameDescriber(params, MODEL, WINDOW)
+def test_one_by_one(town):
+    describer = FrameDescriber(town.describer, WINDOW)
     images = [read_image(path) for path in town.paths]
     found = np.concatenate([describer(image) for image in images])
     np.testing.assert_allclose(found, town.expected, atol=ROUNDING)  # as above
@@ -75,11 +81,9 @@ def test_windows_that_mean_nothing_are_refused():
     check_window(alone, 1)
 
 
-def test_components_shorten_what_is_described(town, params):
+def test_components_shorten_what_is_described(town):
     components = fit_pca(town.expected, 4)
-    stream = describe_windows(
-        params, MODEL, town.paths, window=WINDOW, batch_size=BATCH, components=components
-    )
+    stream = described(town.describer, town.paths, READING, window=WINDOW, components=components)
     found = np.concatenate([part.descriptors for part in stream])
     # As above, times what unit length gives back of a vector that lost most of its own.
     np.testing.assert_allclose(found, components.apply(town.expected), atol=10 * ROUNDING)

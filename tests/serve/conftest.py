@@ -11,14 +11,13 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import pytest
-import uvicorn
 
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
-from crisalad_jax.serve.access import Access
 from crisalad_jax.serve.app import make_app
-from crisalad_jax.serve.server import _bound, _Server
-from crisalad_jax.serve.service import MapService
+from crisalad_jax.serve.server import Server, _bound
 from crisalad_jax.serve.worker import MapWorker
 from crisalad_jax.utils.signals import SignalState
 from tests.conftest import BATCH, MODEL
@@ -63,20 +62,16 @@ class Service(NamedTuple):
 def serving(
     folder: pathlib.Path, params: Any, *, appends: bool = False, **options: Any
 ) -> Iterator[Service]:
-    token = options.pop("token", None)
     with contextlib.ExitStack() as stack:
         places = stack.enter_context(Map.open(folder))
         if appends:
-            places = stack.enter_context(open_for_appending(folder, places.description))
-        worker = stack.enter_context(MapWorker(places, params, batch_size=TOGETHER))
-        service = MapService(worker, appends=appends, images=options.pop("images", None))
-        stack.enter_context(contextlib.closing(service))
-        app = make_app(service, Access(token), max_bytes=LIMIT, **options)
-        config = uvicorn.Config(
-            app, loop="asyncio", http="h11", lifespan="off", log_level="critical"
-        )
+            places = stack.enter_context(open_for_appending(folder, places.metadata))
+        describer = places.describer(Model(params, places.config))
+        worker = MapWorker(places, describer, batch_size=TOGETHER)
+        stack.enter_context(contextlib.closing(worker))
+        app = make_app(worker, appends=appends, max_bytes=LIMIT, **options)
         stop, up = SignalState(), threading.Event()
-        server = _Server(config, stop, up.set)
+        server = Server(app, stop, up.set)
         listener = stack.enter_context(contextlib.closing(_bound("127.0.0.1", 0)))
         thread = threading.Thread(target=server.run, args=([listener],), daemon=True)
         thread.start()
@@ -98,7 +93,13 @@ def sides(shared) -> tuple[pathlib.Path, pathlib.Path]:
 def folder(shared, params, sides, tmp_path_factory) -> pathlib.Path:
     out = tmp_path_factory.mktemp("serve") / "town.map"
     weights = shared / "weights.safetensors"
-    index(params, MODEL, sides[0], out, weights=weights, batch_size=BATCH, quiet=True)
+    index(
+        Model(params, MODEL),
+        sides[0],
+        out,
+        weights=weights,
+        reading=Reading(batch_size=BATCH, quiet=True),
+    )
     return out
 
 

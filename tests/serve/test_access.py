@@ -3,7 +3,8 @@
 import pytest
 
 from crisalad_jax.cli import main
-from crisalad_jax.serve.access import Access, RefusedError, check_host, is_loopback, read_token
+from crisalad_jax.serve import serve_map
+from crisalad_jax.serve.server import is_loopback
 from crisalad_jax.utils.errors import InputError
 
 TOKEN = "0123456789abcdef"
@@ -24,51 +25,35 @@ TOKEN = "0123456789abcdef"
         ("example.org", False),
     ],
 )
-def test_what_is_this_machine(host, own):
+def test_what_other_machines_can_reach_needs_a_token(host, own):
     assert is_loopback(host) is own
-    if own:
-        check_host(host, None)
-    else:
-        with pytest.raises(InputError, match="other machines can reach, and no token"):
-            check_host(host, None)
-    check_host(host, TOKEN)
-
-
-@pytest.mark.parametrize("host", ["localhost:8000", "127.0.0.1", "[::1]:8000", "LOCALHOST"])
-def test_hosts_that_are_answered(host):
-    Access(None).check("GET", "/map", {"host": host})
-    Access(None).check("POST", "/locate", {"host": host, "origin": f"http://{host}"})
-
-
-@pytest.mark.parametrize("host", ["", "[", "evil.example", "127.0.0.1.evil.example", "a@[::1"])
-def test_hosts_that_are_not(host):
-    with pytest.raises(RefusedError) as refused:
-        Access(None).check("GET", "/", {"host": host})
-    assert refused.value.status == 421
-
-
-@pytest.mark.parametrize("origin", ["null", "https://localhost:8000", "http://localhost:9000"])
-def test_pages_of_other_sites(origin):
-    with pytest.raises(RefusedError) as refused:
-        Access(None).check("POST", "/images", {"host": "localhost:8000", "origin": origin})
-    assert refused.value.status == 403
+    words = "no.map: found no map" if own else "other machines can reach, and no token"
+    with pytest.raises(InputError, match=words):
+        serve_map("no.map", host=host, port=0)
 
 
 def test_where_a_token_comes_from(tmp_path, monkeypatch):
+    given = []
+    monkeypatch.setattr(
+        "crisalad_jax.cli.serve.serve_map", lambda *_, token, **__: given.append(token)
+    )
+    command = ["serve", "--map", "no.map"]
     monkeypatch.delenv("CRISALAD_TOKEN", raising=False)
-    assert read_token(None) is None
+    assert main(command) == 0
     monkeypatch.setenv("CRISALAD_TOKEN", "a" * 16)
-    assert read_token(None) == "a" * 16
-    file = tmp_path / "token"
-    file.write_text(f"{TOKEN}\n")
-    assert read_token(file) == TOKEN  # the flag wins
-    for text in ("", "short", f"{TOKEN} {TOKEN}", f"{TOKEN}é"):
-        file.write_text(text)
-        with pytest.raises(InputError, match=rf"{file}: found a token of {len(text)} letters"):
-            read_token(file)
+    assert main(command) == 0
+    (tmp_path / "token").write_text(f"{TOKEN}\n")
+    assert main([*command, "--token-file", str(tmp_path / "token")]) == 0  # the flag wins
+    assert given == [None, "a" * 16, TOKEN]
 
 
-def test_the_command_refuses_in_one_line(capfd, monkeypatch, tmp_path):
+@pytest.mark.parametrize("token", ["", "short", f"{TOKEN} {TOKEN}", f"{TOKEN}é"])
+def test_a_token_that_is_easy_to_guess(token):
+    with pytest.raises(InputError, match=f"token: found {len(token)} letters"):
+        serve_map("no.map", token=token)
+
+
+def test_the_command_refuses_in_one_line(capfd, monkeypatch):
     monkeypatch.delenv("CRISALAD_TOKEN", raising=False)
     for given, words in (
         (["--host", "0.0.0.0"], "crisalad: host: found '0.0.0.0', which other machines can reach"),
@@ -78,10 +63,15 @@ def test_the_command_refuses_in_one_line(capfd, monkeypatch, tmp_path):
         (["--batch-size", "0"], "crisalad: batch size: found 0"),
         (["--map-images", "none"], "crisalad: map_images: found no folder none"),
         (["--token-file", "none"], "crisalad: none: "),
-        (["--host", "no.such.name.invalid"], "crisalad: host: found 'no.such.name.invalid'"),
+        (["--host", "256.1"], "crisalad: host: found '256.1', which other"),
         (["--port", "0"], "crisalad: no.map: found no map, expected a folder"),
     ):
         assert main(["serve", "--map", "no.map", *given]) == 2
         err = capfd.readouterr().err
         assert err.startswith(words), err
         assert err.count("\n") == 1
+    monkeypatch.setenv("CRISALAD_TOKEN", TOKEN)
+    assert main(["serve", "--map", "no.map", "--host", "no.such.name.invalid"]) == 2
+    assert capfd.readouterr().err.startswith(
+        "crisalad: host and port: cannot listen at no.such.name.invalid:8000: "
+    )

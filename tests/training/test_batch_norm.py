@@ -17,7 +17,7 @@ from crisalad_jax.losses import LossConfig
 from crisalad_jax.losses.multi_similarity import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.model import describe, init_crisalad, train_tokens
-from crisalad_jax.training import run as module
+from crisalad_jax.training import run_files
 from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.step import StepConfig, init_train_state, train_step
@@ -26,6 +26,7 @@ from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import MODEL as TESTS_MODEL
 from tests.conftest import RECIPE, assert_equal, random_params
 from tests.nn.test_model import pictures
+from tests.training.test_loop import Interrupted, fail_at
 
 # Of 64 the multi-resolution adapter's narrow convolutions have 4 channels.
 ADAPTER = AdapterConfig(kind="multi-resolution", bottleneck=2.0)
@@ -139,22 +140,10 @@ def test_runs_keep_and_resume_the_statistics(shared, tmp_path) -> None:
     start = init_crisalad(jax.random.key(0), MODEL)
     assert any(np.abs(x - statistics(start)[n]).max() > 0 for n, x in statistics(whole).items())
 
-    class EndedError(Exception):
-        pass
-
-    taken = []
-    step = module.train_step
-
-    def interrupted(*arguments):
-        if len(taken) == 3:
-            raise EndedError
-        taken.append(None)
-        return step(*arguments)
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "train_step", interrupted)
-        patch.setattr(module, "SAVE_SECONDS", -1)
-        with pytest.raises(EndedError):
+        fail_at(patch, "train_step", 4)
+        patch.setattr(run_files, "SAVE_SECONDS", -1)
+        with pytest.raises(Interrupted):
             fit(config, places, tmp_path / "resumed", quiet=True)
     resumed = fit(config, places, tmp_path / "resumed", quiet=True).params
     assert_equal(resumed, whole)

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-import crisalad_jax.training.run
 from crisalad_jax.checkpoints.train_state import StateStore
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.classes import ClassesConfig
@@ -25,6 +24,7 @@ from crisalad_jax.losses.large_margin_cosine import (
 )
 from crisalad_jax.nn.config import with_aggregator
 from crisalad_jax.nn.model import describe
+from crisalad_jax.training import run_files
 from crisalad_jax.training.classifier import init_classifiers, update_classifiers
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
@@ -170,7 +170,7 @@ def test_an_interrupted_run_goes_on_with_the_same_bits(
 ):
     """Within an epoch of the second group, and of the first when it trains once more."""
     with monkeypatch.context() as patch:
-        patch.setattr(crisalad_jax.training.run, "SAVE_SECONDS", -1.0)
+        patch.setattr(run_files, "SAVE_SECONDS", -1.0)
         fail_at(patch, "train_step", call)
         with pytest.raises(Interrupted):
             fit(CONFIG, places, tmp_path / "run", validation=benchmark, quiet=True)
@@ -189,12 +189,12 @@ def state_in(out: pathlib.Path):
         random_params(CONFIG.model), "all", config, key=jax.random.key(1)
     )
     store = StateStore(out / "state")
-    saved = store.load(template)
+    saved = store.load(run_files.RunState(template, None))
     store.close()
     assert saved is not None
     assert saved.step == STEPS
-    assert saved.state.classifiers.weights.shape == (2, 4, 32)
-    return saved.state
+    assert saved.state.training.classifiers.weights.shape == (2, 4, 32)
+    return saved.state.training
 
 
 @pytest.mark.slow

@@ -61,8 +61,7 @@ def test_a_learning_rate_over_the_whole_run_jumps_and_a_note_says_so(
 ):
     longer = dataclasses.replace(RECIPE, patience=None, epochs=4)
     fail_at(monkeypatch, "train_step", 1)  # nothing of it is compiled
-    # At step 6 of 6 the rate is 0; at step 6 of 8 it is a quarter of 1e-3.
-    note = r"jumps from 0 to 0\.00025 at step 6: this is not the run of 4 epochs at once"
+    note = "jumps at step 6: this is not the run of 4 epochs at once"
     with pytest.warns(Note, match=note), pytest.raises(Interrupted):
         fit(longer, places, copied, validation=benchmark, initial=params, quiet=True)
     assert read_config(TrainConfig, copied / "config.json") == longer

@@ -21,12 +21,13 @@ from tests.training.test_loop import metrics_of
 
 ROOT = pathlib.Path(__file__).parents[2]
 EPOCHS = 4
-CONFIG = dataclasses.replace(RECIPE, epochs=EPOCHS, patience=None, keep_best=2)
+CONFIG = dataclasses.replace(RECIPE, epochs=EPOCHS, patience=None, save_top_k=2)
 PROGRAM = """
 import pathlib, sys
 
 import crisalad_jax.training.loop
-import crisalad_jax.training.run
+import crisalad_jax.training.run_files
+import crisalad_jax.training.validation
 from crisalad_jax.utils import compiler
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
@@ -35,7 +36,7 @@ from tests.training.test_interruption import CONFIG
 
 city, town, out = map(pathlib.Path, sys.argv[1:4])
 compiler.configure()
-crisalad_jax.training.run.SAVE_SECONDS = -1.0
+crisalad_jax.training.run_files.SAVE_SECONDS = -1.0
 for statement in sys.argv[4:]:
     exec(statement)
 try:
@@ -137,7 +138,7 @@ def test_a_run_killed_at_random_moments_ends_with_the_same_bits(start, whole, tm
 def test_a_signal_saves_first_and_the_same_command_goes_on(start, whole, tmp_path, number):
     out = tmp_path / "run"
     # Without these saves, what is resumed from was saved because of the signal.
-    seldom = "crisalad_jax.training.run.SAVE_SECONDS = 1e9"
+    seldom = "crisalad_jax.training.run_files.SAVE_SECONDS = 1e9"
     program = start(out, seldom)
     wait_for_lines(program, out, 4)
     program.send_signal(number)
@@ -156,11 +157,11 @@ def test_a_signal_saves_first_and_the_same_command_goes_on(start, whole, tmp_pat
 def test_a_signal_during_a_validation_does_not_wait_for_its_end(start, whole, tmp_path):
     """The validation is repeated, and is in the log once."""
     slow = (
-        "real = crisalad_jax.training.run.evaluate\n"
+        "real = crisalad_jax.training.validation.evaluate\n"
         "def evaluate(*arguments, **more):\n"
         "    print('validating', flush=True)\n"
         "    import time; time.sleep(60)\n"
-        "crisalad_jax.training.run.evaluate = evaluate"
+        "crisalad_jax.training.validation.evaluate = evaluate"
     )
     out = tmp_path / "run"
     program = start(out, slow)

@@ -15,28 +15,36 @@ from tensorboardX.proto import event_pb2
 
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.io import read_config
+from crisalad_jax.config.plugins import sources_of
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.images import read_image
+from crisalad_jax.data.loader import ImageCache
 from crisalad_jax.data.places import Places, epoch_batches, read_places
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.evaluation.evaluate import GroupingResult, evaluate
 from crisalad_jax.nn.config import with_aggregator
-from crisalad_jax.nn.model import Crisalad, extract_tokens
+from crisalad_jax.nn.model import Crisalad, Model, extract_tokens
 from crisalad_jax.nn.tokens import Tokens, TransportStatistics
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.training import run as run_module
-from crisalad_jax.training import run_files
+from crisalad_jax.training import run_files, trainer, validation
+from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog, read_metrics
 from crisalad_jax.training.loop import FitResult, fit
-from crisalad_jax.training.run_files import claim_run
-from crisalad_jax.training.step import train_step
+from crisalad_jax.training.run_files import (
+    RunFiles,
+    RunRecord,
+    RunState,
+    acquire_run,
+    checksum,
+    checksum_of_places,
+)
+from crisalad_jax.training.step import init_train_state, step_config, train_step
 from crisalad_jax.training.trainable import merge_params
-from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from crisalad_jax.utils.pytree import named_leaves
-from crisalad_jax.utils.signals import SignalState
 from crisalad_jax.utils.temporaries import temporary_beside
 from tests.conftest import RECIPE, STEPS, random_params
 
@@ -72,15 +80,26 @@ def assert_same_run(found: pathlib.Path, expected: pathlib.Path) -> None:
         assert_same_params(load_weights(found / name)[0], load_weights(expected / name)[0])
 
 
-def open_run(config, places, out, params, validation=None) -> run_module.Run:
-    return run_module.Run(config, places, out, params, validation)
+def save_steps(config, places, out, params, steps: tuple[int, ...] = (0,)) -> None:
+    """Save a state for each of these steps, with the files of a run as `fit` opens them."""
+    weights = checksum(jax.tree.leaves(params))
+    checksums = {"places": checksum_of_places(places), "validation": 0, "weights": weights}
+    record = RunRecord(checksums, {name: [*each] for name, each in sources_of(config).items()})
+    static = step_config(config, steps=STEPS)
+    state, _ = init_train_state(params, config.trainable, static)
+    files = RunFiles(out, config, record)
+    state = files.load(RunState(state, None))
+    for files.record.step in steps:
+        files.save(state, lambda: params)
+    files.close()
+
+
+PLACES_OF = {"train_step": trainer, "evaluate": validation, "save_weights": run_files}
 
 
 def fail_at(monkeypatch: pytest.MonkeyPatch, name: str, call: int) -> None:
     """Let the given call, counted from 1, of a function that `fit` uses end the process."""
-    module = run_files if name == "save_weights" else run_module
-    function = getattr(module, name)
-    calls = []
+    function, calls = getattr(PLACES_OF[name], name), []
 
     def counted(*args, **kwargs):
         calls.append(None)
@@ -88,7 +107,7 @@ def fail_at(monkeypatch: pytest.MonkeyPatch, name: str, call: int) -> None:
             raise Interrupted
         return function(*args, **kwargs)
 
-    monkeypatch.setattr(module, name, counted)
+    monkeypatch.setattr(PLACES_OF[name], name, counted)
 
 
 def test_a_run_leaves_its_files(run: pathlib.Path, benchmark: Benchmark):
@@ -118,7 +137,9 @@ def test_a_run_leaves_its_files(run: pathlib.Path, benchmark: Benchmark):
     validations = [line for line in lines if "R@5" in line]
     assert [(line["step"], line["epoch"]) for line in validations] == [(2, 1), (4, 2), (6, 3)]
     params, config = load_weights(run / "last.safetensors")
-    (result,) = evaluate(params, config, benchmark, groupings=("single",), quiet=True)
+    (result,) = evaluate(
+        Model(params, config), benchmark, groupings=("single",), reading=Reading(quiet=True)
+    )
     size = config.image_size
     queries = np.stack([resize_image(read_image(q), size) for q in benchmark.queries])
     transport = extract_tokens(params, queries, config).transport
@@ -184,7 +205,7 @@ def test_an_interrupted_run_goes_on_as_if_it_had_not_been(
         )
 
     with monkeypatch.context() as patch:
-        patch.setattr(run_module, "SAVE_SECONDS", -1.0)
+        patch.setattr(run_files, "SAVE_SECONDS", -1.0)
         fail_at(patch, function, call)
         with pytest.raises(Interrupted):
             go()
@@ -208,7 +229,7 @@ def test_a_run_interrupted_between_batches_that_share_a_step_goes_on(
 
     whole = go("whole")
     with monkeypatch.context() as patch:
-        patch.setattr(run_module, "SAVE_SECONDS", -1.0)
+        patch.setattr(run_files, "SAVE_SECONDS", -1.0)
         fail_at(patch, "train_step", 4)
         with pytest.raises(Interrupted):
             go("cut")
@@ -239,14 +260,14 @@ def scripted(monkeypatch: pytest.MonkeyPatch, recalls_at_5: list[float]) -> list
     """Validations that find these recalls; returned: the parameters that each was asked about."""
     seen = []
 
-    def fake(params, config, benchmark, *, groupings, cache, on_bad_image, quiet):
+    def fake(model, benchmark, *, groupings, reading):
         assert groupings == ("single",)
-        seen.append(jax.device_get(params))
+        seen.append(jax.device_get(model.params))
         recall = recalls_at_5[len(seen) - 1]
         neighbours = Neighbours(np.zeros((1, 1), np.int64), np.zeros((1, 1), np.float32))
         return [GroupingResult("single", {1: 1 - recall, 5: recall, 10: 1.0}, neighbours)]
 
-    monkeypatch.setattr(run_module, "evaluate", fake)
+    monkeypatch.setattr(validation, "evaluate", fake)
     return seen
 
 
@@ -301,24 +322,24 @@ def test_a_validation_has_its_own_size(shared, places, tmp_path, monkeypatch):
 
     def recorded(params, model, *rest, **options):
         seen.append(model)
-        return evaluate(params, model, *rest, **options)
+        return evaluate(Model(params, model), *rest, **options)
 
-    monkeypatch.setattr(run_module, "evaluate", recorded)
+    monkeypatch.setattr(validation, "evaluate", recorded)
     config = dataclasses.replace(ENDLESS, epochs=1, validation_size=(56, 84))
     result = fit(config, places, tmp_path, validation=town, quiet=True)
     params, model = load_weights(tmp_path / "best.safetensors")
     assert model == config.model
     larger = dataclasses.replace(model, image_size=(56, 84))
     assert seen == [larger]
-    (expected,) = evaluate(params, larger, town, groupings=("single",), quiet=True)
+    (expected,) = evaluate(
+        Model(params, larger), town, groupings=("single",), reading=Reading(quiet=True)
+    )
     assert result.best_recall == expected.recalls[5]
     line = metrics_of(tmp_path)[-1]
     assert {f"R@{k}": recall for k, recall in expected.recalls.items()}.items() <= line.items()
 
 
-def test_a_validation_watches_the_transport_on_the_first_queries(
-    tmp_path, places, params, benchmark, monkeypatch
-):
+def test_a_validation_watches_the_transport_on_the_first_queries(params, benchmark, monkeypatch):
     seen = []
 
     def tell(params, images, model):
@@ -326,48 +347,44 @@ def test_a_validation_watches_the_transport_on_the_first_queries(
         each = TransportStatistics(*jnp.array([[0.0, 0.5], [0.5, 0.5], [3.0, 5.0]]))
         return Tokens(jnp.zeros((2, 0)), jnp.zeros((2, 0, 0)), each)
 
-    monkeypatch.setattr(run_module, "extract_tokens", tell)
-    monkeypatch.setattr(run_module, "WATCHED_QUERIES", 2)
+    monkeypatch.setattr(validation, "extract_tokens", tell)
+    monkeypatch.setattr(validation, "WATCHED_QUERIES", 2)
     scripted(monkeypatch, [0.5])
-    run = open_run(RECIPE, places, tmp_path, params, benchmark)
-    run.validate(SignalState())
-    run.close()
+    found = validated(RECIPE, params, benchmark)
     first = [resize_image(read_image(q), RECIPE.model.image_size) for q in benchmark.queries[:2]]
     np.testing.assert_array_equal(seen, [first])
-    (line,) = metrics_of(tmp_path)
-    logged = [line[name] for name in TransportStatistics._fields]
-    assert logged == [0.25, 0.5, 4.0]
+    assert [found.metrics[name] for name in TransportStatistics._fields] == [0.25, 0.5, 4.0]
+
+
+def validated(config: TrainConfig, params: Crisalad, benchmark: Benchmark) -> validation.Validation:
+    cache = ImageCache()
+    return validation.Validator(config, benchmark, on_bad_image="stop", cache=cache).validate(
+        params
+    )
 
 
 @pytest.mark.parametrize(
-    ("select_by", "best"),
+    ("monitor", "best"),
     # Of R@5 0.25 and 0.75 the R@1 are 0.75 and 0.25, and the sums equal: the first counts.
     [("R@1", [0.75, 1]), ("R@5", [0.75, 2]), ("R@1+R@5", [1.0, 1])],
 )
 def test_the_best_weights_are_chosen_by_the_recall_that_is_named(
-    tmp_path, places, params, benchmark, monkeypatch, select_by, best
+    params, benchmark, monkeypatch, monitor, best
 ):
     scripted(monkeypatch, [0.25, 0.75])
-    config = dataclasses.replace(RECIPE, select_by=select_by)
-    run = open_run(config, places, tmp_path, params, benchmark)
-    for step in (1, 2):
-        run.step = step
-        run.validate(SignalState())
-    run.close()
-    assert run.record.best == [best]
+    config = dataclasses.replace(RECIPE, monitor=monitor)
+    record = RunRecord({}, {})
+    for record.step in (1, 2):
+        record.add_validation(validated(config, params, benchmark).monitored, config)
+    assert record.best == [best]
 
 
-def test_without_salad_a_validation_has_no_transport_to_watch(
-    tmp_path, places, benchmark, monkeypatch
-):
+def test_without_salad_a_validation_has_no_transport_to_watch(benchmark, monkeypatch):
     scripted(monkeypatch, [0.5])
     model = with_aggregator(RECIPE.model, "class-token", "tiny")
     config = dataclasses.replace(RECIPE, model=model)
-    run = open_run(config, places, tmp_path, random_params(model), benchmark)
-    run.validate(SignalState())
-    run.close()
-    (line,) = metrics_of(tmp_path)
-    assert line.keys() == {"step", "epoch", "R@1", "R@5", "R@10"}
+    found = validated(config, random_params(model), benchmark)
+    assert found.metrics.keys() == {"R@1", "R@5", "R@10"}
 
 
 @pytest.mark.slow
@@ -387,7 +404,7 @@ def test_nothing_is_compiled_after_the_first_step_and_validation(
 
     jax.clear_caches()
     jax.monitoring.register_event_duration_secs_listener(count)
-    monkeypatch.setattr(run_module, "train_step", step)
+    monkeypatch.setattr(trainer, "train_step", step)
     fit(ENDLESS, places, tmp_path, validation=benchmark, initial=params, quiet=True)
     jax.monitoring.unregister_event_duration_listener(count)
     assert len(after_step) == STEPS
@@ -418,8 +435,8 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(
         return state, metrics
 
     with monkeypatch.context() as patch:
-        patch.setattr(run_module, "train_step", step)
-        with pytest.raises(InputError, match=r"loss nan.* at step 3,.* after step 2 is kept"):
+        patch.setattr(trainer, "train_step", step)
+        with pytest.raises(InputError, match=r"loss nan.* at step 3,.* after step 2 is saved"):
             fit(config, places, tmp_path, initial=params, quiet=True)
     assert len(good) == 4
     assert [line["step"] for line in metrics_of(tmp_path)] == [1, 2]
@@ -438,11 +455,11 @@ def test_a_step_is_started_before_the_one_before_is_read(tmp_path, places, param
         events.append("step")
         return train_step(*args)
 
-    def log_step(self, values, *, of=""):
+    def log(self, values, *, of=""):
         events.append(f"line {values['step']}")
 
-    monkeypatch.setattr(run_module, "train_step", step)
-    monkeypatch.setattr(run_files.RunFiles, "log_step", log_step)
+    monkeypatch.setattr(trainer, "train_step", step)
+    monkeypatch.setattr(RunFiles, "log", log)
     fit(RECIPE, places, tmp_path, initial=params, quiet=True)
     assert events[:4] == ["step", "step", "line 1", "line 2"]  # an epoch has two
 
@@ -463,53 +480,32 @@ def test_a_step_costs_one_fetch_from_the_devices(tmp_path, places, params, monke
     def save(self, *args):
         events.append("save")
 
-    monkeypatch.setattr(run_module, "train_step", step)
-    monkeypatch.setattr(run_module.jax, "device_get", device_get)
-    monkeypatch.setattr(run_files.RunFiles, "save", save)
+    monkeypatch.setattr(trainer, "train_step", step)
+    monkeypatch.setattr(trainer.jax, "device_get", device_get)
+    monkeypatch.setattr(RunFiles, "save", save)
     fit(config, places, tmp_path, initial=params, quiet=True)
     assert events[events.index("step") :] == ["step", "step", "fetch", "fetch", "save"]
-
-
-def test_between_steps_no_process_waits_for_the_others(tmp_path, places, params, monkeypatch):
-    """What they tell each other is read a step late; the end of an epoch alone is agreed upon."""
-    config, events = dataclasses.replace(RECIPE, epochs=1), []
-
-    def step(*args):
-        events.append("step")
-        return train_step(*args)
-
-    def all_max(*numbers):
-        events.append("wait")
-        return numbers
-
-    monkeypatch.setattr(run_module, "train_step", step)
-    monkeypatch.setattr(distributed, "all_max", all_max)
-    fit(config, places, tmp_path, initial=params, quiet=True)
-    first = events.index("step")
-    assert events[first : first + 3] == ["step", "step", "wait"]
 
 
 def test_an_error_of_the_system_that_is_none_of_writing_is_not_told_as_one(
     tmp_path, places, params, monkeypatch
 ):
-    def batches_of(*args, **options):
+    def batches(self, step):
         raise OSError("network is unreachable")
         yield
 
-    monkeypatch.setattr(run_module, "batches_of", batches_of)
+    monkeypatch.setattr(PlaceBatches, "batches", batches)
     with pytest.raises(OSError, match=r"^network is unreachable$"):
         fit(RECIPE, places, tmp_path, initial=params, quiet=True)
 
 
-def test_a_log_that_cannot_be_written_is_told_with_the_way_on(
-    tmp_path, places, params, monkeypatch
-):
+def test_a_log_that_cannot_be_written_is_one_line(tmp_path, places, params, monkeypatch):
     def write(self, values, *, of=""):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(MetricsLog, "write", write)
-    words = f"{tmp_path}: cannot write: No space left on device; "
-    with pytest.raises(InputError, match=f"^{re.escape(words)}"):
+    words = f"{tmp_path}: cannot be written: No space left on device"
+    with pytest.raises(InputError, match=f"^{re.escape(words)}$"):
         fit(RECIPE, places, tmp_path, initial=params, quiet=True)
 
 
@@ -521,7 +517,7 @@ def test_a_plan_without_mass_has_no_statistics_and_ends_nothing(
         transport = metrics.transport._replace(dustbin_share=np.float32(np.nan))
         return state, metrics._replace(transport=transport)
 
-    monkeypatch.setattr(run_module, "train_step", step)
+    monkeypatch.setattr(trainer, "train_step", step)
     assert fit(RECIPE, places, tmp_path, initial=params, quiet=True).steps == STEPS
     for line in metrics_of(tmp_path):
         assert "dustbin_share" not in line
@@ -592,55 +588,43 @@ def test_what_does_not_fit_is_found_before_anything_is_written(tmp_path, places,
 
 
 @pytest.mark.parametrize("trainable", ["adapters+head", "all"])
-def test_a_run_is_gone_on_with_only_from_the_same_weights(tmp_path, places, params, trainable):
+def test_a_run_resumes_only_from_the_same_weights_and_places(tmp_path, places, params, trainable):
     config = dataclasses.replace(RECIPE, trainable=trainable)
-    run = open_run(config, places, tmp_path, params)
-    run.save()
-    run.close()
+    save_steps(config, places, tmp_path, params)
     other = jax.tree.map(lambda leaf: leaf + 1, params)
     with pytest.raises(InputError, match=f"{tmp_path}: the run started from other weights"):
-        open_run(config, places, tmp_path, other)
-
-
-def test_a_run_is_gone_on_with_only_on_the_same_places(tmp_path, places, params):
-    run = open_run(RECIPE, places, tmp_path, params)
-    run.save()
-    run.close()
+        fit(config, places, tmp_path, initial=other)
     other = dataclasses.replace(places, files=(*places.files[:-1], "Images/Brill/another.jpg"))
     with pytest.raises(InputError, match=f"{tmp_path}: the run started from other places"):
-        open_run(RECIPE, other, tmp_path, params)
+        fit(config, other, tmp_path, initial=params)
 
 
 def test_a_damaged_state_is_one_line_that_names_it_and_the_way_back(tmp_path, places, params):
-    run = open_run(RECIPE, places, tmp_path, params)
-    run.save()
-    run.step = 2
-    run.save()
-    run.close()
+    save_steps(RECIPE, places, tmp_path, params, (0, 2))
     for path in (tmp_path / "state" / "2" / "state").rglob("*"):
         if path.is_file():
             path.write_bytes(path.read_bytes()[:3])
     with pytest.raises(InputError, match=r"damaged.*delete it to go on from step 0") as error:
-        open_run(RECIPE, places, tmp_path, params)
+        fit(RECIPE, places, tmp_path, initial=params)
     assert str(error.value).startswith(str(tmp_path / "state" / "2"))
     assert "\n" not in str(error.value)
 
 
 def test_a_folder_belongs_to_one_configuration(tmp_path):
-    claim_run(tmp_path / "new" / "run", RECIPE)
-    claim_run(tmp_path / "new" / "run", RECIPE)
+    acquire_run(tmp_path / "new" / "run", RECIPE)
+    acquire_run(tmp_path / "new" / "run", RECIPE)
     with pytest.raises(InputError, match=r"seed: found 6, expected 5.*another folder"):
-        claim_run(tmp_path / "new" / "run", dataclasses.replace(RECIPE, seed=6))
+        acquire_run(tmp_path / "new" / "run", dataclasses.replace(RECIPE, seed=6))
 
 
 def test_a_folder_of_other_files_is_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("words")
     with pytest.raises(InputError, match=f"{tmp_path}: found files but no run"):
-        claim_run(tmp_path, RECIPE)
+        acquire_run(tmp_path, RECIPE)
     with pytest.raises(
         InputError, match=r"thesis\.tex: found a file, expected the folder of a run"
     ):
-        claim_run(tmp_path / "thesis.tex", RECIPE)
+        acquire_run(tmp_path / "thesis.tex", RECIPE)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
@@ -648,13 +632,11 @@ def test_hidden_files_of_the_user_outlive_a_run(tmp_path, places, params):
     """A run once removed every hidden file of its folder."""
     hidden = {".env": "secret", ".gitignore": "*", ".bashrc": "alias"}
     run = tmp_path / "run"
-    claim_run(run, RECIPE)
+    acquire_run(run, RECIPE)
     cut_off = temporary_beside(run / "last.safetensors")
     for name, text in (hidden | {cut_off.name: "cut off"}).items():
         (run / name).write_text(text)
-    opened = open_run(RECIPE, places, run, params)
-    opened.save()
-    opened.close()
+    save_steps(RECIPE, places, run, params)
     assert {p.name: p.read_text() for p in run.glob(".*")} == hidden
 
 
@@ -663,7 +645,7 @@ def test_a_folder_of_hidden_files_is_no_empty_folder(tmp_path, name):
     """A home folder may hold nothing else."""
     (tmp_path / name).write_text("words")
     with pytest.raises(InputError, match=f"{tmp_path}: found files but no run"):
-        claim_run(tmp_path, RECIPE)
+        acquire_run(tmp_path, RECIPE)
 
 
 def test_the_log_drops_what_will_be_repeated_and_a_line_cut_off(tmp_path):
@@ -682,10 +664,10 @@ def test_a_step_that_does_not_fit_is_told_before_the_first_file(
     tmp_path, places, params, monkeypatch
 ):
     """A limit stands for a GPU's, which a CPU does not have."""
-    monkeypatch.setattr(run_module, "memory_limit", lambda devices: 2**12)
+    monkeypatch.setattr(trainer, "memory_limit", lambda devices: 2**12)
     words = (
         "^training: found a step that takes 0.0 GB of each device, expected at most 0.0 GB; "
-        "no --micro-batch is small enough: take --model.compute-dtype bfloat16"
+        r"less take a smaller --micro-batch \(now None\), --model.compute-dtype bfloat16"
     )
     with pytest.raises(InputError, match=words):
         fit(RECIPE, places, tmp_path / "run", initial=params, quiet=True)
@@ -693,7 +675,7 @@ def test_a_step_that_does_not_fit_is_told_before_the_first_file(
 
 
 def test_a_step_that_fits_is_compiled_once(tmp_path, places, params, monkeypatch, caplog):
-    monkeypatch.setattr(run_module, "memory_limit", lambda devices: 2**34)
+    monkeypatch.setattr(trainer, "memory_limit", lambda devices: 2**34)
     jax.clear_caches()
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         fit(dataclasses.replace(RECIPE, epochs=1), places, tmp_path, initial=params, quiet=True)

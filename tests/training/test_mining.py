@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import json
 import pathlib
 import shutil
 
@@ -24,15 +23,22 @@ from crisalad_jax.losses.selavpr import SelaVprLoss
 from crisalad_jax.losses.triplet import TripletConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.model import describe
-from crisalad_jax.training import run as run_module
-from crisalad_jax.training.batches import batches_of_tuples, rounds_of
+from crisalad_jax.training import run_files
 from crisalad_jax.training.config import MiningConfig, TrainConfig
 from crisalad_jax.training.loop import fit
-from crisalad_jax.training.mining import Mined, draw_queries, mine_tuples, no_tuples
+from crisalad_jax.training.mining import (
+    Mined,
+    Miner,
+    draw_queries,
+    mine_tuples,
+    no_tuples,
+    rounds_of,
+)
 from crisalad_jax.training.optimiser import learning_rate_schedule
 from crisalad_jax.training.run_files import checksum_of_places
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import RECIPE, write_picture
+from tests.training.test_loop import Interrupted, assert_same_params, fail_at, metrics_of
 
 ROLES = np.array([[0, 1, 2, 2, 2], [0, 1, 2, 3, 3], [0, 1, 3, 3, 3]])
 """Three tuples: of three negatives, of one, and of none."""
@@ -320,7 +326,7 @@ def test_recipes_are_the_codes():
         assert (sgd.kind, sgd.learning_rate, sgd.momentum) == ("sgd", 1e-4, 0.9)
         assert sgd.weight_decay == 1e-3
         # Both stop after more than 10 epochs without gain.
-        assert (config.epochs, config.patience, config.select_by) == (30, 11, "R@5")
+        assert (config.epochs, config.patience, config.monitor) == (30, 11, "R@5")
         assert (config.places_per_batch, config.trainable) == (4, "last-1-blocks+head")
     assert netvlad.mining == MiningConfig("whole", 10, 1000, 1000, None, 10.0, 25.0, 0.1**0.5)
     assert patches.mining == MiningConfig("sample", 5, 1000, 1000, None, 10.0, 25.0, None)
@@ -334,7 +340,7 @@ def test_recipes_are_the_codes():
     adam = selavpr.optimiser
     assert (adam.kind, adam.learning_rate, adam.weight_decay) == ("adam", 1e-5, 0)
     assert adam.end_lr_fraction == 1
-    assert (selavpr.epochs, selavpr.patience, selavpr.select_by) == (50, 3, "R@5")
+    assert (selavpr.epochs, selavpr.patience, selavpr.monitor) == (50, 3, "R@5")
     assert selavpr.trainable == "adapters+head"
 
 
@@ -472,25 +478,21 @@ def test_batches_hold_the_tuples_and_their_roles(street):
     images = np.array([[20, 0, 4, 6], [21, 2, 8, 0], [22, 4, 0, 2], [23, 6, 2, 0]], np.int32)
     roles = np.array([[0, 1, 2, 2], [0, 1, 2, 3], [0, 1, 2, 2], [0, 1, 3, 3]], np.int32)
     round_ = no_tuples(CONFIG.mining, queries, 4)._replace(
-        step=np.array(0), images=images, roles=roles
+        step=np.array(2), images=images, roles=roles
     )
-    first, second = batches_of_tuples(CONFIG, queries, round_)
+
+    def batches(step: int, **reading):
+        miner = Miner(CONFIG, queries, **reading)
+        miner.mined = round_
+        return miner.batches(step)
+
+    first, second = batches(2)
     assert first.indices.tolist() == images[:2].ravel().tolist()
     assert second.labels.tolist() == [8, 9, 10, 10, 12, 13, 15, 15]
-    (again,) = batches_of_tuples(CONFIG, queries, round_, start_step=1)
+    (again,) = batches(3)
     np.testing.assert_array_equal(again.images, second.images)
-    (half, _) = batches_of_tuples(CONFIG, queries, round_, part=(1, 2))
+    (half, _) = batches(2, part=(1, 2))
     np.testing.assert_array_equal(half.images, first.images[4:])
-
-
-class Interrupted(Exception):
-    """Stands for a kill: nothing is saved on its way out."""
-
-
-def lines_of(out: pathlib.Path) -> list[dict]:
-    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
-    times = "images_per_second", "waited_for_images"
-    return [{k: v for k, v in line.items() if k not in times} for line in lines]
 
 
 @pytest.fixture(scope="module")
@@ -501,7 +503,7 @@ def whole(street, tmp_path_factory) -> pathlib.Path:
 
 
 def test_a_run_learns_from_its_tuples(whole):
-    lines = lines_of(whole)
+    lines = metrics_of(whole)
     assert [line["epoch"] for line in lines] == [1] * 4 + [2] * 4
     assert all(np.isfinite(line["loss"]) for line in lines)
     assert all(line["gradient_norm"] > 0 for line in lines)
@@ -516,40 +518,30 @@ def test_a_run_interrupted_in_a_round_goes_on_with_its_tuples(
 ):
     """Ends at a step, or (call 1) as the first tuples were just mined."""
     queries, out = read_query_set(street), tmp_path / "run"
-    step, calls = run_module.train_step, itertools.count(1)
-
-    def interrupted(*arguments):
-        if next(calls) == call:
-            raise Interrupted
-        return step(*arguments)
-
     with monkeypatch.context() as patch:
-        patch.setattr(run_module, "train_step", interrupted)
+        fail_at(patch, "train_step", call)
         if saves == "always":
-            patch.setattr(run_module, "SAVE_SECONDS", -1)
+            patch.setattr(run_files, "SAVE_SECONDS", -1)
         with pytest.raises(Interrupted):
             fit(CONFIG, queries, out, quiet=True)
     fit(CONFIG, queries, out, quiet=True)
-    assert lines_of(out) == lines_of(whole)
-    for mine, theirs in zip(
-        *(jax.tree.leaves(load_weights(each / "last.safetensors")[0]) for each in (out, whole)),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(mine, theirs)
+    assert metrics_of(out) == metrics_of(whole)
+    assert_same_params(*(load_weights(each / "last.safetensors")[0] for each in (out, whole)))
     assert not [path for path in out.rglob("*") if "tmp" in path.name]
 
 
 def test_every_round_is_mined_by_the_model_as_it_is(street, tmp_path, monkeypatch):
     """Against `mine_tuples` by hand: the model of each round's begin, and the last negatives."""
     queries, out, seen = read_query_set(street), tmp_path / "run", []
-    mine = run_module.Run._mine
+    mine = Miner.mine
 
-    def recorded(self, params, *rest):
-        mined, words = mine(self, params, *rest)
-        seen.append((jax.tree.map(np.array, params), mined))  # a step uses up its buffers
-        return mined, words
+    def recorded(self, step, describe):
+        words = mine(self, step, describe)
+        (params,) = describe.args
+        seen.append((jax.tree.map(np.array, params), self.mined))  # a step uses up its buffers
+        return words
 
-    monkeypatch.setattr(run_module.Run, "_mine", recorded)
+    monkeypatch.setattr(Miner, "mine", recorded)
     config = dataclasses.replace(
         CONFIG, mining=dataclasses.replace(CONFIG.mining, candidates=3), epochs=2
     )
@@ -588,16 +580,9 @@ def test_every_round_is_mined_by_the_model_as_it_is(street, tmp_path, monkeypatc
 def test_an_older_state_has_its_own_tuples(street, whole, tmp_path, monkeypatch):
     """The newest state is damaged and deleted, as the message says: the one before goes on."""
     queries, out = read_query_set(street), tmp_path / "run"
-    step, calls = run_module.train_step, itertools.count(1)
-
-    def interrupted(*arguments):
-        if next(calls) == 5:
-            raise Interrupted
-        return step(*arguments)
-
     with monkeypatch.context() as patch:
-        patch.setattr(run_module, "train_step", interrupted)
-        patch.setattr(run_module, "SAVE_SECONDS", -1)
+        fail_at(patch, "train_step", 5)
+        patch.setattr(run_files, "SAVE_SECONDS", -1)
         with pytest.raises(Interrupted):
             fit(CONFIG, queries, out, quiet=True)
     newest, older = sorted(
@@ -607,7 +592,7 @@ def test_an_older_state_has_its_own_tuples(street, whole, tmp_path, monkeypatch)
     assert (newest.name, older.name) == ("4", "3")  # of two rounds
     shutil.rmtree(newest)
     fit(CONFIG, queries, out, quiet=True)
-    assert lines_of(out) == lines_of(whole)
+    assert metrics_of(out) == metrics_of(whole)
 
 
 def test_the_wrong_kind_of_set_is_refused(street, shared, tmp_path):
@@ -651,14 +636,18 @@ WHOLE = MiningConfig(kind="whole")
             {"candidates": 9},
             r"MiningConfig\.candidates: found 9, expected at l",
         ),
-        (WHOLE, {"positive_radius": 30.0}, r"positive_radius: found 30.0 beside"),
+        (WHOLE, {"positive_radius": 30.0}, r"positive_radius: found 30.0, expected metres above 0"),
         (WHOLE, {"margin": -1.0}, r"MiningConfig\.margin: found -1.0"),
         (
             CONFIG,
             {"images_per_place": 5},
-            r"images_per_place: found 5 with mined tuples, exp",
+            r"images_per_place: found 5, expected 4 with mined tuples",
         ),
-        (CONFIG, {"mining": MiningConfig()}, r"mining: found 'none' for loss selavpr, expected 'w"),
+        (
+            CONFIG,
+            {"mining": MiningConfig()},
+            "kind: found 'none', expected 'whole' or 'sample'",
+        ),
     ],
 )
 def test_a_configuration_that_does_not_fit_is_refused(config, changes, message):
@@ -668,5 +657,5 @@ def test_a_configuration_that_does_not_fit_is_refused(config, changes, message):
 
 def test_a_loss_of_classes_takes_no_tuples():
     classes = recipe("tiny", "cosplace").loss
-    with pytest.raises(InputError, match="mining: found 'whole' for loss large-margin-cosine"):
+    with pytest.raises(InputError, match="kind: found 'whole', expected 'none' for loss large-m"):
         TrainConfig(loss=classes, mining=MiningConfig(kind="whole"), images_per_place=12)

@@ -35,7 +35,7 @@ DEVICES = """
 import dataclasses, pathlib, sys
 from unittest import mock
 import jax
-from crisalad_jax.training import run as module
+from crisalad_jax.training import trainer as module
 from crisalad_jax.training.loop import fit
 from crisalad_jax.utils import devices as spreading
 from crisalad_jax.data.benchmarks import open_benchmark
@@ -116,7 +116,7 @@ COMMAND_LINE = """
 import sys
 from jax.experimental import multihost_utils
 from crisalad_jax import cli
-from crisalad_jax.training import run
+from crisalad_jax.training import trainer
 from crisalad_jax.utils import devices
 devices.SHARD_FROM = 64
 events = []
@@ -127,7 +127,7 @@ def told(what, function):
         return function(*args, **options)
     return call
 
-run.train_step = told("s", run.train_step)
+trainer.train_step = told("s", trainer.train_step)
 for name in ("process_allgather", "broadcast_one_to_all"):
     setattr(multihost_utils, name, told("w", getattr(multihost_utils, name)))
 code = cli.main()
@@ -148,8 +148,8 @@ def start(
             [
                 *(sys.executable, "-c", COMMAND_LINE, "train", "--config", str(config)),
                 *("--data", str(shared / "city"), "--val", str(shared / "town")),
-                *("--out", str(out), "--coordinator", meet),
-                *("--processes", "2", "--process", str(index), "--quiet", *both),
+                *("--out", str(out), "--coordinator-address", meet),
+                *("--num-processes", "2", "--process-id", str(index), "--quiet", *both),
                 *(more if index == 1 else ()),
             ],
             cwd=ROOT,
@@ -250,7 +250,7 @@ def test_two_processes_do_not_change_a_run(shared, by_devices, tmp_path):
     [
         (("--data", "{smaller}"), "places"),
         (("--epochs", "9"), "configuration"),
-        (("--split-state",), "--shard-state"),
+        (("--shard-state",), "--shard-state"),
     ],
 )
 @pytest.mark.slow
@@ -313,7 +313,7 @@ def test_where_one_process_is_killed_the_other_ends_and_both_go_on(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("both", [(), ("--split-state", "--workers", "1")], ids=str)
+@pytest.mark.parametrize("both", [(), ("--shard-state", "--num-threads", "1")], ids=str)
 def test_a_signal_to_one_process_stops_all_and_all_go_on(shared, by_devices, tmp_path, both):
     out = tmp_path / "run"
     programs = start(shared, out, both=both)

@@ -9,6 +9,7 @@ import pytest
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.data.places import read_places
 from crisalad_jax.experiments.train import train
+from crisalad_jax.nn.model import Model
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.training.start import with_vocabulary_of
 from crisalad_jax.training.vocabulary import needs_vocabulary
@@ -39,7 +40,7 @@ def test_a_recipe_trains_its_own_parts_from_its_own_start(
         seed=3,
     )
     given = random_params(config.model)
-    save_weights(tmp_path / "given.safetensors", given, config.model)
+    save_weights(tmp_path / "given.safetensors", Model(given, config.model))
     what = "backbone" if needs_vocabulary(config.model) else "weights"
     options = {what: tmp_path / "given.safetensors", "quiet": True}
     result = train(config, shared / "city", tmp_path / "run", **options)

@@ -12,7 +12,7 @@ PROGRAM = """
 import collections, dataclasses, re, sys, warnings
 import jax, numpy as np, optax
 from crisalad_jax.nn.model import describe, extract_tokens, init_crisalad
-from crisalad_jax.training import run, step as module
+from crisalad_jax.training import trainer, step as module
 from crisalad_jax.training.step import StepConfig, init_train_state, train_step
 from crisalad_jax.utils import devices as sharding
 from tests.conftest import RECIPE
@@ -30,20 +30,16 @@ assert devices.mesh.size == 8
 images, valid = np.asarray(pictures(COUNT)), np.arange(COUNT) != 3
 key = jax.random.key(1)
 
-def step(model, shared=None, told=False, lowered=False, **options):
+def step(model, shared=None, lowered=False, **options):
     config = StepConfig(model, RECIPE.loss, SGD, 10, **options)
     params = init_crisalad(jax.random.key(0), model)
     state, frozen = init_train_state(params, "adapters+head", config)
-    batch, more = (images, LABELS, valid), ()
+    batch = images, LABELS, valid
     if shared is not None:
         batch = [shared.shard_batch(x) for x in batch]
         place = shared.shard if config.shard_over else shared.replicate
         state, frozen = place(state), shared.replicate(frozen)
-        if told:
-            rows = np.zeros((8, 3), np.int32)
-            rows[5] = told
-            more = (shared.replicate(np.asarray(True)), shared.shard_batch(rows))
-    arguments = state, frozen, *batch, key, config, *more
+    arguments = state, frozen, *batch, key, config
     if lowered:
         return train_step.lower(*arguments).as_text()
     if "count" in sys.argv:
@@ -61,7 +57,7 @@ MODEL = RECIPE.model
 assert MODEL.cross_image.dropout > 0 and MODEL.cross_image.layers == 2
 """
 COUNTS = """
-print(step(MODEL, devices, told=(0, 15, 0), micro_batch=8))
+print(step(MODEL, devices, micro_batch=8))
 # Whether the loss is computed whole on each device: of few images it is.
 whole, loss = [], module.metric_loss
 
@@ -88,19 +84,12 @@ for function in describe, extract_tokens:
 VALUES = """
 # Dropout too has the same bits: images are valid or not, one device or eight.
 alone = step(MODEL)
-assert alone[1].updated and alone[1].told is None
+assert alone[1].updated
 agree(step(MODEL, devices), alone)
 agree(step(MODEL, devices, shard_over=devices.mesh), alone)
 # Two of eight devices would have no image of a micro-batch of four: each takes one.
 agree(step(MODEL, devices, micro_batch=4), alone)
 agree(step(MODEL, devices, micro_batch=8), step(MODEL, micro_batch=8))
-# What one process tells comes with the step, and a failure skips it.
-trained, metrics = step(MODEL, devices, told=(0, 15, 1))
-assert metrics.told.tolist() == [0, 15, 1] and metrics.updated
-agree(trained, alone[0])
-agree(metrics._replace(told=None), alone[1])
-before, metrics = step(MODEL, devices, told=(1, 0, 0))
-assert metrics.told.tolist() == [1, 0, 0] and not metrics.updated
 params = init_crisalad(jax.random.key(0), MODEL)
 agree(
     describe(devices.replicate(params), devices.shard_batch(images), MODEL),
@@ -110,8 +99,8 @@ agree(
 few = dataclasses.replace(RECIPE, trainable="adapters+head")
 with warnings.catch_warnings(record=True) as notes:
     warnings.simplefilter("always")
-    assert run._devices(few).mesh.size == 6
-    assert run._devices(dataclasses.replace(few, places_per_batch=4)).mesh.size == 8
+    assert trainer._choose_devices(few).mesh.size == 6
+    assert trainer._choose_devices(dataclasses.replace(few, places_per_batch=4)).mesh.size == 8
 for note in notes:
     print(note.message)
 """

@@ -22,7 +22,7 @@ from crisalad_jax.nn.aggregators.anyloc import AnyLoc, AnyLocConfig
 from crisalad_jax.nn.aggregators.netvlad import NetVlad, NetVladConfig
 from crisalad_jax.nn.aggregators.vlad_buff import VladBuff, VladBuffConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import Crisalad, unit_features
+from crisalad_jax.nn.model import Crisalad, Model, unit_features
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.trainable import split_params
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
@@ -140,13 +140,11 @@ def test_who_needs_one() -> None:
 
 def test_what_does_not_fit_is_said_before_images_are_read(fresh, tmp_path) -> None:
     nowhere = [tmp_path / "none.jpg"]
-    many = dataclasses.replace(ANYLOC, aggregator=AnyLocConfig(clusters=13, layer=0))
     for config, options, words in (
         (MODEL, {}, "aggregator: found salad, which has no vocabulary, expected .*anyloc, netvlad"),
-        (many, {}, "images: found 1, which is 12 features, expected at least 13"),
         (ANYLOC, {"images": 0}, "images: found 0, expected at least 1"),
         (ANYLOC, {"seed": -1}, "seed: found -1, expected at least 0"),
-        (ANYLOC, {"batch_size": 0}, "batch_size: found 0"),
+        (ANYLOC, {"batch_size": 0}, "batch size: found 0"),
     ):
         with pytest.raises(InputError, match=words):
             with_vocabulary(fresh, config, nowhere, **{"batch_size": BATCH} | options)
@@ -185,10 +183,10 @@ def test_a_vocabulary_of_another_backbone_is_refused(capfd, built, shared, tmp_p
     path = tmp_path / "w.safetensors"
     mixed = dataclasses.replace(built, backbone=other(built.backbone))
     with pytest.raises(InputError, match=f"{path}: found a vocabulary of another backbone"):
-        save_weights(path, mixed, ANYLOC)
+        save_weights(path, Model(mixed, ANYLOC))
     assert not path.exists()
 
-    save_weights(path, built, ANYLOC)
+    save_weights(path, Model(built, ANYLOC))
     found, _ = load_weights(path)
     assert_equal(found, built)
     arrays = safetensors.numpy.load_file(path)
@@ -203,7 +201,7 @@ def test_a_vocabulary_of_another_backbone_is_refused(capfd, built, shared, tmp_p
 
 def test_words_that_nobody_built_go_with_any_backbone(fresh, tmp_path) -> None:
     mixed = dataclasses.replace(fresh, backbone=other(fresh.backbone))
-    save_weights(tmp_path / "w.safetensors", mixed, ANYLOC)
+    save_weights(tmp_path / "w.safetensors", Model(mixed, ANYLOC))
     assert_equal(load_weights(tmp_path / "w.safetensors")[0], mixed)
 
 
@@ -243,7 +241,7 @@ def test_training_netvlad_starts_from_the_training_images(
     assert_equal(starts[1], expected)
     assert_equal(starts[0].backbone, load_weights(weights)[0].backbone)
 
-    save_weights(tmp_path / "w.safetensors", random_params(NETVLAD), NETVLAD)
+    save_weights(tmp_path / "w.safetensors", Model(random_params(NETVLAD), NETVLAD))
     begin = (*command, "--out", tmp_path / "run", "--weights", tmp_path / "w.safetensors")
     fails(capfd, *begin, "--quiet", words=("far enough",))
     assert_equal(starts[2], load_weights(tmp_path / "w.safetensors")[0])

@@ -163,8 +163,9 @@ def test_the_command_line_keeps_programs_unless_a_plugin_is_loaded(tmp_path):
     image.parent.mkdir()
     program = """
 import sys, jax
-from crisalad_jax import PRESETS, init_crisalad, save_weights
-save_weights(sys.argv[1], init_crisalad(jax.random.key(0), PRESETS["tiny"]), PRESETS["tiny"])
+from crisalad_jax import PRESETS, Model, init_crisalad, save_weights
+config = PRESETS["tiny"]
+save_weights(sys.argv[1], Model(init_crisalad(jax.random.key(0), config), config))
 import cv2, numpy
 cv2.imwrite(sys.argv[2], numpy.zeros((50, 60, 3), numpy.uint8))
 """

@@ -28,7 +28,7 @@ from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.aggregators.base import TokenShape
 from crisalad_jax.nn.config import PRESETS, ModelConfig, with_aggregator
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import check_params, describe, init_crisalad, parameter_shapes
+from crisalad_jax.nn.model import Model, check_params, describe, init_crisalad, parameter_shapes
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.optimiser import make_optimiser
@@ -127,11 +127,11 @@ def test_a_training_step_is_the_same() -> None:
     optimiser = optax.chain(
         make_optimiser(RECIPE.optimiser, steps=8), optax.GradientTransformation(init, update)
     )
-    options = {"steps": 8, "optimiser": optimiser}
+    static = step_config(RECIPE, steps=8, optimiser=optimiser)
 
     def train() -> Any:
-        step = make_train_step(RECIPE, **options)
-        state, frozen = init_train_state(PARAMS, "all", step_config(RECIPE, **options))
+        step = make_train_step(static)
+        state, frozen = init_train_state(PARAMS, "all", static)
         for _ in range(3):
             labels = jnp.asarray(LABELS)  # int64 in the 64-bit mode
             state, metrics = step(state, frozen, IMAGES, labels, jax.random.key(4))
@@ -162,9 +162,11 @@ def test_so_is_the_accuracy_of_a_classification() -> None:
 
 def test_files_and_digests_are_the_same(tmp_path: pathlib.Path) -> None:
     params = init_crisalad(jax.random.key(0), MODEL)
-    save_weights(tmp_path / "narrow.safetensors", params, MODEL)
+    save_weights(tmp_path / "narrow.safetensors", Model(params, MODEL))
     with jax.enable_x64(True):
-        save_weights(tmp_path / "wide.safetensors", init_crisalad(jax.random.key(0), MODEL), MODEL)
+        save_weights(
+            tmp_path / "wide.safetensors", Model(init_crisalad(jax.random.key(0), MODEL), MODEL)
+        )
         loaded, config = load_weights(tmp_path / "narrow.safetensors", MODEL)
     assert_equal(loaded, params)
     assert model_hash(loaded, config) == model_hash(params, MODEL)
@@ -280,7 +282,7 @@ def test_a_file_of_another_model_lists_three_misfits_and_counts_the_others(
     tmp_path: pathlib.Path,
 ) -> None:
     path = tmp_path / "w.safetensors"
-    save_weights(path, PARAMS, MODEL)
+    save_weights(path, Model(PARAMS, MODEL))
     with safetensors.safe_open(path, framework="numpy") as file:
         metadata = file.metadata()
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

@@ -12,7 +12,7 @@ import numpy as np
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.torch_io import read_backbone
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.config.checks import check_types
+from crisalad_jax.config.checks import check_count, check_types
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.benchmark import leave_out_unreadable
@@ -35,9 +35,9 @@ from crisalad_jax.experiments.comparison.methods import (
 from crisalad_jax.experiments.comparison.rows import AblationRow, as_row
 from crisalad_jax.losses import LossConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.retrieval.grouping import check_grouping, parse_groupings
+from crisalad_jax.retrieval.grouping import parse_groupings
 from crisalad_jax.retrieval.reranking import parse_reranking
-from crisalad_jax.training.batches import groups_of, steps_per_epoch
+from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.optimiser import count_steps, warmup_length, with_short_warmup
 from crisalad_jax.training.trainable import count_trainable
@@ -96,7 +96,8 @@ class ComparisonConfig:
         object.__setattr__(self, "names", (*self.names, *own))
         check_types(self)
         self._check_rows(rows)
-        check_grouping((), self.batch_size, 0, self.seeds)
+        check_count("batch size", self.batch_size)
+        check_count("seeds", self.seeds)
         parse_groupings(self.grouping.split(","))
         what = "--methods" if self.kind == "compare" else "--rows"
         for name in self.names:
@@ -341,7 +342,7 @@ def _own_training_set(
             config.train, min_images=training.min_images_of_place, on_bad_image=on_bad_image
         )
     try:
-        steps = steps_per_epoch(training, groups_of(training, places))
+        steps = PlaceBatches(training, places).steps_per_epoch
     except InputError as error:
         raise InputError(f"{draft.name}: {error}") from error
     return places, steps

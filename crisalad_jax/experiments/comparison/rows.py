@@ -22,7 +22,7 @@ _NOT_A_ROWS = {
     "preset": "the comparison's --preset",
     "mining.kind": "places alone, which a comparison trains on",
     **dict.fromkeys(
-        ("patience", "validate-every", "validation-size", "select-by", "keep-best"),
+        ("patience", "validate-every", "validation-size", "monitor", "save-top-k"),
         "none: a comparison validates nothing, and takes the weights after the last step",
     ),
 }

@@ -24,6 +24,7 @@ from crisalad_jax.checkpoints.torch_io import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import read_pixels
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.metrics import right_retrievals
 from crisalad_jax.evaluation.results import GroupingResult
@@ -37,8 +38,8 @@ from crisalad_jax.experiments.comparison.plan import (
 from crisalad_jax.experiments.comparison.records import advised, is_number, read_result
 from crisalad_jax.experiments.comparison.timing import Race, describing, is_absolute, machine, race
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, init_crisalad
-from crisalad_jax.retrieval.photographs import prepare_image
+from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
+from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.reranking import parse_reranking
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
@@ -286,14 +287,12 @@ def _evaluated(
         options["rerank"] = parse_reranking(variant.rerank)
     started = time.monotonic()
     results = evaluate(
-        params,
-        variant.model,
+        Model(params, variant.model),
         benchmark,
         groupings=config.grouping.split(","),
-        batch_size=config.batch_size,
         seed=seed,
         seeds=1,
-        quiet=True,
+        reading=Reading(batch_size=config.batch_size, quiet=True),
         **options,
     )
     return {
@@ -372,7 +371,7 @@ def _start(
         params = with_backbone_of(params, variant.model, prepared.config.backbone)
     if needs_vocabulary(variant.model):
         params = _with_vocabulary(prepared, params, variant.model, seed, quiet)
-        save_weights(path, params, variant.model)
+        save_weights(path, Model(params, variant.model))
     return params
 
 

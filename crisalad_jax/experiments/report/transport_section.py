@@ -24,7 +24,7 @@ from crisalad_jax.experiments.report.transport import (
 )
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, transport_masses
-from crisalad_jax.retrieval.photographs import prepare_image
+from crisalad_jax.retrieval.describe import prepare_image
 
 
 class Kept(NamedTuple):

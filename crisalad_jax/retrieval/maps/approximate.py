@@ -8,7 +8,7 @@ import hashlib
 import pathlib
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -81,17 +81,16 @@ def open_approximate(
     Raises:
         InputError: it is damaged, or changed where `verify` asks for that.
     """
-    path = next(iter(_of_these(_indices(folder), additions)), None)
+    path = _current(folder, additions)
     if path is None:
         return None
     from crisalad_jax.retrieval.faiss_index import load_index
 
-    record = read_json(path.with_suffix(".json"), "a record of an approximate search")
     index = load_index(path, verify=verify)
     count = sum(count for _, count, _ in additions)
     if index.size != count:
         raise InputError(f"{path}: found {index.size} descriptors, expected {count} as in the map")
-    return Approximate(index.kind, index, float(record["recall"]))
+    return Approximate(index.kind, index, float(_record(path)["recall"]))
 
 
 def indexed_images(folder: pathlib.Path) -> list[tuple[pathlib.Path, int]]:
@@ -100,17 +99,15 @@ def indexed_images(folder: pathlib.Path) -> list[tuple[pathlib.Path, int]]:
     Raises:
         InputError: what says so is damaged.
     """
-    found = []
-    for path in _indices(folder):
-        record = read_json(path.with_suffix(".json"), "a record of an approximate search")
-        found.append((path, int(record["images"])))
-    return found
+    return [(path, int(_record(path)["images"])) for path in _indices(folder)]
 
 
 def stale_kind(folder: pathlib.Path, additions: Additions) -> str | None:
     """Return the kind of a map's approximate search of fewer or other images; None without any."""
     found = _indices(folder)
-    return None if not found or _of_these(found, additions) else _kind(found[0])
+    if not found or _current(folder, additions) is not None:
+        return None
+    return found[0].stem.rpartition("-")[0]
 
 
 def tell_stale(folder: pathlib.Path, additions: Additions) -> None:
@@ -129,7 +126,6 @@ def build_approximate(
     additions: Additions,
     store: object,
     rows: Callable[[], Iterator[np.ndarray]],
-    length: int,
     *,
     quiet: bool = True,
 ) -> Approximate | None:
@@ -141,7 +137,6 @@ def build_approximate(
         additions: to the map.
         store: of its descriptors.
         rows: yields them from the first on.
-        length: numbers in a descriptor.
         quiet: no progress bar.
 
     Raises:
@@ -155,14 +150,13 @@ def build_approximate(
         raise InputError(
             f"search: found {kind}, expected exact, as a map in Milvus is searched by Milvus"
         )
-    digest = _digest(additions)
-    path = folder / FOLDER / f"{kind}-{digest}.index"
+    path = folder / FOLDER / f"{kind}-{_digest(additions)}.index"
     if path.exists():
         return open_approximate(folder, additions, verify=True)
-    from crisalad_jax.retrieval.faiss_index import build_from, recall_against_exact, save_index
+    from crisalad_jax.retrieval.faiss_index import build, recall_against_exact, save_index
 
     count = sum(count for _, count, _ in additions)
-    index = build_from(kind, count, length, rows, seed=_SEED, quiet=quiet)  # pyright: ignore
+    index = build(kind, rows, seed=_SEED, quiet=quiet)  # pyright: ignore[reportArgumentType]
     built = Approximate(index.kind, index, 0.0)
     places = sample(count, min(SAMPLE, count), _SEED)
     k = min(NEIGHBOURS + 1, count)
@@ -197,11 +191,11 @@ def _indices(folder: pathlib.Path) -> list[pathlib.Path]:
     return sorted((folder / FOLDER).glob("*.index"))
 
 
-def _of_these(found: Sequence[pathlib.Path], additions: Additions) -> list[pathlib.Path]:
-    """Return which indices were built from these additions."""
+def _current(folder: pathlib.Path, additions: Additions) -> pathlib.Path | None:
+    """Return the index that was built from these additions."""
     digest = _digest(additions)
-    return [path for path in found if path.stem.endswith(digest)]
+    return next((path for path in _indices(folder) if path.stem.endswith(digest)), None)
 
 
-def _kind(path: pathlib.Path) -> str:
-    return path.stem.rpartition("-")[0]
+def _record(path: pathlib.Path) -> dict[str, Any]:
+    return read_json(path.with_suffix(".json"), "a record of an approximate search")

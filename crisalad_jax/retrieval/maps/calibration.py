@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 
 from crisalad_jax.config.io import from_plain, to_plain
-from crisalad_jax.retrieval.maps.head import write_record
+from crisalad_jax.retrieval.segments import write_record
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 

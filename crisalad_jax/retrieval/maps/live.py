@@ -12,15 +12,16 @@ from crisalad_jax.config.checks import check_count, takes
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.live import Frame
-from crisalad_jax.retrieval.maps.follow import Follower
+from crisalad_jax.retrieval.describe import FrameDescriber
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, asked_similarity, json_rows, json_text
+from crisalad_jax.retrieval.maps.tracking import SequenceTracker
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.output import counted
 
 if TYPE_CHECKING:  # answers are searched without JAX
-    from crisalad_jax.nn.model import Crisalad
+    from crisalad_jax.nn.model import Model
 
 
 class FrameSource(Protocol):
@@ -55,9 +56,9 @@ class LiveAnswer(NamedTuple):
 @takes(places=Map)
 def query_live(
     places: Map,
-    params: "Crisalad | Runtime",
     source: FrameSource,
     *,
+    model: "Model | Runtime | None" = None,
     k: int = 5,
     window: int = 1,
     min_similarity: float | None = None,
@@ -71,8 +72,8 @@ def query_live(
 
     Args:
         places: the map, open.
-        params: parameters of the model that made the map (`Map.load_params`).
         source: a `Camera` or a `FolderWatch`.
+        model: the model that made the map; None loads it from where it was (`Map.load_model`).
         k: number of answers to each frame.
         window: frames that are described together: each with those just answered before it. 1
             describes each alone, as a map's images are.
@@ -89,44 +90,41 @@ def query_live(
 
     Example:
         >>> import jax, shutil
-        >>> from crisalad_jax import PRESETS, FolderWatch, Map, index, init_crisalad, save_weights
+        >>> from crisalad_jax import (
+        ...     PRESETS, FolderWatch, Map, Model, Reading, index, init_crisalad, save_weights
+        ... )
         >>> config = PRESETS["tiny"]
-        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> model = Model(init_crisalad(jax.random.key(0), config), config)
         >>> weights = folder / "weights.safetensors"
-        >>> save_weights(weights, params, config)
-        >>> _ = index(params, config, pictures, folder / "map", weights=weights, quiet=True)
+        >>> save_weights(weights, model)
+        >>> quiet = Reading(quiet=True)
+        >>> _ = index(model, pictures, folder / "map", weights=weights, reading=quiet)
         >>> (folder / "new").mkdir()
         >>> watch = FolderWatch(folder / "new")
         >>> _ = shutil.copy(pictures / "2.png", folder / "new")
         >>> with Map.open(folder / "map") as places:
-        ...     found = next(query_live(places, params, watch, k=1))
+        ...     found = next(query_live(places, watch, k=1))
         >>> [answer.image.name for _, ranked in found.answers.rows() for answer in ranked]
         ['2.png']
     """
-    from crisalad_jax.retrieval.model import check_params
-    from crisalad_jax.retrieval.windows import FrameDescriber, check_window
-
     check_count("k", k)
-    config = places.description.config
-    check_window(config, window)
-    places.check_params(params)
-    check_params(params, config)
     least = asked_similarity(places, min_similarity)
-    follower = None if sequence is None else Follower(places, sequence)
-    describer = FrameDescriber(params, config, window)
+    model_describer = places.describer(model, groupings=["single" if window == 1 else "window"])
+    tracker = None if sequence is None else SequenceTracker(places, sequence)
+    describer = FrameDescriber(model_describer, window)
 
     def answers() -> Iterator[LiveAnswer]:
-        blank = np.zeros((*(source.size or config.image_size), 3), np.uint8)
+        blank = np.zeros((*(source.size or places.config.image_size), 3), np.uint8)
         places.search(places.shorten(describer(blank)), k)
         describer.forget()
         ready()
         for frame in source.frames(check):
             described = places.shorten(describer(frame.image))
-            if follower is None:
+            if tracker is None:
                 neighbours, filtered = places.search(described, k), ()
             else:
                 name = pathlib.Path(frame.name)
-                numbers, similarities, *filtered = follower.answer(described, k, [name])
+                numbers, similarities, *filtered = tracker.answer(described, k, [name])
                 neighbours = Neighbours(numbers, similarities)
             found = Answers(
                 [pathlib.Path(frame.name)],

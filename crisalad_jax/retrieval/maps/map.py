@@ -8,12 +8,11 @@ is as it was before the addition or after it. docs/maps.md has the format.
 import contextlib
 import datetime
 import functools
-import hashlib
 import os
 import pathlib
 import weakref
-from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -21,11 +20,13 @@ from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
 from crisalad_jax.config.checks import PATH, check_count, takes
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.retrieval.chunks import check_rows
+from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import (
     Approximate,
     build_approximate,
@@ -36,31 +37,32 @@ from crisalad_jax.retrieval.maps.approximate import (
 from crisalad_jax.retrieval.maps.calibration import Calibration, read_calibration
 from crisalad_jax.retrieval.maps.contents import MapAddition, contents, with_addition
 from crisalad_jax.retrieval.maps.file_store import FileStore
-from crisalad_jax.retrieval.maps.head import (
+from crisalad_jax.retrieval.maps.metadata import (
     COMPONENTS,
     SEGMENTS,
-    MapHead,
+    MapMetadata,
     check_model,
     has_images,
+    model_config,
     read_components,
-    read_head,
-    read_value,
+    read_metadata,
+    undone_without_images,
     weights_of,
-    write_record,
+    write_metadata,
 )
-from crisalad_jax.retrieval.maps.store import Store, open_store
-from crisalad_jax.retrieval.maps.unrecorded import check_no_record_lost, remove_unrecorded
+from crisalad_jax.retrieval.maps.recovery import check_no_record_lost, remove_unrecorded
+from crisalad_jax.retrieval.maps.store import open_store
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, save_pca
+from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.shapes import Float, Float32
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 if TYPE_CHECKING:  # a map is searched without JAX
-    from crisalad_jax.nn.model import Crisalad
-    from crisalad_jax.retrieval.maps.manifest import MapDescription
+    from crisalad_jax.nn.config import ModelConfig
+    from crisalad_jax.nn.model import Model
 
 
 @brief
@@ -89,12 +91,6 @@ class Answer(NamedTuple):
     """Probability that the camera is there; None without a filter."""
 
 
-class _Segment(NamedTuple):
-    first: int
-    count: int
-    sha256: str
-
-
 class Map:
     """An open map: made by `Map.open` to search it, or by `open_for_appending`.
 
@@ -113,11 +109,11 @@ class Map:
         '2.png'
     """
 
-    def __init__(self, folder: pathlib.Path, head: MapHead, store: Store) -> None:
-        """Read all records, and check that the store has all of their descriptors."""
+    def __init__(self, folder: pathlib.Path, metadata: MapMetadata, segments: Segments) -> None:
+        """Read what the records say of the images."""
         self.folder = folder
-        self.head = head
-        """All of map.json but the model's configuration."""
+        self.metadata = metadata
+        """The contents of map.json."""
         self.images: list[MapImage] = []
         """The images by number."""
         self.additions: list[MapAddition] = []
@@ -127,27 +123,19 @@ class Map:
         """Axes of the positions, see `positions.AXES`; None where no image has a position."""
         self.zone: Zone | None = None
         """Zone of UTM of all positions in metres east and north; None where it is unknown."""
-        self._store = store
-        self._close = weakref.finalize(self, store.close)
+        self._segments = segments
+        self._close = weakref.finalize(self, segments.store.close)
         self.calibration: Calibration | None = None
         """What `calibrate` measured; None where it did not, or the map is open for appending."""
-        self.components = read_components(folder, head)
+        self.components = read_components(folder, metadata)
         """The components that shorten descriptors, and those of queries; None is none."""
         self._approximate: Approximate | None = None
         self._tells_stale = True
         """Whether the next search that is not asked to be exact tells why it is."""
-        self._checked: Crisalad | Runtime | None = None
-        """Parameters that are known to be of the model that made the map."""
-        self._segments: list[_Segment] = []
-        # A writer adds records in order, so those that are listed now have all before them. It may
-        # add more while they are read.
-        listed = set((folder / SEGMENTS).glob("[0-9]*.json"))
-        while (path := self._record(len(self))).exists():
-            self._read_record(path)
-            listed.discard(path)
-        if listed:
-            raise InputError(f"{min(listed)}: expected {path.name} before it, found no such file")
-        store.check([(first, count) for first, count, _ in self._segments])
+        self._describer: tuple[object, Describer] | None = None
+        """A model that is known to be the one that made the map, and what describes with it."""
+        for span, record in zip(segments.spans, segments.records, strict=True):
+            self._read_record(record, segments.path(span.first))
 
     @classmethod
     @takes(folder=PATH)
@@ -179,37 +167,37 @@ class Map:
             crisalad_jax.utils.errors.InputError: no-map: found no map, expected a folder that ...
         """
         folder = pathlib.Path(folder)
-        head = read_head(folder)
-        if head is None:
+        metadata = read_metadata(folder)
+        if metadata is None:
             raise InputError(
                 f"{folder}: found no map, expected a folder that `crisalad index` wrote"
             )
         if not has_images(folder):
             raise InputError(f"{folder}: found a map without images, expected at least one")
-        opened = cls._opened(folder, head)
+        opened = cls._opened(folder, metadata)
         try:
             if calibrated:
-                opened.calibration = read_calibration(folder, head.model)
-            if verify and head.store == "files":
+                opened.calibration = read_calibration(folder, metadata.model)
+            if verify and metadata.store == "files":
                 opened.verify()
-            opened._approximate = open_approximate(folder, opened._segments, verify=verify)
+            opened._approximate = open_approximate(folder, opened._segments.spans, verify=verify)
         except BaseException:
             opened.close()
             raise
         return opened
 
     @classmethod
-    def _opened(cls, folder: pathlib.Path, head: MapHead) -> Self:
+    def _opened(cls, folder: pathlib.Path, metadata: MapMetadata) -> Self:
         store = open_store(
-            head.store,
+            metadata.store,
             folder,
-            collection=head.collection,
-            length=head.descriptor_length,
-            dtype=head.dtype,
+            collection=metadata.collection,
+            length=metadata.descriptor_length,
+            dtype=metadata.dtype,
             new=not has_images(folder),
         )
         try:
-            return cls(folder, head, store)
+            return cls(folder, metadata, Segments(folder / SEGMENTS, store, metadata.dtype))
         except BaseException:
             store.close()
             raise
@@ -224,7 +212,7 @@ class Map:
 
     def __repr__(self) -> str:
         """Return one line for a notebook."""
-        length = self.head.descriptor_length
+        length = self.metadata.descriptor_length
         return f"Map({str(self.folder)!r}: {len(self)} images, {length} numbers each)"
 
     def __len__(self) -> int:
@@ -232,68 +220,42 @@ class Map:
         return len(self.images)
 
     @functools.cached_property
-    def description(self) -> "MapDescription":
-        """The map's description: its `head`, and the model's configuration.
+    def config(self) -> "ModelConfig":
+        """Configuration of the model, at the image size and in the type of the map's images.
 
         Raises:
-            InputError: the configuration is not one that this package knows.
+            InputError: it is not one that this package knows.
         """
-        from crisalad_jax.retrieval.maps.manifest import read_description
-
-        found = read_description(self.folder)
-        if found is None:
-            raise InputError(f"{self.folder}: found no map any more, expected the one that is open")
-        return found
+        return model_config(self.metadata, self.folder)
 
     def image(self, name: str) -> MapImage | None:
         """Return what the map knows of the image of this name; None if it has none."""
         number = self._numbers.get(name)
         return None if number is None else self.images[number]
 
-    def _record(self, first: int) -> pathlib.Path:
-        return self.folder / SEGMENTS / f"{first:010d}.json"
+    def _read_record(self, record: Mapping[str, Any], path: pathlib.Path) -> None:
+        """Take the images of a record.
 
-    def _read_record(self, path: pathlib.Path) -> None:
-        record = read_json(path, "a record of images")
+        Raises:
+            InputError: a value is missing or of another type.
+        """
         try:
+            root, added = record["root"], record["added"]
             columns = (record["names"], record["bytes"], record["positions"])
             images = [
-                MapImage(
-                    _inside(name),
-                    int(size),
-                    at and (float(at[0]), float(at[1])),
-                    record["root"],
-                )
+                MapImage(_inside(name), int(size), at and (float(at[0]), float(at[1])), root)
                 for name, size, at in zip(*columns, strict=True)
             ]
-            if not isinstance(record["root"], str):
-                raise ValueError(f"found root {record['root']!r}, expected text")
             axes = record["axes"] and (record["axes"][0], record["axes"][1])
-            added = record["added"]
-            if not isinstance(added, str | None):
-                raise ValueError(f"found added {added!r}, expected a time")
             zone = record["zone"] and Zone(int(record["zone"][0]), bool(record["zone"][1]))
-            segment = _Segment(len(self), len(images), str(record["sha256"]))
-            if not images:
-                raise ValueError("no images")
+            if not isinstance(root, str) or not isinstance(added, str | None):
+                raise TypeError(f"found root {root!r}, expected text, and added {added!r}, a time")
         except (ValueError, LookupError, TypeError, OverflowError) as error:
             raise InputError(f"{path}: not a whole record of images: {error!r}") from error
-        self._take(images, axes, zone, segment, added)
-
-    def _take(
-        self,
-        images: list[MapImage],
-        axes: tuple[str, str] | None,
-        zone: Zone | None,
-        segment: _Segment,
-        added: str | None,
-    ) -> None:
-        self.additions = with_addition(self.additions, added, images[0].root, len(images))
-        self._numbers |= {image.name: segment.first + i for i, image in enumerate(images)}
+        self._numbers |= {image.name: i for i, image in enumerate(images, len(self))}
         self.images += images
-        self.axes = self.axes or axes
-        self.zone = self.zone or zone
-        self._segments.append(segment)
+        self.axes, self.zone = self.axes or axes, self.zone or zone
+        self.additions = with_addition(self.additions, added, root, len(images))
 
     def search(
         self, queries: Float32[np.ndarray, "q d"], k: int, *, exact: bool = False
@@ -318,12 +280,13 @@ class Map:
             raise InputError(f"{self.folder}: found a map without images, expected at least one")
         self._check_descriptors("queries", queries)
         k = min(k, len(self))
-        if self._approximate is not None and isinstance(self._store, FileStore) and not exact:
-            return self._approximate.search(self._store, queries, k, len(self))
+        store = self._segments.store
+        if self._approximate is not None and isinstance(store, FileStore) and not exact:
+            return self._approximate.search(store, queries, k, len(self))
         if self._tells_stale and not exact:
-            tell_stale(self.folder, self._segments)
+            tell_stale(self.folder, self._segments.spans)
             self._tells_stale = False
-        return self._store.search(queries, k, len(self))
+        return store.search(queries, k, len(self))
 
     @property
     def search_kind(self) -> str:
@@ -333,7 +296,7 @@ class Map:
     @property
     def stale_search(self) -> str | None:
         """Kind of an approximate search that is not used, as it is of fewer or other images."""
-        return stale_kind(self.folder, self._segments) if self._approximate is None else None
+        return stale_kind(self.folder, self._segments.spans) if self._approximate is None else None
 
     def shorten(self, descriptors: Float32[np.ndarray, "n d"]) -> Float32[np.ndarray, "n short"]:
         """Shorten a model's descriptors by the map's `components`; without any they stay."""
@@ -356,10 +319,9 @@ class Map:
         self._approximate = build_approximate(
             self.folder,
             kind,
-            self._segments,
-            self._store,
-            lambda: self.descriptors,
-            self.head.descriptor_length,
+            self._segments.spans,
+            self._segments.store,
+            self._segments.blocks,
             quiet=quiet,
         )
         return None if self._approximate is None else self._approximate.recall
@@ -369,46 +331,46 @@ class Map:
         image: np.ndarray | str | os.PathLike[str],
         k: int = 5,
         *,
-        params: "Crisalad | Runtime | None" = None,
+        model: "Model | Runtime | None" = None,
     ) -> list[Answer]:
-        """Find the images of the map that are most similar to one picture.
+        """Find the images of the map that are most similar to one image.
 
         The first call loads the model that made the map, and compiles it; later ones do neither.
         `query` asks for many images at once.
 
         Args:
-            image: a picture of 8-bit RGB, as `read_image` returns it, or of grey (height, width) or
-                (height, width, 1), such as ROS's mono8; or its file.
+            image: 8-bit RGB, as `read_image` returns it, or grey (height, width) or (height,
+                width, 1), such as ROS's mono8; or its file.
             k: number of answers; all where the map has fewer.
-            params: parameters of the model that made the map; None loads them from where they were.
+            model: the model that made the map; None loads it from where it was.
 
         Returns:
             The answers, best first. Positions are in `axes`.
 
         Raises:
             InputError: a file that cannot be read, an array that `prepare_image` does not take, k
-                below 1; what `load_params`, `check_params` and `search` raise.
+                below 1; what `load_model`, `describer` and `search` raise.
 
         Example:
             >>> import jax
-            >>> from crisalad_jax import PRESETS, index, init_crisalad, read_image, save_weights
+            >>> from crisalad_jax import (
+            ...     PRESETS, Model, Reading, index, init_crisalad, read_image, save_weights
+            ... )
             >>> config = PRESETS["tiny"]
-            >>> params = init_crisalad(jax.random.key(0), config)
+            >>> model = Model(init_crisalad(jax.random.key(0), config), config)
             >>> weights = folder / "weights.safetensors"
-            >>> save_weights(weights, params, config)
-            >>> _ = index(params, config, pictures, folder / "map", weights=weights, quiet=True)
+            >>> save_weights(weights, model)
+            >>> quiet = Reading(quiet=True)
+            >>> _ = index(model, pictures, folder / "map", weights=weights, reading=quiet)
             >>> answers = Map.open(folder / "map").locate(read_image(pictures / "3.png"), k=2)
             >>> [(answer.rank, answer.image.name) for answer in answers][0]
             (1, '3.png')
         """
-        from crisalad_jax.retrieval.alone import describe_images
+        from crisalad_jax.retrieval.describe import describe_images
 
         check_count("k", k)
-        picture = read_pixels(image) if isinstance(image, str | os.PathLike) else image
-        if params is None:
-            params = self._checked or self.load_params()
-        self.check_params(params)
-        descriptor = describe_images(params, self.description.config, [picture])
+        pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
+        descriptor = describe_images(self.describer(model), [pixels])
         found = self.search(self.shorten(descriptor), k)
         pairs = zip(found.indices[0], found.similarities[0], strict=True)
         return [
@@ -430,7 +392,7 @@ class Map:
         return np.concatenate(parts, axis=1)
 
     def _check_descriptors(self, name: str, descriptors: Float[np.ndarray, "n d"]) -> None:
-        length = self.head.descriptor_length
+        length = self.metadata.descriptor_length
         if descriptors.ndim != 2 or not len(descriptors) or descriptors.shape[1] != length:
             raise InputError(
                 f"{name}: found shape {descriptors.shape}, expected (images, {length})"
@@ -479,31 +441,23 @@ class Map:
             )
         positions = self.fitted(names, positions)
         axes, known, zone = positions or (None, {}, None)
-        images = [
-            MapImage(name, size, known.get(name), root)
-            for name, size in zip(names, sizes, strict=True)
-        ]
-        rows = np.ascontiguousarray(descriptors, self.head.dtype)
-        segment = _Segment(len(self), len(images), hashlib.sha256(rows.data).hexdigest())
-        self._store.add(segment.first, rows)
         record = {
             "root": root,
             "added": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "axes": axes,
             "zone": zone,
-            "sha256": segment.sha256,
             "names": list(names),
             "bytes": list(sizes),
-            "positions": [image.position for image in images],
+            "positions": [known.get(name) for name in names],
         }
-        write_record(self._record(segment.first), record)
-        self._take(images, axes, zone, segment, record["added"])
+        path = self._segments.path(len(self))
+        self._segments.append(record, descriptors)
+        self._read_record(record, path)
 
     @property
     def descriptors(self) -> Iterator[Float[np.ndarray, "n d"]]:
         """Descriptors in order, one array for each addition."""
-        for first, count, _ in self._segments:
-            yield self._store.read(first, count)
+        return self._segments.blocks()
 
     def verify(self) -> None:
         """Read all descriptors, and compare them with the digests in the records.
@@ -511,13 +465,7 @@ class Map:
         Raises:
             InputError: one has changed; the message says of which images.
         """
-        for segment, descriptors in zip(self._segments, self.descriptors, strict=True):
-            rows = np.ascontiguousarray(descriptors, self.head.dtype)
-            if hashlib.sha256(rows.data).hexdigest() != segment.sha256:
-                raise InputError(
-                    f"{self._record(segment.first).with_suffix('')}: descriptors {segment.first} "
-                    f"to {segment.first + segment.count - 1} have changed since they were written"
-                )
+        self._segments.verify()
 
     def summary(self, *, verify: bool = False) -> dict[str, Any]:
         """Summarise the map as JSON values by name.
@@ -534,109 +482,111 @@ class Map:
         """
         if verify:
             self.verify()
-        description = self.description
+        metadata = self.metadata
         return {
             "images": len(self),
             "positions": sum(image.position is not None for image in self.images),
             "axes": self.axes,
             **contents(self),
             "zone": self.zone and str(self.zone),
-            "descriptor": f"{description.descriptor_length} numbers, {description.dtype}",
-            "image_size": list(description.config.image_size),
-            "resize": description.config.images_in_words,
-            "grouping": description.grouping,
-            "store": description.store,
+            "descriptor": f"{metadata.descriptor_length} numbers, {metadata.dtype}",
+            "image_size": list(self.config.image_size),
+            "resize": self.config.images_in_words,
+            "grouping": metadata.grouping,
+            "store": metadata.store,
             "search": self.search_kind,
             "stale_search": self.stale_search or "none",
-            "components": description.pca or "none",
-            "model": description.model,
-            "weights": description.weights,
-            "created": description.created,
+            "components": metadata.pca or "none",
+            "model": metadata.model,
+            "weights": metadata.weights,
+            "created": metadata.created,
             "calibration": None if self.calibration is None else to_plain(self.calibration),
             **({"verified": True} if verify else {}),
         }
 
-    def load_params(self, weights: str | os.PathLike[str] | None = None) -> "Crisalad":
-        """Load the parameters of the model that made the map.
-
-        Args:
-            weights: the file; None is where it was then.
-
-        Returns:
-            The parameters, which go with `description.config`.
-
-        Raises:
-            InputError: there is no such file, or it is of another model.
-        """
-        from crisalad_jax.checkpoints.weights import load_with_hash
-
-        file = self._weights(weights)
-        params, _, digest = load_with_hash(file)
-        check_model(self.head, self.folder, digest, file)
-        self._checked = params
-        return params
-
-    def load_runtime(
+    def load_model(
         self,
-        engine: EngineName,
         weights: str | os.PathLike[str] | None = None,
         *,
-        any_grouping: bool = False,
+        engine: EngineName | Literal["jax"] = "jax",
+        groupings: Sequence[str] = ("single",),
         verify: bool = True,
-    ) -> Runtime:
-        """Open the model that made the map in another engine; JAX is not imported for it.
+    ) -> "Model | Runtime":
+        """Load the model that made the map, or open it in another engine, which needs no JAX.
 
         Args:
-            engine: "onnxruntime" or "openvino".
-            weights: an exported folder or the file; None is where it was then.
-            any_grouping: whether queries look at each other.
-            verify: whether to compare the exported files with their checksums.
+            weights: the file, or an exported folder; None is where it was then.
+            engine: "jax", "onnxruntime" or "openvino".
+            groupings: the groupings that queries will be described in.
+            verify: whether to compare exported files with their checksums.
 
         Returns:
-            The model, in the place of parameters.
+            The model, at the image size and in the type of the map's images.
 
         Raises:
-            InputError: what `open_runtime` raises, or it is of another model.
+            InputError: there is no such file, what `open_runtime` raises, or it is another model.
         """
-        file = self._weights(weights)
-        config = read_value(self.folder)["config"]  # pyright: ignore[reportOptionalSubscript]
-        runtime = open_runtime(
-            file,
-            engine,
-            image_size=tuple(config["image_size"]),
-            preprocessing=config["preprocessing"],
-            precision=config["compute_dtype"],
-            any_grouping=any_grouping,
-            verify=verify,
-        )
-        self._check_runtime(runtime, file)
-        return runtime
+        file = weights_of(self.metadata, self.folder) if weights is None else weights
+        if engine == "jax":
+            from crisalad_jax.checkpoints.weights import load_with_hash
+            from crisalad_jax.nn.model import Model
 
-    def _weights(self, weights: str | os.PathLike[str] | None) -> str | os.PathLike[str]:
-        """Return a model's file, by default where it was when the map was made."""
-        return weights_of(self.head, self.folder) if weights is None else weights
+            params, _, digest = load_with_hash(file)
+            check_model(self.metadata, self.folder, digest, file)
+            model = Model(params, self.config)
+        else:
+            config = self.metadata.config
+            model = open_runtime(
+                file,
+                engine,
+                image_size=tuple(config["image_size"]),
+                preprocessing=config["preprocessing"],
+                precision=config["compute_dtype"],
+                any_grouping=set(groupings) != {"single"},
+                verify=verify,
+            )
+            self._check_runtime(model, file)
+        self._describer = model, describer_of(model, groupings)
+        return model
 
-    def check_params(self, params: "Crisalad | Runtime") -> None:
-        """Check that parameters are of the model that made the map; the same ones only once.
+    def describer(
+        self, model: "Model | Runtime | None" = None, groupings: Sequence[str] = ("single",)
+    ) -> Describer:
+        """Return what describes queries with the model that made the map.
+
+        Args:
+            model: the model; None is the last one, or loads it. The map's image size and types
+                are taken in place of those of its configuration.
+            groupings: the groupings that queries will be described in.
 
         Raises:
-            InputError: they are not.
+            InputError: another model, or what `describer_of` raises.
         """
-        if params is not self._checked:
-            if isinstance(params, Runtime):
-                self._check_runtime(params, "the given parameters")
-                return
-            from crisalad_jax.checkpoints.weights import model_hash
-
-            digest = model_hash(params, self.description.config)
-            check_model(self.head, self.folder, digest, "the given parameters")
-            self._checked = params
+        if model is None and self._describer is None:
+            self.load_model(groupings=groupings)
+        known = self._describer
+        if known is None or not (model is None or model is known[0]):
+            if isinstance(model, Runtime):
+                self._check_runtime(model, "the given model")
+                found = describer_of(model, groupings)
+            else:
+                if not isinstance(model, tuple):
+                    raise InputError(
+                        f"model: found {type(model).__name__}, expected a Model(params, config) or "
+                        "a Runtime"
+                    )
+                config = with_non_semantic_fields_of(self.config, model.config)
+                found = describer_of(model._replace(config=config), groupings)
+                check_model(self.metadata, self.folder, found.digest, "the given model")
+            known = self._describer = model, found
+        if isinstance(known[1], Runtime):
+            known[1].check_groupings(groupings)
+        return known[1]
 
     def _check_runtime(self, runtime: Runtime, given: object) -> None:
         check_model(
-            self.head, self.folder, runtime.digest, given, quantised_from=runtime.quantised_from
+            self.metadata, self.folder, runtime.digest, given, quantised_from=runtime.quantised_from
         )
-        self._checked = runtime
 
     def close(self) -> None:
         """Close the store; a map that nothing refers to any more closes itself."""
@@ -646,10 +596,10 @@ class Map:
 @contextlib.contextmanager
 def open_for_appending(
     folder: str | os.PathLike[str],
-    description: "MapDescription",
+    metadata: MapMetadata,
     components: Pca | None = None,
 ) -> Iterator[Map]:
-    """Open the map with this description to append to it, or make it, with its components.
+    """Open the map with this metadata to append to it, or make it, with its components.
 
     One process at a time may append; others may search meanwhile. A map that a kill left without
     images is made anew; one that an exception leaves without images is removed. A note tells of
@@ -659,29 +609,23 @@ def open_for_appending(
         InputError: another process appends, the map there is another one or has lost a record of
             images, what `Map.open` raises, or the folder cannot be written to.
     """
-    from crisalad_jax.retrieval.maps.manifest import (
-        read_description,
-        undone_without_images,
-        write_description,
-    )
-
     folder = pathlib.Path(folder)
-    read_description(folder)  # raises where something else is there, before anything is made
+    read_metadata(folder)  # raises where something else is there, before anything is made
     with contextlib.ExitStack() as stack:
         stack.enter_context(made_folder(folder / SEGMENTS))
         stack.enter_context(lock(folder))
-        existing = read_description(folder)
+        existing = read_metadata(folder)
         for each in (folder, folder / SEGMENTS):
             remove_temporaries(each)
         check_no_record_lost(folder)  # first: what follows removes a map without images
         stack.enter_context(undone_without_images(folder))
-        if existing != description:
+        if existing != metadata:
             if has_images(folder):
                 raise InputError(f"{folder}: found another map than was expected here")
             if components is not None:
                 save_pca(folder / COMPONENTS, components)
-            write_description(folder, description)
-        opened = stack.enter_context(Map._opened(folder, description))
+            write_metadata(folder, metadata)
+        opened = stack.enter_context(Map._opened(folder, metadata))
         remove_unrecorded(folder, len(opened))
         yield opened
 

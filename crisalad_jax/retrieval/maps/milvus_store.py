@@ -1,19 +1,18 @@
 """Descriptors in Milvus: a server, or milvus-lite in this process, by the same code."""
 
 import contextlib
-import importlib.util
 import logging
 import os
 import pathlib
 import urllib.parse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from crisalad_jax.retrieval.maps.ties import lower_first
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.shapes import Float, Float32
 
 TOKEN = "CRISALAD_MILVUS_TOKEN"
@@ -52,19 +51,18 @@ class MilvusStore:
 
     def __init__(self, address: str, collection: str, length: int, *, new: bool) -> None:
         """Connect to `address`, and make the collection if it is `new`."""
-        needed = ("pymilvus",) if check_address(address) else ("pymilvus", "milvus_lite")
-        if missing := [name for name in needed if importlib.util.find_spec(name) is None]:
-            raise InputError(
-                f"store: found no {' nor '.join(missing)}, expected them installed: "
-                'pip install "crisalad-jax[milvus]"'
-            )
-        import pymilvus
+        self._is_file = not check_address(address)
+        try:
+            import pymilvus
 
+            if self._is_file:
+                import milvus_lite as _milvus_lite  # noqa: F401
+        except ModuleNotFoundError as error:
+            raise InputError(missing_extra(error, "store milvus")) from error
         self._address, self._collection = address, collection
         self._rows = max(1, min(_MOST, _MESSAGE_BYTES // (4 * length)))
-        self._is_file = "milvus_lite" in needed
         if self._is_file and new:
-            _make_folder(pathlib.Path(address).parent)
+            pathlib.Path(address).parent.mkdir(parents=True, exist_ok=True)
         if self._is_file and not new and not pathlib.Path(address).exists():
             raise InputError(f"{address}: found nothing, expected the descriptors of this map")
         with self._one_line():
@@ -189,7 +187,7 @@ class MilvusStore:
             ]
             return Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
 
-        return lower_first(ask, np.ascontiguousarray(queries, np.float32), k, min(count, _MOST))
+        return break_ties(ask, np.ascontiguousarray(queries, np.float32), k, min(count, _MOST))
 
     def _ask(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
         with self._one_line():
@@ -201,11 +199,6 @@ class MilvusStore:
                 # milvus-lite reads an empty list as all fields, descriptors included.
                 output_fields=["id"],
                 search_params={"metric_type": "IP"},
-            )
-        if any(len(hits) != k for hits in answers):
-            raise InputError(
-                f"{self._address}: found {min(map(len, answers))} descriptors in "
-                f"{self._collection}, expected at least {k}"
             )
         return Neighbours(
             np.array([[hit["id"] for hit in hits] for hits in answers], np.int64),
@@ -222,8 +215,38 @@ class MilvusStore:
             server_manager_instance.release_server(self._address)
 
 
-def _make_folder(folder: pathlib.Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot make this folder: {error.strerror}") from error
+def break_ties(
+    ask: Callable[[Float32[np.ndarray, "q d"], int], Neighbours],
+    queries: Float32[np.ndarray, "q d"],
+    k: int,
+    count: int,
+) -> Neighbours:
+    """Search so that equal similarities are ordered by number, also at the k-th place.
+
+    One more than k is asked for. Where the last is as similar as the k-th, there may be more equal
+    ones. Such queries ask again for twice as many, until the last is less similar.
+
+    Args:
+        ask: takes queries and k; returns the k most similar of each, equal ones in any order.
+        queries: unit descriptors.
+        k: neighbours per query, at most `count`.
+        count: how many descriptors there are.
+    """
+    asked = min(k + 1, count)
+    found = _in_order(ask(queries, asked))
+    indices, similarities = (part[:, :k].copy() for part in found)
+    rows = np.arange(len(queries))
+    while asked < count:
+        is_open = found.similarities[:, k - 1] == found.similarities[:, -1]
+        rows = rows[is_open]
+        if not len(rows):
+            break
+        asked = min(2 * asked, count)
+        found = _in_order(ask(queries[rows], asked))
+        indices[rows], similarities[rows] = (part[:, :k] for part in found)
+    return Neighbours(indices, similarities)
+
+
+def _in_order(neighbours: Neighbours) -> Neighbours:
+    order = np.lexsort((neighbours.indices, -neighbours.similarities))
+    return Neighbours(*(np.take_along_axis(array, order, axis=1) for array in neighbours))

@@ -14,15 +14,13 @@ from crisalad_jax.config.checks import check_count, takes
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.loader import OnBadImage
 from crisalad_jax.data.metres import Zone
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import frame_time
-from crisalad_jax.retrieval.by_engine import describe_by_engine
-from crisalad_jax.retrieval.described import Described
-from crisalad_jax.retrieval.grouping import check_grouping, useful_batch_size
+from crisalad_jax.retrieval.describe import Described, check_window, described_sources
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
-from crisalad_jax.retrieval.maps.follow import Followed, Follower
-from crisalad_jax.retrieval.maps.head import DESCRIPTION
 from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage
+from crisalad_jax.retrieval.maps.tracking import SequenceTracker, TrackResult
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
@@ -31,7 +29,7 @@ from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Bool, Float32, Float64
 
 if TYPE_CHECKING:  # answers are searched without JAX
-    from crisalad_jax.nn.model import Crisalad
+    from crisalad_jax.nn.model import Model
 
 AT_ONCE = 1024
 """Number of queries that are searched for together: the map is read once for so many."""
@@ -103,92 +101,94 @@ class Answers(NamedTuple):
 @takes(places=Map)
 def query(
     places: Map,
-    params: "Crisalad | Runtime",
     images: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
+    model: "Model | Runtime | None" = None,
     k: int = 5,
     fps: float | None = None,
     window: int = 1,
     exact: bool = False,
-    batch_size: int = 16,
-    on_bad_image: OnBadImage = "stop",
     min_similarity: float | None = None,
     sequence: BayesFilter | None = None,
-    quiet: bool = False,
+    reading: Reading = Reading(),
 ) -> Answers:
     """Find the images of a map that are most similar to others.
 
     Args:
         places: the map, open.
-        params: parameters of the model that made the map (`Map.load_params`).
         images: an image file, a folder, another source of images
             (docs/how-to/image-sources.md), or a list of these.
+        model: the model that made the map; None loads it from where it was (`Map.load_model`).
         k: number of answers to each query.
         fps: frames a second taken of a video, which is then expected; None is one.
         window: frames that are described together: each with those just before it in its source,
             as a moving camera has them. Files listed one after the other are one source. 1
-            describes each alone, as a map's images are.
+            describes each independently, as a map's images are.
         exact: whether to search exactly although the map has an approximate search.
-        batch_size: number of queries described at once, each as if it were alone.
-        on_bad_image: "stop" at an unreadable image, or "skip" it.
         min_similarity: a query to which no image is that similar is of an unknown place; see
             `Answers.known`. None is what `calibrate` measured, and any where it did not; -1 is any.
         sequence: a filter over the map's images in their order, where queries are consecutive
             frames of one camera; None takes every query for itself.
-        quiet: whether to show no progress bar.
+        reading: how images are read.
 
     Returns:
         The answers, of use after the map is closed too.
 
     Raises:
-        InputError: parameters of another model; no image, one that cannot be read, or none
-            that can; a number out of range; or what `Map.search` raises.
+        InputError: another model; no image, one that cannot be read, or none that can; a number
+            out of range; or what `Map.search` raises.
 
     Example:
         >>> import jax
-        >>> from crisalad_jax import PRESETS, index, init_crisalad, save_weights
+        >>> from crisalad_jax import PRESETS, Model, index, init_crisalad, save_weights
         >>> config = PRESETS["tiny"]
-        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> model = Model(init_crisalad(jax.random.key(0), config), config)
         >>> weights = folder / "weights.safetensors"
-        >>> save_weights(weights, params, config)
-        >>> _ = index(params, config, pictures, folder / "map", weights=weights, quiet=True)
+        >>> save_weights(weights, model)
+        >>> quiet = Reading(quiet=True)
+        >>> _ = index(model, pictures, folder / "map", weights=weights, reading=quiet)
         >>> with Map.open(folder / "map") as places:
-        ...     answers = query(places, places.load_params(), pictures / "2.png", k=1, quiet=True)
+        ...     answers = query(places, pictures / "2.png", k=1, reading=quiet)
         >>> [answer.image.name for _, found in answers.rows() for answer in found]
         ['2.png']
     """
-    check_grouping((), batch_size, seed=0)
     check_count("k", k)
     min_similarity = asked_similarity(places, min_similarity)
-    root, sources = _listed(images, fps, on_bad_image)
+    root, sources = _listed(images, fps, reading.on_bad_image)
     paths = [path for source in sources for path in source]
     check_rate_used(fps, paths)
-    batch_size = useful_batch_size(batch_size, len(paths))
-    descriptions = _described(
-        places, params, sources, window=window, batch_size=batch_size, on_bad_image=on_bad_image
+    describer = places.describer(model, groupings=["single" if window == 1 else "window"])
+    if window != 1:
+        check_window(places.config, window)
+    stream = described_sources(
+        describer,
+        sources,
+        reading.fitted(len(paths)),
+        window=window,
+        components=places.components,
     )
-    follower = None if sequence is None else Follower(places, sequence)
-    parts: list[Neighbours | Followed] = []
+    tracker = None if sequence is None else SequenceTracker(places, sequence)
+    parts: list[Neighbours | TrackResult] = []
     waiting: list[Described] = []
     unreadable: list[pathlib.Path] = []
-    described = 0
-    with progress_bar("queries", len(paths), "images", quiet=quiet) as bar:
-        for part in descriptions:
+    seen = 0
+    with progress_bar("queries", len(paths), "images", quiet=reading.quiet) as bar:
+        for part in stream:
             waiting.append(part)
             unreadable += (paths[index] for index in part.unreadable)
             tried = len(part.indices) + len(part.unreadable)
-            described += tried
+            seen += tried
             bar.advance(tried)
             if len(unreadable) == len(paths):
                 raise InputError(f"images: found {len(paths)}, none of them readable")
             count = sum(len(each.indices) for each in waiting)
-            if count >= AT_ONCE or (count and described == len(paths)):
+            if count >= AT_ONCE or (count and seen == len(paths)):
                 found = np.concatenate([each.descriptors for each in waiting])
                 asked = [paths[index] for each in waiting for index in each.indices]
                 parts.append(
                     places.search(found, k, exact=exact)
-                    if follower is None
-                    else follower.answer(found, k, asked)
+                    if tracker is None
+                    else tracker.answer(found, k, asked)
                 )
                 waiting.clear()
     indices, similarities, *filtered = map(np.concatenate, zip(*parts, strict=True))
@@ -213,46 +213,6 @@ def asked_similarity(places: Map, min_similarity: float | None) -> float | None:
         return None if places.calibration is None else places.calibration.min_similarity
     check_min_similarity(min_similarity)
     return min_similarity if min_similarity > -1 else None
-
-
-def _described(
-    places: Map,
-    params: "Crisalad | Runtime",
-    sources: Sequence[list[pathlib.Path]],
-    *,
-    window: int,
-    batch_size: int,
-    on_bad_image: OnBadImage,
-) -> Iterator[Described]:
-    """Check that the model made the map, then describe the images of all sources."""
-    if window == 1 and isinstance(params, Runtime):
-        places.check_params(params)
-        return describe_by_engine(
-            params,
-            list(itertools.chain(*sources)),
-            batch_size=batch_size,
-            on_bad_image=on_bad_image,
-            components=places.components,
-        )
-    from crisalad_jax.retrieval.model import check_params
-    from crisalad_jax.retrieval.windows import check_window, describe_sources
-
-    places.check_params(params)
-    config = places.description.config
-    check_window(config, window)
-    try:
-        check_params(params, config)
-    except InputError as error:
-        raise InputError(f"{places.folder / DESCRIPTION}: {error}") from error
-    return describe_sources(
-        params,
-        config,
-        sources,
-        window=window,
-        batch_size=batch_size,
-        on_bad_image=on_bad_image,
-        components=places.components,
-    )
 
 
 def _listed(

@@ -1,4 +1,4 @@
-"""Where a map's descriptors are: files that FAISS searches, or Milvus, behind one interface.
+"""Where a map's descriptors are: files, or Milvus, behind one interface.
 
 A store knows descriptors by their numbers, from 0, and nothing of images. The map says how many of
 them count. Descriptors beyond, which a killed addition left, are never returned, and the next

@@ -3,4 +3,3 @@
 from crisalad_jax.retrieval.reranking.stage import Reranker as Reranker
 from crisalad_jax.retrieval.reranking.stage import Reranking as Reranking
 from crisalad_jax.retrieval.reranking.stage import parse_reranking as parse_reranking
-from crisalad_jax.retrieval.reranking.stage import rerank as rerank

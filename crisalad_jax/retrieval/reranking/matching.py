@@ -1,10 +1,19 @@
-"""Patches of two images that are each other's nearest, and whether they lie alike."""
+"""Matches of two images' patches, and the scores of SelaVPR and TransVPR that count them."""
+
+import functools
+import math
 
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+
+from crisalad_jax.nn.aggregators.selavpr import SelaVpr, SelaVprConfig, local_features
+from crisalad_jax.nn.aggregators.transvpr import TransVpr, TransVprConfig, key_features
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Crisalad, Images, extract_features
+from crisalad_jax.utils import compiler
 
 INLIER_DISTANCE = 1.5
 """Largest distance of an inlier from where the homography maps it, in patches (public codes)."""
@@ -68,3 +77,64 @@ def inliers(matches: Int[np.ndarray, " m"], grid: tuple[int, int]) -> int:
     cv2.setRNGSeed(0)
     _, mask = cv2.findHomography(before, after, cv2.RANSAC, INLIER_DISTANCE)
     return 0 if mask is None else int(np.count_nonzero(mask))
+
+
+@compiler.jit
+def _match_all(
+    query: Float[Array, "m d"], candidates: Float[Array, "candidate n d"]
+) -> Int[Array, "candidate m"]:
+    # One after the other: the products of a pair of SelaVPR's images of 224 x 224 are 55 MB.
+    return jax.lax.map(functools.partial(mutual_matches, query), candidates)
+
+
+def selavpr_shape(config: ModelConfig) -> tuple[int, int]:
+    """Return the number of local features of an image, and their width."""
+    assert isinstance(config.aggregator, SelaVprConfig)
+    return math.prod(config.aggregator.local_grid(config.grid)), config.aggregator.local
+
+
+@functools.partial(compiler.jit, static_argnames="config")
+def describe_selavpr(
+    params: Crisalad, images: Images, config: ModelConfig
+) -> Float[Array, "image feature dim"]:
+    """Compute SelaVPR's `local_features` of every image in row order, in float16."""
+    assert isinstance(params.aggregator, SelaVpr)
+    patches = extract_features(params, images, config).patches
+    local = local_features(params.aggregator, patches, config.grid)
+    return local.reshape(len(local), *selavpr_shape(config)).astype(jnp.float16)
+
+
+def count_matches(
+    query: Float[np.ndarray, "feature dim"],
+    candidates: Float[np.ndarray, "candidate feature dim"],
+    config: ModelConfig,
+) -> Float[np.ndarray, " candidate"]:
+    """Count the mutual matches (SelaVPR, section 3.4)."""
+    matches = np.asarray(_match_all(jnp.asarray(query), jnp.asarray(candidates)))
+    return (matches >= 0).sum(axis=1).astype(np.float32)
+
+
+def transvpr_shape(config: ModelConfig) -> tuple[int, int]:
+    """Return the number of patches of an image, and the length of a patch's feature."""
+    return config.patches, config.backbone.dim
+
+
+@functools.partial(compiler.jit, static_argnames="config")
+def describe_transvpr(
+    params: Crisalad, images: Images, config: ModelConfig
+) -> Float[Array, "image patch dim"]:
+    """Compute TransVPR's `key_features` of every image, in float16."""
+    assert isinstance(params.aggregator, TransVpr)
+    assert isinstance(config.aggregator, TransVprConfig)
+    patches = extract_features(params, images, config).patches
+    return key_features(params.aggregator, patches, config.aggregator.levels).astype(jnp.float16)
+
+
+def count_inliers(
+    query: Float[np.ndarray, "patch dim"],
+    candidates: Float[np.ndarray, "candidate patch dim"],
+    config: ModelConfig,
+) -> Float[np.ndarray, " candidate"]:
+    """Count the mutual matches that are inliers of RANSAC (TransVPR, section 3.3)."""
+    matches = np.asarray(_match_all(jnp.asarray(query), jnp.asarray(candidates)))
+    return np.array([inliers(each, config.grid) for each in matches], np.float32)

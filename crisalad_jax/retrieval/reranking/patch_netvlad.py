@@ -111,15 +111,6 @@ def describe(
     return jax.lax.map(of_one, (assignment, features))
 
 
-def spatial_scores(
-    query: Float[np.ndarray, "window dim"],
-    candidates: Float[np.ndarray, "candidate window dim"],
-    config: ModelConfig,
-) -> Float[np.ndarray, "candidate size"]:
-    """Compute the rapid spatial score of each size of windows (paper section 3.4)."""
-    return np.asarray(_spatial_scores(jnp.asarray(query), jnp.asarray(candidates), config))
-
-
 @functools.partial(compiler.jit, static_argnames="config")
 def _spatial_scores(
     query: Float[Array, "window dim"],
@@ -127,14 +118,31 @@ def _spatial_scores(
     config: ModelConfig,
 ) -> Float[Array, "candidate size"]:
     def of_one(candidate: Array) -> Array:
-        return jnp.stack(
-            [
-                spatial_score(mutual_matches(query[part], candidate[part]), grid)
-                for part, grid in _parts(config)
-            ]
-        )
+        matched = [(mutual_matches(query[w], candidate[w]), grid) for w, grid in _parts(config)]
+        return jnp.stack([spatial_score(matches, grid) for matches, grid in matched])
 
     return jax.vmap(of_one)(candidates)
+
+
+@functools.partial(compiler.jit, static_argnames="config")
+def _matches_to(
+    query: Float[Array, "window dim"],
+    candidates: Float[Array, "candidate window dim"],
+    config: ModelConfig,
+) -> list[Int[Array, "candidate part"]]:
+    def of_one(candidate: Array) -> list[Array]:
+        return [mutual_matches(candidate[w], query[w]) for w, _ in _parts(config)]
+
+    return jax.vmap(of_one)(candidates)
+
+
+def spatial_scores(
+    query: Float[np.ndarray, "window dim"],
+    candidates: Float[np.ndarray, "candidate window dim"],
+    config: ModelConfig,
+) -> Float[np.ndarray, "candidate size"]:
+    """Compute the rapid spatial score of each size of windows (paper section 3.4)."""
+    return np.asarray(_spatial_scores(jnp.asarray(query), jnp.asarray(candidates), config))
 
 
 def inlier_scores(
@@ -152,18 +160,6 @@ def inlier_scores(
         for matches, (_, grid) in zip(by_size, _parts(config), strict=True)
     ]
     return np.array(scores, np.float32).T
-
-
-@functools.partial(compiler.jit, static_argnames="config")
-def _matches_to(
-    query: Float[Array, "window dim"],
-    candidates: Float[Array, "candidate window dim"],
-    config: ModelConfig,
-) -> list[Int[Array, "candidate part"]]:
-    def of_one(candidate: Array) -> list[Array]:
-        return [mutual_matches(candidate[part], query[part]) for part, _ in _parts(config)]
-
-    return jax.vmap(of_one)(candidates)
 
 
 def _parts(config: ModelConfig) -> list[tuple[slice, Grid]]:

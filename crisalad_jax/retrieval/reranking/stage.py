@@ -1,22 +1,21 @@
 """The second stage: local features of the retrieved images, computed once, and the new order."""
 
 import dataclasses
-import math
 import pathlib
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Self
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from crisalad_jax.config.checks import choose
-from crisalad_jax.data.loader import ImageBatch, ImageCache
+from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, cast_params
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.retrieval.photographs import photograph_batches
-from crisalad_jax.retrieval.reranking import patch_netvlad, selavpr, transvpr
+from crisalad_jax.retrieval.reranking import matching, patch_netvlad
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import progress_bar
@@ -52,8 +51,12 @@ _METHODS: Mapping[str, Method] = {
     "patch-netvlad": _PATCH_NETVLAD,
     "patch-netvlad-ransac": dataclasses.replace(_PATCH_NETVLAD, score=patch_netvlad.inlier_scores),
     "patch-netvlad-sum": dataclasses.replace(_PATCH_NETVLAD, fuse=patch_netvlad.weighted_sum),
-    "selavpr": Method("selavpr", selavpr.shape, selavpr.describe, selavpr.score),
-    "transvpr": Method("transvpr", transvpr.shape, transvpr.describe, transvpr.score),
+    "selavpr": Method(
+        "selavpr", matching.selavpr_shape, matching.describe_selavpr, matching.count_matches
+    ),
+    "transvpr": Method(
+        "transvpr", matching.transvpr_shape, matching.describe_transvpr, matching.count_inliers
+    ),
 }
 _AT_ONCE = 16
 """Largest number of candidates of a query that are scored together."""
@@ -140,25 +143,13 @@ def parse_reranking(text: str) -> Reranking:
     return Reranking(name, int(top))
 
 
-def rerank(
-    reranking: Reranking,
-    neighbours: Neighbours,
-    database: Sequence[pathlib.Path],
-    queries: Sequence[pathlib.Path],
-    *,
-    batch_size: int = 16,
-    cache: ImageCache | None = None,
-    quiet: bool = False,
-) -> Neighbours:
-    """Re-rank the neighbours of one first stage; see `Reranker`.
+class _Side(NamedTuple):
+    """The images of one side, and their local features in a sparse file."""
 
-    Raises:
-        InputError: what `Reranker` raises.
-    """
-    with Reranker(
-        reranking, database, queries, batch_size=batch_size, cache=cache, quiet=quiet
-    ) as stage:
-        return stage(neighbours)
+    paths: Sequence[pathlib.Path]
+    features: Float[np.ndarray, "image feature dim"]
+    known: Bool[np.ndarray, " image"]
+    """Whether the features of an image are there."""
 
 
 class Reranker:
@@ -175,10 +166,7 @@ class Reranker:
         reranking: Reranking,
         database: Sequence[pathlib.Path],
         queries: Sequence[pathlib.Path],
-        *,
-        batch_size: int = 16,
-        cache: ImageCache | None = None,
-        quiet: bool = False,
+        reading: Reading = Reading(),
     ) -> None:
         """Prepare the second stage; enter it as a context before use.
 
@@ -188,25 +176,20 @@ class Reranker:
         if reranking.params is None or reranking.config is None:
             raise InputError("rerank: found no model, expected one, or `over` the first stage's")
         reranking.check(reranking.config, len(database))
-        self._top, self._config = reranking.top, reranking.config
+        self._top, self._config, self._label = reranking.top, reranking.config, reranking.name
         self._method = _METHODS[reranking.name]
-        self._label, self._quiet = reranking.name, quiet
-        self._folder = tempfile.TemporaryDirectory(prefix="rerank-", ignore_cleanup_errors=True)
+        self._reading, self._quiet = reading, reading.quiet
+        self._devices = devices_for(reading.batch_size)
+        self._params = self._devices.replicate(cast_params(reranking.params, reranking.config))
         self._scores: dict[tuple[int, int], float | list[float]] = {}
+        self._folder = tempfile.TemporaryDirectory(prefix="rerank-", ignore_cleanup_errors=True)
+        self._database, self._queries = self._side(database, "db"), self._side(queries, "queries")
 
-        def describe(images: Any) -> Any:
-            return self._method.describe(shared, devices.shard_batch(images), self._config)
-
-        def read(paths: Sequence[pathlib.Path]) -> Iterator[ImageBatch]:
-            return photograph_batches(self._config, paths, batch_size=batch_size, cache=cache)
-
-        def side(name: str, paths: Sequence[pathlib.Path]) -> _Features:
-            file = pathlib.Path(self._folder.name) / name
-            return _Features(paths, read, describe, self._method.shape(self._config), file)
-
-        devices = devices_for(batch_size)
-        shared = devices.replicate(cast_params(reranking.params, reranking.config))
-        self._database, self._queries = side("database", database), side("queries", queries)
+    def _side(self, paths: Sequence[pathlib.Path], name: str) -> _Side:
+        shape = len(paths), *self._method.shape(self._config)
+        file = pathlib.Path(self._folder.name) / name
+        features = np.memmap(file, np.float16, "w+", shape=shape)
+        return _Side(paths, features, np.zeros(len(paths), bool))
 
     def __enter__(self) -> Self:
         """Return the second stage itself."""
@@ -214,8 +197,7 @@ class Reranker:
 
     def __exit__(self, *_: object) -> None:
         """Remove the temporary files."""
-        self._database.close()
-        self._queries.close()
+        del self._database, self._queries  # some systems cannot remove open files
         self._folder.cleanup()
 
     def __call__(self, neighbours: Neighbours) -> Neighbours:
@@ -236,11 +218,8 @@ class Reranker:
                 f"expected at least {top} of {len(self._queries.paths)}"
             )
         first = indices[:, :top]
-        for side, wanted, name in (
-            (self._queries, np.arange(len(indices)), "queries"),
-            (self._database, np.unique(first), "candidates"),
-        ):
-            side.ensure(wanted, f"{self._label}, {name}", quiet=self._quiet)
+        self._describe(self._queries, np.arange(len(indices)), "queries")
+        self._describe(self._database, np.unique(first), "candidates")
         pairs = len(first) * top
         with progress_bar(f"{self._label}, pairs", pairs, "pairs", quiet=self._quiet) as bar:
             for query, candidates in enumerate(first):
@@ -250,6 +229,34 @@ class Reranker:
                 similarities[query, :top] = scores[order]
                 bar.advance(top)
         return Neighbours(indices, similarities)
+
+    def _describe(self, side: _Side, images: Int[np.ndarray, " image"], name: str) -> None:
+        """Compute the features of those images that have none yet.
+
+        Raises:
+            InputError: an image cannot be read, or the disk has no room.
+        """
+        missing = images[~side.known[images]]
+        needed = len(missing) * side.features[:1].nbytes
+        free = shutil.disk_usage(self._folder.name).free
+        if needed > free:
+            raise InputError(
+                f"{self._folder.name}: found {free / 2**30:.1f} GiB free, expected "
+                f"{needed / 2**30:.1f} GiB for the local features of {len(missing)} images"
+            )
+        if not len(missing):
+            return
+        config, paths = self._config, [side.paths[i] for i in missing]
+        how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
+        batches = self._reading.batches(paths, how, config.check_image_size)
+        label = f"{self._label}, {name}"
+        with progress_bar(label, len(missing), "images", quiet=self._quiet) as bar:
+            for batch in batches:
+                sharded = self._devices.shard_batch(batch.images)
+                found = np.asarray(self._method.describe(self._params, sharded, config))
+                rows = missing[batch.indices[batch.valid]]
+                side.features[rows], side.known[rows] = found[batch.valid], True
+                bar.advance(len(rows))
 
     def _score(
         self, query: int, candidates: Int[np.ndarray, " candidate"]
@@ -270,47 +277,3 @@ class Reranker:
             }
         scores = np.array([self._scores[query, int(c)] for c in candidates])
         return self._method.fuse(scores, self._config).astype(np.float32)
-
-
-class _Features:
-    """Local features of a side's images in a sparse file, computed when first asked for."""
-
-    def __init__(
-        self,
-        paths: Sequence[pathlib.Path],
-        read: Callable[[Sequence[pathlib.Path]], Iterator[ImageBatch]],
-        describe: Callable[[Any], Any],
-        shape: tuple[int, int],
-        file: pathlib.Path,
-    ) -> None:
-        self.paths, self._read, self._describe, self._file = paths, read, describe, file
-        self.features = np.memmap(file, np.float16, "w+", shape=(len(paths), *shape))
-        self._known: Bool[np.ndarray, " image"] = np.zeros(len(paths), bool)
-
-    def ensure(self, images: Int[np.ndarray, " image"], label: str, *, quiet: bool) -> None:
-        """Compute the features of those images that have none yet.
-
-        Raises:
-            InputError: an image cannot be read, or the disk has no room.
-        """
-        missing = images[~self._known[images]]
-        if not len(missing):
-            return
-        needed = len(missing) * math.prod(self.features.shape[1:]) * self.features.itemsize
-        free = shutil.disk_usage(self._file.parent).free
-        if needed > free:
-            raise InputError(
-                f"{self._file.parent}: found {free / 2**30:.1f} GiB free, expected "
-                f"{needed / 2**30:.1f} GiB for the local features of {len(missing)} images"
-            )
-        batches = self._read([self.paths[i] for i in missing])
-        with progress_bar(label, len(missing), "images", quiet=quiet) as bar:
-            for batch in batches:
-                rows = missing[batch.indices[batch.valid]]
-                self.features[rows] = np.asarray(self._describe(batch.images))[batch.valid]
-                self._known[rows] = True
-                bar.advance(len(rows))
-
-    def close(self) -> None:
-        """Release the file; some systems cannot remove it before."""
-        del self.features

@@ -1,8 +1,12 @@
 """Training recipes of published methods, one module for each family."""
 
-import importlib
-import pkgutil
-
+from crisalad_jax.training.recipes import (  # noqa: F401, they register theirs
+    classification,
+    convolutional,
+    dinov2,
+    netvlad,
+    paper,
+)
 from crisalad_jax.training.recipes.base import RECIPES as RECIPES
 from crisalad_jax.training.recipes.base import find_part as find_part
 from crisalad_jax.training.recipes.base import from_scratch as from_scratch
@@ -11,6 +15,3 @@ from crisalad_jax.training.recipes.base import recipe as recipe
 from crisalad_jax.training.recipes.base import register_recipe as register_recipe
 from crisalad_jax.training.recipes.base import split_name as split_name
 from crisalad_jax.training.recipes.base import with_part as with_part
-
-for _module in pkgutil.iter_modules(__path__):
-    importlib.import_module(f"{__name__}.{_module.name}")

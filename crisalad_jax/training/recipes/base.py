@@ -1,12 +1,13 @@
 """Recipes: how a published method is trained, by its name; or a recipe with one part swapped."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from crisalad_jax.config.checks import choose, takes
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.plugins import load_entry_points
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
@@ -44,14 +45,10 @@ def register_recipe(name: str) -> Callable[[Make], Make]:
     """
 
     def decorate(make: Make) -> Make:
-        there = RECIPES.get(name)
-        if there is not None and (there.__module__, there.__qualname__) != (
-            make.__module__,
-            make.__qualname__,
-        ):
+        module = RECIPES[name].__module__ if name in RECIPES else make.__module__
+        if module != make.__module__:
             raise InputError(
-                f"register_recipe {name!r}: found the name taken by {there.__module__}, expected "
-                "another"
+                f"register_recipe {name!r}: found the name taken by {module}, expected another"
             )
         RECIPES[name] = make
         return make
@@ -89,11 +86,6 @@ def recipe(
         >>> recipe(name="salad", model=load("starter").config).model.image_size
         (192, 256)
     """
-    if preset not in PRESETS and preset.partition("+")[0] in RECIPES:
-        raise InputError(
-            f"preset: found {preset!r}, which is a recipe (--recipe {preset}), expected a size of "
-            f"the model: {', '.join(sorted(PRESETS))}"
-        )
     size = choose("preset", preset, PRESETS)
     name = ("scratch" if preset == "tiny" else "crisalad") if name is None else name
     if name in RECIPES:
@@ -118,34 +110,29 @@ def _of_model(config: TrainConfig, model: ModelConfig | None) -> TrainConfig:
     )
 
 
-def with_resizing(config: TrainConfig, **fields: Any) -> TrainConfig:
-    """Set how a recipe's model resizes photographs, as the published weights' do.
+def resized(chain: PreprocessingConfig, **fields: Any) -> PreprocessingConfig:
+    """Set how photographs are resized, as the published weights' code does.
 
     Training images are resized as `PreprocessingConfig.for_training` says, whatever is set. A model
     that normalises by local contrast, as `tiny`, takes the filter alone: it is no published one.
 
     Args:
-        config: the recipe.
+        chain: the preset's.
         **fields: of `PreprocessingConfig`.
 
-    Returns:
-        The recipe, with these fields changed.
-
     Example:
-        >>> boq = with_resizing(recipe("b14"), filter="bicubic")
-        >>> boq.model.preprocessing.filter
+        >>> from crisalad_jax import PRESETS
+        >>> resized(PRESETS["b14"].preprocessing, filter="bicubic").filter
         'bicubic'
     """
-    chain = config.model.preprocessing
     if chain.normalisation == "local-contrast":
         fields = {name: value for name, value in fields.items() if name == "filter"}
-    model = dataclasses.replace(config.model, preprocessing=dataclasses.replace(chain, **fields))
-    return dataclasses.replace(config, model=model)
+    return dataclasses.replace(chain, **fields)
 
 
-def validated_at(config: TrainConfig, preset: str, size: tuple[int, int]) -> TrainConfig:
-    """Set the size that a recipe's code validates at; of preset tiny it is the model's."""
-    return dataclasses.replace(config, validation_size=None if preset == "tiny" else size)
+def validation_size(preset: str, side: int) -> tuple[int, int] | None:
+    """Return the size that a recipe's code validates at; None for preset tiny."""
+    return None if preset == "tiny" else (side, side)
 
 
 def split_name(name: str) -> tuple[str | None, str]:
@@ -191,92 +178,65 @@ def find_part(
         'newton'
     """
     kind, colon, part = name.rpartition(":")
-    kinds = [kind] if colon else list(_PLACES)
-    for again in (False, True):
-        if again:
-            load_entry_points()
-        matches = [k for k in kinds if k in _PLACES and part in REGISTRIES[k]]
-        if matches:
-            break
+    kinds = [each for each in _KINDS if each == kind or not colon]
+    matches = [each for each in kinds if part in REGISTRIES[each]]
     if not matches:
-        if name in PRESETS:
-            raise InputError(
-                f"{what}: found {name!r}, which is a preset (--preset {name}), expected one of "
-                f"{', '.join(sorted(others))}"
-            )
+        load_entry_points()
+        matches = [each for each in kinds if part in REGISTRIES[each]]
+    if not matches:
         raise InputError(
             f"{what}: found {name!r}, expected one of {', '.join(sorted(others))}, or a "
-            f"registered part as NAME or KIND:NAME, with a kind of {', '.join(_PLACES)} (is a "
+            f"registered part as NAME or KIND:NAME, with a kind of {', '.join(_KINDS)} (is a "
             "plug-in missing? --plugin FILE.py or MODULE)"
         )
     if len(matches) > 1:
         raise InputError(
             f"{what}: found {name!r}, which is a part of several kinds, expected "
-            f"{' or '.join(f'{k}:{part}' for k in matches)}"
+            f"{' or '.join(f'{each}:{part}' for each in matches)}"
         )
     return REGISTRIES[matches[0]].make(part, preset)
 
 
-def with_part(config: TrainConfig, part: Part) -> TrainConfig:
-    """Replace a recipe's part by another of the same kind.
+_KINDS = ("aggregator", "step", "dustbin", "loss", "backbone", "augmentation", "gradient")
+
+
+def with_part(config: TrainConfig, part: Any) -> TrainConfig:
+    """Replace a recipe's part by another of the same kind, and train all else as it does.
+
+    Another aggregator has no cross-image encoder: its descriptor depends on its own image alone. Of
+    CriSALAD the backbone stays frozen, with the same adapters, so that methods differ only in what
+    they make of its features.
 
     Raises:
         InputError: the part does not fit, or the recipe has no place for it.
     """
-    return _PLACES[part.registry.kind](config, part)
-
-
-def _with_aggregator(config: TrainConfig, part: Any) -> TrainConfig:
-    """Replace a recipe's head by another aggregator, and train all else as it does.
-
-    Of CriSALAD the backbone stays frozen, with the same adapters, so that methods differ only in
-    what they make of its features. There is no cross-image encoder: a descriptor depends on its own
-    image alone.
-    """
-    cross_image = dataclasses.replace(config.model.cross_image, layers=0)
-    model = dataclasses.replace(config.model, aggregator=part, cross_image=cross_image)
-    return dataclasses.replace(config, model=model, validation_size=None)
-
-
-def _with_backbone(config: TrainConfig, part: Any) -> TrainConfig:
-    model = dataclasses.replace(config.model, backbone=part)
-    trainable = "head" if getattr(part, "adapter", None) is None else config.trainable
-    return dataclasses.replace(config, model=model, trainable=trainable, validation_size=None)
-
-
-def _with_loss(config: TrainConfig, part: Any) -> TrainConfig:
-    miner = "none" if part.ranks_all else config.loss.miner
-    loss = dataclasses.replace(config.loss, kind=part, miner=miner)
-    return dataclasses.replace(config, loss=loss)
-
-
-def _in_aggregator(field: str, inside: str | None = None) -> Callable[[TrainConfig, Any], Any]:
-    def put(config: TrainConfig, part: Any) -> TrainConfig:
-        aggregator = config.model.aggregator
-        if not hasattr(aggregator, field):
-            raise InputError(
-                f"recipe: found {part.registry.kind} {part.part_name!r} for aggregator "
-                f"{aggregator.part_name}, expected one that transports, such as salad"
-            )
-        if inside is not None:
-            part = dataclasses.replace(getattr(aggregator, field), **{inside: part})
-        aggregator = dataclasses.replace(aggregator, **{field: part})
-        model = dataclasses.replace(config.model, aggregator=aggregator)
-        return dataclasses.replace(config, model=model)
-
-    return put
-
-
-_PLACES: Mapping[str, Callable[[TrainConfig, Any], TrainConfig]] = {
-    "aggregator": _with_aggregator,
-    "step": _in_aggregator("sinkhorn", "step"),
-    "dustbin": _in_aggregator("dustbin"),
-    "loss": _with_loss,
-    "backbone": _with_backbone,
-    "augmentation": lambda config, part: dataclasses.replace(config, augmentation=part),
-    "gradient": _in_aggregator("sinkhorn", "gradient"),
-}
-"""Functions that put a part in place, by its kind."""
+    kind, model = part.registry.kind, config.model
+    if kind == "augmentation":
+        return dataclasses.replace(config, augmentation=part)
+    if kind == "loss":
+        miner = "none" if part.ranks_all else config.loss.miner
+        loss = dataclasses.replace(config.loss, kind=part, miner=miner)
+        return dataclasses.replace(config, loss=loss)
+    if kind == "backbone":
+        trainable = "head" if getattr(part, "adapter", None) is None else config.trainable
+        model = dataclasses.replace(model, backbone=part)
+        return dataclasses.replace(config, model=model, trainable=trainable, validation_size=None)
+    if kind == "aggregator":
+        cross_image = dataclasses.replace(model.cross_image, layers=0)
+        model = dataclasses.replace(model, aggregator=part, cross_image=cross_image)
+        return dataclasses.replace(config, model=model, validation_size=None)
+    # Steps and gradients are settings of the solver, and a dustbin of the aggregator itself.
+    field = "dustbin" if kind == "dustbin" else "sinkhorn"
+    if not hasattr(model.aggregator, field):
+        raise InputError(
+            f"recipe: found {kind} {part.part_name!r} for aggregator {model.aggregator.part_name}, "
+            "expected one that transports, such as salad"
+        )
+    if field != kind:
+        part = dataclasses.replace(getattr(model.aggregator, field), **{kind: part})
+    aggregator: Any = dataclasses.replace(model.aggregator, **{field: part})
+    model = dataclasses.replace(model, aggregator=aggregator)
+    return dataclasses.replace(config, model=model)
 
 
 @takes(config=TrainConfig)

@@ -1,4 +1,4 @@
-"""Recipes over ResNet and VGG: MixVPR, Conv-AP, BoQ, CosPlace and EigenPlaces.
+"""Recipes over ResNet: MixVPR, Conv-AP, BoQ, and the `starter` of this package.
 
 Their sizes are the published ones for every preset but `tiny`, whose backbone is smaller.
 """
@@ -6,23 +6,22 @@ Their sizes are the published ones for every preset but `tiny`, whose backbone i
 import dataclasses
 from typing import Any
 
-from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
-from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.large_margin_cosine import LargeMarginCosineConfig
-from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
+from crisalad_jax.data.augmentations.camera import CameraAugmentConfig
+from crisalad_jax.nn.aggregators import AGGREGATORS
+from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.backbones import BACKBONES, Backbone
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.recipes.base import register_recipe, validated_at
-from crisalad_jax.training.recipes.boq import trained_as_boq
-from crisalad_jax.training.recipes.mixvpr import MIXVPR_OPTIMISER
-
-_TINY = "tiny"
-_ADAM = OptimiserConfig(kind="adam", learning_rate=1e-5, end_lr_fraction=1.0, weight_decay=0.0)
+from crisalad_jax.training.recipes.base import (
+    from_scratch,
+    register_recipe,
+    resized,
+    validation_size,
+)
+from crisalad_jax.training.recipes.dinov2 import BOQ_TRAINING, MIXVPR_OPTIMISER
 
 
 def model_over(
@@ -36,11 +35,12 @@ def model_over(
     **preprocessing: Any,
 ) -> ModelConfig:
     """Make a model without an encoder; of preset tiny over a small ResNet, with its images."""
-    small = preset == _TINY
+    small = preset == "tiny"
+    chain = PreprocessingConfig(**preprocessing)
     return ModelConfig(
         image_size=tiny.image_size if small else size,
-        preprocessing=tiny.preprocessing if small else PreprocessingConfig(**preprocessing),
-        backbone=BACKBONES.make("resnet", _TINY) if small else backbone,
+        preprocessing=tiny.preprocessing if small else chain,
+        backbone=BACKBONES.make("resnet", preset) if small else backbone,
         aggregator=aggregator,
         cross_image=CrossImageConfig(layers=0),
         compute_dtype=compute_dtype,
@@ -50,19 +50,14 @@ def model_over(
 @register_recipe("mixvpr")
 def mixvpr(model: ModelConfig, preset: str) -> TrainConfig:
     """Make MixVPR's recipe, of amaralibey/MixVPR: ResNet-50, whose third stage trains, and SGD."""
+    head = AGGREGATORS.make("mixvpr", preset)
     return TrainConfig(
-        model=model_over(
-            preset,
-            model,
-            ResNetConfig(stages=3),
-            AGGREGATORS.make("mixvpr", preset),
-            (320, 320),
-        ),
+        model=model_over(preset, model, ResNetConfig(stages=3), head, (320, 320)),
         optimiser=MIXVPR_OPTIMISER,
         trainable="last-1-blocks+head",
         places_per_batch=120,
         epochs=80,
-        select_by="R@1",
+        monitor="R@1",
         patience=None,
     )
 
@@ -74,15 +69,9 @@ def conv_ap(model: ModelConfig, preset: str) -> TrainConfig:
     The head and the filter, bicubic, are those of its model of 4,096 numbers. Its optimiser is
     called Adam there, and is AdamW.
     """
+    head = AGGREGATORS.make("conv-ap", preset)
     return TrainConfig(
-        model=model_over(
-            preset,
-            model,
-            ResNetConfig(),
-            AGGREGATORS.make("conv-ap", preset),
-            (320, 320),
-            filter="bicubic",
-        ),
+        model=model_over(preset, model, ResNetConfig(), head, (320, 320), filter="bicubic"),
         optimiser=OptimiserConfig(
             learning_rate=2e-4,
             schedule="milestones",
@@ -94,7 +83,7 @@ def conv_ap(model: ModelConfig, preset: str) -> TrainConfig:
         trainable="last-2-blocks+head",
         places_per_batch=100,
         epochs=30,
-        select_by="R@1",
+        monitor="R@1",
         patience=None,
     )
 
@@ -106,68 +95,34 @@ def boq_resnet50(model: ModelConfig, preset: str) -> TrainConfig:
     The head is that of the published weights, of 16,384 numbers.
     """
     queries: Any = AGGREGATORS.make("boq", preset)
-    if preset != _TINY:
+    if preset != "tiny":
         queries = dataclasses.replace(queries, channels=512)
-    config = trained_as_boq(
-        model_over(preset, model, ResNetConfig(stages=3), queries, (320, 320)),
-        trainable="last-2-blocks+head",
-    )
-    return validated_at(config, preset, (384, 384))
-
-
-@register_recipe("cosplace")
-def cosplace(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make CosPlace's recipe, of gmberton/CosPlace: ResNet-18 and 512 numbers, its code's defaults.
-
-    Classes are cells of position and heading, which ask for the headings of `northdeg`, and for
-    many images of a spot, as in San Francisco XL. Images are described at their own sizes.
-    """
-    loss = LargeMarginCosineConfig(classes=ClassesConfig(kind="cells", steps=10_000))
-    return _classified(model, preset, loss, min_images=10, epochs=50, compute_dtype="float32")
-
-
-@register_recipe("eigenplaces-turns")
-def eigenplaces_turns(model: ModelConfig, preset: str) -> TrainConfig:
-    """Make EigenPlaces' recipe, of gmberton/EigenPlaces, with two differences.
-
-    A step of its code takes a batch of lateral and one of frontal classes, here they take turns by
-    epochs, of which there are twice as many. It cuts images out of panoramas, towards the focal
-    point; here photographs have the headings that they have.
-    """
-    classes = ClassesConfig(kind="viewpoints", groups=9, steps=5000, cell=15.0, spacing=3)
-    loss = LargeMarginCosineConfig(scale=100.0, classes=classes)
-    return _classified(model, preset, loss, min_images=5, epochs=80, compute_dtype="bfloat16")
-
-
-def _classified(
-    model: ModelConfig,
-    preset: str,
-    loss: LargeMarginCosineConfig,
-    *,
-    min_images: int,
-    epochs: int,
-    compute_dtype: Any,
-) -> TrainConfig:
-    aggregator: Aggregator = AGGREGATORS.make("cosplace", preset)
+    whole = model_over(preset, model, ResNetConfig(stages=3), queries, (320, 320))
+    chain = resized(whole.preprocessing, filter="bicubic", pixels="floats")
     return TrainConfig(
-        model=model_over(
-            preset,
-            model,
-            ResNetConfig(layers=18),
-            aggregator,
-            (512, 512),
-            compute_dtype=compute_dtype,
-            size_rule="native",
-        ),
-        loss=LossConfig(kind=loss),
-        optimiser=_ADAM,
-        trainable="last-2-blocks+head",
-        augmentation=ColourCropConfig(),
-        places_per_batch=32,
-        images_per_place=1,
-        min_images=min_images,
-        batch_order="shuffled",
-        epochs=epochs,
-        select_by="R@1",
-        patience=None,
+        model=dataclasses.replace(whole, preprocessing=chain),
+        validation_size=validation_size(preset, 384),
+        **BOQ_TRAINING,
+    )
+
+
+@register_recipe("starter")
+def starter(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make the recipe of `starter`'s last run, of 24,000 places (`render --scenes 6000`).
+
+    Its weights started from a first run of smaller images, which docs/starter.md describes.
+    """
+    whole = model_over(
+        *(preset, model, ResNetConfig(layers=18, stages=3, width=32)),
+        *(ConvApConfig(channels=64, side=6), (144, 192)),
+        compute_dtype="float32",
+        normalisation="local-contrast",
+    )
+    config = from_scratch(TrainConfig(model=whole, trainable="all"))
+    return dataclasses.replace(
+        config,
+        optimiser=dataclasses.replace(config.optimiser, learning_rate=7e-4),
+        augmentation=CameraAugmentConfig(flip=0.5, gamma=0.3, illumination=0.3),
+        epochs=4,
+        validate_every=1,
     )

@@ -32,16 +32,10 @@ def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
     part of the file; here all are shuffled. Its loader's processes forget a query's last negatives
     with each round, which the paper keeps, as is done here.
     """
+    head = AGGREGATORS.make("netvlad", preset)
     mining = MiningConfig(kind="whole", negatives=10, margin=MARGIN)
     return TrainConfig(
-        model=model_over(
-            preset,
-            model,
-            VggConfig(),
-            AGGREGATORS.make("netvlad", preset),
-            (480, 640),
-            compute_dtype="float32",
-        ),
+        model=model_over(preset, model, VggConfig(), head, (480, 640), compute_dtype="float32"),
         loss=LossConfig(kind=TripletConfig(margin=MARGIN, average="all"), miner="none"),
         optimiser=dataclasses.replace(
             _SGD, schedule="milestones", milestones=(4, 9, 14, 19, 24, 29), step_gamma=0.5

@@ -14,6 +14,7 @@ import pytest
 from crisalad_jax.checkpoints.weights import load_weights, model_hash, save_weights
 from crisalad_jax.cli import main
 from crisalad_jax.config.preprocessing import PreprocessingConfig
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments import comparison
 from crisalad_jax.experiments.comparison import (
@@ -27,7 +28,7 @@ from crisalad_jax.experiments.comparison import (
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import init_crisalad
+from crisalad_jax.nn.model import Model, init_crisalad
 from crisalad_jax.utils import locks, temporaries
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
@@ -76,7 +77,10 @@ def test_recalls_are_those_of_the_weights_that_are_left(finished, benchmark):
         run_folder = finished / "crisalad" / f"seed-{seed}" / "run"
         params, model = load_weights(run_folder / "last.safetensors")
         (result,) = evaluate(
-            params, model, benchmark, groupings=("single",), batch_size=BATCH, quiet=True
+            Model(params, model),
+            benchmark,
+            groupings=("single",),
+            reading=Reading(batch_size=BATCH, quiet=True),
         )
         by_seed.append(result.recalls)
         assert json.loads((run_folder / "config.json").read_text())["seed"] == seed
@@ -212,11 +216,11 @@ def test_weights_that_change_behind_their_name_are_refused(
     monkeypatch.delattr(runner, "fit")
     weights, out = tmp_path / "weights.safetensors", tmp_path / "out"
     _, model = load_weights(shared / "weights.safetensors")
-    save_weights(weights, params, model)
+    save_weights(weights, Model(params, model))
     config = ComparisonConfig(**settings | {"train": None, "weights": (f"crisalad={weights}",)})
     summary = run(config, out)
     assert run(config, out).rows == summary.rows
-    save_weights(weights, jax.tree.map(lambda x: x + 1, params), model)
+    save_weights(weights, Model(jax.tree.map(lambda x: x + 1, params), model))
     with pytest.raises(InputError, match=r"out: .*weights\.safetensors: found changed since"):
         run(config, out)
 
@@ -230,7 +234,10 @@ def test_weights_are_not_trained(shared, params, benchmark, settings, tmp_path, 
     single, sequential = summary.rows
     _, model = load_weights(weights)
     expected = evaluate(
-        params, model, benchmark, groupings=("single", "sequential"), batch_size=BATCH, quiet=True
+        Model(params, model),
+        benchmark,
+        groupings=("single", "sequential"),
+        reading=Reading(batch_size=BATCH, quiet=True),
     )
     for row, result in zip((single, sequential), expected, strict=True):
         assert row.grouping == result.grouping
@@ -258,14 +265,16 @@ def test_models_of_any_family_are_lines_of_their_own(shared, benchmark, settings
     for name, config in models.items():
         weights.append(f"{name}={tmp_path / name}.safetensors")
         made = init_crisalad(jax.random.key(1), config)
-        save_weights(tmp_path / f"{name}.safetensors", made, config)
+        save_weights(tmp_path / f"{name}.safetensors", Model(made, config))
     names = names_to_compare(None, weights)
     options = {"train": None, "weights": tuple(weights), "names": names}
     summary = run(ComparisonConfig(**settings | options), tmp_path / "out")
     assert [row.labels for row in summary.rows] == [("ours",), ("netvlad",)]
     for row in summary.rows:
         params, config = load_weights(tmp_path / f"{row.name}.safetensors")
-        (expected,) = evaluate(params, config, benchmark, batch_size=BATCH, quiet=True)
+        (expected,) = evaluate(
+            Model(params, config), benchmark, reading=Reading(batch_size=BATCH, quiet=True)
+        )
         (recalls,) = row.recalls.values()
         assert recalls[1].mean == expected.recalls[1]
         assert row.dimension == config.descriptor_dim
@@ -364,9 +373,9 @@ def test_it_grows_by_a_set_and_a_seed_and_nothing_is_repeated(
         runner, "fit", lambda config, *a, **o: trained.append(config.seed) or fit(config, *a, **o)
     )
 
-    def noted(params, model, benchmark, **options):
+    def noted(model, benchmark, **options):
         evaluated.append((benchmark.root.name, options["seed"]))
-        return evaluate_(params, model, benchmark, **options)
+        return evaluate_(model, benchmark, **options)
 
     monkeypatch.setattr(runner, "evaluate", noted)
     before = stamps(finished)

@@ -1,5 +1,6 @@
 """Images into maps: each described alone, in any portions the same."""
 
+import dataclasses
 import pathlib
 import shutil
 import warnings
@@ -11,15 +12,18 @@ import pytest
 import crisalad_jax.retrieval.maps.build
 from crisalad_jax.data.images import list_images
 from crisalad_jax.data.positions import Positions, utm_positions
-from crisalad_jax.retrieval.alone import describe_alone
-from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.data.sources import ImageSource
+from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.describe import described
+from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.maps.build import Indexed, index_images
 from crisalad_jax.retrieval.maps.build import index as index_source
-from crisalad_jax.retrieval.maps.manifest import describe_map
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.metadata import new_metadata
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
-from tests.conftest import BATCH, MODEL
+from tests.conftest import BATCH, MODEL, describe_single, read_options
 
 
 @pytest.fixture
@@ -28,25 +32,21 @@ def database(town) -> pathlib.Path:
 
 
 def index(folder: pathlib.Path, params, images: pathlib.Path, paths=None, **more) -> Indexed:
-    description = describe_map(params, MODEL, folder / "weights", folder)
-    with open_or_new(folder, description) as target:
+    describer = describer_of(Model(params, MODEL))
+    metadata = new_metadata(describer, folder / "weights", folder)
+    with open_or_new(folder, metadata) as target:
         paths = list_images(images) if paths is None else paths
-        where = utm_positions([path.name for path in paths])
-        return index_images(
-            target,
-            params,
-            images,
-            paths,
-            positions=where,
-            **({"batch_size": BATCH, "quiet": True} | more),
-        )
+        names = [path.relative_to(images).as_posix() for path in paths]
+        where = more.pop("positions", utm_positions([path.name for path in paths]))
+        source = ImageSource(images, paths, names)
+        return index_images(target, describer, source, where, **read_options(more))
 
 
-def open_or_new(folder: pathlib.Path, description):
+def open_or_new(folder: pathlib.Path, metadata):
     if (folder / "map.json").exists():
         with Map.open(folder) as found:
-            description = found.description
-    return open_for_appending(folder, description)
+            metadata = found.metadata
+    return open_for_appending(folder, metadata)
 
 
 def descriptors_of(target: Map) -> np.ndarray:
@@ -56,13 +56,12 @@ def descriptors_of(target: Map) -> np.ndarray:
 def test_each_image_is_described_alone(params, database):
     paths = list_images(database)
     assert len(paths) % BATCH
-    parts = list(describe_alone(params, MODEL, paths, batch_size=BATCH))
+    reading = Reading(batch_size=BATCH)
+    parts = list(described(describer_of(Model(params, MODEL)), paths, reading))
     assert [part.indices.tolist() for part in parts] == [[0, 1, 2, 3], [4, 5, 6]]
     found = np.concatenate([part.descriptors for part in parts])
     # Which test_evaluation compares with batches of one.
-    tokens = read_tokens(params, MODEL, paths, batch_size=BATCH, label="", quiet=True)
-    expected = group(params, MODEL, tokens, "single", batch_size=BATCH)
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(found, describe_single(Model(params, MODEL), paths))
 
 
 @pytest.mark.parametrize("segment", [1, 256])
@@ -103,15 +102,15 @@ def test_a_missing_image_of_a_list_is_left_out(params, database, tmp_path, share
     names = [path.name for path in list_images(database)]
     table = database / "table.csv"
     table.write_text("name,x,y\n" + "".join(f"{name},1,2\n" for name in ["none.jpg", *names]))
-    options = {"weights": shared / "weights.safetensors", "batch_size": BATCH, "quiet": True}
+    model, options = Model(params, MODEL), {"weights": shared / "weights.safetensors"}
     out = tmp_path / "map"
     with pytest.raises(InputError, match=r"line 2: .*none.jpg: found no such file"):
-        index_source(params, MODEL, table, out, **options)
+        index_source(model, table, out, **options, **read_options({}))
     assert not out.exists()
-    result = index_source(params, MODEL, table, out, on_bad_image="skip", **options)
+    result = index_source(model, table, out, **options, **read_options({"on_bad_image": "skip"}))
     assert (result.added, result.positions, result.unreadable) == (7, 7, ["none.jpg"])
     (database / names[0]).unlink()
-    result = index_source(params, MODEL, table, out, on_bad_image="skip", **options)
+    result = index_source(model, table, out, **options, **read_options({"on_bad_image": "skip"}))
     assert (result.added, result.there, result.unreadable) == (0, 7, ["none.jpg"])
 
 
@@ -131,37 +130,38 @@ def test_another_picture_by_the_same_name_is_refused_before_any_work(params, dat
 
 def index_folder(folder: pathlib.Path, params, images: pathlib.Path, **options) -> Indexed:
     """`index` as Python users call it."""
-    options = {"weights": "w.safetensors", "batch_size": BATCH, "quiet": True} | options
-    return crisalad_jax.retrieval.maps.build.index(params, MODEL, images, folder, **options)
+    model = Model(params, options.pop("config", MODEL))
+    options = {"weights": "w.safetensors"} | read_options(options)
+    return crisalad_jax.retrieval.maps.build.index(model, images, folder, **options)
 
 
 def test_a_folder_is_indexed_and_its_map_keeps_its_settings(params, database, tmp_path):
-    """At another size than the model's, which the second call takes from the map."""
-    folder, size = tmp_path / "map", (56, 56)
+    """At another size than the model's, which belongs to the map from then on."""
+    folder, other = tmp_path / "map", MODEL.resized((56, 56))
     paths = list_images(database)
     hidden = paths[-1].rename(tmp_path / paths[-1].name)
-    first = index_folder(folder, params, database, image_size=size, dtype="float16")
+    first = index_folder(folder, params, database, config=other, dtype="float16")
     assert first[:5] == (6, 0, 6, 0, [])
     hidden.rename(paths[-1])
-    second = index_folder(folder, params, database)
+    second = index_folder(folder, params, database, config=other)
     assert (second.added, second.there, second.images) == (1, 6, 7)
-    description = second.description
-    assert (description.config.image_size, description.dtype) == (size, "float16")
-    assert (description.weights, description.store) == (
+    metadata = second.metadata
+    assert (metadata.config["image_size"], metadata.dtype) == ([56, 56], "float16")
+    assert (metadata.weights, metadata.store) == (
         str(pathlib.Path.cwd() / "w.safetensors"),
         "files",
     )
     for options, words in (
+        ({"config": MODEL}, "found images at 42 x 56, .*, expected 56 x 56, .* as in the map"),
         (
-            {"image_size": (42, 56)},
-            r"found image size \(42, 56\), expected \(56, 56\) as in the map",
+            {"config": dataclasses.replace(other, compute_dtype="bfloat16")},
+            "found compute dtype bfloat16, expected float32",
         ),
-        ({"compute_dtype": "bfloat16"}, "found compute dtype bfloat16, expected float32"),
         ({"dtype": "float32"}, "found dtype float32, expected float16"),
         ({"store": "redis"}, "store: found 'redis', expected files or milvus:URI"),
     ):
         with pytest.raises(InputError, match=words):
-            index_folder(folder, params, database, **options)
+            index_folder(folder, params, database, **{"config": other} | options)
 
 
 def test_positions_given_in_python(params, database, tmp_path):

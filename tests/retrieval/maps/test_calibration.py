@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 import crisalad_jax.retrieval.maps.build
-import crisalad_jax.retrieval.maps.follow
+import crisalad_jax.retrieval.maps.tracking
 from crisalad_jax.cli.answers import answer_lines
 from crisalad_jax.data.images import list_images
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.calibrate import calibrate, operating_point_of
 from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.calibration import (
     CALIBRATION,
@@ -28,7 +30,7 @@ from crisalad_jax.retrieval.maps.query import Answers, json_lines, query
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
-from tests.conftest import BATCH, MODEL, random_params
+from tests.conftest import BATCH, MODEL, describe_single, random_params
 
 
 @pytest.fixture(scope="module")
@@ -44,13 +46,11 @@ def made(shared, params, tmp_path_factory) -> pathlib.Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(crisalad_jax.retrieval.maps.build, "SEGMENT", 4)
         index(
-            params,
-            MODEL,
+            Model(params, MODEL),
             images,
             out,
             weights=shared / "weights.safetensors",
-            batch_size=BATCH,
-            quiet=True,
+            reading=Reading(batch_size=BATCH, quiet=True),
         )
     return out
 
@@ -64,7 +64,7 @@ def folder(made, tmp_path) -> pathlib.Path:
 def remembered(folder: pathlib.Path, **changes) -> Calibration:
     """A calibration that was never measured, in the map."""
     with Map.open(folder) as places:
-        model = places.description.model
+        model = places.metadata.model
     calibration = dataclasses.replace(
         Calibration(
             min_similarity=0.5,
@@ -87,7 +87,13 @@ def remembered(folder: pathlib.Path, **changes) -> Calibration:
 
 def ask(folder, params, images, **options) -> Answers:
     with Map.open(folder) as places:
-        return query(places, params, images, batch_size=BATCH, quiet=True, **options)
+        return query(
+            places,
+            images,
+            model=Model(params, places.config),
+            **options,
+            reading=Reading(batch_size=BATCH, quiet=True),
+        )
 
 
 # What is remembered
@@ -95,7 +101,11 @@ def ask(folder, params, images, **options) -> Answers:
 
 def test_a_map_remembers_the_point_of_an_evaluation(folder, params, benchmark):
     (result,) = evaluate(
-        params, MODEL, benchmark, groupings=["single"], batch_size=BATCH, precision=0.4, quiet=True
+        Model(params, MODEL),
+        benchmark,
+        groupings=["single"],
+        precision=0.4,
+        reading=Reading(batch_size=BATCH, quiet=True),
     )
     point = result.operating_point
     assert point is not None
@@ -103,9 +113,15 @@ def test_a_map_remembers_the_point_of_an_evaluation(folder, params, benchmark):
     with Map.open(folder) as places:
         assert places.calibration is None
         assert places.summary()["calibration"] is None
-        found = calibrate(places, params, benchmark, 0.4, batch_size=BATCH, quiet=True)
+        found = calibrate(
+            places,
+            benchmark,
+            0.4,
+            model=Model(params, places.config),
+            reading=Reading(batch_size=BATCH, quiet=True),
+        )
         assert places.calibration is found
-        assert found.model == places.description.model
+        assert found.model == places.metadata.model
     assert operating_point_of(found) == point
     assert (found.benchmark, found.rule, found.database) == (benchmark.name, benchmark.rule, 7)
     with Map.open(folder) as places:
@@ -127,7 +143,12 @@ def test_a_precision_out_of_reach_leaves_what_was_there(folder, params, benchmar
     words = "precision: no similarity reaches a precision of 99 %; the highest is 0.0 %"
     with Map.open(folder) as places:
         with pytest.raises(InputError, match=words):
-            calibrate(places, params, lost, batch_size=BATCH, quiet=True)
+            calibrate(
+                places,
+                lost,
+                model=Model(params, places.config),
+                reading=Reading(batch_size=BATCH, quiet=True),
+            )
         assert places.calibration == before
     with Map.open(folder) as places:
         assert places.calibration == before
@@ -149,15 +170,23 @@ def test_a_similarity_that_rests_on_too_few_answers_is_not_remembered(
     words = f"precision: found 1 answer of similarity .* on {where}, 1 right, .* at least 5.0 %"
     with Map.open(folder) as places:
         with pytest.raises(InputError, match=words):
-            calibrate(places, params, one, precision, batch_size=BATCH, quiet=True)
+            calibrate(
+                places,
+                one,
+                precision,
+                model=Model(params, places.config),
+                reading=Reading(batch_size=BATCH, quiet=True),
+            )
         assert places.calibration is None
     assert not (folder / CALIBRATION).exists()
 
 
 def test_another_model_calibrates_nothing(folder, benchmark):
     changed = jax.tree.map(lambda leaf: np.asarray(leaf) * 1.5, random_params(MODEL))
-    with Map.open(folder) as places, pytest.raises(InputError, match="but the given parameters is"):
-        calibrate(places, changed, benchmark, quiet=True)
+    with Map.open(folder) as places, pytest.raises(InputError, match="but the given model is"):
+        calibrate(
+            places, benchmark, model=Model(changed, places.config), reading=Reading(quiet=True)
+        )
     assert not (folder / CALIBRATION).exists()
 
 
@@ -193,9 +222,20 @@ def test_a_damaged_calibration_is_named_and_may_be_left_out(folder, params, benc
     with pytest.raises(InputError, match=r"calibration\.json: .*; the file may be removed"):
         Map.open(folder)
     with Map.open(folder, calibrated=False) as places:
-        answers = query(places, params, queries, batch_size=BATCH, quiet=True)
+        answers = query(
+            places,
+            queries,
+            model=Model(params, places.config),
+            reading=Reading(batch_size=BATCH, quiet=True),
+        )
         assert list(json_lines(answers)) == list(json_lines(plain))
-        calibrate(places, params, benchmark, 0.4, batch_size=BATCH, quiet=True)
+        calibrate(
+            places,
+            benchmark,
+            0.4,
+            model=Model(params, places.config),
+            reading=Reading(batch_size=BATCH, quiet=True),
+        )
     with Map.open(folder) as places:
         assert places.calibration is not None
 
@@ -203,13 +243,11 @@ def test_a_damaged_calibration_is_named_and_may_be_left_out(folder, params, benc
 def test_a_map_with_a_calibration_grows(folder, params, shared, queries):
     before = remembered(folder)
     grown = index(
-        params,
-        MODEL,
+        Model(params, MODEL),
         queries,
         folder,
         weights=shared / "weights.safetensors",
-        batch_size=BATCH,
-        quiet=True,
+        reading=Reading(batch_size=BATCH, quiet=True),
     )
     assert grown.images == 12
     with Map.open(folder) as places:
@@ -279,15 +317,12 @@ def test_a_similarity_equal_to_the_least_is_known():
 def test_a_followed_camera_is_that_of_the_filter(made, params, queries, monkeypatch, numbers):
     """In portions of two frames, and at once; the map has two segments. Names say @UTM positions,
     so that it moves in metres."""
-    monkeypatch.setattr(crisalad_jax.retrieval.maps.follow, "_NUMBERS", numbers)
+    monkeypatch.setattr(crisalad_jax.retrieval.maps.tracking, "_NUMBERS", numbers)
     settings = BayesFilter(reach=1)
     found = ask(made, params, queries, k=3, sequence=settings)
     with Map.open(made) as places:
         rows = np.concatenate(list(places.descriptors)).astype(np.float64)
-    described = crisalad_jax.retrieval.maps.build.describe_alone(
-        params, MODEL, list_images(queries), batch_size=BATCH
-    )
-    asked = np.concatenate([part.descriptors for part in described]).astype(np.float64)
+    asked = describe_single(Model(params, MODEL), list_images(queries)).astype(np.float64)
     similarities = asked @ rows.T
     spots = [
         np.array([path.name.split("@")[1:3] for path in list_images(side)], float)

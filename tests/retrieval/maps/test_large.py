@@ -12,16 +12,17 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.images import list_images
-from crisalad_jax.retrieval.maps import shared as shared_module
-from crisalad_jax.retrieval.maps.build import Indexed, describe_alone, index
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.maps.build import Indexed, index
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.query import query
 from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, save_pca
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
-from tests.conftest import BATCH, MODEL
+from tests.conftest import BATCH, MODEL, describe_single, read_options
 from tests.data.test_sources import write_jpeg
-from tests.killed_appends import append_until, description, names, rows
+from tests.killed_appends import append_until, metadata, names, rows
 from tests.retrieval.maps.test_stores import brute_force
 
 ROOT = pathlib.Path(__file__).parents[3]
@@ -43,8 +44,7 @@ def whole(shared, params, database, tmp_path_factory) -> pathlib.Path:
 
 def run(shared, params, images, out, **options) -> Indexed:
     weights = shared / "weights.safetensors"
-    options = {"batch_size": BATCH, "quiet": True} | options
-    return index(params, MODEL, images, out, weights=weights, **options)
+    return index(Model(params, MODEL), images, out, weights=weights, **read_options(options))
 
 
 def contents(folder: pathlib.Path) -> tuple[list, bytes]:
@@ -111,14 +111,15 @@ def test_shares_add_to_a_map(shared, params, database, whole, tmp_path):
 def test_a_join_that_is_cut_short_goes_on(shared, params, database, whole, tmp_path, monkeypatch):
     out = tmp_path / "map"
     run(shared, params, database, out, share="0/2")
-    real = shared_module._add
+    real = Map.append
 
-    def cut(target: Map, *rest: Any) -> None:
-        real(target, *rest)
-        raise KeyboardInterrupt
+    def cut(target: Map, *given: Any, **options: Any) -> None:
+        real(target, *given, **options)
+        if target.folder == out:
+            raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(shared_module, "_add", cut)
+        patch.setattr(Map, "append", cut)
         with pytest.raises(KeyboardInterrupt):
             run(shared, params, database, out, share="1/2")
     assert len(contents(out)[0]) == 4
@@ -184,14 +185,18 @@ def test_a_map_of_components_shortens_queries_too(shared, params, database, whol
     value = json.loads((out / "map.json").read_text())
     assert (value["format"], value["descriptor_length"]) == (4, 3)
     queries = list_images(shared / "town" / "images" / "test" / "queries")
-    asked = np.concatenate(
-        [part.descriptors for part in describe_alone(params, MODEL, queries, batch_size=BATCH)]
-    )
+    asked = describe_single(Model(params, MODEL), queries)
     with Map.open(out) as places:
         stored = np.concatenate(list(places.descriptors))
         # Products of other shapes round otherwise, by some units in the last place.
         np.testing.assert_allclose(stored, fitted.apply(full), atol=1e-5)
-        answers = query(places, params, queries, k=3, batch_size=BATCH, quiet=True)
+        answers = query(
+            places,
+            queries,
+            model=Model(params, places.config),
+            k=3,
+            reading=Reading(batch_size=BATCH, quiet=True),
+        )
     expected = brute_force(fitted.apply(full), fitted.apply(asked), 3)
     np.testing.assert_array_equal(answers.neighbours.indices, expected)
     other = fit_pca(full, 2)
@@ -222,7 +227,7 @@ def grown(tmp_path) -> pathlib.Path:
 
 
 def build(folder: pathlib.Path, kind: str) -> float | None:
-    with open_for_appending(folder, description("files")) as target:
+    with open_for_appending(folder, metadata("files")) as target:
         return target.build_search(kind)
 
 
@@ -265,7 +270,7 @@ def test_candidates_come_from_the_index(grown, monkeypatch):
 
 def test_a_map_that_grew_is_searched_exactly(grown):
     build(grown, "hnsw")
-    with open_for_appending(grown, description("files")) as target:
+    with open_for_appending(grown, metadata("files")) as target:
         target.append(names(40, 1), [7], rows(40, 1), root="/images")
     with Map.open(grown) as places:
         with warnings.catch_warnings():
@@ -325,7 +330,7 @@ def test_codes_find_most_neighbours(tmp_path):
     views = centres[np.repeat(np.arange(500), 20)]
     views += 0.3 * generator.standard_normal(views.shape).astype(np.float32)
     views /= np.linalg.norm(views, axis=1, keepdims=True)
-    with open_for_appending(tmp_path / "map", description("files")) as target:
+    with open_for_appending(tmp_path / "map", metadata("files")) as target:
         for start in range(0, len(views), 1000):
             part = views[start : start + 1000]
             target.append(names(start, len(part)), [7] * len(part), part, root="/images")

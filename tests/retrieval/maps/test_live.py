@@ -8,14 +8,16 @@ import pytest
 
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.live import Camera, FolderWatch, Frame
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.video import list_frames
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.live import latency_words, query_live
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import json_lines, query
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
-from tests.conftest import BATCH, MODEL, write_video
+from tests.conftest import BATCH, MODEL, read_options, write_video
 from tests.retrieval.maps.test_stores import ROUNDING
 
 
@@ -25,7 +27,13 @@ def folder(shared, params, tmp_path_factory):
     out = tmp_path_factory.mktemp("live") / "map"
     images = shared / "town" / "images" / "test" / "database"
     weights = shared / "weights.safetensors"
-    index(params, MODEL, images, out, weights=weights, batch_size=BATCH, quiet=True)
+    index(
+        Model(params, MODEL),
+        images,
+        out,
+        weights=weights,
+        reading=Reading(batch_size=BATCH, quiet=True),
+    )
     return out
 
 
@@ -50,10 +58,20 @@ def test_the_answers_are_those_of_query(folder, shared, params, window):
     source = Given(paths)
     with Map.open(folder) as places:
         expected = query(
-            places, params, paths[0].parent, k=2, window=window, batch_size=BATCH, quiet=True
+            places,
+            paths[0].parent,
+            model=Model(params, places.config),
+            k=2,
+            window=window,
+            reading=Reading(batch_size=BATCH, quiet=True),
         )
         stream = query_live(
-            places, params, source, k=2, window=window, ready=lambda: seen.append(source.taken)
+            places,
+            source,
+            model=Model(params, places.config),
+            k=2,
+            window=window,
+            ready=lambda: seen.append(source.taken),
         )
         seen = []
         assert not seen  # nothing is compiled before the first answer is asked for
@@ -81,27 +99,40 @@ def test_a_watched_folder_and_a_camera(folder, shared, params, tmp_path):
     shutil.copy(image, tmp_path / "in")
     video = write_video(tmp_path / "walk.avi", 4)
     with Map.open(folder) as places:
-        first = next(query_live(places, params, watch, k=1))
+        first = next(query_live(places, watch, model=Model(params, places.config), k=1))
         line = json.loads(first.json_line())
         assert line["neighbours"][0]["name"] == image.name
         assert 0 < line["latency_ms"] < 60_000
         with Camera(video) as camera:
-            last = list(query_live(places, params, camera, k=1))[-1]
+            last = list(query_live(places, camera, model=Model(params, places.config), k=1))[-1]
     assert (last.time, json.loads(last.json_line())["query"]) == (0.3, "walk.avi#t=0.300")
 
 
 def test_a_map_of_a_video_tells_times(shared, params, tmp_path):
     video = write_video(tmp_path / "walk.avi", 21)
-    more = {"weights": shared / "weights.safetensors", "batch_size": BATCH, "quiet": True}
-    made = index(params, MODEL, video, tmp_path / "map", fps=1, **more)
+    more = {"weights": shared / "weights.safetensors"} | read_options({})
+    made = index(Model(params, MODEL), video, tmp_path / "map", fps=1, **more)
     assert (made.added, made.positions) == (3, 0)
-    made = index(params, MODEL, video, tmp_path / "map", fps=2, **more)
+    made = index(Model(params, MODEL), video, tmp_path / "map", fps=2, **more)
     assert (made.added, made.there) == (2, 3)
     with Map.open(tmp_path / "map") as places:
         assert {image.root for image in places.images} == {tmp_path.resolve().as_posix()}
         assert places.images[1].bytes == video.stat().st_size
-        answers = query(places, params, list_frames(video, 1)[2], k=1, batch_size=BATCH, quiet=True)
-        whole = query(places, params, video, fps=2, k=1, batch_size=BATCH, quiet=True)
+        answers = query(
+            places,
+            list_frames(video, 1)[2],
+            model=Model(params, places.config),
+            k=1,
+            reading=Reading(batch_size=BATCH, quiet=True),
+        )
+        whole = query(
+            places,
+            video,
+            model=Model(params, places.config),
+            fps=2,
+            k=1,
+            reading=Reading(batch_size=BATCH, quiet=True),
+        )
     (line,) = map(json.loads, json_lines(answers))
     assert (line["query"], line["time"]) == ("walk.avi#t=2.000", 2.0)
     assert line["neighbours"][0] == {
@@ -124,22 +155,36 @@ def test_latencies_in_words():
 def test_what_is_refused(folder, params):
     with Map.open(folder) as places:
         with pytest.raises(InputError, match="k: found 0, expected at least 1"):
-            query_live(places, params, Given([]), k=0)
+            query_live(places, Given([]), model=Model(params, places.config), k=0)
         with pytest.raises(InputError, match="window: found 0, expected at least 1"):
-            query_live(places, params, Given([]), window=0)
+            query_live(places, Given([]), model=Model(params, places.config), window=0)
 
 
 def test_a_filter_and_a_least_similarity_are_those_of_query(folder, shared, params):
     paths = list_images(shared / "town" / "images" / "test" / "queries")
     with Map.open(folder) as places:
         options = {"k": 2, "sequence": BayesFilter(reach=1)}
-        best = query(places, params, paths, k=1, batch_size=BATCH, quiet=True).neighbours
+        best = query(
+            places,
+            paths,
+            model=Model(params, places.config),
+            k=1,
+            reading=Reading(batch_size=BATCH, quiet=True),
+        ).neighbours
         # In the widest gap between two of the queries: rounding does not decide.
         ordered = np.sort(best.similarities[:, 0])
         below = int(np.argmax(np.diff(ordered))) + 1
         options["min_similarity"] = float(ordered[below - 1] + ordered[below]) / 2
-        expected = query(places, params, paths, batch_size=BATCH, quiet=True, **options)
-        found = list(query_live(places, params, Given(paths), **options))
+        expected = query(
+            places,
+            paths,
+            model=Model(params, places.config),
+            **options,
+            reading=Reading(batch_size=BATCH, quiet=True),
+        )
+        found = list(
+            query_live(places, Given(paths), model=Model(params, places.config), **options)
+        )
     lines = [json.loads(answer.json_line()) for answer in found]
     for line, right in zip(lines, map(json.loads, json_lines(expected)), strict=True):
         assert line["known"] == right["known"]

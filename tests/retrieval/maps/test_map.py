@@ -17,25 +17,27 @@ import pyproj
 import pytest
 
 import crisalad_jax.retrieval.maps.map
-from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.positions import Positions, utm_positions
+from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.describer import describer_of
+from crisalad_jax.retrieval.maps.build import _append_share
 from crisalad_jax.retrieval.maps.file_store import FileStore
-from crisalad_jax.retrieval.maps.head import check_model, write_record
-from crisalad_jax.retrieval.maps.manifest import describe_map, read_description
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
-from crisalad_jax.retrieval.maps.shared import _add
+from crisalad_jax.retrieval.maps.metadata import check_model, new_metadata, read_metadata
+from crisalad_jax.retrieval.segments import write_record
 from crisalad_jax.utils.checksums import checksummed_json
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.output import Note
 from tests import killed_appends
 from tests.conftest import MODEL, random_params
-from tests.killed_appends import append_until, description, names, rows
+from tests.killed_appends import append_until, metadata, names, rows
 from tests.retrieval.maps.test_stores import brute_force
 from tests.utils.test_checksums import flips
 
 ROOT = pathlib.Path(__file__).parents[3]
 LENGTH = killed_appends.LENGTH
+DESCRIBER = describer_of(Model(random_params(MODEL), MODEL))
 
 
 def killed(how: str, folder: pathlib.Path, store: str = "files", kills: int = 0, longest=0.0):
@@ -94,7 +96,7 @@ def test_a_map_lists_its_folders_additions_and_extent(tmp_path, monkeypatch):
         ("/videos", ["walk.mp4#t=0.500", "walk.mp4#t=12.250"]),
         ("/videos", ["@3@4@32@N@.jpg", "@1@5@32@N@.jpg"]),
     ]
-    with open_for_appending(tmp_path / "map", description("files")) as target:
+    with open_for_appending(tmp_path / "map", metadata("files")) as target:
         for root, new in parts:
             first = len(target)
             where = utm_positions(new)
@@ -172,7 +174,7 @@ def test_descriptors_without_a_record_are_removed_with_a_note(folder):
 )
 def test_a_map_that_lost_its_only_record_is_refused(tmp_path, told, value):
     folder = tmp_path / "map"
-    with open_for_appending(folder, description("files")) as target:
+    with open_for_appending(folder, metadata("files")) as target:
         target.append(names(0, 3), [7] * 3, rows(0, 3), root="/images")
     (folder / told).parent.mkdir(exist_ok=True)
     (folder / told).write_bytes(b"")
@@ -211,7 +213,7 @@ def test_more_descriptors_without_a_record_than_a_kill_leaves_are_refused(folder
 
 def test_what_was_appended_is_there_by_number_name_and_position(tmp_path):
     where = Positions(("lat", "lon"), {"a.jpg": (1.25, -2.5), "c.jpg": (3.0, 4.0)})
-    with open_for_appending(tmp_path / "map", description("files")) as target:
+    with open_for_appending(tmp_path / "map", metadata("files")) as target:
         target.append(["a.jpg", "b.jpg"], [10, 20], rows(0, 2), root="/x", positions=where)
         assert len(target) == 2
         target.append(["c.jpg"], [30], rows(2, 1), root="/y", positions=where)
@@ -225,7 +227,7 @@ def test_what_was_appended_is_there_by_number_name_and_position(tmp_path):
         assert found.image("b.jpg") == found.images[1]
         assert found.image("d.jpg") is None
         np.testing.assert_array_equal(np.concatenate(list(found.descriptors)), rows(0, 3))
-        assert found.description == description("files")
+        assert found.metadata == metadata("files")
 
 
 @pytest.mark.parametrize("k", [1, 3, 7, 100])
@@ -345,18 +347,18 @@ def test_who_edits_the_description_removes_its_checksum(folder):
 
 
 def test_a_description_is_read_as_it_was_written(tmp_path):
-    made = describe_map(random_params(MODEL), MODEL, tmp_path / "w.safetensors", tmp_path / "map")
+    made = new_metadata(DESCRIBER, tmp_path / "w.safetensors", tmp_path / "map")
     with open_for_appending(tmp_path / "map", made) as target:
-        assert target.description == made
-    assert read_description(tmp_path / "map") == made
+        assert target.metadata == made
+    assert read_metadata(tmp_path / "map") == made
     assert made.descriptor_length == MODEL.descriptor_dim
     assert (made.grouping, made.format, made.store) == ("single", 4, "files")
-    other = describe_map(random_params(MODEL), MODEL, tmp_path / "w", tmp_path / "map")
+    other = new_metadata(DESCRIBER, tmp_path / "w", tmp_path / "map")
     assert made.collection != other.collection
 
 
 def test_another_model_is_refused_by_both_hashes():
-    made = dataclasses.replace(description("files"), model="a" * 64, weights="/w/old.safetensors")
+    made = dataclasses.replace(metadata("files"), model="a" * 64, weights="/w/old.safetensors")
     check_model(made, "map", "a" * 64, "new")
     words = (
         r"map: found a map made by model a{12} \(/w/old\.safetensors\), but new is model b{12}: "
@@ -371,9 +373,9 @@ def test_another_model_is_refused_by_both_hashes():
 
 def test_one_process_appends_at_a_time(folder):
     with (
-        open_for_appending(folder, description("files")),
+        open_for_appending(folder, metadata("files")),
         pytest.raises(InputError, match="map: found another process that writes here") as error,
-        open_for_appending(folder, description("files")),
+        open_for_appending(folder, metadata("files")),
     ):
         pass
     assert f"(process {os.getpid()} on {socket.gethostname()})" in str(error.value)
@@ -435,7 +437,7 @@ def test_a_damaged_map_is_one_line(folder, spoil, words, write):
     spoil(folder)
     with (
         pytest.raises(InputError) as error,
-        open_for_appending(folder, description("files")) if write else Map.open(folder),
+        open_for_appending(folder, metadata("files")) if write else Map.open(folder),
     ):
         pass
     assert words in str(error.value)
@@ -449,7 +451,7 @@ def test_what_is_no_map_is_refused_and_left_alone(tmp_path):
     for name, words in (("file", "found a file"), ("photos", r"found a\.jpg and no map\.json")):
         with pytest.raises(InputError, match=f"{name}: {words}"):
             Map.open(tmp_path / name)
-        opening = open_for_appending(tmp_path / name, description("files"))
+        opening = open_for_appending(tmp_path / name, metadata("files"))
         with pytest.raises(InputError, match=f"{name}: {words}"), opening:
             pass
     assert os.listdir(tmp_path / "photos") == ["a.jpg"]
@@ -459,7 +461,7 @@ def test_what_is_no_map_is_refused_and_left_alone(tmp_path):
 
 
 def test_another_description_does_not_append(folder):
-    other = dataclasses.replace(description("files"), dtype="float16")
+    other = dataclasses.replace(metadata("files"), dtype="float16")
     with (
         pytest.raises(InputError, match="map: found another map than was expected"),
         open_for_appending(folder, other),
@@ -483,7 +485,7 @@ def test_another_description_does_not_append(folder):
     ],
 )
 def test_what_cannot_be_appended_changes_nothing(folder, new, descriptors, words):
-    with open_for_appending(folder, description("files")) as target:
+    with open_for_appending(folder, metadata("files")) as target:
         with pytest.raises(InputError, match=words):
             target.append(new, [7] * len(new), descriptors, root="/images")
         assert len(target) == 7
@@ -492,7 +494,7 @@ def test_what_cannot_be_appended_changes_nothing(folder, new, descriptors, words
 
 
 def test_positions_of_a_map_are_of_one_kind(folder):
-    with open_for_appending(folder, description("files")) as target:
+    with open_for_appending(folder, metadata("files")) as target:
         for number, axes in ((7, ("east", "north")), (8, ("lat", "lon"))):
             where = Positions(axes, {f"{number}.jpg": (1.0, 2.0)})
             if number == 8:
@@ -509,7 +511,7 @@ NEXT = "@0939500.00@5420600.00@31@U@@@@@@@@@@@.jpg"
 def test_a_map_has_metres_of_one_zone(folder):
     """Images of a neighbouring zone get the numbers that pyproj gives them in the map's."""
     into = pyproj.Transformer.from_crs("EPSG:32631", "EPSG:32632", always_xy=True)
-    with open_for_appending(folder, description("files")) as target:
+    with open_for_appending(folder, metadata("files")) as target:
         target.append([FIRST], [7], rows(7, 1), root="/", positions=utm_positions([FIRST]))
         target.append([NEXT], [7], rows(8, 1), root="/", positions=utm_positions([NEXT]))
         degrees = Positions(("lat", "lon"), {"a.jpg": (48.85, 9.0)})
@@ -527,10 +529,11 @@ def test_a_map_has_metres_of_one_zone(folder):
         first, second, third = (image.position for image in places.images[-3:])
         assert (places.axes, places.zone) == (("east", "north"), (32, False))
         assert places.summary()["zone"] == "32 north"
-        # As a process adds its share of the images.
-        with open_for_appending(folder.parent / "whole", description("files")) as whole:
-            _add(whole, places.images[-3:], rows(7, 3), places)
-            assert (whole.axes, whole.zone) == (places.axes, places.zone)
+    # As a process adds its share of the images.
+    with open_for_appending(folder.parent / "whole", metadata("files")) as whole:
+        _append_share(whole, folder, lambda count: None)
+        assert (whole.axes, whole.zone) == (("east", "north"), (32, False))
+        assert [image.position for image in whole.images[-3:]] == [first, second, third]
     assert first == (499000.0, 5411000.0)
     # Rounded to a tenth of a millimetre; the series is as exact.
     np.testing.assert_allclose(second, into.transform(939500, 5420600), atol=3e-4)
@@ -546,7 +549,7 @@ def test_names_of_several_zones_make_a_map_of_degrees(folder):
     # Ten metres of the plane are 10.004 m on the ground, of 110,574 m a degree.
     assert both.of[north] == (pytest.approx(10.004 / 110_574, abs=1e-9), 9.0)
     assert both.of[south] == (pytest.approx(-10.004 / 110_574, abs=1e-9), 9.0)
-    with open_for_appending(folder, description("files")) as target:
+    with open_for_appending(folder, metadata("files")) as target:
         target.append([south, north], [7, 7], rows(7, 2), root="/", positions=both)
         target.append([FIRST], [7], rows(9, 1), root="/", positions=utm_positions([FIRST]))
         back = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:4326")
@@ -571,7 +574,7 @@ def test_queries_that_are_none_are_refused(folder, queries, k, words):
 
 
 def test_a_map_without_images_answers_nothing(tmp_path):
-    with open_for_appending(tmp_path / "map", description("files")) as target:
+    with open_for_appending(tmp_path / "map", metadata("files")) as target:
         assert len(target) == 0
         with pytest.raises(InputError, match="map: found a map without images"):
             target.search(rows(0, 1), 1)
@@ -583,12 +586,12 @@ def test_a_map_without_images_answers_nothing(tmp_path):
 def test_a_map_that_fails_before_it_has_images_is_removed(tmp_path, there):
     """Also what was written of a first addition that does not count."""
     if there:
-        with open_for_appending(tmp_path / "map", description("files")):
+        with open_for_appending(tmp_path / "map", metadata("files")):
             pass
 
     def fail() -> None:
-        with open_for_appending(tmp_path / "map", description("files")) as target:
-            target._store.add(0, rows(0, 2))
+        with open_for_appending(tmp_path / "map", metadata("files")) as target:
+            target._segments.store.add(0, rows(0, 2))
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
@@ -599,7 +602,7 @@ def test_a_map_that_fails_before_it_has_images_is_removed(tmp_path, there):
 def test_a_map_that_fails_once_it_has_images_keeps_them(tmp_path):
 
     def fail() -> None:
-        with open_for_appending(tmp_path / "map", description("files")) as target:
+        with open_for_appending(tmp_path / "map", metadata("files")) as target:
             target.append(names(0, 1), [7], rows(0, 1), root="/images")
             raise ZeroDivisionError
 
@@ -611,7 +614,7 @@ def test_a_map_that_fails_once_it_has_images_keeps_them(tmp_path):
 def test_what_others_put_into_a_map_that_fails_is_kept(tmp_path):
 
     def fail() -> None:
-        with open_for_appending(tmp_path / "map", description("files")):
+        with open_for_appending(tmp_path / "map", metadata("files")):
             (tmp_path / "map" / "notes.txt").write_text("x")
             raise ZeroDivisionError
 
@@ -623,12 +626,12 @@ def test_what_others_put_into_a_map_that_fails_is_kept(tmp_path):
 
 
 def test_a_map_without_images_is_made_anew_as_another(tmp_path):
-    with open_for_appending(tmp_path / "map", description("files")):
+    with open_for_appending(tmp_path / "map", metadata("files")):
         pass
-    other = dataclasses.replace(description("files"), dtype="float16", model="1" * 64)
+    other = dataclasses.replace(metadata("files"), dtype="float16", model="1" * 64)
     with open_for_appending(tmp_path / "map", other) as target:
         target.append(names(0, 1), [7], rows(0, 1), root="/images")
-    assert read_description(tmp_path / "map") == other
+    assert read_metadata(tmp_path / "map") == other
 
 
 @pytest.mark.parametrize("value", [np.nan, 2.0])
@@ -644,10 +647,10 @@ def test_a_row_of_a_file_that_is_no_descriptor_is_named(folder, value):
 def test_a_map_in_milvus_that_was_killed_before_it_had_images_goes_on(tmp_path):
     """The file is not there yet; or the collection is, but without its index."""
     for number in range(2):
-        made = description("milvus:rows.db")
+        made = metadata("milvus:rows.db")
         folder = tmp_path / str(number)
         folder.mkdir()
-        write_json(folder / "map.json", to_plain(made))
+        write_json(folder / "map.json", dataclasses.asdict(made))
         if number:
             client = pymilvus.MilvusClient(str(folder / "rows.db"))
             schema = client.create_schema(auto_id=False)

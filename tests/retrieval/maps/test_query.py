@@ -16,6 +16,8 @@ from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.cli.answers import answer_lines
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.live import FolderWatch, Frame
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.live import query_live
@@ -27,7 +29,7 @@ from crisalad_jax.retrieval.maps.query import (
     write_answers,
 )
 from crisalad_jax.utils.errors import InputError
-from tests.conftest import BATCH, MODEL, random_params
+from tests.conftest import BATCH, MODEL, random_params, read_options
 from tests.retrieval.maps.test_stores import ROUNDING
 
 
@@ -42,13 +44,24 @@ def sides(shared) -> tuple[pathlib.Path, pathlib.Path]:
 def folder(shared, params, sides, tmp_path_factory) -> pathlib.Path:
     out = tmp_path_factory.mktemp("maps") / "map"
     weights = shared / "weights.safetensors"
-    index(params, MODEL, sides[0], out, weights=weights, batch_size=BATCH, quiet=True)
+    index(
+        Model(params, MODEL),
+        sides[0],
+        out,
+        weights=weights,
+        reading=Reading(batch_size=BATCH, quiet=True),
+    )
     return out
 
 
 def ask(folder, params, images, **options) -> Answers:
     with Map.open(folder) as places:
-        return query(places, params, images, batch_size=BATCH, quiet=True, **options)
+        return query(
+            places,
+            images,
+            model=Model(params, places.config),
+            **read_options(options),
+        )
 
 
 @pytest.fixture(scope="module")
@@ -151,24 +164,30 @@ def test_lines_for_people(answers):
         ([], {}, "images: found none, expected images or folders of them"),
         (["none.jpg"], {}, "none.jpg: found no such file"),
         (["none.jpg"], {"k": 0}, "k: found 0, expected at least 1"),
-        (["none.jpg"], {"batch_size": 0}, "batch size: found 0"),
     ],
 )
 def test_what_is_refused(folder, params, images, options, words):
     with Map.open(folder) as places, pytest.raises(InputError, match=words):
-        query(places, params, images, quiet=True, **options)
+        query(
+            places,
+            images,
+            model=Model(params, places.config),
+            **options,
+            reading=Reading(quiet=True),
+        )
 
 
 def test_the_model_of_a_map(folder, shared, params, tmp_path):
     with Map.open(folder) as places:
-        found = places.load_params()
-        np.testing.assert_array_equal(found.backbone.cls_token, params.backbone.cls_token)
+        found = places.load_model()
+        np.testing.assert_array_equal(found.params.backbone.cls_token, params.backbone.cls_token)
+        assert found.config == places.config
         other = tmp_path / "other.safetensors"
         changed = random_params(MODEL)
         changed.backbone.__dict__["cls_token"] = changed.backbone.cls_token + 1
-        save_weights(other, changed, MODEL)
+        save_weights(other, Model(changed, MODEL))
         with pytest.raises(InputError, match=r"found a map made by model .* is model"):
-            places.load_params(other)
+            places.load_model(other)
 
 
 def test_a_summary(folder, shared):
@@ -182,7 +201,7 @@ def test_a_summary(folder, shared):
 def test_parameters_of_another_model_are_refused(folder, params, sides):
     """Also where they have the same shapes, and answers would come."""
     other = jax.tree.map(lambda x: x + 1, params)
-    with pytest.raises(InputError, match=r"found a map made by model \w+ .*, but the given param"):
+    with pytest.raises(InputError, match=r"found a map made by model \w+ .*, but the given model"):
         ask(folder, other, sides[1])
 
 
@@ -199,7 +218,9 @@ def test_one_picture_is_located_as_by_a_query(folder, params, answers):
                 atol=5e-6,
             )
             assert [answer.rank for answer in found] == [1, 2, 3]
-    assert len(places.locate(answers.queries[0], k=10**6, params=params)) == len(places)
+    assert len(
+        places.locate(answers.queries[0], k=10**6, model=Model(params, places.config))
+    ) == len(places)
 
 
 @pytest.mark.parametrize("last", [(), (1,)], ids=["mono8", "one channel"])
@@ -217,7 +238,7 @@ def test_grey_is_located_as_its_three_channels(folder, answers, last):
             for each in (picture, repeated):
                 yield Frame("camera", 1.5, each, 0.0)
 
-    first, second = query_live(places, places.load_params(), Node(), k=3)
+    first, second = query_live(places, Node(), k=3)
     assert list(first.answers.rows()) == list(second.answers.rows())
 
 
@@ -233,11 +254,11 @@ def test_a_map_of_thermal_images_reads_queries_as_it_was_made(tmp_path, shared, 
         for name, values in (("thermal", thermal), ("by_hand", by_hand)):
             (tmp_path / name).mkdir(exist_ok=True)
             cv2.imwrite(str(tmp_path / name / f"{number}.png"), values)
-    options = {"weights": weights, "batch_size": BATCH, "quiet": True}
+    options = {"weights": weights} | read_options({})
     out = tmp_path / "map"
-    way = {"resize": ["contrast-stretch"]}
-    index(params, MODEL, tmp_path / "thermal", out, **options, **way)
-    index(params, MODEL, tmp_path / "by_hand", tmp_path / "map2", **options)
+    stretched = MODEL.resized(None, ["contrast-stretch"])
+    index(Model(params, stretched), tmp_path / "thermal", out, **options)
+    index(Model(params, MODEL), tmp_path / "by_hand", tmp_path / "map2", **options)
     places, expected = Map.open(out), Map.open(tmp_path / "map2")
     np.testing.assert_array_equal(
         np.concatenate(list(places.descriptors)), np.concatenate(list(expected.descriptors))
@@ -252,16 +273,17 @@ def test_a_map_of_thermal_images_reads_queries_as_it_was_made(tmp_path, shared, 
         ]
     watch = FolderWatch(tmp_path)
     shutil.copy(one, tmp_path / "new.png")
-    live = next(query_live(places, params, watch, k=3))
-    asked = query(places, params, one, k=3, quiet=True)
+    live = next(query_live(places, watch, model=Model(params, places.config), k=3))
+    asked = query(places, one, model=Model(params, places.config), k=3, reading=Reading(quiet=True))
     for each in (live.answers, asked):
         ((_, ranked),) = each.rows()
         assert [answer.image.name for answer in ranked] == [answer.image.name for answer in right]
         # Batches of one and of many round otherwise.
         assert ranked[0].similarity == pytest.approx(right[0].similarity, abs=5e-6)
     # More images in another way are refused, as in any map.
+    other = MODEL.resized(None, ["high-byte"])
     with pytest.raises(InputError, match=r"expected .*contrast-stretch as in the map"):
-        index(params, MODEL, tmp_path / "thermal", out, **options, resize=["high-byte"])
+        index(Model(params, other), tmp_path / "thermal", out, **options)
 
 
 def test_what_locate_refuses(folder, params, answers):
@@ -273,18 +295,22 @@ def test_what_locate_refuses(folder, params, answers):
     with pytest.raises(InputError, match="image: found float64 of shape"):
         places.locate(np.zeros((8, 8, 3)))
     with pytest.raises(InputError, match="found a map made by model"):
-        places.locate(answers.queries[0], params=jax.tree.map(lambda x: x + 1, params))
+        places.locate(
+            answers.queries[0], model=Model(jax.tree.map(lambda x: x + 1, params), places.config)
+        )
 
 
 @pytest.mark.parametrize("k", [1.5, 2.0, "3", None, True, np.float32(1)])
 def test_a_number_of_answers_is_a_whole_number(folder, params, answers, k):
     with Map.open(folder) as places:
-        rows = np.eye(1, places.head.descriptor_length, dtype=np.float32)
+        rows = np.eye(1, places.metadata.descriptor_length, dtype=np.float32)
         for ask_for in (
             lambda: places.locate(answers.queries[0], k=k),
             lambda: places.search(rows, k),
-            lambda: query(places, params, answers.queries, k=k),
-            lambda: query_live(places, params, FolderWatch(folder), k=k),
+            lambda: query(places, answers.queries, model=Model(params, places.config), k=k),
+            lambda: query_live(
+                places, FolderWatch(folder), model=Model(params, places.config), k=k
+            ),
         ):
             with pytest.raises(InputError, match=r"k: found .*, expected a whole number"):
                 ask_for()

@@ -3,15 +3,14 @@
 import fcntl
 import os
 import pathlib
+import sys
 
 import numpy as np
 import pymilvus
 import pytest
 
-from crisalad_jax.retrieval.maps import file_store
 from crisalad_jax.retrieval.maps import milvus_store as milvus
 from crisalad_jax.retrieval.maps.store import Store, open_store, store_name
-from crisalad_jax.retrieval.maps.ties import lower_first
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.search import search
 from crisalad_jax.utils.errors import InputError
@@ -20,12 +19,6 @@ LENGTH = 24
 # Sums of 24 products of float32 below one, in whatever order.
 ROUNDING = 2e-6
 STORES = ("files", "milvus:rows.db")
-
-
-@pytest.fixture(params=[0, file_store._FEW], ids=["FAISS", "numpy"], autouse=True)
-def _largest(request, monkeypatch):
-    """Rank products by FAISS, as of many queries, and by numpy."""
-    monkeypatch.setattr(file_store, "_FEW", request.param)
 
 
 def unit_rows(count: int, seed: int = 0, length: int = LENGTH) -> np.ndarray:
@@ -315,11 +308,10 @@ def test_a_server_gets_the_token_of_the_environment(tmp_path, monkeypatch):
 
 
 def test_milvus_is_asked_for_when_it_is_not_installed(tmp_path, monkeypatch):
-    find = milvus.importlib.util.find_spec
-    monkeypatch.setattr(
-        milvus.importlib.util, "find_spec", lambda name: None if "milvus" in name else find(name)
-    )
-    with pytest.raises(InputError, match=r'found no pymilvus nor milvus_lite.*pip install "crisa'):
+    monkeypatch.setitem(sys.modules, "milvus_lite", None)
+    with pytest.raises(
+        InputError, match=r"found no module milvus_lite, .*pip install 'crisalad-jax"
+    ):
         opened(tmp_path, "milvus:rows.db")
 
 
@@ -378,26 +370,9 @@ def test_any_choice_among_equals_becomes_the_lower_number(seed):
         return Neighbours(indices, np.take_along_axis(chosen, indices, axis=1))
 
     rows = np.arange(queries, dtype=np.float32)[:, None]
-    found = lower_first(ask, rows, k, count)
+    found = milvus.break_ties(ask, rows, k, count)
     expected = np.argsort(-similarities, axis=1, kind="stable")[:, :k]
     np.testing.assert_array_equal(found.indices, expected)
     np.testing.assert_array_equal(
         found.similarities, np.take_along_axis(similarities, expected, axis=1)
     )
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_candidates_that_are_off_by_the_margin_hide_nothing(seed):
-    """`ask` chooses by similarities that are off by 0.1 at most, and gives the right ones."""
-    generator = np.random.default_rng(seed)
-    count, k = 40, 3
-    similarities = generator.integers(0, 20, (1, count)).astype(np.float32) / 50
-    rough = similarities + generator.uniform(-0.1, 0.1, similarities.shape)
-
-    def ask(part: np.ndarray, asked: int) -> Neighbours:
-        indices = np.argsort(-rough, axis=1)[:, :asked]
-        return Neighbours(indices, np.take_along_axis(similarities, indices, axis=1))
-
-    found = lower_first(ask, np.zeros((1, 1), np.float32), k, count, margin=0.2 + 1e-6)
-    expected = np.argsort(-similarities, axis=1, kind="stable")[:, :k]
-    np.testing.assert_array_equal(found.indices, expected)

@@ -1,27 +1,29 @@
 """The new order against scores of single pairs; each image is described once; bad input."""
 
 import dataclasses
-from collections.abc import Callable
+import pathlib
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 
 from crisalad_jax.data.images import read_image
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.aggregators.netvlad import NetVladConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import Model
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.reranking import (
     Reranker,
     Reranking,
+    matching,
     parse_reranking,
-    rerank,
     stage,
-    transvpr,
 )
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL, random_params
@@ -53,6 +55,16 @@ def first_stage() -> Neighbours:
     indices = np.stack([rng.permutation(7) for _ in range(5)])
     similarities = -np.sort(-rng.random((5, 7)).astype(np.float32), axis=1)
     return Neighbours(indices, similarities)
+
+
+def rerank(
+    given: Reranking,
+    neighbours: Neighbours,
+    database: Sequence[pathlib.Path],
+    queries: Sequence[pathlib.Path],
+) -> Neighbours:
+    with Reranker(given, database, queries, Reading(batch_size=BATCH, quiet=True)) as second:
+        return second(neighbours)
 
 
 def reranking(name: str, top: int) -> Reranking:
@@ -98,8 +110,6 @@ def test_the_order_is_that_of_single_pairs(name: str, first_stage, benchmark, mo
         first_stage,
         benchmark.database,
         benchmark.queries,
-        batch_size=BATCH,
-        quiet=True,
     )
     for query, row in enumerate(first_stage.indices):
         scores = dict(zip(row, method.fuse(parts[query, row[:top]], config), strict=False))
@@ -118,9 +128,7 @@ def test_an_image_is_most_like_itself(name: str, first_stage, benchmark) -> None
     own = benchmark.database[:5]
     last = np.array([np.roll(np.arange(7), -1 - i) for i in range(5)])
     neighbours = Neighbours(last, first_stage.similarities)
-    found = rerank(
-        reranking(name, 7), neighbours, benchmark.database, own, batch_size=BATCH, quiet=True
-    )
+    found = rerank(reranking(name, 7), neighbours, benchmark.database, own)
     np.testing.assert_array_equal(found.indices[:, 0], np.arange(5))
 
 
@@ -140,8 +148,6 @@ def test_equal_scores_keep_the_first_stages_order(
         first_stage,
         benchmark.database,
         benchmark.queries,
-        batch_size=BATCH,
-        quiet=True,
     )
     np.testing.assert_array_equal(found.indices, first_stage.indices)
     assert np.isfinite(found.similarities).all()
@@ -149,7 +155,7 @@ def test_equal_scores_keep_the_first_stages_order(
 
 def test_images_are_described_and_pairs_scored_once(first_stage, benchmark, monkeypatch) -> None:
     described, scored = [], []
-    describe, score = transvpr.describe, transvpr.score
+    describe, score = matching.describe_transvpr, matching.count_inliers
     changed(
         monkeypatch,
         "transvpr",
@@ -162,8 +168,7 @@ def test_images_are_described_and_pairs_scored_once(first_stage, benchmark, monk
         reranking("transvpr", 2),
         benchmark.database,
         benchmark.queries,
-        batch_size=BATCH,
-        quiet=True,
+        Reading(batch_size=BATCH, quiet=True),
     ) as reranker:
         folder = reranker._folder.name
         found = reranker(two)
@@ -172,14 +177,16 @@ def test_images_are_described_and_pairs_scored_once(first_stage, benchmark, monk
         again = reranker(two)
         assert (len(described), len(scored)) == (batches, 5)
     np.testing.assert_array_equal(found.indices, again.indices)
-    assert not stage.pathlib.Path(folder).exists()
+    assert not pathlib.Path(folder).exists()
 
 
 def test_an_evaluation_has_a_row_without_and_a_row_with(benchmark) -> None:
     own = random_params(PLAIN)
-    plain = evaluate(own, PLAIN, benchmark, batch_size=BATCH, quiet=True)
+    plain = evaluate(Model(own, PLAIN), benchmark, reading=Reading(batch_size=BATCH, quiet=True))
     with_own = reranking("transvpr", 3)
-    both = evaluate(own, PLAIN, benchmark, batch_size=BATCH, rerank=with_own, quiet=True)
+    both = evaluate(
+        Model(own, PLAIN), benchmark, rerank=with_own, reading=Reading(batch_size=BATCH, quiet=True)
+    )
     assert [(r.grouping, r.rerank) for r in both] == [("any", None), ("any", "transvpr:3")]
     assert both[0].recalls == plain[0].recalls
     np.testing.assert_array_equal(both[0].neighbours.indices, plain[0].neighbours.indices)
@@ -188,8 +195,6 @@ def test_an_evaluation_has_a_row_without_and_a_row_with(benchmark) -> None:
         plain[0].neighbours,
         benchmark.database,
         benchmark.queries,
-        batch_size=BATCH,
-        quiet=True,
     )
     np.testing.assert_array_equal(both[1].neighbours.indices, expected.indices)
     # Any order of the first three has as many right ones among them as they had.
@@ -201,7 +206,12 @@ def test_an_evaluation_has_a_row_without_and_a_row_with(benchmark) -> None:
 def test_the_first_stages_model_serves_where_it_can(name: str, benchmark) -> None:
     own, config = model_of(name)
     results = [
-        evaluate(own, config, benchmark, batch_size=BATCH, rerank=given, quiet=True)[1]
+        evaluate(
+            Model(own, config),
+            benchmark,
+            rerank=given,
+            reading=Reading(batch_size=BATCH, quiet=True),
+        )[1]
         for given in (Reranking(name, 7), Reranking(name, 7, own, config))
     ]
     assert results[0].rerank == f"{name}:7"
@@ -251,7 +261,12 @@ def test_what_does_not_fit_is_found_before_any_work(
     monkeypatch.setattr("crisalad_jax.retrieval.describe.read_tokens", None)
     rerank = parse_reranking(given)
     with pytest.raises(InputError, match=words):
-        evaluate(random_params(config), config, benchmark, rerank=rerank, quiet=True)
+        evaluate(
+            Model(random_params(config), config),
+            benchmark,
+            rerank=rerank,
+            reading=Reading(quiet=True),
+        )
 
 
 def test_a_stage_is_given_its_model_and_enough_neighbours(first_stage, benchmark) -> None:
@@ -260,13 +275,11 @@ def test_a_stage_is_given_its_model_and_enough_neighbours(first_stage, benchmark
         rerank(Reranking("transvpr", 3), first_stage, *sides)
     few = Neighbours(*(part[:, :2] for part in first_stage))
     with pytest.raises(InputError, match="found 2 neighbours of 5 queries, expected at least 3"):
-        rerank(reranking("transvpr", 3), few, *sides, batch_size=BATCH, quiet=True)
+        rerank(reranking("transvpr", 3), few, *sides)
 
 
 def test_a_full_disk_is_one_line(first_stage, benchmark, monkeypatch) -> None:
     usage = stage.shutil.disk_usage("/")._replace(free=1000)
     monkeypatch.setattr(stage.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(InputError, match=r"GiB free, expected .* for the local features of 5 im"):
-        rerank(
-            reranking("transvpr", 3), first_stage, benchmark.database, benchmark.queries, quiet=True
-        )
+        rerank(reranking("transvpr", 3), first_stage, benchmark.database, benchmark.queries)

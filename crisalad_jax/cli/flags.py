@@ -1,0 +1,92 @@
+"""Flags that several commands share."""
+
+import dataclasses
+import pathlib
+from typing import TYPE_CHECKING, Literal
+
+from crisalad_jax.cli.common import RuntimeName
+
+if TYPE_CHECKING:
+    from crisalad_jax.data.reading import Reading
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReadFlags:
+    """How images are read."""
+
+    batch_size: int = 16
+    """Number of images described together."""
+    on_bad_image: Literal["stop", "skip"] = "stop"
+    """Stop at an unreadable image, or leave it out and say so."""
+    max_pixels: int = 2**28
+    """Pixels that an image file may have; larger ones are not decoded."""
+    plugin: tuple[str, ...] = ()
+    """Files FILE.py or modules that register custom parts; their code is run."""
+    quiet: bool = False
+    """No progress bars."""
+
+    @property
+    def reading(self) -> "Reading":
+        """The record of these flags that the library takes."""
+        from crisalad_jax.data.reading import Reading
+
+        return Reading(batch_size=self.batch_size, on_bad_image=self.on_bad_image, quiet=self.quiet)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ModelFlags:
+    """Which model describes images, and how."""
+
+    weights: pathlib.Path | None = None
+    """By default starter, the small model in this package; or hog, a baseline that learns nothing;
+    or a .safetensors file, or a published model's name (`crisalad models`)."""
+    image_size: tuple[int, int] | None = None
+    """Height and width, multiples of the patch size; by default the model's, or the map's."""
+    resize: tuple[str, ...] = ()
+    """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
+    bicubic or area; antialias or no-antialias; bytes or floats; round;
+    high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
+    runtime: RuntimeName = "jax"
+    """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
+    for it once; --weights may be an exported folder."""
+    compute_dtype: Literal["float32", "bfloat16"] | None = None
+    """Type of the matrix products, by default the model's, or the map's; docs/performance.md shows
+    what bfloat16 gains and loses."""
+    verify: bool = True
+    """Check all files against their checksums; --no-verify skips that, where they are huge."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class JsonFlag:
+    """Where the result goes as JSON."""
+
+    json: pathlib.Path | None = None
+    """File for the result as JSON; - prints it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SetFlags:
+    """Which evaluation set, and what is a positive."""
+
+    data: pathlib.Path
+    """Evaluation set in any layout of docs/datasets.md: @UTM names, VPR-Bench, raw MSLS, two plain
+    folders; a .mat file of NetVLAD; .npy lists of SALAD."""
+    split: str | None = None
+    """train, val or test, where the set has several."""
+    layout: str | None = None
+    """utm, vpr-bench, netvlad, salad, msls, msls-subtask or folders; by default what DATA looks
+    like (msls-subtask, the 740 queries of raw MSLS, only by name)."""
+    images: pathlib.Path | None = None
+    """Folder of the images that a .mat file or .npy lists name; by default where it is."""
+    queries: str | None = None
+    """Folder of the queries, where @UTM sets have several: queries_night of SVOX; by default
+    queries."""
+    ignore_zones: bool = False
+    """Compare @UTM numbers of all zones as if of one plane, as the public tools do."""
+    radius: float | None = None
+    """Largest distance of a positive in metres; by default 25, or what a .mat file says."""
+    max_heading_difference: float | None = None
+    """Largest difference of compass angles of a positive in degrees, for raw MSLS; by default any
+    (the paper: 40)."""
+    frames: int | None = None
+    """How many frames a positive may be away, for two plain folders of the same moments."""

@@ -1,0 +1,119 @@
+"""Describe images with a model in JAX, over all devices that can share a batch."""
+
+import functools
+from collections.abc import Iterable, Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from crisalad_jax.checkpoints.weights import model_hash
+from crisalad_jax.config.preprocessing import Size
+from crisalad_jax.data.loader import ImageBatch
+from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.layers import at_least_float32
+from crisalad_jax.nn.model import (
+    AnyArray,
+    Crisalad,
+    Images,
+    attend_across_images,
+    cast_params,
+    check_params,
+    extract_tokens,
+)
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.retrieval.describer import Rows
+from crisalad_jax.utils import compiler
+from crisalad_jax.utils.devices import Devices, devices_for, over_images
+
+
+class JaxDescriber:
+    """A `Describer` of a model in JAX."""
+
+    def __init__(self, params: Crisalad, config: ModelConfig) -> None:
+        """Check that the parameters are of the configuration, and cast them once."""
+        check_params(params, config)
+        self.config = config
+        self._given, self._params = params, cast_params(params, config)
+        self._placed: tuple[int, Devices, Crisalad] | None = None
+        """A batch size, the devices that share such a batch, and the parameters on them."""
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """The `model_hash` of the model."""
+        return model_hash(self._given, self.config)
+
+    @property
+    def preparation(self) -> Preparation:
+        """How images are prepared."""
+        config = self.config
+        return Preparation(config.image_size, config.preprocessing, config.side_multiple)
+
+    @property
+    def row_length(self) -> int:
+        """Number of values in the row of an image's tokens."""
+        return self.config.unprojected_dim
+
+    @property
+    def row_dtype(self) -> str:
+        """Type of the values in rows of tokens."""
+        return "float64" if self.config.compute_dtype == "float64" else "float32"
+
+    def check_size(self, size: Size) -> None:
+        """Raise InputError for a height and width that the model cannot describe."""
+        self.config.check_image_size(size)
+
+    def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[Rows, ImageBatch]]:
+        """Yield each batch with its images' tokens; the devices compute one batch ahead."""
+        ahead: tuple[jax.Array, ImageBatch] | None = None
+        for batch in batches:
+            devices, params = self._on_devices(len(batch.images))
+            rows = _token_rows(params, devices.shard_batch(batch.images), self.config)
+            if ahead is not None:
+                yield np.asarray(ahead[0]), ahead[1]
+            ahead = rows, batch
+        if ahead is not None:
+            yield np.asarray(ahead[0]), ahead[1]
+
+    def _on_devices(self, batch_size: int) -> tuple[Devices, Crisalad]:
+        if self._placed is None or self._placed[0] != batch_size:
+            devices = devices_for(batch_size)
+            self._placed = batch_size, devices, devices.replicate(self._params)
+        return self._placed[1:]
+
+    def attend(
+        self,
+        rows: Float[np.ndarray, "group image row"],
+        mask: Bool[np.ndarray, "group image image"],
+    ) -> Float[np.ndarray, "group image descriptor"]:
+        """Make descriptors of the tokens of some groups of images; see `Describer.attend`."""
+        return np.asarray(_attend(self._params, rows, mask, self.config))
+
+
+@over_images("images", 1)
+@functools.partial(compiler.jit, static_argnames="config")
+def _token_rows(params: Crisalad, images: Images, config: ModelConfig) -> Float[Array, "image row"]:
+    """Extract tokens, and flatten each image's into a row."""
+    tokens = extract_tokens(params, images, config)
+    width = config.token_shape.tokens * config.token_shape.token_dim
+    local = tokens.local.reshape(len(images), width)
+    return at_least_float32(jnp.concatenate([tokens.global_token, local], axis=1))
+
+
+@functools.partial(compiler.jit, static_argnames="config")
+def _attend(
+    params: Crisalad,
+    rows: Float[AnyArray, "group image row"],
+    mask: Bool[AnyArray, "group image image"],
+    config: ModelConfig,
+) -> Float[Array, "group image descriptor"]:
+    shape = config.token_shape
+
+    def one_group(rows: Array, mask: Array) -> Array:
+        global_token, local = jnp.split(rows, [shape.global_dim], axis=1)
+        tokens = Tokens(global_token, local.reshape(len(rows), shape.tokens, shape.token_dim))
+        return attend_across_images(params, tokens, config, mask=mask)
+
+    return jax.vmap(one_group)(jnp.asarray(rows), jnp.asarray(mask))

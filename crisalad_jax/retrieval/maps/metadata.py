@@ -1,0 +1,255 @@
+"""The metadata of a map, in map.json: the model, its settings, where descriptors are.
+
+Nothing here imports JAX until `model_config` is called.
+"""
+
+import contextlib
+import dataclasses
+import datetime
+import os
+import pathlib
+import uuid
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from crisalad_jax.checkpoints.runtime import read_header
+from crisalad_jax.checkpoints.starter import FILES, recorded, resolved
+from crisalad_jax.config.io import from_plain, to_plain
+from crisalad_jax.retrieval.maps.store import store_name
+from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
+from crisalad_jax.retrieval.segments import write_record
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import read_json
+from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.temporaries import LOCK, is_temporary, remove_temporaries
+
+if TYPE_CHECKING:  # a map is searched without JAX
+    from crisalad_jax.nn.config import ModelConfig
+    from crisalad_jax.retrieval.describer import Describer
+
+FORMAT = 4
+"""Version of the format."""
+METADATA, SEGMENTS = "map.json", "segments"
+"""Names of the metadata's file, and of the folder of additions."""
+COMPONENTS, SHARES = "pca.safetensors", "shares"
+"""Names of the components that shorten descriptors, and of the folder of shares to be joined."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MapMetadata:
+    """The contents of map.json."""
+
+    model: str
+    """The `model_hash` of the weights that describe its images, and its queries."""
+    weights: str
+    """Where those weights were: a path, or a name in `starter.FILES`."""
+    config: dict
+    """The model's configuration as JSON values, at the image size and in the type in which images
+    are described."""
+    descriptor_length: int
+    store: str = "files"
+    """Where descriptors are stored; see `store.store_name`."""
+    dtype: str = "float32"
+    """Type of the stored descriptors."""
+    grouping: str = "single"
+    """Every image is described independently, so that no descriptor depends on neighbours."""
+    collection: str = ""
+    """Name of Milvus' collection of the descriptors."""
+    created: str = ""
+    pca: str = ""
+    """The `pca_hash` of the components that shorten its descriptors, and those of queries; "" is
+    none."""
+    format: int = FORMAT
+
+
+def model_config(metadata: MapMetadata, folder: str | os.PathLike[str]) -> "ModelConfig":
+    """Return the configuration of the model that describes the images of a map.
+
+    Raises:
+        InputError: it is not one that this package knows.
+    """
+    from crisalad_jax.nn.config import ModelConfig
+
+    return from_plain(ModelConfig, metadata.config, source=f"{pathlib.Path(folder) / METADATA}")
+
+
+def new_metadata(
+    describer: "Describer",
+    weights: str | os.PathLike[str],
+    folder: pathlib.Path,
+    *,
+    store: str = "files",
+    dtype: str = "float32",
+    pca: Pca | None = None,
+) -> MapMetadata:
+    """Make the metadata of a new map in `folder`, whose images this model will describe.
+
+    Raises:
+        InputError: the model's descriptors are not unit vectors, or its components make none or are
+            of another length; what `store_name` raises.
+    """
+    from crisalad_jax.nn.config import check_unit_length
+
+    config = describer.config
+    check_unit_length(config, str(weights))
+    if pca is not None:
+        pca.check(config.descriptor_dim, str(weights))
+        if not pca.config.renormalise:
+            raise InputError(
+                "pca: found components that leave lengths as they are, expected some that make "
+                "unit vectors, which maps compare by cosine"
+            )
+    return MapMetadata(
+        model=describer.digest,
+        weights=recorded(weights),
+        config=to_plain(config),
+        descriptor_length=config.descriptor_dim if pca is None else len(pca.components),
+        store=store_name(store, folder, dtype),
+        dtype=dtype,
+        collection=f"crisalad_{uuid.uuid4().hex}",
+        created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        pca="" if pca is None else pca_hash(pca),
+    )
+
+
+def write_metadata(folder: pathlib.Path, metadata: MapMetadata) -> None:
+    """Write map.json, whole or not at all.
+
+    Raises:
+        InputError: the disk is full, or the folder cannot be written to.
+    """
+    write_record(folder / METADATA, dataclasses.asdict(metadata), indent=2)
+
+
+def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
+    """Read the metadata of the map in `folder`; None where a new map can be made.
+
+    Raises:
+        InputError: the folder is a file or holds other things than a map, or the map is damaged or
+            of another format.
+    """
+    folder = pathlib.Path(folder)
+    path = folder / METADATA
+    if not path.exists():
+        if folder.exists() and not folder.is_dir():
+            raise InputError(f"{folder}: found a file, expected a map's folder")
+        # A process killed before it has made the map leaves its lock and temporary files behind.
+        others = sorted(_other_files(folder, LOCK, SEGMENTS, COMPONENTS, SHARES))
+        if _other_files(folder / SEGMENTS):
+            others.append(SEGMENTS)
+        if others:
+            raise InputError(
+                f"{folder}: found {others[0]} and no {METADATA}, expected a map or an empty folder"
+            )
+        return None
+    # Who edits the metadata removes its checksum. A changed key would be an unknown field.
+    value = read_json(path, "a map", sealed=False)
+    version = value.get("format") if isinstance(value, dict) else None
+    if version != FORMAT:
+        raise InputError(
+            f"{path}: found a map of format {version}, expected {FORMAT}: `crisalad index` into a "
+            "new folder makes one"
+        )
+    metadata = from_plain(MapMetadata, value, source=str(path))
+    try:
+        store_name(metadata.store, folder, metadata.dtype)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return metadata
+
+
+def read_components(folder: pathlib.Path, metadata: MapMetadata) -> Pca | None:
+    """Read the components of a map; None where it has none.
+
+    Raises:
+        InputError: the file is gone, damaged, or of other components.
+    """
+    if not metadata.pca:
+        return None
+    pca = load_pca(folder / COMPONENTS)
+    if pca_hash(pca) != metadata.pca:
+        raise InputError(
+            f"{folder / COMPONENTS}: found other components, expected those that {METADATA} says"
+        )
+    return pca
+
+
+def _other_files(folder: pathlib.Path, *names: str) -> list[str]:
+    """Return the names in `folder` that are neither temporary nor in `names`."""
+    if not folder.is_dir():
+        return []
+    return [p.name for p in folder.iterdir() if p.name not in names and not is_temporary(p)]
+
+
+def has_images(folder: pathlib.Path) -> bool:
+    """Return whether a folder holds a map with images; a map without any counts as none."""
+    return any((folder / SEGMENTS).glob("[0-9]*.json"))
+
+
+def check_model(
+    metadata: MapMetadata,
+    folder: str | os.PathLike[str],
+    digest: str,
+    weights: object,
+    *,
+    quantised_from: str | None = None,
+) -> None:
+    """Check that a map was made by the model with the hash `digest`.
+
+    A note says where the model is an int8 program of `quantised_from`, which made the map.
+
+    Raises:
+        InputError: the hashes differ; the message has both.
+    """
+    if quantised_from == metadata.model:
+        warn(
+            f"{weights}: an int8 program of the model that made {folder}; similarities are rougher"
+        )
+    elif digest != metadata.model:
+        file = FILES.get(metadata.weights)
+        is_todays = file is None or read_header(file)["model_sha256"] == metadata.model
+        version = "" if is_todays else " of another version of this package"
+        raise InputError(
+            f"{folder}: found a map made by model {metadata.model[:12]} "
+            f"({metadata.weights}{version}), but {weights} is model {digest[:12]}: expected the "
+            "same (--weights), or a new map (`crisalad index` into a new folder)"
+        )
+
+
+def weights_of(metadata: MapMetadata, folder: str | os.PathLike[str]) -> pathlib.Path:
+    """Return the file of the weights that made a map.
+
+    Raises:
+        InputError: it is no longer where it was.
+    """
+    file = resolved(metadata.weights)
+    if not file.exists():
+        raise InputError(
+            f"{folder}: found no {file}, which made this map, expected it there or as --weights"
+        )
+    return file
+
+
+@contextlib.contextmanager
+def undone_without_images(folder: pathlib.Path) -> Iterator[None]:
+    """Remove the map if the block raises before it has images: nothing is lost."""
+    try:
+        yield
+    except BaseException:
+        if not has_images(folder):
+            with contextlib.suppress(OSError):
+                _remove(folder)
+        raise
+
+
+def _remove(folder: pathlib.Path) -> None:
+    """Remove a map without images; its metadata stays where other files are left."""
+    segments = folder / SEGMENTS
+    remove_temporaries(segments)
+    for path in segments.glob("[0-9]*.npy"):
+        path.unlink()
+    segments.rmdir()
+    if {path.name for path in folder.iterdir()} <= {METADATA, COMPONENTS, LOCK}:
+        for name in (METADATA, COMPONENTS, LOCK):
+            (folder / name).unlink(missing_ok=True)
+        folder.rmdir()

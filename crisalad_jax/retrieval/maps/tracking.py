@@ -1,0 +1,148 @@
+"""Answers of a map to consecutive frames of one camera, by a filter over its images in order."""
+
+import itertools
+import math
+import pathlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.metres import comparable
+from crisalad_jax.data.positions import AXES, utm_positions
+from crisalad_jax.data.video import moment_of
+from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.sequence import BayesFilter, SequenceState
+from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.shapes import Float32, Float64, Int64
+
+_NUMBERS = 2**25
+"""Similarities computed at a time: 128 MiB."""
+_GAP = 1e9
+"""Seconds from one video of a map to the next: no camera reaches as far."""
+
+_Spot = tuple[str, tuple[float, ...]]
+"""A clock and the seconds on it, when an image was taken; or nothing, and the metres where."""
+
+
+@brief
+class TrackResult(NamedTuple):
+    """Images of a map at each of some frames, the most probable first."""
+
+    numbers: Int64[np.ndarray, "frame k"]
+    similarities: Float32[np.ndarray, "frame k"]
+    probabilities: Float64[np.ndarray, "frame k"]
+    """Probability of each image that the camera is there."""
+    best: Float32[np.ndarray, " frame"]
+    """Similarity of the image of the whole map that is most similar to the frame."""
+
+
+class SequenceTracker:
+    """A camera that is followed through a map, a few frames at a time."""
+
+    def __init__(self, places: Map, bayes: BayesFilter) -> None:
+        """Begin a sequence in a map, whose descriptors are read twice."""
+        self._map, self._filter = places, bayes
+        total = sum(part.sum(axis=0, dtype=np.float64) for part in places.descriptors)
+        mean = total / len(places)
+        common = [part.astype(np.float64) @ mean for part in places.descriptors]
+        self.state: SequenceState = bayes.start(np.concatenate(common))
+        self._read: Callable[[str], _Spot | None] | None = None
+        self._before: _Spot | None = None
+
+    def answer(
+        self,
+        descriptors: Float32[np.ndarray, "frame d"],
+        k: int,
+        frames: Sequence[pathlib.Path],
+    ) -> "TrackResult":
+        """Take the next frames into account, and rank the map's images at each of them.
+
+        Motion is in metres where the map has a position of every image, and the names of the first
+        frames say @UTM positions; else in seconds where names on both sides say times; else in
+        images of the map a frame, which a note tells.
+
+        Args:
+            descriptors: unit descriptors of the frames in order, of the map's model.
+            k: images for each frame; all where there are fewer.
+            frames: their names.
+
+        Returns:
+            The images that the camera is most probably at, best first.
+
+        Raises:
+            InputError: what `Map.similarities` raises.
+        """
+        if self.state.frames == 0:
+            self._choose_unit(frames)
+        rows = [
+            self._ranked(row, k, self._moved(frame))
+            for row, frame in zip(self._similarities(descriptors), frames, strict=True)
+        ]
+        numbers, similarities, probabilities, best = map(np.stack, zip(*rows, strict=True))
+        return TrackResult(numbers, similarities, probabilities, best)
+
+    def _choose_unit(self, frames: Sequence[pathlib.Path]) -> None:
+        moments = [_when(image.name) for image in self._map.images]
+        for read, spots in ((_where, _metres(self._map)), (_when, moments)):
+            if None not in spots and all(read(str(frame)) is not None for frame in frames):
+                steps = [_apart(*pair) for pair in itertools.pairwise(spots)]
+                along = np.cumsum([0.0, *np.minimum(steps, _GAP)])
+                self.state = self._filter.start(self.state.common, along)
+                self._read = read
+                return
+        warn(
+            "sequence: not all names of the map and of the queries say when or where they were "
+            "taken, so a frame counts as an image of the map, and the camera moves by at most "
+            f"{self._filter.reach:g} images a frame; where the map has more frames a second, raise "
+            "--sequence-reach"
+        )
+
+    def _moved(self, frame: pathlib.Path) -> float:
+        """Return how far the camera moved since the frame before; infinity where unknown."""
+        if self._read is None:
+            return 1.0
+        before, self._before = self._before, self._read(str(frame))
+        return _apart(before, self._before)
+
+    def _ranked(
+        self, row: Float32[np.ndarray, " place"], k: int, moved: float
+    ) -> tuple[np.ndarray, ...]:
+        self.state = self._filter.step(self.state, row, moved)
+        belief = self.state.belief
+        numbers = np.argsort(-belief, kind="stable")[:k]
+        return numbers, row[numbers], belief[numbers], row.max()
+
+    def _similarities(
+        self, descriptors: Float32[np.ndarray, "frame d"]
+    ) -> Iterator[Float32[np.ndarray, " place"]]:
+        """Yield the similarities of each frame to all images of the map."""
+        step = max(1, _NUMBERS // len(self._map))
+        for start in range(0, len(descriptors), step):
+            yield from self._map.similarities(descriptors[start : start + step])
+
+
+def _apart(first: _Spot | None, second: _Spot | None) -> float:
+    """Return the seconds or metres between two images; infinity where they say nothing of it."""
+    if first is None or second is None or first[0] != second[0]:
+        return math.inf
+    return math.dist(first[1], second[1])
+
+
+def _when(name: str) -> _Spot | None:
+    moment = moment_of(name)
+    return moment and (moment.clock, (moment.seconds,))
+
+
+def _where(name: str) -> _Spot | None:
+    found = utm_positions([pathlib.PurePath(name).name])
+    # Two zones are two clocks: their metres say nothing of how far the camera moved.
+    return (str(found.zone), next(iter(found.of.values()))) if found.of else None
+
+
+def _metres(places: Map) -> Sequence[_Spot | None]:
+    positions = [image.position for image in places.images]
+    if places.axes == AXES[1] and None not in positions:
+        positions = map(tuple, comparable(*np.array(positions).T).tolist())
+    return [each and ("", each) for each in positions]

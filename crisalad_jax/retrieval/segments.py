@@ -1,0 +1,261 @@
+"""Rows of numbers that grow in a folder, segment by segment: what `extract` and `index` resume.
+
+A segment's rows go to a store. Then its record, JSON with a checksum, appears under its name: that
+single rename commits the segment. Whoever is killed at any moment leaves the rows as they were
+before the segment or after it.
+
+Several processes can work on shares of a collection, each on segments of its own.
+"""
+
+import contextlib
+import hashlib
+import json
+import pathlib
+import re
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from crisalad_jax.retrieval.maps.store import Store
+from crisalad_jax.utils.checksums import checksummed_json
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import atomic_path, read_json, write_json
+from crisalad_jax.utils.locks import BusyFolderError, lock
+from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.shapes import Float, Int64
+
+SEGMENT = 256
+"""Number of images appended together, and so described again at most after a kill."""
+
+
+class Segment(NamedTuple):
+    """Consecutive rows that were appended together."""
+
+    first: int
+    count: int
+    sha256: str
+    """Digest of the rows' bytes."""
+
+
+def write_record(path: pathlib.Path, value: Mapping[str, Any], indent: int | None = None) -> None:
+    """Write an object as JSON with its checksum, whole or not at all, and flush it to the disk.
+
+    Raises:
+        InputError: the disk is full, or the folder cannot be written to.
+    """
+    with atomic_path(path, durable=True) as temporary:
+        temporary.write_bytes(checksummed_json(value, indent))
+
+
+class Segments:
+    """Rows in a store, and the records in a folder that say which of them count."""
+
+    def __init__(self, folder: pathlib.Path, store: Store, dtype: str) -> None:
+        """Read all records, and check that the store has their rows.
+
+        Raises:
+            InputError: a record or its rows are damaged or gone.
+        """
+        self.folder, self.store, self._dtype = folder, store, np.dtype(dtype)
+        self.spans: list[Segment] = []
+        self.records: list[dict[str, Any]] = []
+        """The records in order; each has the `names` of its rows."""
+        # A writer adds records in order, so those that are listed now have all before them. It may
+        # add more while they are read.
+        listed = set(folder.glob("[0-9]*.json"))
+        while (path := self.path(len(self))).exists():
+            self._take(read_json(path, "a record of images"), path)
+            listed.discard(path)
+        if listed:
+            raise InputError(f"{min(listed)}: expected {path.name} before it, found no such file")
+        store.check([(span.first, span.count) for span in self.spans])
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self.spans[-1].first + self.spans[-1].count if self.spans else 0
+
+    def path(self, first: int) -> pathlib.Path:
+        """Return the file of the record of the segment that begins with a row."""
+        return self.folder / f"{first:010d}.json"
+
+    def _take(self, record: dict[str, Any], path: pathlib.Path) -> None:
+        names, digest = record.get("names"), record.get("sha256")
+        if not isinstance(names, list) or not names or not isinstance(digest, str):
+            raise InputError(f"{path}: not a whole record of images: no names, or no sha256")
+        self.spans.append(Segment(len(self), len(names), digest))
+        self.records.append(record)
+
+    def append(self, record: Mapping[str, Any], rows: Float[np.ndarray, "n d"]) -> None:
+        """Append a segment: it is there for good once this returns, and not at all before.
+
+        Args:
+            record: JSON values, among them `names`, one of each row.
+            rows: the rows.
+
+        Raises:
+            InputError: the store or the folder cannot be written to.
+        """
+        rows = np.ascontiguousarray(rows, self._dtype)
+        path = self.path(len(self))
+        whole = {**record, "sha256": hashlib.sha256(rows.data).hexdigest()}
+        self.store.add(len(self), rows)
+        write_record(path, whole)
+        self._take(whole, path)
+
+    def blocks(self) -> Iterator[Float[np.ndarray, "n d"]]:
+        """Yield the rows of each segment in order."""
+        for span in self.spans:
+            yield self.store.read(span.first, span.count)
+
+    def __getitem__(self, numbers: Int64[np.ndarray, " n"]) -> Float[np.ndarray, "n d"]:
+        """Read rows of files by number, in any order."""
+        return self.store.rows(numbers)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def verify(self) -> None:
+        """Read all rows, and compare them with the digests in the records.
+
+        Raises:
+            InputError: one has changed; the message says in which segment.
+        """
+        for span, rows in zip(self.spans, self.blocks(), strict=True):
+            if (
+                hashlib.sha256(np.ascontiguousarray(rows, self._dtype).data).hexdigest()
+                != span.sha256
+            ):
+                raise InputError(
+                    f"{self.path(span.first).with_suffix('')}: descriptors {span.first} to "
+                    f"{span.first + span.count - 1} have changed since they were written"
+                )
+
+
+class Share(NamedTuple):
+    """One share of several: a run of a collection's images."""
+
+    index: int
+    """Number of the share, from 0."""
+    count: int
+    """Number of shares."""
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Read INDEX/COUNT.
+
+        Raises:
+            InputError: anything else, or an index that is not below the count.
+        """
+        match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
+        if match is None or int(match[1]) >= int(match[2]):
+            raise InputError(
+                f"share: found {text!r}, expected INDEX/COUNT, with an index from 0 and below the "
+                "count, such as 0/8"
+            )
+        return cls(int(match[1]), int(match[2]))
+
+    def of(self, images: int, batch_size: int) -> slice:
+        """Return the places of this share's images: whole batches, so that bits stay the same.
+
+        Raises:
+            InputError: there are fewer batches than shares.
+        """
+        batches = -(-images // batch_size)
+        if batches < self.count:
+            raise InputError(
+                f"share: found {self.count} shares of {images} images in batches of {batch_size}, "
+                f"expected at most {batches}, or smaller batches"
+            )
+        ends = (i * batches // self.count * batch_size for i in (self.index, self.index + 1))
+        return slice(*(min(images, end) for end in ends))
+
+
+def digest_of(names: Sequence[str], settings: Mapping[str, Any]) -> str:
+    """Compute a digest of what all shares of one collection have in common."""
+    digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
+    for name in names:
+        digest.update(f"{name}\n".encode(errors="surrogateescape"))
+    return digest.hexdigest()
+
+
+class Shares(NamedTuple):
+    """A folder in which several processes work, each on its share, and the last one joins all."""
+
+    folder: pathlib.Path
+    share: Share
+    """The share of this process."""
+    digest: str
+    """Of all that the shares have in common."""
+
+    def path(self, index: int) -> pathlib.Path:
+        """Return the folder of a share's work."""
+        return self.folder / f"{index}-of-{self.share.count}"
+
+    def _marker(self, index: int) -> pathlib.Path:
+        return self.path(index).with_suffix(".json")
+
+    @property
+    def own(self) -> pathlib.Path:
+        """The folder of this process's share."""
+        return self.path(self.share.index)
+
+    def result(self, index: int) -> dict[str, Any] | None:
+        """Return what a share's process recorded at its end; None while it has not ended."""
+        path = self._marker(index)
+        if not path.exists():
+            return None
+        value = read_json(path, "a record of a share")
+        if value.get("shares") != self.digest:
+            warn(
+                f"{path}: found a share of other images or settings; its process has to run again, "
+                "as the others do"
+            )
+            return None
+        return value
+
+    def finish(self, result: Mapping[str, Any]) -> None:
+        """Record that this process's share is done."""
+        write_json(self._marker(self.share.index), {"shares": self.digest, **result})
+
+    def left(self) -> int:
+        """Count the shares that are not done."""
+        return sum(self.result(index) is None for index in range(self.share.count))
+
+    @contextlib.contextmanager
+    def joining(self) -> Iterator[list[dict[str, Any]] | None]:
+        """Yield the results of all shares while no other process joins them; then remove them.
+
+        Yields None where another process joins them, or has done so.
+        """
+        with contextlib.ExitStack() as stack:
+            try:
+                stack.enter_context(lock(self.folder))
+            except BusyFolderError:
+                warn(f"{self.folder}: another process joins the shares")
+                yield None
+                return
+            found = [self.result(index) for index in range(self.share.count)]
+            results = [each for each in found if each is not None]
+            if len(results) < len(found):
+                yield None
+                return
+            yield results
+            for index in range(self.share.count):
+                self._marker(index).unlink()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def check_same_count(self) -> None:
+        """Check that the work in the folder is of as many shares.
+
+        Raises:
+            InputError: it is of another count.
+        """
+        others = [
+            path.name
+            for path in self.folder.glob("[0-9]*-of-[0-9]*")
+            if not path.stem.endswith(f"-of-{self.share.count}")
+        ]
+        if others:
+            raise InputError(
+                f"{self.folder}: found {min(others)}, expected shares of {self.share.count}: "
+                "finish those first, or remove the folder"
+            )

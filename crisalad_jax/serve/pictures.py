@@ -1,0 +1,120 @@
+"""Pictures that requests bring, and small ones of the map's images."""
+
+import asyncio
+import os
+import pathlib
+
+import cv2
+import numpy as np
+from fastapi import HTTPException, Request
+from starlette.datastructures import UploadFile
+from starlette.types import Message
+
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.resize import resize_image
+from crisalad_jax.data.video import file_of
+from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.serve.worker import ADDED
+from crisalad_jax.utils.errors import InputError
+
+_PATIENCE = 60.0
+"""Seconds in which a picture has to arrive."""
+_FIELDS = 10
+"""Most files, and most fields, that are read of a form."""
+_LONGEST, _LONGEST_PATH = 200, 1000
+"""Most bytes of each part of a new image's name, and of all: file systems take 255 of a part, and
+a temporary file's name is longer."""
+_SIDE = 480
+"""Largest side of a thumbnail in pixels."""
+
+
+async def receive_picture(request: Request, most_bytes: int) -> tuple[bytes, str]:
+    """Receive a picture's file, and its name, in the body or in a form's field `image`.
+
+    Raises:
+        HTTPException: it is too large or too slow, or the form is another one.
+    """
+    received = 0
+
+    async def receive() -> Message:
+        nonlocal received
+        message = await request.receive()
+        received += len(message.get("body", b""))
+        if received > most_bytes:
+            raise HTTPException(413, f"image: found more than {most_bytes} bytes")
+        return message
+
+    limited = Request(request.scope, receive)
+    try:
+        async with asyncio.timeout(_PATIENCE):
+            kind = request.headers.get("content-type", "").lower()
+            if not kind.startswith("multipart/form-data"):
+                return await limited.body(), "image"
+            async with limited.form(max_files=_FIELDS, max_fields=_FIELDS) as form:
+                image = form.get("image")
+                if len(form.multi_items()) != 1 or not isinstance(image, UploadFile):
+                    names = ", ".join(name for name, _ in form.multi_items()) or "nothing"
+                    raise HTTPException(
+                        400, f"image: found a form of {names}, expected one file of this name"
+                    )
+                return await image.read(), image.filename or "image"
+    except TimeoutError as error:
+        raise HTTPException(408, f"image: found half of it after {_PATIENCE:g} s") from error
+
+
+def check_new_name(name: str) -> None:
+    """Check that a name is a plain path below a folder, without hidden parts.
+
+    Raises:
+        InputError: a part is empty, hidden or too long, or the name has control characters.
+
+    Example:
+        >>> check_new_name("tuesday/0001.jpg")
+    """
+    # First, since what cannot be encoded is not printable either.
+    plain = name.isprintable() and "\\" not in name and len(name.encode()) <= _LONGEST_PATH
+    if not plain or any(
+        not part or part.startswith(".") or part != part.strip() or len(part.encode()) > _LONGEST
+        for part in name.split("/")
+    ):
+        raise InputError(
+            f"name: found {name[:80]!r}, expected a path such as 'tuesday/0001.jpg', of parts of "
+            f"1 to {_LONGEST} bytes that do not begin with a dot"
+        )
+
+
+def read_thumbnail(places: Map, images: str | os.PathLike[str] | None, number: int) -> bytes:
+    """Return a small JPEG of an image of a map.
+
+    Args:
+        places: the map.
+        images: folder of the map's images; None is where they were.
+        number: the image's.
+
+    Raises:
+        InputError: the map has no such image, or its file is gone, changed or unreadable.
+    """
+    if not 0 <= number < len(places):
+        raise InputError(f"number: found {number}, expected 0 to {len(places) - 1}")
+    image = places.images[number]
+    # The record of a map keeps its names below a folder.
+    folders = [*([] if images is None else [images]), image.root, places.folder / ADDED]
+    paths = (pathlib.Path(folder, image.name) for folder in folders)
+    path = next((path for path in paths if _size(path) == image.bytes), None)
+    if path is None:
+        raise InputError(f"{image.name}: found no such picture any more, see --map-images")
+    try:
+        pixels = read_image(path, enough=(_SIDE, _SIDE), bit_depth="contrast-stretch")
+    except InputError as error:
+        raise InputError(f"{image.name}: found a picture that cannot be read") from error
+    factor = _SIDE / max(pixels.shape[:2])
+    if factor < 1:
+        height, width = (max(1, round(factor * side)) for side in pixels.shape[:2])
+        pixels = resize_image(pixels, (height, width))
+    return cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes()
+
+
+def _size(path: pathlib.Path) -> int | None:
+    """Return the bytes of an image's file, of a frame its video's; None where there is none."""
+    file = file_of(path)
+    return file.stat().st_size if file.is_file() else None

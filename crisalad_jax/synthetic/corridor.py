@@ -1,0 +1,320 @@
+"""One place indoors: a corridor, a hall or a tunnel, with all that stands and hangs in it."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from crisalad_jax.synthetic.mesh import (
+    DOWN,
+    GROUND_LAYER,
+    SIGNS,
+    UP,
+    WALLS,
+    Colour,
+    Kind,
+    Mesh,
+    Place,
+    Reach,
+    Rng,
+    bars,
+    discs,
+    flat,
+    palette,
+    pick,
+    rects,
+    scaled,
+)
+
+_EYE = 1.2
+_START = -4.0
+"""Metres along the corridor at which its walls begin, behind every camera."""
+_WOOD = palette("50 34 20, 36 23 14, 66 52 36, 75 75 72, 30 38 46, 55 20 17")
+_FLOORS = palette("40 40 41, 55 52 47, 30 31 36, 62 60 57, 42 27 20, 24 26 24")
+_CEILINGS = palette("86 85 82, 72 72 70, 60 56 50, 30 30 30")
+
+
+class _Box(NamedTuple):
+    """The inside of a corridor in metres: x of its walls, its height, its length."""
+
+    left: float
+    right: float
+    height: float
+    length: float
+
+
+def corridor(rng: Rng) -> Place:
+    """Build a corridor; one in four is a wide hall with columns."""
+    mesh = Mesh(_EYE)
+    mesh.layer = GROUND_LAYER + 1  # walls and ceiling, before all that stands in the corridor
+    hall = rng.random() < 0.25
+    width = rng.uniform(5.0, 16.0) if hall else rng.uniform(1.5, 4.2)
+    height = rng.uniform(3.0, 8.0) if hall else rng.uniform(2.2, 3.4)
+    length = rng.uniform(14.0, 50.0)
+    left = -width * rng.uniform(0.3, 0.7)
+    box = _Box(left, left + width, height, length)
+    walls = [pick(rng, WALLS), pick(rng, WALLS)]
+    if rng.random() < 0.7:
+        walls[1] = walls[0]
+    band = rng.uniform(0.8, 1.4) if rng.random() < 0.4 else 0.0
+    dado, skirting = pick(rng, WALLS), scaled(pick(rng, _WOOD), 0.8)
+
+    _floor(mesh, rng, box)
+    _ceiling(mesh, rng, box)
+    _end(mesh, rng, box)
+    for x, side, wall in ((box.left, -1.0, walls[0]), (box.right, 1.0, walls[1])):
+        front = mesh.front(x, 0.0, side)
+        front.add(rects(_START, 0, length, height), wall)
+        _stains(front, rng, wall, box)
+        if band:
+            front.add(rects(_START, 0, length, band), dado)
+            front.add(rects(_START, band, length, band + 0.06), skirting)
+        front.add(rects(_START, 0, length, 0.12), skirting)
+        _along_wall(front, rng, box)
+    if hall or rng.random() < 0.15:
+        _columns(mesh, rng, box)
+    if rng.random() < 0.5:
+        _hanging(mesh, rng, box)
+    lateral = min(0.8, 0.12 * width)
+    reach = Reach((0.5, min(1.9, height - 0.4)), lateral, forward=0.3, step=rng.uniform(1.2, 2.5))
+    heading, lanes = rng.uniform(-12, 12), (box.left, box.left, box.right, box.right)
+    return Place(mesh.scene(), heading, lanes, reach, indoors=True, traffic=False)
+
+
+def _floor(mesh: Mesh, rng: Rng, box: _Box) -> None:
+    """Add the floor, with tiles, a carpet, planks or spots."""
+    left, right, _, length = box
+    colour = pick(rng, _FLOORS)
+    mesh.add(flat(left, _START, right, length), colour, normal=UP, layer=GROUND_LAYER + 2)
+    kind = rng.choice(("plain", "tiles", "carpet", "boards", "checks"), p=(0.2, 0.3, 0.2, 0.1, 0.2))
+    if kind == "tiles":
+        size, line = rng.uniform(0.3, 1.2), rng.uniform(0.01, 0.03)
+        shade = scaled(colour, rng.choice((0.75, 1.25)))
+        z, x = np.arange(_START, length, size), np.arange(left, right, size)
+        mesh.ground(flat(left, z - line, right, z + line), shade)
+        mesh.ground(flat(x - line, _START, x + line, length), shade)
+    elif kind == "carpet":
+        inset = rng.uniform(0.1, 0.3) * (right - left)
+        mesh.ground(flat(left + inset, _START, right - inset, length), pick(rng, SIGNS, 0.3))
+        if rng.random() < 0.5:
+            edge = np.array((left + inset, right - inset - 0.08))
+            mesh.ground(flat(edge, _START, edge + 0.08, length), pick(rng, SIGNS, 0.3))
+    elif kind == "boards":
+        x = np.arange(left, right, rng.uniform(0.15, 0.4))[::2]
+        mesh.ground(flat(x, _START, x + 0.1, length), scaled(colour, 0.88))
+    elif kind == "checks":
+        size = rng.uniform(0.3, 1.0)
+        x, z = np.meshgrid(np.arange(left, right, size), np.arange(_START, length, size))
+        odd = (np.indices(x.shape).sum(0) % 2).astype(bool)
+        x, z = x[odd], z[odd]
+        checks = flat(x, z, np.minimum(x + size, right), z + size)
+        mesh.ground(checks, scaled(colour, rng.uniform(0.5, 0.9)))
+    count = int(rng.integers(0, 14))
+    x, z = rng.uniform(left, right - 0.3, count), rng.uniform(0, length, count)
+    size = rng.uniform(0.1, 0.6, count)
+    spots = flat(x, z, np.minimum(x + size, right), z + size * rng.uniform(0.5, 2.0))
+    mesh.ground(spots, scaled(colour, rng.uniform(0.6, 1.3)))
+
+
+def _ceiling(mesh: Mesh, rng: Rng, box: _Box) -> None:
+    """Add the ceiling: plain, of panels, with beams, pipes or a skylight; and its lamps."""
+    left, right, height, length = box
+    colour = pick(rng, _CEILINGS)
+    ceiling = flat(left, _START, right, length, height)
+    mesh.add(ceiling, colour, normal=DOWN, layer=GROUND_LAYER + 2)
+    if rng.random() < 0.45:
+        size = rng.uniform(0.5, 1.3)
+        z, x = np.arange(_START, length, size), np.arange(left, right, size)
+        shade = scaled(colour, rng.uniform(0.7, 0.9))
+        mesh.add(flat(left, z - 0.015, right, z + 0.015, height), shade, normal=DOWN)
+        mesh.add(flat(x - 0.015, _START, x + 0.015, length, height), shade, normal=DOWN)
+    kind = rng.choice(("panels", "strip", "points", "none"), p=(0.45, 0.2, 0.2, 0.15))
+    gap, start = rng.uniform(1.8, 5.0), rng.uniform(0.0, 3.0)
+    z = np.arange(start, length, gap)
+    middle = (left + right) / 2
+    rows = (middle,) if right - left < 6 else tuple(np.linspace(left, right, 4)[1:3])
+    for x in rows if kind != "none" else ():
+        if kind == "panels":
+            w, d = rng.uniform(0.15, 0.7), rng.uniform(0.3, 0.7)
+            lamps = flat(x - w, z - d, x + w, z + d, height)
+        elif kind == "strip":
+            lamps = flat(x - 0.07, z, x + 0.07, z + gap * 0.7, height)
+        else:
+            z = np.arange(start, length, gap / 2)
+            lamps = flat(x - 0.1, z - 0.1, x + 0.1, z + 0.1, height)
+        mesh.add(lamps, (0.96, 0.96, 0.92), Kind.LAMP, DOWN)
+    if rng.random() < 0.25:
+        depth = rng.uniform(0.15, 0.6)
+        for at in np.arange(length - rng.uniform(0.5, 2), 0, -rng.uniform(2.0, 5.0)):
+            mesh.add(rects(left, height - depth, right, height, at), scaled(colour, 0.8), layer=at)
+            under = flat(left, at, right, at + 0.3, height - depth)
+            mesh.add(under, scaled(colour, 0.9), normal=DOWN, layer=at)
+    if rng.random() < 0.3:
+        for _ in range(int(rng.integers(1, 4))):
+            x, r = rng.uniform(left + 0.1, right - 0.2), rng.uniform(0.04, 0.15)
+            pipe = flat(x - r, _START, x + r, length, height - 0.25)
+            mesh.add(pipe, pick(rng, SIGNS + WALLS), normal=DOWN)
+
+
+def _end(mesh: Mesh, rng: Rng, box: _Box) -> None:
+    """Add what closes the corridor: a wall, a door, a window, or a way on."""
+    left, right, height, length = box
+    wall = pick(rng, WALLS)
+    mesh.add(rects(left, 0, right, height, length), wall)
+    middle, half = rng.uniform(0.3, 0.7) * (right - left) + left, rng.uniform(0.2, 0.45)
+    half *= min(right - left, 3.0)
+    kind = rng.choice(("wall", "door", "window", "way"), p=(0.2, 0.35, 0.2, 0.25))
+    low, high = max(left, middle - half), min(right, middle + half)
+    if kind == "door":
+        door, top = pick(rng, _WOOD), min(2.1, height - 0.1)
+        mesh.add(rects(low - 0.08, 0, high + 0.08, top + 0.08, length), scaled(door, 0.7))
+        mesh.add(rects(low, 0, high, top, length), door)
+        if rng.random() < 0.5:
+            pane = rects(low + 0.15, 1.1, high - 0.15, top - 0.15, length)
+            mesh.add(pane, (0.8, 0.85, 0.9), Kind.WINDOW)
+    elif kind == "window":
+        sill, top = rng.uniform(0.0, 1.2), height - rng.uniform(0.1, 0.6)
+        mesh.add(rects(low, sill, high, top, length), (1.0, 1.0, 1.0), Kind.WINDOW)
+        panes = np.linspace(low, high, int(rng.integers(2, 6)))
+        mesh.add(bars(panes, 0.03, sill, top, length), wall)
+    elif kind == "way":
+        shade = rng.uniform(0.15, 1.2)
+        mesh.add(rects(low, 0, high, height * 0.9, length), scaled(wall, shade))
+        inner = rects(low + 0.2 * half, 0, high - 0.3 * half, height * 0.75, length)
+        mesh.add(inner, scaled(wall, shade * rng.uniform(0.5, 1.5)))
+
+
+def _stains(front: Mesh, rng: Rng, wall: Colour, box: _Box) -> None:
+    """Add bricks, panels or spots to a wall."""
+    height, length = box.height, box.length
+    kind = rng.choice(("none", "bricks", "panels", "spots"), p=(0.4, 0.15, 0.2, 0.25))
+    if kind == "bricks":
+        n = 260
+        u, v = rng.uniform(_START, length, n), rng.integers(0, int(height / 0.2), n) * 0.2
+        bricks = rects(u, v, u + rng.uniform(0.3, 0.5), np.minimum(v + 0.18, height))
+        front.add(bricks[: n // 2], scaled(wall, 0.82))
+        front.add(bricks[n // 2 :], scaled(wall, 1.15))
+    elif kind == "panels":
+        u = np.arange(_START, length, rng.uniform(0.8, 2.5))
+        front.add(bars(u, 0.02, 0, height), scaled(wall, 0.7))
+    elif kind == "spots":
+        n = 30
+        u, v = rng.uniform(_START, length, n), rng.uniform(0, height * 0.9, n)
+        size = rng.uniform(0.1, 0.7, n)
+        spots = rects(u, v, u + size, np.minimum(v + size * rng.uniform(0.3, 2), height))
+        front.add(spots, scaled(wall, rng.uniform(0.75, 1.2)))
+
+
+def _along_wall(front: Mesh, rng: Rng, box: _Box) -> None:
+    """Add doors, windows, boards and furniture along one wall, each at its place."""
+    doors, trim = pick(rng, _WOOD), scaled(pick(rng, _WOOD), 0.9)
+    # What recurs in this corridor; the distances, and what comes between, make the place.
+    kinds = ("door", "recess", "window", "board", "pillar", "cupboard", "bench", "box")
+    kinds += ("opening", "pipe")
+    weights = rng.dirichlet(np.full(len(kinds), 0.7))
+    top = min(2.1, box.height - 0.15)
+    z = _START + rng.uniform(0.0, 2.0)
+    while z < box.length - 1.2:
+        kind = rng.choice(kinds, p=weights)
+        front.layer = GROUND_LAYER - 1 - z * 1e-3  # after both walls
+        wide = rng.uniform(0.75, 1.1)
+        if kind == "door":
+            _door(front, rng, z, wide, top, doors, trim)
+        elif kind == "recess":
+            front.add(rects(z, 0, z + wide * 1.4, top), scaled(trim, 0.5))
+            front.add(rects(z + 0.35, 0, z + wide * 1.4, top), doors)
+        elif kind == "opening":
+            wide *= 1.8
+            front.add(rects(z, 0, z + wide, top * 1.05), (0.12, 0.12, 0.13))
+            inner = scaled((0.8, 0.8, 0.76), rng.uniform(0.2, 0.9))
+            front.add(rects(z + wide * 0.5, 0, z + wide, top * 1.05), inner)
+        elif kind == "window":
+            wide *= rng.uniform(1.0, 2.0)
+            sill, high = rng.uniform(0.5, 1.2), box.height - rng.uniform(0.2, 0.7)
+            front.add(rects(z - 0.08, sill - 0.1, z + wide + 0.08, high + 0.08), trim)
+            front.add(rects(z, sill, z + wide, high), (1.0, 1.0, 1.0), Kind.WINDOW)
+            panes = np.linspace(z, z + wide, int(rng.integers(1, 4)) + 1)[1:-1]
+            front.add(bars(panes, 0.03, sill, high), trim)
+        elif kind == "board":
+            v, tall = rng.uniform(1.0, 1.5), rng.uniform(0.3, 0.9)
+            wide *= rng.uniform(0.5, 1.8)
+            front.add(rects(z, v, z + wide, v + tall), pick(rng, SIGNS + WALLS, 0.2))
+            n = int(rng.integers(0, 9))
+            u, w = z + rng.uniform(0, 0.7, n) * wide, v + rng.uniform(0, 0.7, n) * tall
+            notes = rects(u, w, u + 0.25 * wide, w + 0.25 * tall)
+            front.add(notes[: n // 2], pick(rng, SIGNS, 0.3))
+            front.add(notes[n // 2 :], (0.9, 0.9, 0.88))
+        else:
+            _furniture(front, rng, kind, z, wide, box.height)
+        z += wide + rng.exponential(1.6) + 0.15
+
+
+def _door(
+    front: Mesh, rng: Rng, z: float, wide: float, top: float, doors: Colour, trim: Colour
+) -> None:
+    """Add a door in its frame, at times with a pane or a panel, and with a sign."""
+    end = z + wide
+    front.add(rects(z - 0.08, 0, end + 0.08, top + 0.08), trim)
+    colour = doors if rng.random() < 0.8 else pick(rng, _WOOD)
+    front.add(rects(z, 0, end, top), colour)
+    look = rng.integers(3)
+    if look == 1:
+        front.add(rects(z + 0.2, 1.2, end - 0.2, top - 0.2), (0.25, 0.3, 0.33))
+    elif look == 2:
+        front.add(rects(z + 0.1, 0.1, end - 0.1, 0.9), scaled(colour, 0.8))
+    front.add(rects(end - 0.15, 0.95, end - 0.05, 1.05), (0.8, 0.8, 0.75))
+    if rng.random() < 0.4:
+        front.add(rects(end + 0.15, 1.4, end + 0.4, 1.6), pick(rng, SIGNS))
+
+
+def _furniture(front: Mesh, rng: Rng, kind: str, z: float, wide: float, height: float) -> None:
+    """Add what stands out of the wall: a pillar, a cupboard, a bench, a pipe or a box."""
+    front.layer = z
+    colour = pick(rng, _WOOD + WALLS)
+    if kind == "pillar":
+        rect, out = (z, 0.0, z + rng.uniform(0.3, 0.7), height), rng.uniform(0.1, 0.5)
+    elif kind == "cupboard":
+        rect = (z, 0.0, z + wide, rng.uniform(0.9, min(2.2, height - 0.1)))
+        out = rng.uniform(0.3, 0.5)
+    elif kind == "bench":
+        rect, out = (z, 0.35, z + wide * 1.4, 0.5), 0.45
+    elif kind == "pipe":
+        rect, out = (z, 0.0, z + 0.12, height), 0.12
+    else:
+        v = rng.uniform(0.2, 1.4)
+        rect = (z, v, z + rng.uniform(0.2, 0.6), v + rng.uniform(0.2, 0.7))
+        out, colour = rng.uniform(0.08, 0.25), pick(rng, SIGNS, 0.2)
+    front.boxes(rect, out, colour)
+    if kind == "cupboard":
+        middle = z + wide / 2
+        front.add(bars(middle, 0.02, 0.05, rect[3] - 0.05, 0.45), scaled(colour, 0.6))
+
+
+def _columns(mesh: Mesh, rng: Rng, box: _Box) -> None:
+    """Add two rows of columns, or one."""
+    stone, half = pick(rng, WALLS), rng.uniform(0.15, 0.45)
+    rows = (box.left * 0.6, box.right * 0.6) if rng.random() < 0.7 else (box.right * 0.5,)
+    for z in np.arange(box.length - 1, 3.0, -rng.uniform(2.5, 6.0)):
+        mesh.layer = float(z)
+        for x in rows:
+            mesh.block((x - half, 0, z), (x + half, box.height, z + 2 * half), stone)
+
+
+def _hanging(mesh: Mesh, rng: Rng, box: _Box) -> None:
+    """Add signs under the ceiling, and things that stand about on the floor."""
+    left, right, height, length = box
+    for z in rng.uniform(4.0, length, int(rng.integers(0, 4))):
+        mesh.layer = float(z)
+        x, wide = rng.uniform(left, right - 0.5), rng.uniform(0.3, 1.2)
+        v = height - rng.uniform(0.4, 0.7)
+        sign = rects(x, v, min(x + wide, right), v + rng.uniform(0.15, 0.35), z)
+        mesh.add(sign, pick(rng, SIGNS), Kind.LAMP if rng.random() < 0.3 else Kind.SOLID)
+    for z in rng.uniform(3.0, length, int(rng.integers(0, 5))):
+        mesh.layer = float(z)
+        edge = rng.uniform(0.1, 0.3) * (right - left)
+        x = left + edge if rng.random() < 0.5 else right - edge
+        colour = pick(rng, _WOOD + SIGNS)
+        if rng.random() < 0.4:
+            mesh.add(discs(x, 0.8, rng.uniform(0.2, 0.4), z), (0.18, 0.34, 0.16), Kind.NEEDLE)
+        else:
+            half, tall = rng.uniform(0.1, 0.35), rng.uniform(0.3, 1.1)
+            mesh.block((x - half, 0, z), (x + half, tall, z + 2 * half), colour)

@@ -1,0 +1,244 @@
+"""The geometry of a place, in metres: x to the right across the street, y up, z along it.
+
+The camera of the default view stands at x = z = 0. A scene is a list of parts, painted from the far
+ones to the near.
+"""
+
+import copy
+import enum
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from crisalad_jax.synthetic.view import EYE
+
+Colour = tuple[float, float, float]
+"""Red, green and blue, 0 to 1."""
+Vector = tuple[float, float, float]
+Number = int | float | np.ndarray
+Polygons = Float[np.ndarray, "polygon corner 3"]
+Rect = tuple[Number, Number, Number, Number]
+"""The left, low, right and high edges of rectangles."""
+Rng = np.random.Generator
+Lanes = tuple[float, float, float, float]
+"""x of the left fronts, the left kerb, the right kerb and the right fronts of a street."""
+Body = tuple[float, float, float, float, float]
+"""A building's x0, x1, z0, z1 and height in metres, for its shadow."""
+
+GROUND_LAYER = 1e6
+"""Smallest layer of parts on the ground, which are painted below every shadow."""
+UP: Vector = (0.0, 1.0, 0.0)
+DOWN: Vector = (0.0, -1.0, 0.0)
+TO_CAMERA: Vector = (0.0, 0.0, -1.0)
+
+
+class Kind(enum.IntEnum):
+    """Material of a part, which decides how season and light change it.
+
+    SOIL is a field or ballast: of its own colour, under snow in winter. BUSH is leaves that are
+    bare twigs in winter. WINDOW is an opening to the sky, seen from inside.
+    """
+
+    SOLID, ROOF, LEDGE, PAVEMENT, ROAD, GRASS, LEAF, NEEDLE = range(8)
+    GLASS, SHOP, LAMP, HEADLIGHT, TAILLIGHT, SOIL, BUSH, WINDOW = range(8, 16)
+
+
+def palette(percents: str) -> tuple[Colour, ...]:
+    """Read colours from text: red, green and blue in percent, a comma between colours."""
+    rows = (map(int, colour.split()) for colour in percents.split(","))
+    return tuple((red / 100, green / 100, blue / 100) for red, green, blue in rows)
+
+
+WALLS = palette(
+    "55 29 23, 76 60 36, 84 78 64, 56 56 57, 70 60 48, 74 54 49, 58 66 72, 57 63 50, 86 85 82,"
+    "40 27 24, 66 64 61, 42 45 49, 70 42 30"
+)
+ROOFS = palette("52 27 20, 33 33 36, 42 34 29, 30 42 38")
+SIGNS = palette("70 16 14, 13 28 52, 12 40 24, 85 66 14, 20 18 20, 82 80 76")
+GLASS: Colour = (0.16, 0.20, 0.25)
+
+
+def scaled(colour: Colour, gain: float) -> Colour:
+    """Multiply a colour, or any other vector, by a number."""
+    return (colour[0] * gain, colour[1] * gain, colour[2] * gain)
+
+
+def pick(rng: np.random.Generator, colours: tuple[Colour, ...], spread: float = 0.06) -> Colour:
+    """Draw one of the colours, up to a share `spread` lighter or darker."""
+    colour = colours[rng.integers(len(colours))]
+    return scaled(colour, 1 + rng.uniform(-spread, spread))
+
+
+def polygons(*corners: tuple[Number, Number, Number]) -> Polygons:
+    """Make as many polygons as a coordinate's array has numbers; single numbers are repeated."""
+    numbers = [number for corner in corners for number in corner]
+    count = next((len(n) for n in numbers if isinstance(n, np.ndarray)), 1)
+    table = np.empty((count, len(numbers)))
+    for column, number in enumerate(numbers):
+        table[:, column] = number
+    return table.reshape(count, len(corners), 3)
+
+
+def rects(
+    x0: Number, y0: Number, x1: Number, y1: Number, z: Number = 0.0, top_z: Number | None = None
+) -> Polygons:
+    """Make rectangles between two edges along x, upright unless `top_z` differs from `z`."""
+    top_z = z if top_z is None else top_z
+    return polygons((x0, y0, z), (x1, y0, z), (x1, y1, top_z), (x0, y1, top_z))
+
+
+def bars(x: Number, half: Number, y0: Number, y1: Number, z: Number = 0.0) -> Polygons:
+    """Make upright rectangles that reach `half` metres to either side of x."""
+    return rects(x - half, y0, x + half, y1, z)
+
+
+def flat(x0: Number, z0: Number, x1: Number, z1: Number, y: float = 0.0) -> Polygons:
+    """Make level rectangles, on the ground unless a height `y` is given."""
+    return rects(x0, y, x1, y, z0, z1)
+
+
+def sheets(
+    x0: Number, z0: Number, x1: Number, z1: Number, low: Number, high: Number, lean: Number = 0.0
+) -> Polygons:
+    """Make upright sheets over lines on the ground; their tops are moved along x by `lean`."""
+    return polygons((x0, low, z0), (x1, low, z1), (x1 + lean, high, z1), (x0 + lean, high, z0))
+
+
+def discs(x: Number, y: Number, radius: Number, z: float) -> Polygons:
+    """Make round polygons that face the camera."""
+    angles = np.arange(10) * (2 * np.pi / 10)
+    return polygons(*((x + radius * np.cos(a), y + radius * np.sin(a), z) for a in angles))
+
+
+class Scene(NamedTuple):
+    """Parts as arrays: points in metres, polygons as runs of points, parts as runs of polygons."""
+
+    points: Float[np.ndarray, "point 3"]
+    polygon_sizes: Int[np.ndarray, " polygon"]
+    part_sizes: Int[np.ndarray, " part"]
+    albedo: Float[np.ndarray, "part 3"]
+    normal: Float[np.ndarray, "part 3"]
+    kind: Int[np.ndarray, " part"]
+    layer: Float[np.ndarray, " part"]
+    """Painting order: larger is farther away."""
+
+
+class Mesh:
+    """A scene being built of parts: polygons of one colour, one normal and one layer."""
+
+    def __init__(self, eye: float = EYE) -> None:
+        """Start without parts; cameras are some `eye` metres above the ground."""
+        self.eye = eye
+        self.layer = 0.0
+        """Painting order of the parts to come: larger is farther away, and painted first."""
+        self.normal: Vector = TO_CAMERA
+        """Direction that the parts to come face unless told otherwise."""
+        self.sees_start = False
+        """Whether the camera sees the ends towards small u of a front, or those towards large u."""
+        self.end_normal: Vector = UP
+        self._origin, self._axes = np.zeros(3), np.eye(3)
+        self._points: list[np.ndarray] = []
+        self._polygon_sizes: list[np.ndarray] = []
+        self._parts: list[tuple[int, Colour, Vector, int, float]] = []
+
+    def front(self, x: float, z: float, side: float) -> "Mesh":
+        """Return the same mesh in other axes: those of a vertical plane, in the present layer.
+
+        u runs along the plane, v up, d out of it. The plane stands on (x, z), on a side of the
+        street, which is -1 or 1, or across the street where that is 0.
+        """
+        front = copy.copy(self)
+        along = (0.0, 0.0, 1.0) if side else (1.0, 0.0, 0.0)
+        front.normal = (-side, 0.0, 0.0) if side else TO_CAMERA
+        front.sees_start = side != 0 or x > 0
+        front.end_normal = scaled(along, -1.0 if front.sees_start else 1.0)
+        front._origin, front._axes = np.array((x, 0.0, z)), np.array((along, UP, front.normal))
+        return front
+
+    def world(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Convert points from the mesh's axes to the world's."""
+        return points @ self._axes + self._origin
+
+    def add(
+        self,
+        polygons: Polygons,
+        albedo: Colour,
+        kind: Kind = Kind.SOLID,
+        normal: Vector | None = None,
+        layer: float | None = None,
+    ) -> None:
+        """Add a part; without polygons it is left out."""
+        count, corners, _ = polygons.shape
+        if count:
+            self._points.append(self.world(polygons).reshape(-1, 3))
+            self._polygon_sizes.append(np.full(count, corners))
+            layer = self.layer if layer is None else layer
+            self._parts.append((count, albedo, normal or self.normal, int(kind), layer))
+
+    def ground(self, polygons: Polygons, albedo: Colour, kind: Kind = Kind.SOLID) -> None:
+        """Add a part of the ground, over those before it."""
+        self.add(polygons, albedo, kind, UP, GROUND_LAYER + 1)
+
+    def block(self, low: Vector, high: Vector, albedo: Colour) -> None:
+        """Add an upright box: its top, its side towards the middle of the street, its front."""
+        (x0, y0, z0), (x1, y1, z1) = low, high
+        x, outwards = (x1, 1.0) if x0 + x1 < 0 else (x0, -1.0)
+        self.add(flat(x0, z0, x1, z1, y1), albedo, Kind.ROOF, UP)
+        self.add(sheets(x, z0, x, z1, y0, y1), albedo, normal=(outwards, 0.0, 0.0))
+        self.add(rects(x0, y0, x1, y1, z0), albedo)
+
+    def boxes(self, rect: Rect, out: float, albedo: Colour, kind: Kind = Kind.SOLID) -> None:
+        """Add boxes that protrude from a front: the visible end, the top or underside, the face."""
+        u0, v0, u1, v1 = rect
+        end = u0 if self.sees_start else u1
+        self.add(sheets(end, 0.0, end, out, v0, v1), albedo, normal=self.end_normal)
+        above = float(np.min(v0)) > self.eye
+        v = v0 if above else v1
+        self.add(rects(u0, v, u1, v, 0.0, out), albedo, normal=DOWN if above else UP)
+        self.add(rects(u0, v0, u1, v1, out), albedo, kind)
+
+    def scene(self) -> Scene:
+        """Make a scene of all parts, of which there has to be at least one."""
+        counts, albedo, normal, kind, layer = map(np.array, zip(*self._parts, strict=True))
+        points, sizes = np.concatenate(self._points), np.concatenate(self._polygon_sizes)
+        return Scene(points, sizes, counts, albedo, normal, kind, layer)
+
+
+class Reach(NamedTuple):
+    """Where cameras stand in a place."""
+
+    height: tuple[float, float]
+    """Least and most metres from the ground."""
+    lateral: float
+    """Most metres to the side."""
+    forward: float
+    """Most metres along it, from a station."""
+    step: float
+    """Metres from one station to the next, which are places of their own that look alike."""
+
+
+class Place(NamedTuple):
+    """The scene of one place, and the orientation of its street."""
+
+    scene: Scene
+    heading: float
+    """Direction of the default view in degrees clockwise from the street."""
+    lanes: Lanes
+    reach: Reach
+    bearing: float = 0.0
+    """Direction of the street in degrees clockwise from north."""
+    hills: Float[np.ndarray, " bearing"] = np.zeros(96)
+    """Height of the hills over the horizon, as a tangent, at equal steps around the compass."""
+    bodies: Sequence[Body] = ()
+    lamps: Float[np.ndarray, "lamp 3"] = np.zeros((0, 3))
+    indoors: bool = False
+    traffic: bool = True
+    """Whether vehicles pass; people do everywhere."""
+
+
+def draw_hills(rng: np.random.Generator, most: float) -> Float[np.ndarray, " bearing"]:
+    """Draw the hills of a place, no steeper than the tangent `most`."""
+    ridge = rng.uniform(0.0, 1.0, 24) ** 2 * rng.uniform(0.02, most)
+    return np.interp(np.arange(96), np.arange(24) * 4.0, ridge, period=96)

@@ -1,0 +1,202 @@
+"""A world to learn from: streets, corridors and country, in the layouts of real sets."""
+
+import dataclasses
+import itertools
+import os
+from collections.abc import Iterator, Sequence
+from typing import Literal, get_args
+
+import numpy as np
+
+from crisalad_jax.config.checks import check_seed, check_types
+from crisalad_jax.synthetic.layouts import (
+    METRES_PER_DEGREE,
+    UTM_ORIGIN,
+    Files,
+    Progress,
+    TrainImage,
+    gsv_city,
+    holds,
+    jpeg,
+    panoid,
+    utm_path,
+    write_set,
+)
+from crisalad_jax.synthetic.mesh import Reach, Rng
+from crisalad_jax.synthetic.picture import build_place, render
+from crisalad_jax.synthetic.view import (
+    SCENERIES,
+    SEASONS,
+    TIMES,
+    WEATHERS,
+    Scenery,
+    View,
+    check_range,
+    check_size,
+)
+
+Variation = Literal["stand", "season", "time", "weather", "traffic", "exposure"]
+"""What changes from image to image of a place, besides paint; exposure has the noise with it.
+
+The sun's place, the clouds and the white balance come of a picture's seed, which always changes.
+"""
+VARIATIONS: tuple[Variation, ...] = get_args(Variation)
+_FIELDS: dict[Variation, tuple[str, ...]] = {
+    "stand": ("lateral", "forward", "heading", "height", "pitch", "field"),
+    "season": ("season",),
+    "time": ("time",),
+    "weather": ("weather",),
+    "traffic": ("occluders",),
+    "exposure": ("exposure", "noise"),
+}
+"""Fields of `View` that are one variation."""
+_FILE = "world.json"
+_SCENES_PER_CITY = 12
+_SPACING = 100.0
+"""Metres between places in the files, where stations of a scene lie nearer in truth."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WorldConfig:
+    """Size and seed of a world."""
+
+    scenes: int = 2400
+    """Scenes to train on, of streets, corridors and country in turn."""
+    stations: int = 4
+    """Places of a scene, one behind the other: they look alike."""
+    images_per_place: int = 4
+    test_scenes: int = 100
+    """Other scenes, with two images of each station: one to find and one to ask with."""
+    image_size: tuple[int, int] = (120, 160)
+    """Height and width in pixels."""
+    sceneries: tuple[Scenery, ...] = SCENERIES
+    repaint: float = 0.3
+    """Largest `View.repaint`."""
+    varied: tuple[Variation, ...] = VARIATIONS
+    """What changes between the training images of a place. The rest is as in a plain `View`, the
+    stand as the scene's camera. Test images change in all of these."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check the types and ranges."""
+        check_types(self)
+        # The order of variations makes no other world.
+        varied = tuple(name for name in VARIATIONS if name in self.varied)
+        object.__setattr__(self, "varied", varied)
+        for name in ("scenes", "stations", "images_per_place", "test_scenes"):
+            check_range(f"WorldConfig.{name}", getattr(self, name), 1)
+        check_range("WorldConfig.repaint", self.repaint, 0, 3)
+        check_range("WorldConfig.sceneries: length", len(self.sceneries), 1)
+        check_seed("WorldConfig.seed", self.seed)
+        check_size("WorldConfig.image_size", self.image_size)
+
+    @property
+    def images(self) -> int:
+        """Number of all images."""
+        return (self.scenes * self.images_per_place + self.test_scenes * 2) * self.stations
+
+
+def write_world(
+    root: str | os.PathLike[str], config: WorldConfig, *, progress: Progress = None
+) -> None:
+    """Render a world into `root`, whole or not at all.
+
+    `root/train` has the layout of GSV-Cities; a city is some scenes of one kind. `root/test` has
+    that of VPR-datasets-downloader. Coordinates are placeholders: places are 100 m apart.
+
+    Args:
+        root: a folder that does not exist, or is empty, or holds this world.
+        config: how many scenes and images, their size, the seed.
+        progress: called with 1 after every image.
+
+    Raises:
+        InputError: `root` is a file, holds something else, or cannot be written to.
+    """
+    write_set(root, _FILE, config, _files(config), progress)
+
+
+def has_world(root: str | os.PathLike[str], config: WorldConfig) -> bool:
+    """Return whether `root` holds this world already; False where it can be written there.
+
+    Args:
+        root: a folder.
+        config: the world.
+
+    Raises:
+        InputError: `root` is a file, or holds something else.
+    """
+    return holds(root, _FILE, config)
+
+
+def _files(config: WorldConfig) -> Files:
+    for city, first in enumerate(range(0, config.scenes, _SCENES_PER_CITY)):
+        scenes = range(first, min(first + _SCENES_PER_CITY, config.scenes))
+        scenery = config.sceneries[city % len(config.sceneries)]
+        yield from gsv_city(f"{scenery}{city:04d}", _train_images(config, scenery, scenes))
+    config = dataclasses.replace(config, varied=VARIATIONS, images_per_place=2)
+    for scene in range(config.test_scenes):
+        scenery = config.sceneries[scene % len(config.sceneries)]
+        sides = itertools.cycle(("database", "queries"))
+        for place, view, picture, rng in _images(config, 1, scene, scenery):
+            north = UTM_ORIGIN[1] + place * _SPACING
+            note = f"{scenery}_{view.season}_{view.time}"
+            yield utm_path(next(sides), UTM_ORIGIN[0], north, panoid(rng), note), picture
+
+
+def _train_images(
+    config: WorldConfig, scenery: Scenery, scenes: Sequence[int]
+) -> Iterator[TrainImage]:
+    for scene in scenes:
+        for place, view, picture, rng in _images(config, 0, scene, scenery):
+            lat = f"{10 + (place + 1) * _SPACING / METRES_PER_DEGREE:.7f}"
+            yield TrainImage(place + 1, picture, lat, "-40.0000000", 0, view.season, rng)
+
+
+def _images(
+    config: WorldConfig, split: int, scene: int, scenery: Scenery
+) -> Iterator[tuple[int, View, bytes, Rng]]:
+    """Render a scene: each image's place, view, picture, and what drew the views of the place."""
+    entropy = (config.seed, 2 + split, scene)
+    seed = int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0])
+    for station in range(config.stations):
+        rng = np.random.default_rng((config.seed, split, scene, station))
+        for view in views(config, seed, scenery, station, rng):
+            picture = jpeg(render(seed, view, config.image_size, scenery))
+            yield scene * config.stations + station, view, picture, rng
+
+
+def views(config: WorldConfig, seed: int, scenery: Scenery, station: int, rng: Rng) -> list[View]:
+    """Draw views of one station: a camera for the scene, and what changes from image to image."""
+    reach = build_place(seed, scenery).reach
+    camera = np.random.default_rng((seed, 6))
+    plain = View(
+        forward=station * reach.step,
+        height=camera.uniform(*reach.height),
+        field=camera.uniform(55.0, 95.0),
+        pitch=camera.uniform(-4.0, 9.0),
+    )
+    still = [name for one in _FIELDS if one not in config.varied for name in _FIELDS[one]]
+    fixed = {name: getattr(plain, name) for name in still}
+    drawn = [_draw_view(plain, reach, config.repaint, rng) for _ in range(config.images_per_place)]
+    return [dataclasses.replace(view, **fixed) for view in drawn]
+
+
+def _draw_view(plain: View, reach: Reach, repaint: float, rng: Rng) -> View:
+    """Draw a view near the plain one."""
+    time = TIMES[rng.choice(3, p=(0.6, 0.25, 0.15))]
+    return View(
+        lateral=float(rng.uniform(-1, 1) * reach.lateral),
+        forward=float(plain.forward + rng.uniform(-1, 1) * reach.forward),
+        heading=float(rng.uniform(-5, 5)),
+        height=float(plain.height * rng.uniform(0.93, 1.07)),
+        pitch=float(plain.pitch + rng.uniform(-1.5, 1.5)),
+        field=float(plain.field * rng.uniform(0.95, 1.05)),
+        repaint=float(rng.uniform(0, repaint)),
+        season=SEASONS[rng.integers(4)],
+        time=time,
+        weather=WEATHERS[rng.choice(4, p=(0.45, 0.3, 0.13, 0.12))],
+        occluders=int(rng.integers(2**31)) if rng.random() < 0.6 else None,
+        exposure=float(rng.uniform(-0.5, 0.6)),
+        noise=float(rng.uniform(1, 5) + 2 * (time == "night")),
+        seed=int(rng.integers(2**31)),
+    )

@@ -1,0 +1,105 @@
+"""CosPlace (Berton et al., CVPR 2022) and EigenPlaces (ICCV 2023): classification of places.
+
+Over ResNet they are the codes' own, over our ViT what the paper compares.
+"""
+
+import dataclasses
+from typing import Any
+
+from crisalad_jax.config.classes import ClassesConfig
+from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
+from crisalad_jax.losses import LossConfig
+from crisalad_jax.losses.large_margin_cosine import LargeMarginCosineConfig
+from crisalad_jax.nn.aggregators import AGGREGATORS
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.recipes.base import register_recipe
+from crisalad_jax.training.recipes.convolutional import model_over
+
+_VIEWPOINTS = LargeMarginCosineConfig(
+    scale=100.0,
+    classes=ClassesConfig(kind="viewpoints", groups=9, steps=5000, cell=15.0, spacing=3),
+)
+
+
+def _classified(model: ModelConfig, loss: LargeMarginCosineConfig, **fields: Any) -> TrainConfig:
+    """Make what both codes share: Adam at 1e-5, and 32 classes, an image of each."""
+    return TrainConfig(
+        model=model,
+        loss=LossConfig(kind=loss),
+        optimiser=OptimiserConfig(
+            kind="adam", learning_rate=1e-5, end_lr_fraction=1.0, weight_decay=0.0
+        ),
+        places_per_batch=32,
+        images_per_place=1,
+        batch_order="shuffled",
+        patience=None,
+        **fields,
+    )
+
+
+def _over_resnet(
+    model: ModelConfig, preset: str, loss: LargeMarginCosineConfig, dtype: str, **fields: Any
+) -> TrainConfig:
+    """Make a recipe over ResNet-18, whose last two stages train, for images at their own sizes."""
+    head = AGGREGATORS.make("cosplace", preset)
+    backbone, size = ResNetConfig(layers=18), (512, 512)
+    return _classified(
+        model_over(preset, model, backbone, head, size, compute_dtype=dtype, size_rule="native"),
+        loss,
+        trainable="last-2-blocks+head",
+        augmentation=ColourCropConfig(),
+        monitor="R@1",
+        **fields,
+    )
+
+
+@register_recipe("cosplace")
+def cosplace(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make CosPlace's recipe, of gmberton/CosPlace: ResNet-18 and 512 numbers, its code's defaults.
+
+    Classes are cells of position and heading, which ask for the headings of `northdeg`, and for
+    many images of a spot, as in San Francisco XL. Images are described at their own sizes.
+    """
+    loss = LargeMarginCosineConfig(classes=ClassesConfig(kind="cells", steps=10_000))
+    return _over_resnet(model, preset, loss, "float32", min_images=10, epochs=50)
+
+
+@register_recipe("eigenplaces-turns")
+def eigenplaces_turns(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make EigenPlaces' recipe, of gmberton/EigenPlaces, with two differences.
+
+    A step of its code takes a batch of lateral and one of frontal classes, here they take turns by
+    epochs, of which there are twice as many. It cuts images out of panoramas, towards the focal
+    point; here photographs have the headings that they have.
+    """
+    return _over_resnet(model, preset, _VIEWPOINTS, "bfloat16", min_images=5, epochs=80)
+
+
+@register_recipe("cosplace-vit")
+def cosplace_vit(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make CosPlace's recipe for our ViT, whose adapters and head train.
+
+    Images have the ViT's size, and RandAugment. The classes are GSV-Cities' places, for each of
+    them is one spot in one direction.
+    """
+    loss = LargeMarginCosineConfig(classes=ClassesConfig(steps=10_000))
+    head = AGGREGATORS.make("cosplace", preset)
+    return _classified(_over_vit(model, head), loss, epochs=50)
+
+
+@register_recipe("eigenplaces-vit")
+def eigenplaces_vit(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make EigenPlaces' recipe for our ViT: viewpoint classes, longer descriptors.
+
+    As in `eigenplaces_turns`, lateral and frontal classes take turns by epochs.
+    """
+    head: Any = AGGREGATORS.make("cosplace", preset)
+    head = dataclasses.replace(head, dim=4 * head.dim)
+    return _classified(_over_vit(model, head), _VIEWPOINTS, epochs=80, min_images=5)
+
+
+def _over_vit(model: ModelConfig, aggregator: Any) -> ModelConfig:
+    cross_image = dataclasses.replace(model.cross_image, layers=0)
+    return dataclasses.replace(model, aggregator=aggregator, cross_image=cross_image)

@@ -1,0 +1,281 @@
+"""Recipes over DINOv2, each as its authors' code trains it.
+
+All but CricaVPR's have no cross-image encoder. Where a code validates at a larger size, so do
+these, but for preset tiny, which validates at the model's.
+"""
+
+import dataclasses
+from typing import Any
+
+from crisalad_jax.data.augmentations import NoAugmentation
+from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
+from crisalad_jax.losses import LossConfig
+from crisalad_jax.losses.selavpr import SelaVprLoss
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.aggregators import AGGREGATORS
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.training.config import MiningConfig, OptimiserConfig, TrainConfig
+from crisalad_jax.training.recipes.base import register_recipe, resized, validation_size
+
+NO_ADAPTER = AdapterConfig(kind="none")
+ADAM_STEP = OptimiserConfig(kind="adam", learning_rate=5e-5, schedule="step", weight_decay=0.0)
+"""Of CricaVPR's code, and of those that grew from it."""
+BOQ_TRAINING: dict[str, Any] = {
+    "optimiser": OptimiserConfig(
+        learning_rate=1e-4,
+        schedule="milestones",
+        milestones=(10, 20),
+        step_gamma=0.1,
+        warmup_epochs=10,
+        weight_decay=1e-4,
+    ),
+    "trainable": "last-2-blocks+head",
+    "augmentation": RandAugmentConfig(magnitude=15),
+    "places_per_batch": 128,
+    "epochs": 40,
+    "monitor": "R@1",
+    "patience": None,
+}
+"""What BoQ's code has for all its backbones."""
+MIXVPR_OPTIMISER = OptimiserConfig(
+    kind="sgd",
+    learning_rate=0.05,
+    schedule="milestones",
+    milestones=(5, 10, 15, 25, 45),
+    step_gamma=0.3,
+    warmup_steps=650,
+    weight_decay=1e-3,
+)
+"""That of amaralibey/MixVPR, for 120 places."""
+
+
+def _model(
+    model: ModelConfig,
+    preset: str,
+    aggregator: str | None,
+    *,
+    adapter: AdapterConfig = NO_ADAPTER,
+    layers: int = 0,
+    compute_dtype: Any = "float32",
+    backbone: dict[str, Any] | None = None,
+    **preprocessing: Any,
+) -> ModelConfig:
+    """Put a method's head and adapters on a preset's backbone.
+
+    Args:
+        model: the preset's.
+        preset: its name.
+        aggregator: name of the head; None keeps the preset's.
+        adapter: what is beside the blocks.
+        layers: number of layers of the cross-image encoder.
+        compute_dtype: see `ModelConfig`.
+        backbone: other settings of the backbone.
+        **preprocessing: how photographs are resized; see `resized`.
+    """
+    head = model.aggregator if aggregator is None else AGGREGATORS.make(aggregator, preset)
+    vit: Any = dataclasses.replace(model.backbone, adapter=adapter, **(backbone or {}))
+    return dataclasses.replace(
+        model,
+        preprocessing=resized(model.preprocessing, **preprocessing),
+        backbone=vit,
+        aggregator=head,
+        cross_image=dataclasses.replace(model.cross_image, layers=layers),
+        compute_dtype=compute_dtype,
+    )
+
+
+@register_recipe("anyloc")
+def anyloc(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make AnyLoc's recipe (Keetha et al., RA-L 2023), of whose model nothing trains."""
+    return TrainConfig(model=_model(model, preset, "anyloc"), trainable="head")
+
+
+@register_recipe("salad")
+def salad(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make SALAD's recipe, of serizba/salad (Izquierdo and Civera, CVPR 2024).
+
+    There is no adapter or encoder; the last four blocks train in mixed precision.
+
+    Its code also moves the schedule on by a step at the end of each epoch, which is left out: a
+    learning rate lower by less than 1 part in 1,000.
+    """
+    return TrainConfig(
+        model=_model(model, preset, None, compute_dtype="bfloat16"),
+        optimiser=OptimiserConfig(weight_decay=9.5e-9, end_lr_fraction=0.2, decay_steps=4000),
+        trainable="last-4-blocks+head",
+        places_per_batch=60,
+        epochs=4,
+        monitor="R@1",
+        patience=None,
+    )
+
+
+@register_recipe("vlad-buff")
+def vlad_buff(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make VLAD-BuFF's recipe, of Ahmedest61/VLAD-BuFF (Khaliq et al., ECCV 2024).
+
+    It is SALAD's training of another head, which starts from principal components and centroids of
+    500 training images. The code takes images of London for these; its published weights are those
+    of the last epoch.
+    """
+    head = _model(model, preset, "vlad-buff", compute_dtype="bfloat16")
+    return dataclasses.replace(salad(model, preset), model=head)
+
+
+@register_recipe("cricavpr")
+def cricavpr(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make CricaVPR's recipe, of Lu-Feng/CricaVPR (Lu et al., CVPR 2024).
+
+    It has multi-resolution adapters, a GeM pyramid, and Adam with step decay. Its README trains 10
+    epochs, fewer than its patience of 10 would ever end. The best weights are those of the best
+    R@5, as in its code of today; its first version added R@1.
+    """
+    return TrainConfig(
+        model=_model(
+            *(model, preset, "gem-pyramid"),
+            adapter=AdapterConfig(kind="multi-resolution"),
+            layers=model.cross_image.layers,
+            antialias=False,
+            pixels="floats",
+        ),
+        optimiser=dataclasses.replace(ADAM_STEP, learning_rate=1e-4),
+        places_per_batch=72,
+        epochs=10,
+        patience=10,
+    )
+
+
+@register_recipe("selavpr")
+def selavpr(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make SelaVPR's recipe, of Lu-Feng/SelaVPR (ICLR 2024): of preset l14, tuples mined in MSLS.
+
+    4 tuples of a query, a positive and 2 negatives make a batch; the loss compares descriptors and
+    local features. An epoch has 30,000 queries, in rounds of 1,000. For Pitts30k, which follows
+    from the weights of MSLS, it has 5,000: `--mining.queries-per-epoch 5000`. The code validates
+    with re-ranking, here without.
+    """
+    mining = MiningConfig(kind="sample", negatives=2, queries_per_epoch=30_000)
+    return TrainConfig(
+        model=_model(
+            *(model, preset, "selavpr"),
+            adapter=AdapterConfig(kind="serial-parallel"),
+            antialias=False,
+            pixels="floats",
+        ),
+        loss=LossConfig(kind=SelaVprLoss(), miner="none"),
+        optimiser=OptimiserConfig(
+            kind="adam", learning_rate=1e-5, end_lr_fraction=1.0, weight_decay=0.0
+        ),
+        augmentation=NoAugmentation(),
+        mining=mining,
+        places_per_batch=4,
+        images_per_place=2 + mining.negatives,
+        epochs=50,
+        patience=3,
+    )
+
+
+@register_recipe("edtformer")
+def edtformer(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make EDTformer's recipe, of Tong-Jin01/EDTformer (Jin et al. 2025).
+
+    It has adapters of width 4 beside the blocks, a decoder, and Adam with step decay.
+    """
+    adapter = AdapterConfig(kind="side", bottleneck=4 / model.backbone.dim, alpha=0.5)
+    return TrainConfig(
+        model=_model(
+            model, preset, "edtformer", adapter=adapter, pixels="floats", round_to_patch=True
+        ),
+        optimiser=dataclasses.replace(ADAM_STEP, learning_rate=1e-4, step_gamma=0.7),
+        places_per_batch=72,
+        epochs=15,
+        patience=15,
+        validation_size=validation_size(preset, 322),
+    )
+
+
+@register_recipe("supervlad")
+def supervlad(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make SuperVLAD's recipe, of Lu-Feng/SuperVLAD (NeurIPS 2024), without its encoder.
+
+    The last four blocks train. Scores start from k-means centroids of 5,000 training images. The
+    code takes images of MSLS for these, at 322 x 322. (Its encoder of the cross-image model has an
+    optimiser of its own, which after the first step finds no gradient.)
+    """
+    return TrainConfig(
+        model=_model(model, preset, "supervlad", pixels="floats", round_to_patch=True),
+        optimiser=ADAM_STEP,
+        trainable="last-4-blocks+no-norm+head",
+        places_per_batch=120,
+        epochs=20,
+        monitor="R@1+R@5",
+        validation_size=validation_size(preset, 322),
+    )
+
+
+@register_recipe("image")
+def image(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make ImAge's recipe, of Lu-Feng/ImAge (NeurIPS 2025): DINOv2 with registers.
+
+    The blocks train from the one on that the tokens enter at. The tokens start from centroids of
+    the last features of 5,000 training images. The code takes images of MSLS for these, unless
+    asked otherwise, at 322 x 322.
+    """
+    tokens: Any = AGGREGATORS.make("aggregation-tokens", preset)
+    return TrainConfig(
+        model=_model(
+            *(model, preset, "aggregation-tokens"),
+            compute_dtype="bfloat16",
+            backbone={"registers": 4, "position_resize": "plain"},
+            pixels="floats",
+            round_to_patch=True,
+        ),
+        optimiser=ADAM_STEP,
+        trainable=f"last-{-tokens.insertion}-blocks+no-norm+head",
+        places_per_batch=120,
+        epochs=20,
+        monitor="R@1+R@5",
+        patience=20,
+        validation_size=validation_size(preset, 322),
+    )
+
+
+@register_recipe("boq")
+def boq(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make BoQ's recipe over DINOv2, of amaralibey/Bag-of-Queries (Ali-bey et al., CVPR 2024).
+
+    The last two blocks train. The head is that of the published weights, of 12,288 numbers; the
+    code's own default is wider and has 8,192.
+    """
+    return TrainConfig(
+        model=_model(
+            model, preset, "boq", compute_dtype="bfloat16", filter="bicubic", pixels="floats"
+        ),
+        validation_size=validation_size(preset, 322),
+        **BOQ_TRAINING,
+    )
+
+
+@register_recipe("dino-mix")
+def dino_mix(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make DINO-Mix's recipe, of GaoShuang98/DINO-Mix (Huang et al. 2024): two mixers over DINOv2.
+
+    The last four blocks train, and the class token and the positions, for its code freezes all else
+    before the blocks. Its code validates on Pitts30k's test set, by which it chooses the best
+    weights; here they are chosen on `--val`.
+    """
+    config = _model(
+        model, preset, "mixvpr", compute_dtype="bfloat16", antialias=False, pixels="floats"
+    )
+    mixers: Any = dataclasses.replace(config.aggregator, depth=2, last_norm=False)
+    return TrainConfig(
+        model=dataclasses.replace(config, aggregator=mixers),
+        optimiser=dataclasses.replace(
+            MIXVPR_OPTIMISER, learning_rate=0.005, accumulate=4, clip_value=0.5
+        ),
+        trainable="last-4-blocks+positions+head",
+        places_per_batch=80,
+        epochs=60,
+        monitor="R@1",
+        patience=None,
+    )

@@ -1,0 +1,249 @@
+"""The training state on the devices, and the compiled steps that change it."""
+
+import collections
+import dataclasses
+import math
+import time
+from collections.abc import Generator, Iterator, Sequence
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from crisalad_jax.data.loader import ImageBatch, one_ahead
+from crisalad_jax.nn.model import Crisalad, cast_params, init_crisalad
+from crisalad_jax.training.batches import PlaceBatches
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.mining import Miner
+from crisalad_jax.training.run_files import checksum
+from crisalad_jax.training.step import (
+    Metrics,
+    TrainState,
+    init_train_state,
+    named_scalars,
+    step_config,
+    train_step,
+)
+from crisalad_jax.training.trainable import merge_params, shards_batch
+from crisalad_jax.utils import distributed
+from crisalad_jax.utils.devices import Devices, devices_for
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.output import warn
+
+Batch = tuple[jax.Array, jax.Array, jax.Array]
+"""Images, labels, and which images are valid, on the devices."""
+_T = TypeVar("_T")
+
+
+class LossNotFiniteError(InputError):
+    """The loss or its gradient is not finite."""
+
+
+class Trainer:
+    """What trains, on the devices; a step is started before the one before is finished."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        data: PlaceBatches | Miner,
+        initial: Crisalad | None,
+        *,
+        shard_state: bool,
+    ) -> None:
+        """Make the state before the first step; see `fit` for the arguments.
+
+        Raises:
+            InputError: the configuration does not fit the model or the devices.
+        """
+        self._config, self._devices = config, _choose_devices(config)
+        mesh = self._devices.mesh
+        if shard_state and mesh.size == 1:
+            raise InputError(
+                "shard_state: found one device to keep the state on, expected several; a CPU's do "
+                "not share a step where all trains"
+            )
+        per_epoch = data.steps_per_epoch
+        self._step_config = dataclasses.replace(
+            step_config(
+                config,
+                steps=per_epoch * config.epochs,
+                steps_per_epoch=per_epoch,
+                classes=data.classes,
+            ),
+            shard_over=mesh if shard_state else None,
+        )
+        init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
+        # Folds in 2, because folding in 0 or 1 may repeat the keys of the split above.
+        classifiers_key = jax.random.fold_in(jax.random.key(config.seed), 2)
+        params = init_crisalad(init_key, config.model) if initial is None else initial
+        self.initial_checksum = checksum(jax.tree.leaves(params))
+        self.state, frozen = init_train_state(
+            params, config.trainable, self._step_config, key=classifiers_key
+        )
+        self._frozen: PyTree = jax.device_get(frozen)
+        self._frozen_on_devices = self._devices.replicate(cast_params(self._frozen, config.model))
+        self._place = self._devices.shard if shard_state else self._devices.replicate
+        self._proceed: Any = self._devices.replicate(np.asarray(True))
+        self._running: collections.deque[tuple[Metrics, int, float]] = collections.deque()
+        """Metrics of the steps that the devices may still be computing, number of their images, and
+        seconds of waiting for these."""
+        self._finished_at = 0.0
+        distributed.raise_together(self._check_memory)
+
+    def resume(self, state: TrainState) -> None:
+        """Go on from a state, which has to be the same in all processes."""
+        # Copied, because a step donates the buffers of its state.
+        self.state = _copied(self._place(state))
+
+    def on_devices(self, batches: Iterator[ImageBatch]) -> Generator[Batch, None, None]:
+        """Yield batches on the devices, each copied while they compute the one before."""
+        yield from one_ahead(
+            self._batch(batch.images, batch.labels, batch.valid) for batch in batches
+        )
+
+    def start_step(self, batch: Batch | None, waited: float) -> None:
+        """Start a step, while the devices may still compute the one before.
+
+        After a step that is not taken no later one is (`train_step`).
+
+        Args:
+            batch: the images; None for none, in a process that has failed to read them.
+            waited: seconds of waiting for them.
+        """
+        if not self._running:
+            self._finished_at = time.monotonic() - waited
+        batch = batch or self._no_images()
+        self.state, metrics = train_step(
+            self.state,
+            self._frozen_on_devices,
+            *batch,
+            self._step_key,
+            self._step_config,
+            self._proceed,
+        )
+        self._proceed = metrics.updated
+        self._running.append((metrics, len(batch[0]), waited))
+
+    def finish_steps(self, *, leave: int = 0) -> Iterator[dict[str, float]]:
+        """Wait for the steps that were started but for the last ones.
+
+        Yields:
+            What is logged of each.
+
+        Raises:
+            InputError: no image of a step could be read.
+            LossNotFiniteError: a step was not taken for its loss; `state` is that before it.
+        """
+        while len(self._running) > leave:
+            metrics, size, waited = self._running.popleft()
+            values = named_scalars(jax.device_get(metrics))
+            now = time.monotonic()
+            seconds, self._finished_at = now - self._finished_at, now
+            skipped = size - int(values.pop("images"))
+            if not values.pop("updated"):
+                step = int(self.state.step) + 1
+                if skipped == size:
+                    raise InputError(
+                        f"training: found none of the {size} images of step {step} readable, "
+                        "expected at least one"
+                    )
+                raise LossNotFiniteError(
+                    f"training: found loss {values['loss']:.4g}, gradient_norm "
+                    f"{values['gradient_norm']:.4g} at step {step}, expected finite numbers; the "
+                    f"state after step {step - 1} is saved"
+                )
+            yield {
+                # The shares of a transport plan without mass are NaN, which JSON lacks.
+                **{name: value for name, value in values.items() if math.isfinite(value)},
+                "images_per_second": round(size / seconds, 2),
+                "waited_for_images": round(min(waited / seconds, 1), 4),
+                "skipped_images": skipped,
+            }
+
+    def gather(self, tree: _T) -> _T:
+        """Gather the state, or a part of it; all processes call it together."""
+        return self._devices.gather(tree)
+
+    def params(self, trainable: PyTree = None) -> Crisalad:
+        """Join the whole model in float32: with what trains as it is now, or as it was gathered."""
+        if trainable is None:
+            trainable = self.gather(self.state.trainable)
+        return merge_params(trainable, jax.tree.map(jnp.asarray, self._frozen), self._config.model)
+
+    def _batch(self, *parts: np.ndarray) -> Batch:
+        images, labels, valid = map(self._devices.shard_batch, parts)
+        return images, labels, valid
+
+    def _no_images(self) -> Batch:
+        """Return a batch of images that are not valid."""
+        own = self._config.places_per_batch * self._config.images_per_place // jax.process_count()
+        images = np.zeros((own, *self._config.model.input_size, 3), np.uint8)
+        return self._batch(images, np.full(own, -1, np.int32), np.zeros(own, bool))
+
+    def _check_memory(self) -> None:
+        """Check that a step fits the devices, by the compiler's analysis of its program.
+
+        The first step finds the program that is compiled here. A TPU's compiler knows the limit
+        itself.
+        """
+        limit = memory_limit(self._devices.mesh.local_devices)
+        if limit is None:
+            return
+        state, batch = self._place(self.state), self._no_images()
+        arguments = state, self._frozen_on_devices, *batch, self._step_key, self._step_config
+        try:
+            needed = memory_of(train_step.lower(*arguments, self._proceed).compile())
+        except jax.errors.JaxRuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            needed = math.inf
+        if needed > limit:
+            raise InputError(
+                f"training: found a step that takes {needed / 1e9:.1f} GB of each device, expected "
+                f"at most {limit / 1e9:.1f} GB; less take a smaller --micro-batch (now "
+                f"{self._config.micro_batch}), --model.compute-dtype bfloat16, --model.remat full, "
+                "--shard-state, a smaller image or model, or more devices"
+            )
+
+
+@jax.jit
+def _copied(tree: PyTree) -> PyTree:
+    return jax.tree.map(jnp.copy, tree)
+
+
+def _choose_devices(config: TrainConfig) -> Devices:
+    """Choose the devices of a step: all that share its images, or one for each process."""
+    spread = shards_batch(config.trainable)
+    images = config.places_per_batch * config.images_per_place
+    if images % jax.process_count():
+        raise InputError(
+            f"processes: found {jax.process_count()}, expected a divisor of {images} images"
+        )
+    devices = devices_for(images if spread else jax.process_count(), processes=True)
+    found, used = len(jax.devices()), devices.mesh.size
+    if spread and used < found and distributed.is_primary():
+        warn(
+            f"training: found {found} devices for {images} images a step, of which {used} share "
+            "them, the most that divide them in each process"
+        )
+    return devices
+
+
+def memory_limit(devices: Sequence[Any]) -> int | None:
+    """Return the bytes that a program may take of each device; None where a platform tells none."""
+    limits = [(device.memory_stats() or {}).get("bytes_limit", 0) for device in devices]
+    return min(limits, default=0) or None
+
+
+def memory_of(program: jax.stages.Compiled) -> int:
+    """Return the bytes that a compiled program takes of each device: all that it reads and writes.
+
+    Args:
+        program: with a state that it may overwrite (`donate_argnames`).
+    """
+    sizes = program.memory_analysis()
+    assert sizes is not None
+    total = sizes.argument_size_in_bytes + sizes.output_size_in_bytes + sizes.temp_size_in_bytes
+    return total + sizes.generated_code_size_in_bytes - sizes.alias_size_in_bytes

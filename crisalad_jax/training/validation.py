@@ -1,0 +1,118 @@
+"""The model of a run as it is: its recalls, its transport on a few queries, its descriptors."""
+
+import dataclasses
+import pathlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.loader import ImageCache, OnBadImage
+from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.nn.model import Crisalad, Model, extract_tokens
+from crisalad_jax.retrieval.describe import described
+from crisalad_jax.retrieval.describer import describer_of
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.step import named_scalars
+
+WATCHED_QUERIES = 16
+"""Number of images whose transport statistics every validation logs."""
+MONITORED = {"R@1": (1,), "R@5": (5,), "R@1+R@5": (1, 5)}
+"""Ranks whose recalls are added, by `TrainConfig.monitor`."""
+DESCRIBED_AT_ONCE = 16
+"""Number of images of a batch while tuples are mined."""
+
+
+class Validation(NamedTuple):
+    """Result of a validation."""
+
+    monitored: float
+    """The recall, or sum of recalls, that `TrainConfig.monitor` names."""
+    metrics: dict[str, float]
+    """Recalls, and the means of the transport's statistics."""
+    words: str
+    """The recalls in words."""
+
+
+class Validator:
+    """Evaluates the model of a run between its steps."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        benchmark: Benchmark | None,
+        *,
+        on_bad_image: OnBadImage,
+        cache: ImageCache,
+    ) -> None:
+        """Check the benchmark's ground truth; without a benchmark no validation is due.
+
+        Raises:
+            InputError: there is none.
+        """
+        if benchmark is not None:
+            benchmark.ground_truth()
+        self._config, self._benchmark = config, benchmark
+        self._reading = Reading(on_bad_image=on_bad_image, cache=cache, quiet=True)
+
+    @property
+    def name(self) -> str:
+        """Name of the benchmark."""
+        return "" if self._benchmark is None else self._benchmark.name
+
+    def is_due(self, step: int, steps_per_epoch: int, *, last: int) -> bool:
+        """Return whether the epoch that ends with this step needs a validation.
+
+        Args:
+            step: number of steps that are taken.
+            steps_per_epoch: number of steps of an epoch.
+            last: the step of the last validation.
+        """
+        epoch, rest = divmod(step, steps_per_epoch)
+        asked = epoch % self._config.validate_every == 0 or epoch == self._config.epochs
+        return self._benchmark is not None and rest == 0 and step > last and asked
+
+    def validate(self, params: Crisalad) -> Validation:
+        """Evaluate the model, each image by itself, and watch its transport."""
+        assert self._benchmark is not None
+        (result,) = evaluate(
+            Model(params, self._config.validation_model),
+            self._benchmark,
+            groupings=("single",),
+            reading=self._reading,
+        )
+        recalls = {f"R@{k}": recall for k, recall in result.recalls.items()}
+        words = "  ".join(f"{name} {100 * recall:.1f}" for name, recall in recalls.items())
+        skipped = sum(map(len, result.skipped))
+        if skipped:
+            words += f"; {skipped} unreadable images left out"
+        watched = self._watch_transport(params, result.skipped.rest_of(self._benchmark))
+        monitored = sum(result.recalls[k] for k in MONITORED[self._config.monitor])
+        return Validation(monitored, recalls | watched, words)
+
+    def describe(self, params: Crisalad, paths: Sequence[pathlib.Path]) -> np.ndarray:
+        """Describe image files, each by itself; NaN for those that cannot be read."""
+        model = self._config.model
+        rows = np.full((len(paths), model.descriptor_dim), np.nan, np.float32)
+        reading = dataclasses.replace(self._reading, batch_size=DESCRIBED_AT_ONCE)
+        for part in described(describer_of(Model(params, model)), paths, reading):
+            rows[part.indices] = part.descriptors
+        return rows
+
+    def _watch_transport(self, params: Crisalad, benchmark: Benchmark) -> dict[str, float]:
+        """Compute statistics of the transport on the first queries, without dropout."""
+        model = self._config.validation_model
+        paths = benchmark.queries[:WATCHED_QUERIES]
+        how = Preparation(model.image_size, model.preprocessing, model.side_multiple)
+        reading = Reading(batch_size=len(paths), cache=self._reading.cache)
+        batches = reading.batches(paths, how, model.check_image_size)
+        batch = next(iter(batches))  # of the size of the first, where sizes differ
+        transport = extract_tokens(params, batch.images[batch.valid], model).transport
+        if transport is None:
+            return {}
+        return named_scalars(jax.device_get(jax.tree.map(jnp.mean, transport)))

@@ -1,0 +1,339 @@
+"""Rendered sets on disk: the same bits for a seed, whole or not at all, layouts read back."""
+
+import collections
+import csv
+import dataclasses
+import itertools
+import json
+import math
+import pathlib
+import re
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.places import read_places
+from crisalad_jax.synthetic import (
+    VARIATIONS,
+    SyntheticCityConfig,
+    View,
+    WorldConfig,
+    render,
+    write_synthetic_city,
+    write_world,
+)
+from crisalad_jax.synthetic.city import place_seed
+from crisalad_jax.synthetic.world import views
+from crisalad_jax.utils.errors import InputError
+
+CITY = SyntheticCityConfig(train_places=4, test_places=5, image_size=(42, 56), seed=3)
+WORLD = WorldConfig(
+    scenes=15, stations=2, images_per_place=2, test_scenes=3, image_size=(30, 40), seed=5
+)
+IMAGES = {"city": 4 * 4 + 5 * 2, "world": 15 * 2 * 2 + 3 * 2 * 2}
+
+
+class Written(NamedTuple):
+    root: pathlib.Path
+    config: Any
+    write: Callable[..., None]
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Written]:
+    folder = tmp_path_factory.mktemp("sets")
+    found = {
+        "city": Written(folder / "city", CITY, write_synthetic_city),
+        "world": Written(folder / "world", WORLD, write_world),
+    }
+    for each in found.values():
+        each.write(each.root, each.config)
+    return found
+
+
+@pytest.fixture
+def city(sets: dict[str, Written]) -> pathlib.Path:
+    return sets["city"].root
+
+
+@pytest.fixture
+def world(sets: dict[str, Written]) -> pathlib.Path:
+    return sets["world"].root
+
+
+@pytest.fixture(params=["city", "world"])
+def written(sets: dict[str, Written], request: pytest.FixtureRequest) -> Written:
+    return sets[request.param]
+
+
+def contents(root: pathlib.Path) -> dict[str, bytes]:
+    files = (path for path in root.rglob("*") if path.is_file())
+    return {str(path.relative_to(root)): path.read_bytes() for path in files}
+
+
+def rows_of(table: pathlib.Path) -> list[dict[str, str]]:
+    with table.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_same_seed_writes_the_same_bits_and_another_seed_others(written, tmp_path):
+    (tmp_path / "again").mkdir()  # an empty folder is used
+    calls = []
+    written.write(tmp_path / "again", written.config, progress=calls.append)
+    assert contents(tmp_path / "again") == contents(written.root)
+    images = IMAGES[written.root.name]
+    assert calls == [1] * images
+    assert written.config.images == images
+    written.write(tmp_path / "other", dataclasses.replace(written.config, seed=6))
+    pictures, others = (
+        {data for name, data in contents(root).items() if name.endswith(".jpg")}
+        for root in (written.root, tmp_path / "other")
+    )
+    assert len(pictures) == images
+    assert not pictures & others
+
+
+def test_a_set_that_is_there_is_kept_and_another_is_not_written_over(written, tmp_path):
+    before = contents(written.root)
+    written.write(written.root, written.config, progress=pytest.fail)
+    words = "found a rendered set of another configuration (seed: "
+    with pytest.raises(InputError, match=re.escape(words)):
+        written.write(written.root, dataclasses.replace(written.config, seed=9))
+    assert contents(written.root) == before
+
+    (tmp_path / "beach.txt").write_text("sand")
+    with pytest.raises(InputError, match="found a folder with other content") as caught:
+        written.write(tmp_path, written.config)
+    assert "\n" not in str(caught.value)
+    assert contents(tmp_path) == {"beach.txt": b"sand"}
+    with pytest.raises(InputError, match="found a file"):
+        written.write(tmp_path / "beach.txt", written.config)
+    with pytest.raises(InputError, match="txt: cannot make this folder"):
+        written.write(tmp_path / "beach.txt" / "set", written.config)
+
+
+# An error of the system's from the caller's own function must not pass for one of writing.
+@pytest.mark.parametrize("error", [RuntimeError("stopped"), OSError(5, "stopped")])
+@pytest.mark.parametrize("at", [3, IMAGES["city"]])
+def test_a_failure_midway_is_passed_on_and_leaves_nothing(tmp_path, at, error):
+    calls = itertools.count(1)
+
+    def fail(_: int) -> None:
+        if next(calls) == at:
+            raise error
+
+    with pytest.raises(type(error), match="stopped") as caught:
+        write_synthetic_city(tmp_path / "city", CITY, progress=fail)
+    assert caught.value is error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failure_to_write_midway_is_named_and_leaves_nothing(tmp_path):
+    def block(_: int) -> None:
+        # A file where the folder of the evaluation images is to be made.
+        (folder,) = tmp_path.iterdir()
+        (folder / "test").write_text("")
+
+    with pytest.raises(InputError, match="city: cannot be written: Not a dir"):
+        write_synthetic_city(tmp_path / "city", CITY, progress=block)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_city_reads_as_gsv_cities(city):
+    name = re.compile(
+        r"(?P<city>[A-Za-z]+)_(?P<place>\d{7})_(?P<year>\d{4})_(?P<month>\d\d)_(?P<north>\d{3})"
+        r"_(?P<lat>-?\d+\.\d+)_(?P<lon>-?\d+\.\d+)_(?P<panoid>[0-9a-f]+)\.jpg"
+    )
+    tables = sorted((city / "train" / "Dataframes").glob("*.csv"))
+    assert len(tables) == 2
+    found = set()
+    for table in tables:
+        rows = rows_of(table)
+        header = ["place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid"]
+        assert list(rows[0]) == header
+        months = collections.defaultdict(list)
+        for row in rows:
+            place, year, month = int(row["place_id"]), int(row["year"]), int(row["month"])
+            stem = (
+                f"{row['city_id']}_{place:07d}_{year:04d}_{month:02d}_{int(row['northdeg']):03d}"
+                f"_{row['lat']}_{row['lon']}_{row['panoid']}"
+            )
+            path = city / "train" / "Images" / row["city_id"] / f"{stem}.jpg"
+            assert name.fullmatch(path.name)
+            assert row["city_id"] == table.stem
+            assert 0 <= int(row["northdeg"]) < 360
+            months[place].append(month)
+            found.add(path)
+        # A place meets every season.
+        assert {place: sorted(each) for place, each in months.items()} == {
+            1: [1, 4, 7, 10],
+            2: [1, 4, 7, 10],
+        }
+    assert found == set((city / "train" / "Images").rglob("*.jpg"))
+    assert len(found) == 4 * 4
+
+
+def test_train_places_lie_apart_and_their_images_together(city):
+    def metres(a: dict[str, str], b: dict[str, str]) -> float:
+        (lat, lon), (other_lat, other_lon) = ((float(r["lat"]), float(r["lon"])) for r in (a, b))
+        mean = math.radians((lat + other_lat) / 2)
+        north, east = math.radians(lat - other_lat), math.radians(lon - other_lon) * math.cos(mean)
+        return 6_371_000 * math.hypot(north, east)
+
+    for table in (city / "train" / "Dataframes").glob("*.csv"):
+        for a, b in itertools.combinations(rows_of(table), 2):
+            together = a["place_id"] == b["place_id"]
+            assert metres(a, b) < 10 if together else metres(a, b) > 60
+
+
+def test_the_city_s_evaluation_reads_as_utm_layout_with_25_m_positives(city):
+    folder = city / "test" / "images" / "test"
+    sides = [sorted((folder / side).iterdir()) for side in ("database", "queries")]
+    seasons, hours = [], []
+    for side in sides:
+        fields = [path.name.split("@") for path in side]
+        # An empty field before the first @, 14 fields of the format, and the suffix.
+        assert {(len(each), each[0], each[-1]) for each in fields} == {(16, "", ".jpg")}
+        assert all(0 <= float(each[9]) < 360 for each in fields)
+        seasons.append({each[14].split("_")[0] for each in fields})
+        hours.append({each[14].split("_")[1] for each in fields})
+        for path in side:
+            with Image.open(path) as picture:
+                assert (picture.size, picture.mode) == ((56, 42), "RGB")
+    # Queries and database never share a season, and queries come at all hours.
+    assert not seasons[0] & seasons[1]
+    assert hours[0] == {"noon"}
+    assert len(hours[1]) > 1
+
+    database, queries = (
+        [tuple(map(float, path.name.split("@")[1:3])) for path in side] for side in sides
+    )
+    claimed = []
+    for query in queries:
+        distances = [math.dist(query, other) for other in database]
+        (positive,) = (i for i, distance in enumerate(distances) if distance <= 25)
+        assert distances[positive] < 10
+        assert all(d > 60 for i, d in enumerate(distances) if i != positive)
+        claimed.append(positive)
+    assert sorted(claimed) == list(range(5))
+
+
+def test_no_place_is_in_both_splits_or_twice():
+    config = SyntheticCityConfig()
+    seeds = [place_seed(config, 0, i) for i in range(config.train_places)]
+    seeds += [place_seed(config, 1, i) for i in range(config.test_places)]
+    assert len(set(seeds)) == config.train_places + config.test_places
+    # And another seed is another place: the same view of each is another picture.
+    assert len({render(seed, View(), (42, 56)).tobytes() for seed in seeds[::10]}) == 39
+
+
+def test_the_world_reads_as_a_training_set_of_one_scenery_a_city(world):
+    places = read_places(world / "train", min_images=2)
+    # Twelve scenes fill a city; the kinds take turns.
+    assert places.cities == ("corridor0001", "street0000")
+    assert sorted(np.bincount(places.place_city)) == [3 * 2, 12 * 2]
+    assert (places.image_counts == 2).all()
+
+
+def test_each_question_has_one_answer(world):
+    benchmark = open_benchmark(world / "test", "test", 25.0)
+    assert (len(benchmark.queries), len(benchmark.database)) == (6, 6)
+    assert [list(found) for found in benchmark.ground_truth()] == [[i] for i in range(6)]
+
+
+def test_a_part_of_a_world_is_the_whole_ones(world, tmp_path):
+    """A scene depends on its number alone: more scenes leave those before as they are."""
+    write_world(tmp_path / "part", dataclasses.replace(WORLD, scenes=12, test_scenes=1))
+    part, whole = contents(tmp_path / "part"), contents(world)
+    del part["world.json"]
+    assert {name: whole[name] for name in part} == part
+
+
+VIEWS: dict[str, set[str]] = {
+    "stand": {"lateral", "forward", "heading", "height", "pitch", "field"},
+    "season": {"season"},
+    "time": {"time"},
+    "weather": {"weather"},
+    "traffic": {"occluders"},
+    "exposure": {"exposure", "noise"},
+}
+
+
+@pytest.mark.parametrize("left_out", VARIATIONS)
+def test_what_does_not_vary_is_the_same_in_every_view_and_the_rest_as_before(left_out):
+    """Twenty views each of two stations of two scenes."""
+    whole = dataclasses.replace(WORLD, images_per_place=20)
+    less = dataclasses.replace(whole, varied=tuple(v for v in VARIATIONS if v != left_out))
+    for seed, station in itertools.product((3, 4), (0, 2)):
+        before, after = (
+            [
+                dataclasses.asdict(view)
+                for view in views(config, seed, "street", station, np.random.default_rng(0))
+            ]
+            for config in (whole, less)
+        )
+        for name in before[0]:
+            values = {view[name] for view in after}
+            if name in VIEWS[left_out]:
+                varied = {view[name] for view in before}
+                assert len(varied) > 1
+                (value,) = values
+                if name in ("forward", "height", "pitch", "field"):  # the scene's camera has these
+                    assert min(varied) < value < max(varied)
+                else:
+                    assert value == getattr(View(), name)
+            else:
+                assert [view[name] for view in after] == [view[name] for view in before]
+
+
+def test_test_images_vary_in_everything(world, tmp_path):
+    write_world(tmp_path / "less", dataclasses.replace(WORLD, varied=("season",), scenes=1))
+    found, whole = contents(tmp_path / "less"), contents(world)
+    tests = {name for name in whole if name.startswith("test/")}
+    assert tests
+    assert {name: found[name] for name in tests} == {name: whole[name] for name in tests}
+    assert any(found[name] != whole[name] for name in found if name.startswith("train/Images/"))
+
+
+def test_the_order_of_variations_makes_no_other_world(world):
+    assert json.loads((world / "world.json").read_text())["varied"] == list(VARIATIONS)
+    write_world(world, dataclasses.replace(WORLD, varied=tuple(reversed(VARIATIONS))))
+    with pytest.raises(InputError, match="found a rendered set of another configuration"):
+        write_world(world, dataclasses.replace(WORLD, varied=VARIATIONS[1:]))
+
+
+def test_views_vary_within_the_place(world):
+    """Months in the table are seasons: of 60 views all four come, and two come to most places."""
+    months = collections.defaultdict(set)
+    for table in (world / "train" / "Dataframes").glob("*.csv"):
+        for row in rows_of(table):
+            months[table, row["place_id"]].add(row["month"])
+    assert set().union(*months.values()) == {"4", "7", "10", "1"}
+    # Of two images of a place, three in four are of two seasons.
+    assert sum(len(found) == 2 for found in months.values()) > len(months) / 2
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "words"),
+    [
+        (SyntheticCityConfig, {"train_places": 1}, "train_places: found 1, expected at least 2"),
+        (SyntheticCityConfig, {"test_places": 0}, "test_places: found 0, expected at least 1"),
+        (SyntheticCityConfig, {"seed": -1}, "seed: found -1, expected at least 0"),
+        (SyntheticCityConfig, {"image_size": (8, 56)}, "image_size: found 8, expected 16 to 2048"),
+        (WorldConfig, {"scenes": 0}, "WorldConfig.scenes: found 0, expected at least 1"),
+        (WorldConfig, {"stations": -1}, "WorldConfig.stations: found -1, expected at least 1"),
+        (WorldConfig, {"image_size": (8, 8)}, "WorldConfig.image_size: found 8"),
+        (WorldConfig, {"seed": -1}, "WorldConfig.seed: found -1"),
+        (WorldConfig, {"repaint": -0.5}, "WorldConfig.repaint: found -0.5, expected 0 to 3"),
+        (WorldConfig, {"varied": ("sun",)}, "WorldConfig.varied: found ('sun',), expected a tuple"),
+        (WorldConfig, {"sceneries": ()}, "WorldConfig.sceneries: length: found 0, expected at lea"),
+    ],
+)
+def test_bad_sizes_are_named_in_one_line(kind, changes, words):
+    with pytest.raises(InputError, match=re.escape(words)) as caught:
+        kind(**changes)
+    assert "\n" not in str(caught.value)
