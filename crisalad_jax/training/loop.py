@@ -239,10 +239,6 @@ class _Loop:
             except LossNotFiniteError:
                 self.save()
                 raise
-            except InputError:
-                # A signal to the process group also ends the workers that read images.
-                self._stop_together()
-                raise
         except Interrupted as stopped:
             self.save()
             where = f"after step {self.files.record.step}; the same command goes on"
