@@ -21,11 +21,11 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
-from crisalad_jax.config.registry import REGISTRIES
 
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config import plugins
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import COLUMNS, read_places
 from crisalad_jax.data.reading import Reading
@@ -160,7 +160,7 @@ def scripts() -> Iterator[Callable[[str], ModuleType]]:
 @pytest.fixture(autouse=True)
 def _own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
     """No test fills the user's compile cache, nor changes for others how this process computes."""
-    monkeypatch.setattr(compiler, "set_up", lambda: None)
+    monkeypatch.setattr(compiler, "configure", lambda: None)
     monkeypatch.delenv("CRISALAD_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
 
@@ -255,8 +255,7 @@ def own_parts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     for registry in REGISTRIES.values():
         for name in ("_parts", "_presets"):
             monkeypatch.setattr(registry, name, dict(getattr(registry, name)))
-    monkeypatch.setattr(plugins, "_FILES", {})
-    monkeypatch.setattr(plugins, "_LOADED", set())
+    monkeypatch.setattr(plugins, "_LOADED", {})
     before = set(sys.modules)
     yield
     for name in set(sys.modules) - before:

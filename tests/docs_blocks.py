@@ -20,7 +20,8 @@ import time
 
 import crisalad_jax as cj
 from crisalad_jax import cli
-from crisalad_jax.config import parts, plugins
+from crisalad_jax.config import plugins
+from crisalad_jax.config import registry as registries
 from crisalad_jax.training.recipes import RECIPES
 
 BLOCK = re.compile(
@@ -33,13 +34,13 @@ BLOCK = re.compile(
 @contextlib.contextmanager
 def own_parts():
     """Forget what is registered meanwhile: pages choose the same names."""
-    tables = [RECIPES, plugins._FILES]
-    for registry in parts.REGISTRIES.values():
+    tables = [RECIPES, plugins._LOADED]
+    for registry in registries.REGISTRIES.values():
         tables += [registry._parts, registry._presets]
     before = [dict(table) for table in tables]
     yield
-    for name in plugins._FILES.keys() - before[1].keys():
-        del sys.modules[name]
+    for plugin in plugins._LOADED.keys() - before[1].keys():
+        del sys.modules[plugins._LOADED[plugin]]
     for table, was in zip(tables, before, strict=True):
         table.clear()
         table.update(was)
@@ -52,9 +53,7 @@ def load(file: str, code: str, page: str, line: int) -> dict:
         cj.load_plugin(file)
     except cj.InputError as error:
         raise RuntimeError(f"{page}: {error}") from error
-    path = pathlib.Path(file).resolve()
-    (name,) = [name for name, at in plugins._FILES.items() if at == path]
-    return vars(sys.modules[name])
+    return vars(sys.modules[plugins._LOADED[str(pathlib.Path(file).resolve())]])
 
 
 def parse(command: str) -> None:

@@ -7,10 +7,10 @@ import subprocess
 import sys
 
 import pytest
-from crisalad_jax.config.registry import REGISTRIES
 
 import crisalad_jax as cj
 from crisalad_jax import sinkhorn
+from crisalad_jax.config.registry import REGISTRIES
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from crisalad_jax.config.registry import REGISTRIES
 
 from crisalad_jax.config import plugins
+from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -38,7 +38,7 @@ def example(name: str) -> ModuleType:
     """Load an example as --plugin does."""
     path = (EXAMPLES / f"{name}.py").resolve()
     plugins.load_plugin(str(path))
-    return next(sys.modules[module] for module, file in plugins._FILES.items() if file == path)
+    return sys.modules[plugins._LOADED[str(path)]]
 
 
 def plan_of(result: SinkhornResult) -> np.ndarray:

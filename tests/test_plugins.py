@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from crisalad_jax.config.registry import REGISTRIES
 
 import crisalad_jax as cj
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
-from crisalad_jax.config import plugins, source
+from crisalad_jax.config import plugins
 from crisalad_jax.config.io import read_config, to_plain
 from crisalad_jax.config.plugins import load_plugin
+from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.losses import LossConfig, metric_loss
 from crisalad_jax.nn.model import Model, describe
 from crisalad_jax.sinkhorn import SinkhornConfig, solve
@@ -51,8 +51,8 @@ def test_an_installed_packages_entry_points_are_plugins(kind, tmp_path, monkeypa
     (folder / name).write_text("Metadata-Version: 2.1\nName: installed-part\nVersion: 1.0\n")
     (folder / "entry_points.txt").write_text("[crisalad_jax.plugins]\nmine = installed_part\n")
     monkeypatch.setattr(sys, "path", [str(tmp_path)])
-    monkeypatch.setattr(plugins, "_ENTERED", set())
-    monkeypatch.setattr(plugins, "_PLUGINS", {})
+    plugins.load_entry_points.cache_clear()
+    monkeypatch.setattr(plugins, "_LOADED", {})
     monkeypatch.setitem(sys.modules, "installed_part", None)  # so that it is gone again
     del sys.modules["installed_part"]
     plugins.load_entry_points()
@@ -74,7 +74,7 @@ import crisalad_jax as cj
 @cj.register_step("newton")
 def mine(problem, potentials):
     return potentials
-""", "register_step: found the name 'newton' taken by crisalad_jax.transport.steps.NewtonStep, "
+""", "register_step 'newton': found the name taken by crisalad_jax.transport.steps.NewtonStep, "
         "expected another name for mine"),
     "thawed": ("""
 import dataclasses
@@ -377,7 +377,7 @@ def test_a_plug_in_that_raises_while_it_runs_is_named_in_one_line(
     monkeypatch.setattr("crisalad_jax.cli.info.run", broken)
     words = f"crisalad: plugin {plugin}: ValueError: not a plug-in's (from Python"
     fails(capfd, "info", "--plugin", plugin, words=(words,))
-    monkeypatch.setattr(plugins, "_LOADED", set())
+    monkeypatch.setattr(plugins, "_LOADED", {})
     with pytest.raises(ValueError, match="not a plug-in's"):
         succeeds(capfd, "info")
 
@@ -561,8 +561,6 @@ def test_a_step_a_dustbin_and_a_loss_are_trained_saved_and_told(
     rest = ("--batch-size", BATCH, "--grouping", "single", "--quiet")
     assert "R@1" in succeeds(capfd, *data, *rest)
     files[0].write_text(files[0].read_text().replace("jnp.exp(", "jnp.exp(0.5 * "))
-    source._file_digest.cache_clear()
-    source._bytes_digest.cache_clear()
     load_plugin(str(files[0]))  # nothing: it is there
     from crisalad_jax.cli import main
 
@@ -708,11 +706,11 @@ def test_tokens_parameters_and_losses_of_another_type_are_named(dtype: str) -> N
     [
         (
             lambda: cj.register_step(lambda a, b: b),
-            "found <function .*, expected a name: @r",
+            "found <function .*, expected a name without .*: @r",
         ),
         (lambda: cj.register_step(3), "found 3, expected a name"),
-        (lambda: cj.register_step(""), "found the name '', expected one without"),
-        (lambda: cj.register_step("my:step"), "found the name 'my:step', expected one without"),
+        (lambda: cj.register_step(""), "found '', expected a name without"),
+        (lambda: cj.register_step("my:step"), "found 'my:step', expected a name without"),
     ],
 )
 def test_a_registration_without_a_name_is_refused(register: Any, words: str) -> None:
@@ -725,7 +723,6 @@ def test_a_registration_without_a_name_is_refused(register: Any, words: str) -> 
     [
         (int, "three", "found 'three', expected a whole number"),
         (tuple, (1, 2), r"found \[1, 2\], expected tuple"),
-        (Any, 1, "found 1, expected .*Any"),
         (Any, print, "configuration: found <built-in function print>"),
     ],
 )
@@ -741,7 +738,7 @@ def test_settings_that_no_file_can_keep_are_refused(kind: Any, default: Any, wor
 def test_a_field_or_a_preset_of_another_name_is_refused() -> None:
     base = type(cj.LossConfig().kind)
     made = dataclasses.make_dataclass("Odd", [("apply", int, 1)], bases=(base,), frozen=True)
-    with pytest.raises(InputError, match=r"found a field 'apply', which is the name of a method$"):
+    with pytest.raises(InputError, match=r"found a field 'apply', which has another meaning here$"):
         cj.register_loss("odd")(made)
     made = dataclasses.make_dataclass("Odd", [("scale", int, 1)], bases=(base,), frozen=True)
     with pytest.raises(InputError, match=r"found scal in a preset, expected alpha, beta, base, sc"):
@@ -767,7 +764,6 @@ def close(batch):
     succeeds(capfd, *given)
     succeeds(capfd, *given)  # the same command finds all done
     plugin.write_text(text.replace("1 -", "2 -"))
-    monkeypatch.setattr(source, "_file_digest", source._file_digest.__wrapped__)
     words = f"{out}: found another source of loss.kind close than the run began with; expected"
     fails(capfd, *given, words=(words,))
 

@@ -11,10 +11,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from crisalad_jax.checkpoints.safetensors_io import read_safetensors, unseal, write_sealed
+from crisalad_jax.checkpoints.safetensors_io import (
+    read_safetensors,
+    unseal,
+    write_sealed,
+)
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.part import fingerprint_fields, with_non_semantic_fields_of
-from crisalad_jax.config.plugins import changed_sources, source_bytes_of, sources_of
+from crisalad_jax.config.plugins import changed_sources, sources_of
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.diff_trees import diff_trees, not_finite
 from crisalad_jax.nn.model import Crisalad, Model, check_params, parameter_shapes
@@ -110,7 +114,6 @@ def save_weights(
         "config": to_plain(config),
         "version": VERSION,
         "parts": sources_of(config),
-        "source_bytes": source_bytes_of(config),
         "aggregator": config.aggregator.metadata(params.aggregator),
         "model_sha256": model_hash(params, config),
     }

@@ -119,7 +119,7 @@ def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
     if not hasattr(module, "needs_jax") or module.needs_jax(chosen):
         from crisalad_jax.utils import compiler, executable_cache
 
-        compiler.set_up()
+        compiler.configure()
         if keep_programs and not has_plugins():
             executable_cache.cache_executables()
     module.run(chosen)
@@ -153,7 +153,8 @@ _show_warning: Callable[..., None] = warnings.showwarning
 def main(arguments: Sequence[str] | None = None, *, keep_programs: bool = False) -> int:
     """Run one command, and return its exit code.
 
-    A process of its own may `keep_programs` (`utils.kept`): nothing else changes the code there.
+    A process of its own may `keep_programs` (`utils.executable_cache`): nothing else changes the
+    code there.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given[:1] == ["help"]:  # as of git

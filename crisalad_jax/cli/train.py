@@ -118,9 +118,6 @@ class Train:
     shard_state: bool = False
     """Keep what trains and its moments in shards, one a device, not whole on each: for --trainable
     all of a large model."""
-    num_workers: int = 0
-    """Processes that read the training images; 0 reads them by threads, which is as fast on few
-    cores, and keeps decoded images of small sets in memory."""
     num_threads: int | None = None
     """Threads that read the training images; by default one for each core that this process may
     use."""
@@ -143,7 +140,7 @@ def prepare(arguments: Sequence[str]) -> Sequence[str]:
     given = find_flag(arguments, "--weights")
     if given is None or asked_for(arguments):
         return arguments
-    compiler.set_up()
+    compiler.configure()
     if find_flag(arguments, "--coordinator-address") is not None:
         _check_cached(given)
     weights = find_weights(given, quiet="--quiet" in arguments)
@@ -219,7 +216,6 @@ def run(arguments: Train) -> None:
         weights=arguments.weights,
         backbone=arguments.backbone,
         on_bad_image=arguments.on_bad_image,
-        num_workers=arguments.num_workers,
         num_threads=arguments.num_threads,
         shard_state=arguments.shard_state,
         quiet=arguments.quiet,

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 
 import numpy as np
 
-from crisalad_jax.config.concise import in_one_line
+from crisalad_jax.config.short_repr import in_one_line
 from crisalad_jax.utils.errors import InputError
 
 _T = TypeVar("_T")
@@ -62,10 +62,11 @@ def check_count(what: str, count: Any) -> None:
     Raises:
         InputError: it is below, or no whole number.
     """
-    words, types = _PLAIN[int]
-    if not isinstance(count, types) or isinstance(count, bool):
-        raise InputError(f"{what}: found {in_one_line(count)}, expected {words} of at least 1")
-    require(int(count) >= 1, f"{what}: found {count}, expected at least 1")
+    whole = "" if fits(int, count) else "a whole number of "
+    require(
+        not whole and count >= 1,
+        f"{what}: found {in_one_line(count)}, expected {whole}at least 1",
+    )
 
 
 PATH = (str, os.PathLike)
@@ -96,18 +97,18 @@ def takes(**kinds: type | tuple[type, ...]) -> Callable[[_F], _F]:
     """
 
     def decorate(function: _F) -> _F:
-        names = list(inspect.signature(function).parameters)
-        places = [(names.index(name), name, kind) for name, kind in kinds.items()]
+        signature = inspect.signature(function)
 
         @functools.wraps(function)
         def call(*args: Any, **options: Any) -> Any:
-            for place, name, kind in places:
-                value = args[place] if place < len(args) else options.get(name, _ABSENT)
+            given = signature.bind_partial(*args, **options).arguments
+            for name, kind in kinds.items():
+                value = given.get(name, _ABSENT)
                 if value is not _ABSENT and not isinstance(value, kind):
                     plain = value is None or isinstance(value, str | int | float)
                     found = repr(value) if plain else type(value).__name__
                     classes = kind if isinstance(kind, tuple) else (kind,)
-                    words = "a path" if kind is PATH else ", or ".join(map(_words, classes))
+                    words = "a path" if kind is PATH else ", or ".join(map(in_words, classes))
                     raise InputError(f"{name}: found {found}, expected {words}")
             return function(*args, **options)
 
@@ -136,15 +137,12 @@ def check_types(config: Any) -> None:
         crisalad_jax.utils.errors.InputError: CrossImageConfig.layers: found 1.5, expected a ...
     """
     for name, hint in _checked_hints(type(config)).items():
-        _check_type(config, name, hint)
-
-
-def _check_type(config: Any, name: str, hint: Any) -> None:
-    value = getattr(config, name)
-    require(
-        _fits(hint, value),
-        f"{type(config).__name__}.{name}: found {in_one_line(value)}, expected {_words(hint)}",
-    )
+        value = getattr(config, name)
+        require(
+            fits(hint, value),
+            f"{type(config).__name__}.{name}: found {in_one_line(value)}, expected "
+            f"{in_words(hint)}",
+        )
 
 
 @functools.cache
@@ -155,17 +153,17 @@ def _checked_hints(kind: type) -> Mapping[str, Any]:
     return {f.name: hints[f.name] for f in fields if REGISTRY not in f.metadata}
 
 
-def _fits(hint: Any, value: Any) -> bool:
+def fits(hint: Any, value: Any) -> bool:
     """Return whether a value is of a type."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
-        return any(_fits(each, value) for each in arguments)
+        return any(fits(each, value) for each in arguments)
     if origin is Literal:
         return type(value) in map(type, arguments) and value in arguments
     if origin is tuple and isinstance(value, tuple):
         endless = arguments[-1:] == (...,)
         kinds = arguments[:1] * len(value) if endless else arguments
-        return len(kinds) == len(value) and all(map(_fits, kinds, value))
+        return len(kinds) == len(value) and all(map(fits, kinds, value))
     if hint in _PLAIN:
         # A bool is an int to Python, and no number of anything.
         return isinstance(value, _PLAIN[hint][1]) and (hint is bool or type(value) is not bool)
@@ -175,16 +173,16 @@ def _fits(hint: Any, value: Any) -> bool:
     return not isinstance(kind, type) or isinstance(value, kind)
 
 
-def _words(hint: Any) -> str:
+def in_words(hint: Any) -> str:
     """Describe a type for a message."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
-        return ", or ".join(map(_words, arguments))
+        return ", or ".join(map(in_words, arguments))
     if origin is Literal:
         return f"one of {', '.join(sorted(map(str, arguments)))}"
     if origin is tuple:
         length = "" if arguments[-1:] == (...,) else f" of {len(arguments)}"
-        return f"a tuple{length}, each {_words(arguments[0])}"  # no tuple here mixes types
+        return f"a tuple{length}, each {in_words(arguments[0])}"  # no tuple here mixes types
     if hint in _PLAIN:
         return _PLAIN[hint][0]
     if hint is type(None):
@@ -193,24 +191,25 @@ def _words(hint: Any) -> str:
     return hint.__name__.rpartition(".")[2] if hasattr(hint, "__name__") else str(hint)
 
 
-def require_positive(config: object, *names: str) -> None:
-    """Check that fields are of their types, positive and finite."""
-    hints = _checked_hints(type(config))
+def require_range(config: object, least: float, most: float, *names: str) -> None:
+    """Check that fields are from `least` to `most`, both included."""
+    limits = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
     for name in names:
-        _check_type(config, name, hints[name])
+        value = getattr(config, name)
+        require(
+            least <= value <= most,
+            f"{type(config).__name__}.{name}: found {value}, expected {limits}",
+        )
+
+
+def require_positive(config: object, *names: str) -> None:
+    """Check that fields, of whose types `check_types` takes care, are positive and finite."""
+    for name in names:
         value = getattr(config, name)
         require(
             0 < value < math.inf,
             f"{type(config).__name__}.{name}: found {value}, expected more than 0, and finite",
         )
-
-
-def require_choice(config: object, *names: str) -> None:
-    """Check that fields annotated `Literal` hold one of its values."""
-    hints = get_type_hints(type(config))
-    for name in names:
-        choices = dict.fromkeys(get_args(hints[name]))
-        choose(f"{type(config).__name__}.{name}", getattr(config, name), choices)
 
 
 def require_fraction(config: object, *names: str) -> None:

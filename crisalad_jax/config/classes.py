@@ -3,11 +3,11 @@
 import dataclasses
 from typing import Literal
 
-from crisalad_jax.config.checks import require, require_choice, require_positive
-from crisalad_jax.config.concise import concise
+from crisalad_jax.config.checks import check_types, require, require_positive
+from crisalad_jax.config.short_repr import short_repr
 
 
-@concise()
+@short_repr()
 @dataclasses.dataclass(frozen=True)
 class ClassesConfig:
     """Classes of a training set, and the groups that epochs train in turn.
@@ -39,17 +39,14 @@ class ClassesConfig:
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require_choice(self, "kind")
+        check_types(self)
         require_positive(
             self,
             *("groups", "cell", "sector", "spacing", "sector_spacing"),
             *("focal_distance", "view_angle"),
         )
         if self.steps is not None:
-            require(
-                self.steps > 0,
-                f"ClassesConfig.steps: found {self.steps}, expected more than 0, or None",
-            )
+            require_positive(self, "steps")
         turn = self.sector * self.sector_spacing
         require(
             360 % turn == 0,

@@ -16,8 +16,9 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
-from crisalad_jax.config.field_docs import field_docs
-from crisalad_jax.config.parts import Part, Registry
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import Registry
+from crisalad_jax.config.short_repr import field_docs
 from crisalad_jax.utils.errors import InputError
 
 _NAME = "part_name"

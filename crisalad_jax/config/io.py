@@ -1,47 +1,44 @@
 """Convert configurations to and from plain JSON values."""
 
 import dataclasses
-import json
 import pathlib
 import types
 import typing
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
-from crisalad_jax.config.concise import fields_in_use
-from crisalad_jax.config.parts import Part
+from crisalad_jax.config.checks import fits, in_words
+from crisalad_jax.config.part import NAME, Part
 from crisalad_jax.config.plugins import home_of
+from crisalad_jax.config.short_repr import fields_in_use
 from crisalad_jax.utils.checksums import CHECKSUM, ChangedFileError
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 
 _T = TypeVar("_T")
-NAME = "name"
-"""Key of a part's name beside its fields."""
 _PLUGIN = "plugin"
 """Key of the plug-in that registered a part, next to its name."""
 
 
-def to_plain(config: Any) -> dict[str, Any]:
+def to_plain(config: Any) -> Any:
     """Convert a configuration to nested dictionaries of JSON values, with its parts' names.
 
-    A part of a plug-in also has the plug-in's, so that who lacks it is told which it was.
+    A part of a plug-in also has the plug-in's, so that messages can name it where it is missing.
+
+    Raises:
+        InputError: a value is neither a number, text, nor a list of them.
     """
-    return json.loads(json.dumps(_plain(config)))
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        if not isinstance(value, Part):
+    if dataclasses.is_dataclass(config) and not isinstance(config, type):
+        fields = {f.name: to_plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
+        if not isinstance(config, Part):
             return fields
-        home = home_of(type(value).__module__)
-        return {NAME: value.part_name, **({_PLUGIN: home} if home else {}), **fields}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    value = value.item() if isinstance(value, np.generic) else value
+        home = home_of(type(config).__module__)
+        return {NAME: config.part_name, **({_PLUGIN: home} if home else {}), **fields}
+    if isinstance(config, list | tuple):
+        return [to_plain(item) for item in config]
+    value = config.item() if isinstance(config, np.generic) else config
     if value is not None and not isinstance(value, bool | int | float | str):
         raise InputError(f"configuration: found {value!r}, expected numbers, text or lists of them")
     return value
@@ -58,104 +55,70 @@ def from_plain(kind: type[_T], value: Any, *, source: str) -> _T:
         source: what messages begin with, such as a file's name.
 
     Raises:
-        InputError: naming `source`, every unknown field, part that is not registered, and value
+        InputError: naming `source`, and an unknown field, part that is not registered, or value
             that does not fit.
     """
-    if not isinstance(value, Mapping):
-        raise InputError(f"{source}: found {type(value).__name__}, expected an object of fields")
-    problems: list[str] = []
-    config = _config(kind, value, "config", problems)
-    if problems:
-        raise InputError(f"{source}: {'; '.join(problems)}")
-    return config
+    try:
+        return _config(kind, value, "config")
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
 
 
-def _config(kind: Any, value: Any, path: str, problems: list[str]) -> Any:
-    """Make a dataclass; errors go to `problems`, and then the result must not be used."""
+def _config(kind: Any, value: Any, path: str) -> Any:
+    """Make a dataclass; messages end with the path of the field."""
     if isinstance(value, str) and issubclass(kind, Part):
         value = {NAME: value}
     if not isinstance(value, Mapping):
-        problems.append(f"found {value!r}, expected an object of fields @ {path}")
-        return None
-    before = len(problems)
+        raise InputError(f"found {value!r}, expected an object of fields @ {path}")
     if issubclass(kind, Part):
-        value = dict(value)
-        name, plugin = value.pop(NAME, None), value.pop(_PLUGIN, None)
+        name, plugin = value.get(NAME), value.get(_PLUGIN)
+        value = {key: each for key, each in value.items() if key not in (NAME, _PLUGIN)}
         try:
             kind = kind.registry.find(name, plugin)
         except InputError as error:
-            problems.append(f"{error} @ {path}")
-            return None
-    hints = typing.get_type_hints(kind)
+            raise InputError(f"{error} @ {path}") from error
     fields = {field.name: field for field in dataclasses.fields(kind)}
-    unknown = sorted(value.keys() - fields.keys())
-    if unknown:
-        problems.append(f"found {', '.join(unknown)}, expected {', '.join(fields)} @ {path}")
-    given = {
-        # A map's description has a field `config`, as the whole is called.
-        name: _value(hints[name], value[name], path if path == name else f"{path}.{name}", problems)
-        for name in fields
-        if name in value
-    }
-    missing = [
+    needed = [
         name
         for name, field in fields.items()
-        if name not in value
-        and field.default is dataclasses.MISSING
-        and field.default_factory is dataclasses.MISSING
+        if field.default is field.default_factory is dataclasses.MISSING
     ]
-    problems += [f"{name} missing @ {path}" for name in missing]
-    if len(problems) > before:
-        return None
+    unknown, missing = sorted(value.keys() - fields.keys()), sorted(set(needed) - value.keys())
+    if unknown or missing:
+        found = f"found {', '.join(unknown)}" if unknown else f"found no {', '.join(missing)}"
+        raise InputError(f"{found}, expected {', '.join(fields)} @ {path}")
+    hints = typing.get_type_hints(kind)
+    given = {
+        # A map's description has a field `config`, as the whole is called.
+        name: _value(hints[name], each, path if path == name else f"{path}.{name}")
+        for name, each in value.items()
+    }
     try:
         return kind(**given)
     except InputError as error:
-        problems.append(f"{error} @ {path}")
-        return None
+        raise InputError(f"{error} @ {path}") from error
 
 
-def _value(hint: Any, value: Any, path: str, problems: list[str]) -> Any:
+def _value(hint: Any, value: Any, path: str) -> Any:
     """Convert a field's value to exactly its type: 3.7 is no number of epochs."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
         # Every union here is of None and one type, or of a part and its name.
-        hint = next(each for each in arguments if each is not type(None))
-        return _value(hint, value, path, problems)
+        kind = next(each for each in arguments if each is not type(None))
+        return _value(kind, value, path)
     if dataclasses.is_dataclass(hint):
-        return _config(hint, value, path, problems)
-    if origin is Literal:
-        if value in arguments and type(value) in map(type, arguments):
-            return value
-        expected = f"one of {', '.join(map(str, sorted(arguments)))}"
-    elif origin is tuple:
-        return _sequence(arguments, value, path, problems)
-    elif type(value) is hint:
-        return value
-    elif hint is float and type(value) is int:
-        return float(value)
-    else:
-        expected = getattr(hint, "__name__", str(hint))
-    problems.append(f"found {value!r}, expected {expected} @ {path}")
-    return None
-
-
-def _sequence(
-    kinds: tuple[Any, ...], value: Any, path: str, problems: list[str]
-) -> tuple[Any, ...]:
-    endless = kinds[-1:] == (Ellipsis,)
-    # Refuse a string, which Python would iterate over letter by letter.
-    if not isinstance(value, list | tuple) or not (endless or len(value) == len(kinds)):
-        of = "names" if kinds[0] is str else f"{kinds[0].__name__}s"
-        count = "" if endless else f"{len(kinds)} "
-        problems.append(f"found {value!r}, expected a list of {count}{of} @ {path}")
-        return ()
-    each = [kinds[0]] * len(value) if endless else kinds
-    return tuple(
-        _value(kind, item, f"{path}[{number}]", problems)
-        for number, (kind, item) in enumerate(zip(each, value, strict=True))
-    )
+        return _config(hint, value, path)
+    if origin is tuple and isinstance(value, list | tuple):
+        kinds = arguments[:1] * len(value) if arguments[-1:] == (...,) else arguments
+        if len(kinds) == len(value):
+            pairs = enumerate(zip(kinds, value, strict=True))
+            return tuple(_value(kind, each, f"{path}[{number}]") for number, (kind, each) in pairs)
+    if not fits(hint, value):
+        raise InputError(f"found {value!r}, expected {in_words(hint)} @ {path}")
+    made: Any = value
+    return float(made) if hint is float else made
 
 
 def read_config(kind: type[_T], path: pathlib.Path) -> _T:

@@ -1,5 +1,6 @@
 """Plug-ins: files or modules that register parts when they are imported."""
 
+import functools
 import hashlib
 import importlib
 import importlib.util
@@ -7,22 +8,23 @@ import os
 import pathlib
 import sys
 import traceback
-from collections.abc import Callable
-from types import ModuleType
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from crisalad_jax.config.checks import takes
+from crisalad_jax.config.part import Part, parts_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 
 ENTRY_POINTS = "crisalad_jax.plugins"
 """Group of entry points under which an installed package names its modules of parts."""
-_FILES: dict[str, pathlib.Path] = {}
-"""File of each loaded plug-in, by its module's name."""
-_ENTERED: set[str] = set()
-_PLUGINS: dict[str, None] = {}
-"""What `load_plugin` loaded, in that order; of a file its whole path."""
-_LOADED: set[str] = set()
-"""Source files of all loaded plug-ins."""
+_PACKAGE = __name__.partition(".")[0]
+_FROM_FILE = "crisalad_plugin_"
+"""Beginning of the names of modules that are loaded from plug-in files."""
+_LOADED: dict[str, str] = {}
+"""What `load_plugin` loaded, in that order, of a file its whole path; and its module's name."""
+_LARGEST = 2**24
+"""Most bytes of a plug-in's file: Python reads and copies it whole."""
 
 
 @takes(plugin=str)
@@ -58,21 +60,16 @@ def load_plugin(plugin: str) -> None:
             _load_module(plugin)
     except InputError as error:
         raise InputError(f"plugin {plugin}: {error}") from error
-    _PLUGINS[str(real_path(pathlib.Path(plugin))) if plugin.endswith(".py") else plugin] = None
 
 
 def has_plugins() -> bool:
     """Return whether code of any plug-in was loaded, of a file, a module or an entry point."""
-    return bool(_LOADED or _ENTERED)
+    return bool(_LOADED)
 
 
 def loaded_plugins() -> list[str]:
     """Return what `load_plugin` takes to load the same in another process."""
-    return list(_PLUGINS)
-
-
-_LARGEST = 2**24
-"""Most bytes of a plug-in's file: Python reads and copies it whole."""
+    return list(_LOADED)
 
 
 def _load_module(name: str) -> None:
@@ -83,41 +80,35 @@ def _load_module(name: str) -> None:
     if spec is None or spec.origin is None:  # a folder without __init__.py has no origin
         raise InputError("found no such module, expected FILE.py or MODULE")
     _run(lambda: importlib.import_module(name), spec.origin)
+    _LOADED[name] = name
 
 
 def _load_file(file: str) -> None:
-    path = pathlib.Path(file)
+    path = real_path(file)
     if not path.is_file():
         raise InputError("found no such file, expected FILE.py or MODULE")
     if (size := path.stat().st_size) > _LARGEST:
         raise InputError(f"found {size} bytes, expected a file of Python, of at most {_LARGEST}")
-    path = real_path(path)
-    # Give files of the same name different modules.
-    name = f"crisalad_plugin_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
-    if name in sys.modules:
-        return
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module, loader = importlib.util.module_from_spec(spec), spec.loader
-    sys.modules[name], _FILES[name] = module, path
-
-    def run() -> ModuleType:
-        loader.exec_module(module)
-        return module
-
-    try:
-        _run(run, str(path))
-    except BaseException:
-        del sys.modules[name], _FILES[name]
-        raise
+    # Files of the same name are different modules.
+    name = f"{_FROM_FILE}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(name, path)
+        assert spec is not None
+        assert spec.loader is not None
+        module, loader = importlib.util.module_from_spec(spec), spec.loader
+        sys.modules[name] = module
+        try:
+            _run(lambda: loader.exec_module(module), str(path))
+        except BaseException:
+            del sys.modules[name]
+            raise
+    _LOADED[str(path)] = name
 
 
-def _run(load: Callable[[], ModuleType], file: str) -> None:
+def _run(load: Callable[[], object], file: str) -> None:
     """Run a plug-in's import, and report in one line what it raises, and where."""
     try:
         load()
-        _LOADED.add(file)
     except InputError:
         raise
     except (Exception, SystemExit) as error:
@@ -142,24 +133,14 @@ def plugin_failure(error: BaseException) -> str | None:
     If it came from a plug-in's code, the line says where. Else a plug-in may have returned what
     nothing here can work with, so the line names all plug-ins. `SystemExit` must be a plug-in's.
     """
-    places = [
-        (place.filename, place.lineno, place.name)
-        for place in traceback.extract_tb(error.__traceback__)
-        if place.filename in _LOADED
-    ]
-    if not _LOADED or (not places and isinstance(error, SystemExit)):
+    files = {str(sys.modules[name].__file__) for name in _LOADED.values()}
+    places = [p for p in traceback.extract_tb(error.__traceback__) if p.filename in files]
+    if not files or (not places and isinstance(error, SystemExit)):
         return None
-    where = ", ".join(sorted(_LOADED))
+    where = ", ".join(sorted(files))
     if places:
-        file, line, function = places[-1]
-        where = f"{file}: line {line}, in {function}"
+        where = f"{places[-1].filename}: line {places[-1].lineno}, in {places[-1].name}"
     return f"plugin {where}: {type(error).__name__}: {' '.join(str(error).split())}"
-
-
-def plugin_of(module: str) -> str | None:
-    """Return the plug-in file that a module was loaded from; None for other modules."""
-    path = _FILES.get(module)
-    return None if path is None else str(path)
 
 
 def home_of(module: str | None) -> str | None:
@@ -168,17 +149,17 @@ def home_of(module: str | None) -> str | None:
     Files record it: no folder, so that a copy on another machine is the same. None for modules of
     this package, and where there is no file or no module, as in a notebook or in `exec`.
     """
-    if module is None or module.partition(".")[0] == __name__.partition(".")[0]:
+    if module is None or module.partition(".")[0] == _PACKAGE:
         return None
-    file = plugin_of(module)
-    if module == "__main__":
+    if module == "__main__" or module.startswith(_FROM_FILE):
         file = getattr(sys.modules[module], "__file__", None)
         return file and os.path.basename(file)
-    return os.path.basename(file) if file else module
+    return module
 
 
+@functools.cache
 def load_entry_points() -> None:
-    """Import the modules that installed packages name under `ENTRY_POINTS`, each once.
+    """Import the modules that installed packages name under `ENTRY_POINTS`, once.
 
     Raises:
         InputError: what `load_plugin` raises.
@@ -186,6 +167,33 @@ def load_entry_points() -> None:
     import importlib.metadata  # a fifth of the time of `crisalad --help`
 
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        if entry.module not in _ENTERED:
-            _ENTERED.add(entry.module)
-            load_plugin(entry.module)
+        load_plugin(entry.module)
+
+
+def source_digest(part: type[Part]) -> str | None:
+    """Compute the digest of the file that defines a plug-in's part.
+
+    None where there is no file, and for a part of this package, whose version says what it is.
+    """
+    file = getattr(sys.modules.get(part.__module__), "__file__", None)
+    if part.__module__.partition(".")[0] == _PACKAGE or file is None:
+        return None
+    return hashlib.sha256(pathlib.Path(file).read_bytes()).hexdigest()
+
+
+def sources_of(config: Any) -> dict[str, tuple[str, str | None]]:
+    """Return the name and the source's digest of every part in a configuration."""
+    return {
+        field: (part.part_name, source_digest(type(part)))
+        for field, part in parts_of(config).items()
+    }
+
+
+def changed_sources(config: Any, recorded: Mapping[str, Any]) -> list[str]:
+    """Return the plug-ins' parts whose source differs from the recorded one, as "field name"."""
+    changed = []
+    for field, (name, digest) in sources_of(config).items():
+        recorded_name, before = recorded.get(field, (None, None))
+        if name == recorded_name and digest and before and digest != before:
+            changed.append(f"{field} {name}")
+    return changed

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from crisalad_jax.config.checks import check_types, require
-from crisalad_jax.config.concise import concise
-from crisalad_jax.config.fields import free_field
+from crisalad_jax.config.part import non_semantic_field
+from crisalad_jax.config.short_repr import short_repr
 
 Size = tuple[int, int]
 """Height and width in pixels."""
@@ -28,7 +28,7 @@ WORDS: Mapping[str, Mapping[str, Any]] = {
 """Words of the flag --resize, and the fields that they set."""
 
 
-@concise(switch=("normalisation", "local-contrast", "mean", "deviation"))
+@short_repr(switch=("normalisation", "local-contrast", "mean", "deviation"))
 @dataclasses.dataclass(frozen=True)
 class PreprocessingConfig:
     """How a photograph becomes a network's input.
@@ -45,23 +45,25 @@ class PreprocessingConfig:
         (322, 322)
     """
 
-    size_rule: Literal["fixed", "shorter-side", "longer-side", "native"] = free_field("fixed")
+    size_rule: Literal["fixed", "shorter-side", "longer-side", "native"] = non_semantic_field(
+        "fixed"
+    )
     """What size an image gets. "fixed" is `ModelConfig.image_size`, whatever the aspect ratio. The
     others keep the aspect ratio: "shorter-side" gives the shorter side the length of that of
     `image_size`, "longer-side" shrinks images until the longer side is at most that of
     `image_size` and never enlarges, and "native" leaves images as they are. Their sides are then
     rounded to the nearest multiples of the patch size, where the backbone takes no others."""
-    filter: Literal["bilinear", "bicubic", "area"] = free_field("bilinear")
+    filter: Literal["bilinear", "bicubic", "area"] = non_semantic_field("bilinear")
     """Filter of the resize; "area" is OpenCV's INTER_AREA, which hloc takes."""
-    antialias: bool = free_field(True)
+    antialias: bool = non_semantic_field(True)
     """Whether the filter widens where an image shrinks, as Pillow's always does."""
-    pixels: Literal["bytes", "floats"] = free_field("bytes")
+    pixels: Literal["bytes", "floats"] = non_semantic_field("bytes")
     """What is resized: "bytes" are rounded after each pass, as Pillow does; "floats" are neither
     rounded nor clamped, as torch does."""
-    round_to_patch: bool = free_field(False)
+    round_to_patch: bool = non_semantic_field(False)
     """Whether images of a fixed size that is no multiple of the patch size are resized once more,
     to the nearest one (halves to the even number), bilinear and antialiased. MegaLoc does so."""
-    bit_depth: BitDepth = free_field("high-byte")  # noqa: RUF009
+    bit_depth: BitDepth = non_semantic_field("high-byte")  # noqa: RUF009
     """How more than 8 bits a colour become 8, before the resize. "high-byte" drops the low byte of
     16. "contrast-stretch" spreads each image's own values, from the 1st to the 99th percentile,
     over 0 to 255: for thermal images, whose values fill a small part of 16 bits, and for floats.

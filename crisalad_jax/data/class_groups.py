@@ -5,31 +5,92 @@ classes. A group is a training set of its own (`Places`) whose places are the cl
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+import math
+import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from crisalad_jax.config.classes import ClassesConfig
+from crisalad_jax.data.metres import continuous, to_metres
 from crisalad_jax.data.places import Places
-from crisalad_jax.data.views import Views, views_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Bool, Float64, Int64
 
+_NAME = re.compile(r".*?_\d{7,}_\d{4,}_\d{2,}_(\d{3,})_([^_]+)_([^_]+)_")
+"""`data.places` writes a row's northdeg, latitude and longitude into its image's name."""
+_WIDEST = 60.0
+"""Degrees of longitude of a city's images; a plane of more stretches distances by over 15 %."""
 _ADVICE = "; --loss.kind.classes.kind places takes its places for classes"
 _ONE_SPOT = 1e-3
 """Spread in metres of a cell's images below which they do not show the direction of a street."""
 
 
-class Classes(NamedTuple):
-    """The images of each class; an image may be of no class."""
+class Views(NamedTuple):
+    """Position and heading of every image; metres are of one UTM zone for each city."""
+
+    east: Float64[np.ndarray, " images"]
+    north: Float64[np.ndarray, " images"]
+    """UTM north in metres; negative south of the equator, where maps add 10,000 km."""
+    heading: Float64[np.ndarray, " images"]
+    """Heading in degrees clockwise from north, 0 to 360; NaN where unknown."""
+    known: Bool[np.ndarray, " cities"]
+    """Whether a city's positions are real; False where all its images have the same position."""
+
+
+def views_of(places: Places) -> Views:
+    """Read positions and headings; a city's UTM zone is that of its median longitude.
+
+    Raises:
+        InputError: in the layout of GSV-Cities, a file is not named in its way, or bears no
+            latitude or longitude; or a city is wider than a plane can be.
+    """
+    if places.names is None:
+        fields = np.array([_fields(places, file) for file in places.files])
+        heading, latitude, longitude = fields.T
+    elif places.views is not None:
+        latitude, longitude, heading = places.views.T
+    else:
+        latitude, longitude, heading = np.zeros((3, len(places.files)))
+    city = places.place_city[places.image_place]
+    east, north = np.empty(len(city)), np.empty(len(city))
+    known = np.zeros(len(places.cities), bool)
+    for number in np.unique(city):
+        of = city == number
+        here = continuous(longitude[of])
+        if (wide := np.ptp(here)) > _WIDEST:
+            raise InputError(
+                f"{places.root}: found the images of {places.cities[number]} over {wide:.0f} "
+                f"degrees of longitude, expected at most {_WIDEST:g}, as cells are of one plane: "
+                "a set of several cities has a table each, or no columns lat,lon"
+            )
+        known[number] = np.ptp(latitude[of]) > 0 or np.ptp(here) > 0
+        east[of], north[of] = to_metres(latitude[of], here)
+    return Views(east, north, heading % 360, known)
+
+
+def _fields(places: Places, file: str) -> list[float]:
+    """Read the heading, latitude and longitude in an image's name."""
+    match = _NAME.match(file.rpartition("/")[2])
+    try:
+        heading, latitude, longitude = map(float, match.groups() if match else ())
+    except ValueError:
+        latitude = longitude = heading = math.nan
+    if not (abs(latitude) < 90 and abs(longitude) <= 180):
+        raise InputError(
+            f"{places.root / file}: found a name without direction and position, expected "
+            "city_place_year_month_northdeg_lat_lon_panoid, in degrees"
+        )
+    return [heading, latitude, longitude]
+
+
+class Class(NamedTuple):
+    """The images of one class; an image may be of no class."""
 
     images: Int64[np.ndarray, " images"]
-    """Image indices, sorted by class."""
-    start: Int64[np.ndarray, " classes+1"]
-    """Class c owns `images[start[c] : start[c + 1]]`."""
-    group: Int64[np.ndarray, " classes"]
-    """Group number of each class; classes of one group are no neighbours."""
+    group: int
+    """Classes of one group are no neighbours."""
 
 
 def class_groups(
@@ -50,56 +111,64 @@ def class_groups(
         InputError: positions are asked for and missing, no class has enough images, or a group has
             fewer classes than a batch asks for.
     """
-    if config.kind == "places":
-        sets = [_place_classes(places, config, min_images)]
-    else:
-        views = views_of(places)
-        _check_own(places, config)
-        if not views.known.all():
-            city = places.cities[int(np.argmin(views.known))]
-            raise InputError(
-                f"{places.root}: found one position (lat, lon) for all images of {city}, expected "
-                f"where each was taken, which loss.kind.classes.kind {config.kind!r} "
-                f"asks for{_ADVICE}"
-            )
-        city = places.place_city[places.image_place]
-        if config.kind == "cells":
-            sets = [cell_classes(views, city, config, min_images=min_images)]
-        else:
-            sets = focal_classes(views, city, config, min_images=min_images)
-        for side, classes in enumerate(sets):
-            if not len(classes.group):
-                raise _no_class(places, views, city, config, min_images, side)
-    chosen = [_largest(classes, config.groups) for classes in sets]
-    for classes, groups in zip(sets, chosen, strict=True):
-        fewest = min(int((classes.group == group).sum()) for group in groups)
+    sets = _classes(places, config, min_images)
+    if not all(sets):
+        largest = min(max(map(_size, each), default=0) for each in _classes(places, config, 1))
+        raise InputError(
+            f"{places.root}: found at most {largest} images {_KINDS[config.kind]}, expected "
+            f"classes of at least {min_images}{_ADVICE if config.kind != 'places' else ''}"
+        )
+    chosen: list[list[list[Class]]] = []
+    for classes in sets:
+        groups: dict[int, list[Class]] = {}
+        for each in sorted(classes, key=lambda each: each.group):
+            groups.setdefault(each.group, []).append(each)
+        # The largest first; ties go to the lower number.
+        chosen.append(sorted(groups.values(), key=len, reverse=True)[: config.groups])
+        fewest = len(chosen[-1][-1])
         if fewest < places_per_batch:
             raise InputError(
-                f"{places.root}: found {fewest} classes in the smallest of {len(groups)} groups, "
-                f"expected at least places_per_batch {places_per_batch}; fewer groups "
+                f"{places.root}: found {fewest} classes in the smallest of {len(chosen[-1])} "
+                f"groups, expected at least places_per_batch {places_per_batch}; fewer groups "
                 "(--loss.kind.classes.groups) have more"
             )
-    return tuple(
-        _regrouped(places, classes, group)
-        for turn in zip(*chosen)  # noqa: B905, for as many of each set
-        for classes, group in zip(sets, turn, strict=True)
-    )
+    turns = zip(*chosen)  # noqa: B905, for as many of each set
+    return tuple(_regrouped(places, group) for turn in turns for group in turn)
 
 
-def _check_own(places: Places, config: ClassesConfig) -> None:
-    """Check that a table of one's own has what classes by position ask for.
+_KINDS = {
+    "places": "of one place",
+    "cells": "in one cell and sector",
+    "viewpoints": "of one cell that look at one of its focal points",
+}
+"""What the images of a class have in common."""
 
-    Raises:
-        InputError: it has no positions or no headings, or the places are folders.
-    """
-    if places.names is None:
-        return
-    lacking = "positions (lat,lon)" if places.views is None else "headings (heading)"
-    if places.views is None or np.isnan(places.views).any():
+
+def _size(each: Class) -> int:
+    return len(each.images)
+
+
+def _classes(places: Places, config: ClassesConfig, min_images: int) -> list[list[Class]]:
+    """Make the sets of classes: one, or the lateral and the frontal one."""
+    views = views_of(places)
+    if config.kind == "places":
+        return [_place_classes(places, views, config, min_images)]
+    lacking = None
+    if places.names is not None and (places.views is None or np.isnan(places.views).any()):
+        what = "positions (lat,lon)" if places.views is None else "headings (heading)"
+        lacking = f"no {what} of the images, which", "a table name,place,lat,lon,heading"
+    elif not views.known.all():
+        city = places.cities[int(np.argmin(views.known))]
+        lacking = f"one position (lat, lon) for all images of {city}, which", "where each was taken"
+    if lacking is not None:
         raise InputError(
-            f"{places.root}: found no {lacking} of the images, which loss.kind.classes.kind "
-            f"{config.kind!r} asks for, expected a table name,place,lat,lon,heading{_ADVICE}"
+            f"{places.root}: found {lacking[0]} loss.kind.classes.kind {config.kind!r} cannot use, "
+            f"expected {lacking[1]}{_ADVICE}"
         )
+    city = places.place_city[places.image_place]
+    if config.kind == "cells":
+        return [cell_classes(views, city, config, min_images=min_images)]
+    return focal_classes(views, city, config, min_images=min_images)
 
 
 def cell_classes(
@@ -108,19 +177,15 @@ def cell_classes(
     config: ClassesConfig,
     *,
     min_images: int,
-) -> Classes:
+) -> list[Class]:
     """Make CosPlace's classes: a square cell and a sector of headings (Berton et al. 2022, sec. 3).
 
     Two classes of a group are at least `spacing - 1` cells, or `sector_spacing - 1` sectors, apart.
     """
-    cells = _cells(views, config)
     sector = np.floor(views.heading / config.sector).astype(np.int64)
-    keys = np.column_stack([city, *cells, sector])
-    return _by_key(
-        keys,
-        _cell_group(keys, config) * config.sector_spacing + sector % config.sector_spacing,
-        min_images,
-    )
+    group, cells = _cells(views, config)
+    group = group * config.sector_spacing + sector % config.sector_spacing
+    return _by_key(np.column_stack([city, *cells, sector]), group, min_images)
 
 
 def focal_classes(
@@ -129,7 +194,7 @@ def focal_classes(
     config: ClassesConfig,
     *,
     min_images: int,
-) -> list[Classes]:
+) -> list[list[Class]]:
     """Make EigenPlaces' lateral and frontal classes of square cells (Berton et al. 2023, sec. 3).
 
     The first principal direction of a cell's positions is the direction of its street. A class
@@ -138,15 +203,21 @@ def focal_classes(
     within `view_angle` of the direction from its position to the focal point. Each line has two
     focal points, of which the one that more images look at is taken.
     """
-    keys = np.column_stack([city, *_cells(views, config)])
-    whole = _by_key(keys, _cell_group(keys, config), min_images)
-    sides: list[list[tuple[np.ndarray, int]]] = [[], []]
-    for number, group in enumerate(whole.group):
-        images = whole.images[whole.start[number] : whole.start[number + 1]]
-        for side, looking in enumerate(_looking(views, images, config)):
+    group, cells = _cells(views, config)
+    sides: list[list[Class]] = [[], []]
+    for cell in _by_key(np.column_stack([city, *cells]), group, min_images):
+        positions = np.column_stack([views.east[cell.images], views.north[cell.images]])
+        points = focal_points(positions, config.focal_distance)
+        if points is None:
+            continue
+        east, north = np.moveaxis(points[:, :, None] - positions, -1, 0)
+        turn = np.rad2deg(np.arctan2(east, north)) - views.heading[cell.images]
+        looks = np.abs((turn + 180) % 360 - 180) <= config.view_angle
+        for side, of_signs in zip(sides, looks, strict=True):
+            looking = of_signs[of_signs.sum(axis=1).argmax()]
             if looking.sum() >= min_images:
-                sides[side].append((images[looking], int(group)))
-    return [_joined(classes) for classes in sides]
+                side.append(Class(cell.images[looking], cell.group))
+    return sides
 
 
 def focal_points(
@@ -165,50 +236,28 @@ def focal_points(
     return mean + distance * ways[None, :, None] * directions[::-1, None]
 
 
-def _looking(
-    views: Views, images: Int64[np.ndarray, " images"], config: ClassesConfig
-) -> Iterator[Bool[np.ndarray, " images"]]:
-    """Mark the images that look at the lateral focal point, then those at the frontal one."""
-    positions = np.column_stack([views.east[images], views.north[images]])
-    points = focal_points(positions, config.focal_distance)
-    if points is None:
-        return
-    east, north = np.moveaxis(points[:, :, None] - positions, -1, 0)
-    turn = np.rad2deg(np.arctan2(east, north)) - views.heading[images]
-    looks = np.abs((turn + 180) % 360 - 180) <= config.view_angle
-    for side in looks:
-        yield side[side.sum(axis=1).argmax()]
-
-
-def _place_classes(places: Places, config: ClassesConfig, min_images: int) -> Classes:
+def _place_classes(
+    places: Places, views: Views, config: ClassesConfig, min_images: int
+) -> list[Class]:
     """Deal the set's places to groups; where positions are known, no group has two neighbours.
 
     A place that is a neighbour in every group is of no class.
     """
     large = np.flatnonzero(places.image_counts >= min_images)
-    views = views_of(places)
     group = np.full(len(places.place_id), -1)
     for city in range(len(places.cities)):
         here = large[places.place_city[large] == city]
         if places.near is not None:
             _deal(group, here, [places.near[place] for place in here], config)
-        elif views.known[city]:
+        elif views.known[city] and len(here):
             _deal(group, here, _near(_centres(places, views), here, config), config)
         else:
             group[here] = np.arange(len(here)) % config.groups
-    grouped = np.flatnonzero(group >= 0)
-    if not len(grouped):
-        raise InputError(
-            f"{places.root}: found no place with at least {min_images} images; the largest has "
-            f"{places.image_counts.max()}"
-        )
-    bounds = zip(places.place_start[grouped], places.place_start[grouped + 1], strict=True)
-    return _joined(
-        [
-            (np.arange(*ends), int(number))
-            for ends, number in zip(bounds, group[grouped], strict=True)
-        ]
-    )
+    start = places.place_start
+    return [
+        Class(np.arange(start[place], start[place + 1]), int(group[place]))
+        for place in np.flatnonzero(group >= 0)
+    ]
 
 
 def _centres(places: Places, views: Views) -> Float64[np.ndarray, "places 2"]:
@@ -245,85 +294,35 @@ def _deal(
             sizes[group[place]] += 1
 
 
-def _cells(views: Views, config: ClassesConfig) -> Int64[np.ndarray, "2 images"]:
-    return np.floor(np.stack([views.east, views.north]) / config.cell).astype(np.int64)
-
-
-def _cell_group(
-    keys: Int64[np.ndarray, "images key"], config: ClassesConfig
-) -> Int64[np.ndarray, " images"]:
-    east, north = keys[:, 1] % config.spacing, keys[:, 2] % config.spacing
-    return east * config.spacing + north
+def _cells(
+    views: Views, config: ClassesConfig
+) -> tuple[Int64[np.ndarray, " images"], Int64[np.ndarray, "2 images"]]:
+    """Return the group and the cell of each image."""
+    cells = np.floor(np.stack([views.east, views.north]) / config.cell).astype(np.int64)
+    east, north = cells % config.spacing
+    return east * config.spacing + north, cells
 
 
 def _by_key(
     keys: Int64[np.ndarray, "images key"], group: Int64[np.ndarray, " images"], min_images: int
-) -> Classes:
+) -> list[Class]:
     """Make a class of the images of each key, in the order of keys."""
-    _, first, number, counts = np.unique(
-        keys, axis=0, return_index=True, return_inverse=True, return_counts=True
-    )
-    number = number.reshape(-1)
-    large = counts >= min_images
-    order = np.argsort(number, kind="stable")
-    return Classes(
-        order[large[number[order]]],
-        np.concatenate([[0], np.cumsum(counts[large])]),
-        group[first[large]],
-    )
+    _, number, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(number.reshape(-1), kind="stable")
+    members = np.split(order, np.cumsum(counts)[:-1])
+    return [Class(each, int(group[each[0]])) for each in members if len(each) >= min_images]
 
 
-def _joined(classes: Sequence[tuple[Int64[np.ndarray, " images"], int]]) -> Classes:
-    images = [images for images, _ in classes]
-    return Classes(
-        np.concatenate([np.empty(0, np.int64), *images]),
-        np.cumsum([0, *map(len, images)]),
-        np.array([group for _, group in classes], np.int64),
-    )
-
-
-def _largest(classes: Classes, most: int) -> Int64[np.ndarray, " groups"]:
-    """Find the groups with the most classes, the largest first; ties go to the lower number."""
-    numbers, counts = np.unique(classes.group, return_counts=True)
-    return numbers[np.argsort(-counts, kind="stable")[:most]]
-
-
-def _no_class(
-    places: Places,
-    views: Views,
-    city: Int64[np.ndarray, " images"],
-    config: ClassesConfig,
-    min_images: int,
-    side: int,
-) -> InputError:
-    """Make the error that tells how many images the largest class of this set has."""
-    if config.kind == "cells":
-        classes = cell_classes(views, city, config, min_images=1)
-        what = f"in one cell of {config.cell:g} m and {config.sector:g} degrees"
-    else:
-        classes = focal_classes(views, city, config, min_images=1)[side]
-        name = ("lateral", "frontal")[side]
-        what = f"that look at the {name} focal point of one cell of {config.cell:g} m"
-    largest = np.diff(classes.start).max(initial=0)
-    return InputError(
-        f"{places.root}: found at most {largest} images {what}, expected classes of at least "
-        f"{min_images}{_ADVICE}"
-    )
-
-
-def _regrouped(places: Places, classes: Classes, group: int) -> Places:
+def _regrouped(places: Places, classes: Sequence[Class]) -> Places:
     """Return the classes of one group as places, numbered within each city."""
-    chosen = np.flatnonzero(classes.group == group)
-    counts = np.diff(classes.start)[chosen]
-    images = np.concatenate(
-        [classes.images[classes.start[number] : classes.start[number + 1]] for number in chosen]
-    )
+    counts = [len(each.images) for each in classes]
+    images = np.concatenate([each.images for each in classes])
     start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     old = places.image_place[images[start[:-1]]]
     return dataclasses.replace(
         places,
         files=tuple(places.files[image] for image in images),
-        image_place=np.repeat(np.arange(len(chosen), dtype=np.int32), counts),
+        image_place=np.repeat(np.arange(len(classes), dtype=np.int32), counts),
         place_city=places.place_city[old],
         place_id=places.place_id[old],
         place_start=start,

@@ -16,8 +16,8 @@ import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.preprocessing import BitDepth
-from crisalad_jax.data.depth import as_rgb
 from crisalad_jax.data.opencv import MAX_PIXELS, QUIET
+from crisalad_jax.data.prepare import as_rgb
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.data.video import frame_time, is_video, read_frame
 from crisalad_jax.utils.errors import InputError

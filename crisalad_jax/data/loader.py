@@ -1,25 +1,24 @@
-"""Batches of decoded images, read ahead by threads or processes in a fixed order."""
+"""Batches of decoded images, read ahead by threads in a fixed order."""
 
+import collections
 import contextlib
-import dataclasses
-import functools
 import itertools
 import os
 import pathlib
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from crisalad_jax.config.checks import takes
+from crisalad_jax.config.checks import choose, takes
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import OnBadImage, read_pixels
 from crisalad_jax.data.opencv import ONE_THREAD
 from crisalad_jax.data.places import Order, Places, epoch_batches
 from crisalad_jax.data.prepare import Preparation
-from crisalad_jax.data.read_ahead import read_ahead
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.data.video import frame_time
 from crisalad_jax.utils.errors import InputError
@@ -29,6 +28,8 @@ from crisalad_jax.utils.shapes import Bool, Float32, Int, Int32, Int64, UInt8
 if TYPE_CHECKING:  # who only reads images starts sooner without them
     from crisalad_jax.data.augmentations import Augmentation
 
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 BATCHES_AHEAD = 2
 _IMAGES_PER_TASK = 8
 """Largest number of images that a thread reads per task, because every task has an overhead."""
@@ -125,13 +126,12 @@ def training_batches(
     part: tuple[int, int] = (0, 1),
     on_bad_image: OnBadImage = "stop",
     threads: int = THREADS,
-    num_workers: int = 0,
     cache: ImageCache | None = None,
 ) -> Iterator[ImageBatch]:
     """Yield the batches of one epoch, place after place.
 
-    The same (seed, epoch, step) gives the same bits, whatever `threads`, `num_workers`,
-    `start_step` and `part`. Images are resized to `image_size` (height, width), large ones from a
+    The same (seed, epoch, step) gives the same bits, whatever `threads`, `start_step`
+    and `part`. Images are resized to `image_size` (height, width), large ones from a
     JPEG's smaller scale (see `read_image`), then augmented. An image that cannot be read stops the
     epoch or, under "skip", leaves a slot that is not valid.
 
@@ -151,8 +151,6 @@ def training_batches(
         part: (i, n) gives the i-th of n equal parts of every batch, for the i-th of n processes.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
         threads: how many decode ahead; 0 decodes in the caller's thread.
-        num_workers: number of processes that decode ahead instead of threads, without `cache`. They
-            start anew for each epoch; see `read_ahead`.
         cache: holds decoded images from epoch to epoch.
 
     Yields:
@@ -198,7 +196,6 @@ def training_batches(
         part=part,
         on_bad_image=on_bad_image,
         threads=threads,
-        num_workers=num_workers,
         cache=cache,
     )
 
@@ -229,7 +226,6 @@ def batches_of_groups(
     part: tuple[int, int] = (0, 1),
     on_bad_image: OnBadImage = "stop",
     threads: int = THREADS,
-    num_workers: int = 0,
     cache: ImageCache | None = None,
 ) -> Iterator[ImageBatch]:
     """Yield batches of chosen images, which are groups of images of a place, or mined tuples.
@@ -246,7 +242,6 @@ def batches_of_groups(
         part: (i, n) gives the i-th of n equal parts of every batch.
         on_bad_image: "stop" or "skip".
         threads: how many decode ahead.
-        num_workers: number of processes that decode ahead instead.
         cache: holds decoded images.
 
     Yields:
@@ -267,23 +262,32 @@ def batches_of_groups(
 
     if any("#t=" in file for file in files.files):
         threads = min(threads, 1)  # more would read a video each, from its beginning
-        if cache is not None and not num_workers:
+        if cache is not None:
             # In order: the frames of a batch are far from each other, with all others in between.
             cache.fill(map(files.path, np.unique(chosen)), how)
     indices = chosen.reshape(-1)
     slots = np.arange(indices.size).reshape(len(chosen), parts, batch_size // parts)
-    images = _TrainingImages(
-        files,
-        indices,
-        _read if cache is None or num_workers else cache.read,
-        how=how,
-        batch_size=batch_size,
-        images_per_group=images_per_group,
-        augmentation=AUGMENTATIONS.resolve(augmentation, "augmentation"),
-        seed=seed,
-    )
+    read = _read if cache is None else cache.read
+    augment = AUGMENTATIONS.resolve(augmentation, "augmentation")
+
+    def load(position: int) -> Pixels:
+        image = read(files.path(indices[position]), how, quickly=True)
+        step, slot = divmod(position, batch_size)
+        # The spawn key makes this stream, one for each place, independent of each image's.
+        place = (*seed, step, slot // images_per_group)
+        of_place = np.random.default_rng(np.random.SeedSequence(place, spawn_key=(1,)))
+        generator = np.random.default_rng((*seed, step, slot))
+        augmented = augment.apply(image, generator, of_place=of_place)
+        shape, dtype = np.shape(augmented), getattr(augmented, "dtype", type(augmented).__name__)
+        if shape != image.shape or dtype != np.uint8:
+            raise InputError(
+                f"augmentation {augment.part_name}: found to return {dtype} of shape {shape}, "
+                f"expected uint8 of {image.shape}"
+            )
+        return augmented
+
     return _batches(
-        images,
+        load,
         labels=labels.reshape(-1),
         indices=indices,
         positions=slots[start_step:, number].reshape(-1),
@@ -291,40 +295,7 @@ def batches_of_groups(
         batch_size=batch_size // parts,
         on_bad_image=on_bad_image,
         threads=threads,
-        num_workers=num_workers,
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class _TrainingImages:
-    """Read and augment an image of an epoch, in this process or in a worker process."""
-
-    files: ImageFiles
-    indices: np.ndarray
-    read: Callable[..., Pixels]
-    _: dataclasses.KW_ONLY
-    how: Preparation
-    batch_size: int
-    images_per_group: int
-    augmentation: "Augmentation"
-    seed: tuple[int, ...]
-
-    def __call__(self, position: int) -> Pixels:
-        path = self.files.path(self.indices[position])
-        image = self.read(path, self.how, quickly=True)
-        step, slot = divmod(position, self.batch_size)
-        # The spawn key makes this stream, one for each place, independent of each image's.
-        place = (*self.seed, step, slot // self.images_per_group)
-        of_place = np.random.default_rng(np.random.SeedSequence(place, spawn_key=(1,)))
-        generator = np.random.default_rng((*self.seed, step, slot))
-        augmented = self.augmentation.apply(image, generator, of_place=of_place)
-        shape, dtype = np.shape(augmented), getattr(augmented, "dtype", type(augmented).__name__)
-        if shape != image.shape or dtype != np.uint8:
-            raise InputError(
-                f"augmentation {self.augmentation.part_name}: found to return {dtype} of shape "
-                f"{shape}, expected uint8 of {image.shape}"
-            )
-        return augmented
 
 
 def image_batches(
@@ -401,62 +372,88 @@ def _batches(
     batch_size: int,
     on_bad_image: OnBadImage,
     threads: int,
-    num_workers: int = 0,
 ) -> Iterator[ImageBatch]:
     """Check the arguments at once, not at the first batch, and return an iterator of batches.
 
     A batch holds the results of `load` for the next `batch_size` of `positions`, or fewer where the
     size changes.
     """
-    if on_bad_image not in ("skip", "stop"):
-        raise InputError(f"on_bad_image: found {on_bad_image!r}, expected one of skip, stop")
-    for name, count in (("threads", threads), ("num_workers", num_workers)):
-        if count < 0:
-            raise InputError(f"{name}: found {count}, expected at least 0")
-    spans = [
-        range(start, min(start + batch_size, len(positions)))
-        for start in range(0, len(positions), batch_size)
-    ]
+    choose("on_bad_image", on_bad_image, {"skip": None, "stop": None})
+    if threads < 0:
+        raise InputError(f"threads: found {threads}, expected at least 0")
     # A chunk is smaller than a batch, so that all threads work on the next batch.
-    size = max(1, min(_IMAGES_PER_TASK, batch_size // max(threads, num_workers, 1)))
+    size = max(1, min(_IMAGES_PER_TASK, batch_size // max(threads, 1)))
     tasks = [
-        positions[span[first : first + size]]
-        for span in spans
-        for first in range(0, len(span), size)
+        positions[first : min(first + size, start + batch_size)].tolist()
+        for start in range(0, len(positions), batch_size)
+        for first in range(start, min(start + batch_size, len(positions)), size)
     ]
 
+    def load_all(task: list[int]) -> list[Pixels | InputError]:
+        return [_result_or_error(load, position) for position in task]
+
     def batches() -> Generator[ImageBatch, None, None]:
-        read = read_ahead(
-            functools.partial(_read_all, load),
-            tasks,
-            ahead=max(-(-BATCHES_AHEAD * batch_size // size), threads, num_workers),
-            threads=threads,
-            num_workers=num_workers,
-        )
+        ahead = max(-(-BATCHES_AHEAD * batch_size // size), threads)
+        read = read_ahead(load_all, tasks, ahead=ahead, threads=threads)
         with ONE_THREAD, contextlib.closing(read):
-            images = itertools.chain.from_iterable(read)
-            if on_bad_image == "stop":
-                images = map(_must, images)
             start = 0
-            for run in _alike(images, batch_size):
+            for run in _same_size_runs(itertools.chain.from_iterable(read), batch_size):
+                for image in run:
+                    if on_bad_image == "stop" and isinstance(image, InputError):
+                        raise InputError(f"{image} (--on-bad-image skip leaves it out)") from image
                 part = positions[start : start + len(run)]
                 start += len(run)
-                sizes = (each.shape[:2] for each in run if not isinstance(each, InputError))
-                # Where none can be read, the size is that of an image of the model's.
-                size_of_all = next(sizes, how.size_of(how.image_size))
-                batch = _empty_batch(batch_size, size_of_all, how.dtype)
-                batch.labels[: len(part)] = labels[part]
-                batch.indices[: len(part)] = indices[part]
-                for slot, image in enumerate(run):
-                    if not isinstance(image, InputError):
-                        batch.images[slot] = image
-                        batch.valid[slot] = True
-                yield batch
+                yield _batch_of(run, labels[part], indices[part], how, batch_size)
 
     return batches()
 
 
-def _alike(
+def read_ahead(
+    work: Callable[[_Item], _Result], items: Iterable[_Item], *, ahead: int, threads: int
+) -> Generator[_Result, None, None]:
+    """Yield the result of `work` for each item, in the order of the items.
+
+    Closing the generator cancels the work that has not begun.
+
+    Args:
+        work: the function.
+        items: what to work on.
+        ahead: number of items that are worked on before they are asked for.
+        threads: number of threads; 0 works in the caller's.
+    """
+    if not threads:
+        yield from map(work, items)
+        return
+    executor = ThreadPoolExecutor(threads)
+    waiting: collections.deque[Future[_Result]] = collections.deque()
+    rest = iter(items)
+    try:
+        waiting.extend(executor.submit(work, item) for item in itertools.islice(rest, ahead))
+        while waiting:
+            result = waiting.popleft().result()
+            waiting.extend(executor.submit(work, item) for item in itertools.islice(rest, 1))
+            yield result
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def one_ahead(stream: Generator[_Item, None, None]) -> Generator[_Item, None, None]:
+    """Yield a stream's items, each computed in a thread while the item before it is in use."""
+    with contextlib.closing(stream), ThreadPoolExecutor(1) as thread:
+        ahead = thread.submit(next, stream, None)
+        while (item := ahead.result()) is not None:
+            ahead = thread.submit(next, stream, None)
+            yield item
+
+
+def _result_or_error(load: Callable[[int], Pixels], position: int) -> Pixels | InputError:
+    try:
+        return load(position)
+    except InputError as error:
+        return error
+
+
+def _same_size_runs(
     images: Iterable[Pixels | InputError], batch_size: int
 ) -> Iterator[list[Pixels | InputError]]:
     """Yield runs of at most `batch_size` consecutive images of one size; errors are of any size."""
@@ -476,28 +473,26 @@ def _alike(
         yield run
 
 
-def _must(image: Pixels | InputError) -> Pixels:
-    """Return an image; raise the error that stands in its place."""
-    if isinstance(image, InputError):
-        raise InputError(f"{image} (--on-bad-image skip leaves it out)") from image
-    return image
-
-
-def _read_all(load: Callable[[int], Pixels], positions: np.ndarray) -> list[Pixels | InputError]:
-    return [_read_or_tell(load, position) for position in positions.tolist()]
-
-
-def _read_or_tell(load: Callable[[int], Pixels], position: int) -> Pixels | InputError:
-    try:
-        return load(position)
-    except InputError as error:
-        return error
-
-
-def _empty_batch(batch_size: int, image_size: Size, dtype: type[np.generic]) -> ImageBatch:
-    return ImageBatch(
-        images=np.zeros((batch_size, *image_size, 3), dtype),
+def _batch_of(
+    run: Sequence[Pixels | InputError],
+    labels: np.ndarray,
+    indices: np.ndarray,
+    how: Preparation,
+    batch_size: int,
+) -> ImageBatch:
+    """Make a padded batch; where none of its images can be read, they have the model's size."""
+    sizes = (image.shape[:2] for image in run if not isinstance(image, InputError))
+    size = next(sizes, how.size_of(how.image_size))
+    batch = ImageBatch(
+        images=np.zeros((batch_size, *size, 3), how.dtype),
         labels=np.full(batch_size, -1, np.int32),
         valid=np.zeros(batch_size, np.bool_),
         indices=np.full(batch_size, -1, np.int64),
     )
+    batch.labels[: len(run)] = labels
+    batch.indices[: len(run)] = indices
+    for slot, image in enumerate(run):
+        if not isinstance(image, InputError):
+            batch.images[slot] = image
+            batch.valid[slot] = True
+    return batch

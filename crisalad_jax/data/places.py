@@ -4,26 +4,29 @@ The layout of GSV-Cities: `Dataframes/{city}.csv` with one row per image, and
 `Images/{city_id}/{city_id}_{place_id:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{panoid}.jpg`.
 """
 
-import csv
 import dataclasses
 import itertools
 import math
 import operator
 import os
 import pathlib
-from collections.abc import Iterator, Sequence
-from typing import Literal
+from collections.abc import Collection, Sequence
+from typing import Any, Literal
 
 import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.grouped_places import places_by_order, places_by_position
 from crisalad_jax.data.images import OnBadImage
-from crisalad_jax.data.names import Disk, plain
-from crisalad_jax.data.own_places import OwnPlaces, read_own_places, views_in_order
+from crisalad_jax.data.named_places import (
+    NamedPlaces,
+    places_by_order,
+    places_by_position,
+    read_named_places,
+)
+from crisalad_jax.data.tables import Disk, normal_name, read_table
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import LARGEST, check_source, real_path
+from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float64, Int, Int32, Int64
 
@@ -33,9 +36,6 @@ _TURNS = 20
 """Draws of all places after which no batch of places that are far from each other is expected."""
 
 Order = Literal["within-city", "shuffled"]
-
-_Listings = dict[str, tuple[str, dict[str, str]]]
-"""Folder below Images/, as a table names it -> its name on disk, and the names in it."""
 
 
 @brief
@@ -141,203 +141,185 @@ def read_places(
     is_grouped = (place_radius, place_frames) != (None, None)
     if fps is not None and not is_grouped:
         raise InputError("--fps: found without --place-radius or --place-frames, expected one")
-    if is_grouped or not (root / "Dataframes").is_dir():
-        if cities is not None:
-            raise InputError(
-                f"cities: found {', '.join(cities)} for {root}, expected none: it is not in the "
-                "layout of GSV-Cities"
-            )
-        if place_radius is not None:
-            found = places_by_position(root, place_radius, positions, fps, on_bad_image)
-            return _own_places(root, found, min_images, f" within {place_radius:g} m")
-        if place_frames is not None:
-            found = places_by_order(root, place_frames, fps, on_bad_image)
-            return _own_places(root, found, min_images, f" of every {place_frames}")
-        return _own_places(root, read_own_places(root, on_bad_image), min_images)
-    tables = _find_tables(root, cities)
-    listings: _Listings = {}
-    files: list[str] = []
-    counts: list[int] = []
-    place_city: list[int] = []
-    place_id: list[int] = []
-    largest = 0
-    for position, table in enumerate(tables):
-        for raw_id, images in _read_city(root, table, listings, on_bad_image):
-            largest = max(largest, len(images))
-            if len(images) >= min_images:
-                files.extend(images)
-                counts.append(len(images))
-                place_city.append(position)
-                place_id.append(position * IDS_PER_CITY + raw_id % IDS_PER_CITY)
-    if not counts:
+    if not is_grouped and (root / "Dataframes").is_dir():
+        return _gsv_cities(root, cities, min_images, on_bad_image)
+    if cities is not None:
         raise InputError(
-            f"{root}: found no place with at least {min_images} images; the largest has {largest}"
+            f"cities: found {', '.join(cities)} for {root}, expected none: it is not in the "
+            "layout of GSV-Cities"
         )
-    return Places(
-        root=root,
-        cities=tuple(table.stem for table in tables),
-        files=tuple(files),
-        image_place=np.repeat(np.arange(len(counts), dtype=np.int32), counts),
-        place_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        place_city=np.array(place_city, np.int32),
-        place_id=np.array(place_id, np.int64),
-    )
+    if place_radius is not None:
+        found = places_by_position(root, place_radius, positions, fps, on_bad_image)
+        return _named_places(found, min_images, f" within {place_radius:g} m")
+    if place_frames is not None:
+        found = places_by_order(root, place_frames, fps, on_bad_image)
+        return _named_places(found, min_images, f" of every {place_frames}")
+    return _named_places(read_named_places(root, on_bad_image), min_images)
 
 
-def _own_places(root: pathlib.Path, found: OwnPlaces, min_images: int, words: str = "") -> Places:
-    """Take the places of one's own that are large enough; they are of one city."""
+def _named_places(found: NamedPlaces, min_images: int, words: str = "") -> Places:
+    """Take the named places that are large enough; they are of one city."""
     kept = {name: files for name, files in found.images.items() if len(files) >= min_images}
-    if not kept:
-        largest = max(map(len, found.images.values()))
-        flags = " (--place-radius, --place-frames, --min-images)" if words else ""
-        raise InputError(
-            f"{root}: found no place with at least {min_images} images{words}; the largest has "
-            f"{largest}, of {len(found.images)} places{flags}"
-        )
+    flags = " (--place-radius, --place-frames, --min-images)" if words else ""
+    _check_some(found.root, kept, found.images.values(), min_images, words, flags)
     if len(kept) < len(found.images):
         warn(
-            f"{root}: left out {len(found.images) - len(kept)} of {len(found.images)} places, with "
-            f"fewer than {min_images} images{words}"
+            f"{found.root}: left out {len(found.images) - len(kept)} of {len(found.images)} places,"
+            f" with fewer than {min_images} images{words}"
         )
     number = {name: place for place, name in enumerate(kept)}
-    near = None
+    near, views = None, None
     if found.near is not None:
         near = tuple(
             np.array(sorted(number[other] for other in found.near[name] if other in number), int)
             for name in kept
         )
-    files = [file for place in kept.values() for file in place]
-    counts = [len(place) for place in kept.values()]
+    if found.views is not None:
+        views = np.array([found.views[file] for files in kept.values() for file in files])
     return Places(
         root=found.root,
         cities=(real_path(found.root).name,),
-        files=tuple(files),
-        image_place=np.repeat(np.arange(len(kept), dtype=np.int32), counts),
-        place_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        **_by_place(list(kept.values())),
         place_city=np.zeros(len(kept), np.int32),
         place_id=np.arange(len(kept), dtype=np.int64),
         names=tuple(kept),
-        views=views_in_order(found, files),
+        views=views,
         near=near,
     )
 
 
+def _check_some(
+    root: pathlib.Path,
+    kept: Collection[object],
+    places: Collection[Sequence[str]],
+    min_images: int,
+    words: str = "",
+    flags: str = "",
+) -> None:
+    """Check that some place is large enough."""
+    if not kept:
+        raise InputError(
+            f"{root}: found no place with at least {min_images} images{words}; the largest has "
+            f"{max(map(len, places), default=0)}, of {len(places)} places{flags}"
+        )
+
+
+def _by_place(images: Sequence[Sequence[str]]) -> dict[str, Any]:
+    """Return the fields of `Places` that say which images each place has."""
+    counts = [len(files) for files in images]
+    return {
+        "files": tuple(itertools.chain.from_iterable(images)),
+        "image_place": np.repeat(np.arange(len(counts), dtype=np.int32), counts),
+        "place_start": np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+    }
+
+
+def _gsv_cities(
+    root: pathlib.Path, cities: Sequence[str] | None, min_images: int, on_bad_image: OnBadImage
+) -> Places:
+    """Read the layout of GSV-Cities."""
+    tables = _find_tables(root, cities)
+    listings = _Listings(root / "Images")
+    read = [
+        (city, place, images)
+        for city, table in enumerate(tables)
+        for place, images in _read_city(root, table, listings, on_bad_image)
+    ]
+    kept = [each for each in read if len(each[2]) >= min_images]
+    _check_some(root, kept, [images for *_, images in read], min_images)
+    return Places(
+        root=root,
+        cities=tuple(table.stem for table in tables),
+        **_by_place([images for *_, images in kept]),
+        place_city=np.array([city for city, *_ in kept], np.int32),
+        place_id=np.array(
+            [city * IDS_PER_CITY + place % IDS_PER_CITY for city, place, _ in kept], np.int64
+        ),
+    )
+
+
+class _Listings(dict[str, tuple[str, dict[str, str]]]):
+    """Folder in Images/ as a table names it -> its name on disk, and the names in it."""
+
+    def __init__(self, images: pathlib.Path) -> None:
+        self._images, self._disk = images, Disk()
+
+    def __missing__(self, folder: str) -> tuple[str, dict[str, str]]:
+        path = self._disk.find(self._images, folder)
+        self[folder] = ("", {}) if path is None else (path.name, self._disk.names(path))
+        return self[folder]
+
+    def find(self, folders: Sequence[str], stem: str) -> str | None:
+        """Return the path of an image relative to the root; None where there is none."""
+        for folder in folders:
+            there, files = self[folder]
+            for name in (f"{stem}.jpg", f"{stem}.JPG"):
+                if (file := files.get(name) or files.get(normal_name(name))) is not None:
+                    return f"Images/{there}/{file}"
+        return None
+
+
 def _find_tables(root: pathlib.Path, cities: Sequence[str] | None) -> list[pathlib.Path]:
     folder = root / "Dataframes"
-    tables = {path.stem: path for path in folder.glob("*.csv")}
+    tables = {path.stem: path for path in sorted(folder.glob("*.csv"))}
     if not tables:
         raise InputError(f"{folder}: found no CSV file, expected one for each city")
-    if cities is None:
-        return [tables[name] for name in sorted(tables)]
-    if not cities or len(set(cities)) < len(cities):
-        raise InputError(f"cities: found {list(cities)}, expected at least one, each named once")
-    unknown = [name for name in cities if name not in tables]
+    chosen = list(tables) if cities is None else cities
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise InputError(f"cities: found {list(chosen)}, expected at least one, each named once")
+    unknown = [name for name in chosen if name not in tables]
     if unknown:
         raise InputError(
             f"cities (--cities): found {', '.join(unknown)}, expected some of those in {folder}: "
-            f"{', '.join(sorted(tables))}"
+            f"{', '.join(tables)}"
         )
-    return [tables[name] for name in cities]
+    return [tables[name] for name in chosen]
 
 
 def _read_city(
-    root: pathlib.Path, table: pathlib.Path, listings: _Listings, on_bad_image: OnBadImage
+    root: pathlib.Path, path: pathlib.Path, listings: _Listings, on_bad_image: OnBadImage
 ) -> list[tuple[int, list[str]]]:
     """Read one city's places, ascending by id, with the images of each."""
     # The inner dict serves as an ordered set.
     places: dict[int, dict[str, None]] = {}
-    name = table.stem
     missing = 0
-    for line, row in _read_rows(table):
-        _, _, _, _, city_id, latitude, longitude, panorama = row
+    city = path.stem
+    table = read_table(path, *COLUMNS)
+    fields = operator.itemgetter(*map(table.columns.index, COLUMNS))
+    for line, row in table.lines:
+        *numbers, city_id, latitude, longitude, panorama = fields(row)
         try:
-            place, year, month, north = map(int, row[:4])
-            right = min(place, year, month, north) >= 0
-            right &= math.isfinite(float(latitude)) and math.isfinite(float(longitude))
+            place, year, month, north = map(int, numbers)
+            whole = min(place, year, month, north) >= 0
+            whole &= math.isfinite(float(latitude)) and math.isfinite(float(longitude))
         except ValueError:
-            right = False
-        if not right:
-            raise _not_a_number(table, line, row)
+            whole = False
+        if not whole:
+            raise InputError(
+                f"{path}: line {line}: found {', '.join(fields(row)[:-1])}, expected whole numbers "
+                "from 0 for place_id, year, month and northdeg, and numbers for lat and lon"
+            )
         stem = (
             f"{city_id}_{place % IDS_PER_CITY:07d}_{year:04d}_{month:02d}_{north:03d}"
             f"_{latitude}_{longitude}_{panorama}"
         )
-        image = _find_image(root, (city_id, name), stem, listings)
-        if image is None and on_bad_image == "skip":
+        image = listings.find((city_id, city), stem)
+        if image is not None:
+            places.setdefault(place, {})[image] = None
+        elif on_bad_image == "skip":
             missing += 1
-            continue
-        if image is None:
-            raise _no_image(root, table, line, (city_id, name), stem)
-        places.setdefault(place, {})[image] = None
+        else:
+            raise _no_image(root, path, line, (city_id, city), stem)
     if missing:
-        warn(f"{table}: left out {missing} rows, whose images are missing")
+        warn(f"{path}: left out {missing} rows, whose images are missing")
     ids = {place % IDS_PER_CITY: place for place in places}
     if len(ids) < len(places):
         first = next(place for place in places if ids[place % IDS_PER_CITY] != place)
         raise InputError(
-            f"{table}: found place_id {first} and {ids[first % IDS_PER_CITY]}, whose files have "
+            f"{path}: found place_id {first} and {ids[first % IDS_PER_CITY]}, whose files have "
             f"the same names; expected ids that differ modulo {IDS_PER_CITY}"
         )
     return [(place, list(places[place])) for place in sorted(places)]
-
-
-def _read_rows(table: pathlib.Path) -> Iterator[tuple[int, tuple[str, ...]]]:
-    """Yield the line number and the fields, in the order of COLUMNS, of every nonblank row."""
-    check_source(table, "a table of UTF-8 CSV", largest=LARGEST)
-    try:
-        # utf-8-sig: a spreadsheet's byte order mark would spoil the first column's name.
-        with table.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            header = next(reader, [])
-            missing = [name for name in COLUMNS if name not in header]
-            if missing:
-                raise InputError(
-                    f"{table}: found columns {', '.join(header) or 'none'}; "
-                    f"missing {', '.join(missing)}"
-                )
-            wanted = operator.itemgetter(*(header.index(name) for name in COLUMNS))
-            for row in reader:
-                if not row:
-                    continue
-                if len(row) != len(header):
-                    raise InputError(
-                        f"{table}: line {reader.line_num}: found {len(row)} fields, "
-                        f"expected {len(header)}"
-                    )
-                yield reader.line_num, wanted(row)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{table}: cannot be read as UTF-8 CSV: {error}") from error
-
-
-def _not_a_number(table: pathlib.Path, line: int, row: Sequence[str]) -> InputError:
-    """Make the error that names a row's field that is no number."""
-    for name, text in zip(COLUMNS, row, strict=True):
-        whole = name in COLUMNS[:4]
-        if not whole and name not in ("lat", "lon"):
-            continue
-        try:
-            right = int(text) >= 0 if whole else math.isfinite(float(text))
-        except ValueError:
-            right = False
-        if not right:
-            break
-    wanted = "a whole number from 0" if whole else "a number"
-    return InputError(f"{table}: line {line}: {name}: found {text!r}, expected {wanted}")
-
-
-def _find_image(
-    root: pathlib.Path, folders: tuple[str, ...], stem: str, listings: _Listings
-) -> str | None:
-    for folder in folders:
-        if folder not in listings:
-            disk, images = Disk(), root / "Images"
-            path = disk.find(images, folder)
-            listings[folder] = ("", {}) if path is None else (path.name, disk.names(path))
-        there, names = listings[folder]
-        for name in (f"{stem}.jpg", f"{stem}.JPG"):
-            if (file := names.get(name) or names.get(plain(name))) is not None:
-                return f"Images/{there}/{file}"
-    return None
 
 
 def _no_image(

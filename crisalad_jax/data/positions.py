@@ -1,17 +1,18 @@
-"""Read where images were taken, from their @UTM names or from a table."""
+"""Read where images were taken: from @UTM names, a table, or EXIF data (CIPA DC-008, 4.6.6)."""
 
+import contextlib
 import math
 import os
 import pathlib
+import warnings
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.metres import Zone
-from crisalad_jax.data.named_table import NamedRow, named_rows
-from crisalad_jax.data.names import matched
+from crisalad_jax.data.tables import matched, read_table
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float64
 
@@ -21,6 +22,8 @@ AXES = (("east", "north"), ("lat", "lon"), ("x", "y"))
 
 MOST_METRES = 1e8
 """Largest coordinate in metres: twice the Earth's circumference, and its square is finite."""
+_MOST = {"lat": 90.0, "lon": 180.0} | dict.fromkeys(("east", "north", "x", "y"), MOST_METRES)
+"""Largest number of a column."""
 _BANDS = "CDEFGHJKLMNPQRSTUVWX"
 """Letters of UTM's bands of latitude, from south to north; N is the first of the north."""
 _BAND_S = (3.4e6, 4.6e6)
@@ -199,7 +202,7 @@ def read_positions(path: str | os.PathLike[str]) -> Positions:
     Raises:
         InputError: as `read_image_table`; no columns of positions, or a row without one.
     """
-    positions = _read_table(pathlib.Path(path), must=True).positions
+    positions = read_image_table(path, all_positions=True).positions
     assert positions is not None
     return positions
 
@@ -231,68 +234,88 @@ def positions_of(
     return positions._replace(of=of)
 
 
-def read_image_table(path: str | os.PathLike[str]) -> ImageTable:
+def read_image_table(path: str | os.PathLike[str], *, all_positions: bool = False) -> ImageTable:
     """Read a table with a column `name`, and perhaps a position: east,north or lat,lon or x,y.
 
-    The separator is a comma or, where the header has more of them, a semicolon; then decimals may
-    have commas. x and y count only where there is neither of the other pairs. A row whose two
-    numbers are both empty has no position. Other columns are ignored.
+    Decimals may have commas where semicolons separate the fields. x and y count only where there
+    is neither of the other pairs. A row whose two numbers are both empty has no position. Other
+    columns are ignored.
+
+    Args:
+        path: the file.
+        all_positions: whether every row must have a position.
 
     Raises:
-        InputError: the file cannot be read, has another header, one with both other pairs or with
-            a column twice, a row with other than as many fields, without a name, a name twice,
-            or a value that is no finite number, or no latitude or longitude.
+        InputError: as `read_table` and `Table.named_rows`; both other pairs of columns or half a
+            pair; or a value that is not a finite number, latitude or longitude.
     """
-    return _read_table(pathlib.Path(path), must=False)
+    table = read_table(pathlib.Path(path), "name")
+    axes = _axes(table.path, table.columns, all_positions)
+    rows = list(table.named_rows())
+    positions = None
+    if axes is not None:
+        of = {
+            name: (row.number(axes[0], _MOST[axes[0]]), row.number(axes[1], _MOST[axes[1]]))
+            for name, row in rows
+            if all_positions or any(row.fields[axis] for axis in axes)
+        }
+        positions = Positions(axes, of)
+    return ImageTable([(row.line, name) for name, row in rows], positions)
 
 
-def _read_table(path: pathlib.Path, *, must: bool) -> ImageTable:
-    """Read a table; with `must`, every row has a position."""
-    found: list[tuple[str, str] | None] = []
-    rows = list(named_rows(path, lambda header: found.append(_axes(path, header, must=must))))
-    (axes,) = found
-    positions = {
-        row.name: _position(row, axes)
-        for row in rows
-        if axes is not None and (must or any(row.fields[axis] for axis in axes))
-    }
-    return ImageTable(
-        [(row.line, row.name) for row in rows], None if axes is None else Positions(axes, positions)
-    )
-
-
-_NEEDED = "name,east,north or name,lat,lon or name,x,y"
-
-
-def _axes(path: pathlib.Path, header: Sequence[str], *, must: bool) -> tuple[str, str] | None:
-    matching = [axes for axes in AXES if {"name", *axes} <= set(header)]
-    if len(matching) > 1 and matching[-1] == AXES[-1]:
-        matching.pop()  # x and y may be of anything, such as pixels
-    used = {"name", *AXES[0], *AXES[1], *sum(matching, ())}
-    twice = [name for name in header if header.count(name) > 1 and name in used]
-    if twice:
-        raise InputError(f"{path}: found the column {twice[0]} twice, expected it once")
-    if len(matching) == 1:
-        return matching[0]
-    found = f"{path}: found columns {', '.join(header) or 'none'}"
-    if matching:
-        raise InputError(f"{found}, expected {_NEEDED}, only one of these")
-    if must:
-        raise InputError(f"{found}, expected {_NEEDED}")
-    if "name" not in header:
-        raise InputError(f"{found}, expected one called name")
-    if any(axis in header for axes in AXES[:2] for axis in axes):
-        raise InputError(f"{found}, expected both numbers of a position: {_NEEDED}")
+def _axes(path: pathlib.Path, columns: Sequence[str], must: bool) -> tuple[str, str] | None:
+    """Return the columns of the positions; None where no column is of any."""
+    *pairs, frame = AXES
+    found = [axes for axes in pairs if set(axes) & set(columns)]
+    if not found and set(frame) <= set(columns):
+        found = [frame]  # x and y may be of anything, such as pixels
+    if len(found) == 1 and set(found[0]) <= set(columns):
+        return found[0]
+    if found or must:
+        raise InputError(
+            f"{path}: found columns {', '.join(columns)}, expected only one of name,east,north or "
+            "name,lat,lon or name,x,y"
+        )
     return None
 
 
-def _position(row: NamedRow, axes: tuple[str, str]) -> tuple[float, float]:
-    first, second = map(row.number, axes)
-    found = f"{row.where}: found {[row.fields[axis] for axis in axes]}"
-    if not (math.isfinite(first) and math.isfinite(second)):
-        raise InputError(f"{found}, expected two finite numbers")
-    if axes == AXES[1] and not (abs(first) <= 90 and abs(second) <= 180):
-        raise InputError(f"{found}, expected a latitude and a longitude")
-    if max(abs(first), abs(second)) > MOST_METRES:
-        raise InputError(f"{found}, expected metres {' and '.join(axes)}, at most {MOST_METRES:g}")
-    return first, second
+_GPS = 0x8825
+_LATITUDE, _LONGITUDE, _STATUS = (1, 2, b"NS"), (3, 4, b"EW"), 9
+_VOID = "V"
+"""Status of a receiver without a fix."""
+
+
+def exif_position(path: str | os.PathLike[str] | BinaryIO) -> tuple[float, float] | None:
+    """Read latitude and longitude in degrees; None where a file says none that can be right."""
+    from PIL import Image
+
+    # EXIF data of any maker may be wrong in any way, and then tells nothing.
+    with contextlib.suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with Image.open(path, formats=("JPEG", "MPO")) as image:
+            fields = image.getexif().get_ifd(_GPS)
+        if fields.get(_STATUS) == _VOID:
+            return None
+        latitude, longitude = _degrees(fields, *_LATITUDE), _degrees(fields, *_LONGITUDE)
+        # Cameras without a fix write zeros.
+        right = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude, longitude) != (0, 0)
+        return (latitude, longitude) if right else None
+    return None
+
+
+def _degrees(fields: dict[int, Any], reference: int, value: int, signs: bytes) -> float:
+    """Return degrees of degrees, minutes and seconds; NaN where a fraction is 0 / 0."""
+    degrees, minutes, seconds = (float(part) for part in fields[value])
+    sign = 1 - 2 * signs.decode().index(fields[reference].strip("\0 ").upper())
+    total = sign * (degrees + minutes / 60 + seconds / 3600)
+    return total if math.isfinite(total) else math.nan
+
+
+def exif_positions(images: Iterable[tuple[str, pathlib.Path]]) -> Positions:
+    """Read the positions of images that have any.
+
+    Args:
+        images: the name and the file of each.
+    """
+    found = ((name, exif_position(path)) for name, path in images)
+    return Positions(AXES[1], {name: position for name, position in found if position is not None})

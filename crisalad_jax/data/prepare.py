@@ -1,15 +1,99 @@
-"""Prepare a decoded photograph for a network: resize it, and normalise what is no bytes."""
+"""Prepare a decoded photograph for a network: 8 bits of RGB, resized, and normalised if floats."""
 
 import dataclasses
+import threading
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
-from crisalad_jax.data.depth import as_rgb
+from crisalad_jax.config.preprocessing import BitDepth, PreprocessingConfig, Size
 from crisalad_jax.data.resize import Pixels, resize_image
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.shapes import Float32
+from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.shapes import Float32, UInt8, UInt16
+
+PERCENTILES = (1, 99)
+"""Of an image's values, between which "contrast-stretch" spreads them. A dead pixel of a thermal
+camera would take the whole range."""
+_NARROW = 2**14
+"""Range of 16-bit values below which an image has less than 64 of 256 grey levels."""
+_noted = threading.Lock()
+"""Taken for good by the first note: a set of thermal images has thousands of them."""
+
+
+def as_rgb(
+    image: Any, bit_depth: BitDepth = "high-byte", name: str = "image"
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return pixels as 8-bit RGB.
+
+    Args:
+        image: RGB (height, width, 3), or grey (height, width) or (height, width, 1). uint8 or
+            uint16; for "contrast-stretch" any integers or floats.
+        bit_depth: how more than 8 bits become 8; see `PreprocessingConfig`.
+        name: what messages begin with, such as the file.
+
+    Raises:
+        InputError: it is not such an array, or none of its values is finite.
+
+    Example:
+        >>> import numpy as np
+        >>> as_rgb(np.array([[7, 9]], np.uint8)).tolist()
+        [[[7, 7, 7], [9, 9, 9]]]
+    """
+    expected = (
+        "uint8 or uint16 of shape (height, width, 3), or grey (height, width), with sides of at "
+        "least 1"
+    )
+    if not isinstance(image, np.ndarray):
+        raise InputError(
+            f"{name}: found {type(image).__name__}, expected {expected}, as of `read_image`"
+        )
+    grey = image.ndim == 2 or image.shape[2:] == (1,)
+    right = bool(image.size) and (grey or image.shape[2:] == (3,))
+    if right and image.dtype != np.uint8 and image.dtype.kind in "iuf":
+        if bit_depth == "contrast-stretch":
+            image = _stretched(image, name)
+        elif image.dtype == np.uint16:
+            _note_narrow(image, name)
+            image = (image >> 8).astype(np.uint8)
+    if not right or image.dtype != np.uint8:
+        found = f"{name}: found {image.dtype} of shape {image.shape}"
+        if right and image.dtype.kind in "iuf":
+            low, high = _range(image, (0, 100), name)
+            found += f", values from {low:,.6g} to {high:,.6g}"
+            expected = "uint8 or uint16; --resize contrast-stretch spreads such values over 8 bits"
+        raise InputError(f"{found}, expected {expected}")
+    return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2) if grey else image
+
+
+def _range(image: np.ndarray, percentiles: tuple[int, int], name: str) -> tuple[float, float]:
+    """Return percentiles of the values that are finite: values, so that grey and RGB agree."""
+    values = image[np.isfinite(image)] if image.dtype.kind == "f" else image
+    if not values.size:
+        raise InputError(f"{name}: found no finite value, expected some")
+    low, high = np.percentile(values, percentiles, method="inverted_cdf")
+    return float(low), float(high)
+
+
+def _stretched(image: np.ndarray, name: str) -> UInt8[np.ndarray, "..."]:
+    """Spread the values between the percentiles over 0 to 255; what is not finite becomes 0."""
+    low, high = _range(image, PERCENTILES, name)
+    share = (image - np.float64(low)) / ((high - low) or 1.0)
+    return np.rint(255 * np.clip(np.nan_to_num(share), 0, 1)).astype(np.uint8)
+
+
+def _note_narrow(image: UInt16[np.ndarray, "..."], name: str) -> None:
+    """Say, once, that 16-bit values of a narrow range lose most of what they show."""
+    if _noted.locked():
+        return
+    low, high = _range(image, PERCENTILES, name)
+    if high - low < _NARROW and _noted.acquire(blocking=False):
+        levels = int(high) // 256 - int(low) // 256 + 1
+        warn(
+            f"{name}: 16-bit values from {low:,.0f} to {high:,.0f} of 65,535 become {levels} of "
+            "256 grey levels; --resize contrast-stretch spreads them over all"
+        )
 
 
 @dataclasses.dataclass(frozen=True)

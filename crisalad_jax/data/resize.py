@@ -3,8 +3,8 @@
 import functools
 import sys
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -59,36 +59,33 @@ def resize_image(
     """
     choose("pixels", pixels, {"bytes": None, "floats": None})
     choose("filter", filter, {**_KERNELS, "area": None})
-    kinds = (np.uint8,) if pixels == "bytes" else (np.uint8, np.float32)
-    check_pixels(image, kinds)
-    if not _is_size(image_size):
-        raise InputError(f"image_size: found {image_size!r}, expected two whole numbers of pixels")
-    if min(image_size) < 1:
-        raise InputError(f"image_size: found {image_size}, expected sides of at least 1")
+    _check_pixels(image, (np.uint8,) if pixels == "bytes" else (np.uint8, np.float32))
+    sides = image_size if isinstance(image_size, tuple | list) else ()
+    if [isinstance(side, int | np.integer) and side >= 1 for side in sides] != [True, True]:
+        raise InputError(
+            f"image_size: found {image_size!r}, expected two whole numbers of pixels from 1"
+        )
     if filter == "area":
         return _resize_by_area(image, image_size, pixels)
     height, width = image.shape[:2]
-    lines = _taps(height, image_size[0], filter, antialias)
-    columns = _taps(width, image_size[1], filter, antialias)
+    taps = (
+        _taps(height, image_size[0], filter, antialias),
+        _taps(width, image_size[1], filter, antialias),
+    )
     flat = np.ascontiguousarray(image).reshape(height, 3 * width)
-    if (filter, antialias, pixels) == ("bilinear", True, "bytes"):
-        resized = np.empty((*image_size, 3), np.uint8)
-        resample = _resampler(flat.size)
-        resample(flat, *lines, *columns, resized.reshape(image_size[0], -1))
-        return resized
-    resized = np.empty((*image_size, 3), np.float32)
-    resample = _resampler_of_floats(flat.size)
-    target = resized.reshape(image_size[0], -1)
-    resample(flat.astype(np.float32), *lines, *columns, target, pixels == "bytes")
+    once = (filter, antialias, pixels) == ("bilinear", True, "bytes")
+    resized = np.empty((image_size[0], 3 * image_size[1]), np.uint8 if once else np.float32)
+    resample = _resampler(flat.size, once)
+    if once:
+        resample(flat, *taps, resized)
+    else:
+        resample(flat.astype(np.float32), *taps, resized, pixels == "bytes")
+    resized = resized.reshape(*image_size, 3)
     return resized.astype(np.uint8) if pixels == "bytes" else resized
 
 
-def check_pixels(image: Any, kinds: Sequence[type] = (np.uint8,)) -> None:
-    """Check that an image is RGB, of one of the types.
-
-    Raises:
-        InputError: it is not.
-    """
+def _check_pixels(image: Any, kinds: Sequence[type]) -> None:
+    """Check that an image is RGB, of one of the types."""
     expected = "uint8 of shape (height, width, 3) with sides of at least 1"
     if not isinstance(image, np.ndarray):
         raise InputError(
@@ -98,15 +95,6 @@ def check_pixels(image: Any, kinds: Sequence[type] = (np.uint8,)) -> None:
         raise InputError(f"image: found {image.dtype} of shape {image.shape}, expected {expected}")
 
 
-def _is_size(size: Any) -> bool:
-    whole = (int, np.integer)
-    return (
-        isinstance(size, tuple | list)
-        and len(size) == 2
-        and all(isinstance(n, whole) for n in size)
-    )
-
-
 def _resize_by_area(image: Pixels, image_size: tuple[int, int], pixels: str) -> Pixels:
     grows = any(new > old for new, old in zip(image_size, image.shape, strict=False))
     how = cv2.INTER_LINEAR if grows else cv2.INTER_AREA
@@ -114,13 +102,9 @@ def _resize_by_area(image: Pixels, image_size: tuple[int, int], pixels: str) -> 
     return cv2.resize(given, image_size[::-1], interpolation=how)
 
 
-class _Taps(NamedTuple):
-    """The filter taps along one side: for each new value, the old neighbours and their weights."""
-
-    first: Int64[np.ndarray, " new"]
-    count: Int64[np.ndarray, " new"]
-    weights: Float32[np.ndarray, "new most"]
-    """Sum to 1; 0 from `count` on."""
+_Taps = tuple[Int64[np.ndarray, " new"], Int64[np.ndarray, " new"], Float32[np.ndarray, "new most"]]
+"""Filter taps along one side: for each new value, the first of its old neighbours, their number,
+and their weights, which sum to 1."""
 
 
 def _triangle(distances: np.ndarray) -> np.ndarray:
@@ -159,7 +143,7 @@ def _taps(old: int, new: int, name: str, antialias: bool) -> _Taps:
     distances = np.abs(first[:, None] + number + 0.5 - centres[:, None]) / stretch
     weights = np.where(number < count[:, None], kernel(distances), 0)
     weights /= weights.sum(axis=1, keepdims=True)
-    return _Taps(first, count, weights.astype(np.float32))
+    return first, count, weights.astype(np.float32)
 
 
 def _taps_at_points(old: int, new: int, name: str) -> _Taps:
@@ -175,7 +159,7 @@ def _taps_at_points(old: int, new: int, name: str) -> _Taps:
     first, count = inside[:, 0], inside[:, -1] - inside[:, 0] + 1
     summed = np.zeros_like(weights)
     np.add.at(summed, (np.arange(new)[:, None], inside - first[:, None]), weights)
-    return _Taps(np.ascontiguousarray(first), count, summed.astype(np.float32))
+    return np.ascontiguousarray(first), count, summed.astype(np.float32)
 
 
 _COMPILING = threading.Lock()
@@ -190,42 +174,30 @@ class _Seen:
     values = 0
 
 
-def _resampler(values: int) -> Callable[..., None]:
-    """Return `_resample` for so many more values: numpy's while they are few, or machine code."""
-    return _step if _are_few(values) else _compiled() or _step
+def _resampler(values: int, once: bool) -> Callable[..., None]:
+    """Return what resamples so many more values: numpy while they are few, or machine code.
 
+    Loading numba takes half a second, a third of the time from a start to a first answer
+    (docs/performance.md). Without numba, numpy resamples all images.
 
-def _resampler_of_floats(values: int) -> Callable[..., None]:
-    """Return `_resample_floats` for so many more values, as `_resampler` does."""
-    return _step_floats if _are_few(values) else _compiled_floats() or _step_floats
-
-
-def _are_few(values: int) -> bool:
-    """Count values, and return whether so few were seen that numba need not be loaded."""
+    Args:
+        values: number of values of the image.
+        once: whether the result is rounded once, as by `_resample`, or as by `_resample_floats`.
+    """
     _Seen.values += values
-    return _Seen.values <= _FEW and "numba" not in sys.modules
-
-
-def _compiled() -> Callable[..., None] | None:
-    """Return `_resample` as machine code; None without numba."""
-    with _COMPILING:
-        return _machine_code(_resample, "uint8", "uint8")
-
-
-def _compiled_floats() -> Callable[..., None] | None:
-    """Return `_resample_floats` as machine code; None without numba."""
-    with _COMPILING:
-        return _machine_code(_resample_floats, "float32", "float32", "bool_")
+    if _Seen.values > _FEW or "numba" in sys.modules:
+        with _COMPILING:
+            compiled = _machine_code(once)
+        if compiled is not None:
+            return compiled
+    return _step if once else _step_floats
 
 
 @functools.cache
-def _machine_code(
-    function: Callable[..., None], old: str, new: str, *more: str
-) -> Callable[..., None] | None:
-    """Compile a function of pixels, taps and result, which then releases Python's global lock.
+def _machine_code(once: bool) -> Callable[..., None] | None:
+    """Compile a loop, which then releases Python's global lock; None without numba.
 
     It compiles in about a second, and is cached in the `user_cache`, or where NUMBA_CACHE_DIR says.
-    The result is None without numba.
     """
     try:
         import numba
@@ -233,35 +205,34 @@ def _machine_code(
     except ModuleNotFoundError:
         return None
 
+    function: Any = _resample if once else _resample_floats
+    values = types.uint8 if once else types.float32
     # A readonly array accepts writable ones too.
-    pixels = types.Array(getattr(types, old), 2, "C", readonly=True)
-    numbers = types.int64[::1]
-    taps = (numbers, numbers, types.float32[:, ::1])
-    result = (getattr(types, new)[:, ::1], *(getattr(types, each) for each in more))
+    pixels = types.Array(values, 2, "C", readonly=True)
+    taps = types.Tuple((types.int64[::1], types.int64[::1], types.float32[:, ::1]))
+    rounds = () if once else (types.bool_,)
+    signature = types.void(pixels, taps, taps, values[:, ::1], *rounds)
     options = {"nogil": True, "fastmath": {"contract"}}
-    signature = types.void(pixels, *taps, *taps, *result)
     config: Any = numba.config  # pyright: ignore
-    told = config.CACHE_DIR
+    before = config.CACHE_DIR
     try:
-        config.CACHE_DIR = told or str(user_cache() / "numba")
+        config.CACHE_DIR = before or str(user_cache() / "numba")
         return numba.njit(signature, cache=True, **options)(function)
     except (RuntimeError, OSError):  # no home or no writable cache folder, or a full disk
         return numba.njit(signature, **options)(function)
     finally:
-        config.CACHE_DIR = told
+        config.CACHE_DIR = before
 
 
 def _resample(
     pixels: np.ndarray,
-    first_line: np.ndarray,
-    line_count: np.ndarray,
-    line_weights: np.ndarray,
-    first_column: np.ndarray,
-    column_count: np.ndarray,
-    column_weights: np.ndarray,
+    line_taps: tuple[np.ndarray, ...],
+    column_taps: tuple[np.ndarray, ...],
     resized: np.ndarray,
 ) -> None:
     """Resample line after line, so that the rows between the two passes stay in the L1 cache."""
+    first_line, line_count, line_weights = line_taps
+    first_column, column_count, column_weights = column_taps
     line = np.empty(pixels.shape[1], np.float32)
     for row in range(resized.shape[0]):
         line[:] = 0
@@ -286,16 +257,14 @@ def _resample(
 
 def _resample_floats(
     pixels: np.ndarray,
-    first_line: np.ndarray,
-    line_count: np.ndarray,
-    line_weights: np.ndarray,
-    first_column: np.ndarray,
-    column_count: np.ndarray,
-    column_weights: np.ndarray,
+    line_taps: tuple[np.ndarray, ...],
+    column_taps: tuple[np.ndarray, ...],
     resized: np.ndarray,
     rounds: bool,
 ) -> None:
     """Resample along rows, then along columns, as Pillow does; with `rounds` to 0 to 255."""
+    first_line, line_count, line_weights = line_taps
+    first_column, column_count, column_weights = column_taps
     lines = np.empty((pixels.shape[0], resized.shape[1]), np.float32)
     for row in range(pixels.shape[0]):
         line = lines[row]
@@ -325,65 +294,41 @@ def _resample_floats(
                 target[i] = min(max(np.floor(target[i] + np.float32(0.5)), 0), 255)
 
 
-def _step(
-    pixels: np.ndarray,
-    first_line: np.ndarray,
-    line_count: np.ndarray,
-    line_weights: np.ndarray,
-    first_column: np.ndarray,
-    column_count: np.ndarray,
-    column_weights: np.ndarray,
-    resized: np.ndarray,
-) -> None:
-    """Resample as `_resample` does, to the bit, a tap of all pixels at a time."""
-    lines = np.zeros((len(first_line), pixels.shape[1]), np.float32)
-    for at, weights in _each_tap(first_line, line_weights, len(pixels)):
-        lines = _fused(weights[:, None], pixels[at], lines)
-    near = lines.reshape(len(lines), -1, 3)
-    result = np.full((len(lines), len(first_column), 3), 0.5, np.float32)
-    for at, weights in _each_tap(first_column, column_weights, near.shape[1]):
-        result = _fused(weights[:, None], near[:, at], result)
+def _step(pixels: np.ndarray, line_taps: _Taps, column_taps: _Taps, resized: np.ndarray) -> None:
+    """Resample as `_resample` does, to the bit, by numpy."""
+    lines = _sums(pixels, line_taps)
+    near = lines.reshape(len(lines), -1, 3).swapaxes(0, 1)
+    result = _sums(near, column_taps, 0.5).swapaxes(0, 1)
     resized[:] = result.astype(np.uint8).reshape(resized.shape)
 
 
 def _step_floats(
     pixels: np.ndarray,
-    first_line: np.ndarray,
-    line_count: np.ndarray,
-    line_weights: np.ndarray,
-    first_column: np.ndarray,
-    column_count: np.ndarray,
-    column_weights: np.ndarray,
+    line_taps: _Taps,
+    column_taps: _Taps,
     resized: np.ndarray,
     rounds: bool,
 ) -> None:
-    """Resample as `_resample_floats` does, to the bit, a tap of all pixels at a time."""
-    near = pixels.reshape(len(pixels), -1, 3)
-    lines = np.zeros((len(pixels), len(first_column), 3), np.float32)
-    for at, weights in _each_tap(first_column, column_weights, near.shape[1]):
-        lines = _fused(weights[:, None], near[:, at], lines)
-    if rounds:
-        lines = np.clip(np.floor(lines + np.float32(0.5)), 0, 255)
-    lines = lines.reshape(len(pixels), -1)
-    result = np.zeros(resized.shape, np.float32)
-    for at, weights in _each_tap(first_line, line_weights, len(lines)):
-        result = _fused(weights[:, None], lines[at], result)
-    resized[:] = np.clip(np.floor(result + np.float32(0.5)), 0, 255) if rounds else result
+    """Resample as `_resample_floats` does, to the bit, by numpy."""
+
+    def rounded(values: np.ndarray) -> np.ndarray:
+        return np.clip(np.floor(values + np.float32(0.5)), 0, 255) if rounds else values
+
+    near = pixels.reshape(len(pixels), -1, 3).swapaxes(0, 1)
+    lines = rounded(_sums(near, column_taps)).swapaxes(0, 1).reshape(len(pixels), -1)
+    resized[:] = rounded(_sums(lines, line_taps))
 
 
-def _each_tap(
-    first: np.ndarray, weights: np.ndarray, old: int
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the old places and the weights of each tap; those beyond the last weigh nothing."""
-    for tap in range(weights.shape[1]):
-        yield np.minimum(first + tap, old - 1), weights[:, tap].astype(np.float64)
+def _sums(values: np.ndarray, taps: _Taps, start: float = 0.0) -> np.ndarray:
+    """Sum the weighted rows of each tap, a tap at a time; those beyond the last weigh nothing.
 
-
-def _fused(weights: np.ndarray, values: np.ndarray, sums: np.ndarray) -> np.ndarray:
-    """Multiply and add as a processor's fused instruction does: rounded once, to float32.
-
-    A product of two float32 is exact in float64.
+    A product of two float32 is exact in float64, so that each sum is rounded once, to float32, as
+    by a processor's fused instruction.
     """
-    products = weights * values
-    products += sums
-    return products.astype(np.float32)
+    first, _, weights = taps
+    sums = np.full((len(first), *values.shape[1:]), start, np.float32)
+    for tap in range(weights.shape[1]):
+        rows = values[np.minimum(first + tap, len(values) - 1)]
+        by_row = weights[:, tap].astype(np.float64).reshape(-1, *[1] * (rows.ndim - 1))
+        sums = (by_row * rows + sums).astype(np.float32)
+    return sums

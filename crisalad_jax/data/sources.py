@@ -15,8 +15,8 @@ from crisalad_jax.data.images import (
     names_in,
     only_images,
 )
-from crisalad_jax.data.names import Disk
 from crisalad_jax.data.positions import Positions, read_image_table
+from crisalad_jax.data.tables import Disk
 from crisalad_jax.data.video import (
     check_rate,
     count_frames,

@@ -15,6 +15,7 @@ import pathlib
 import re
 import threading
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -269,3 +270,35 @@ def read_frame(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
     if image is None:
         raise InputError(f"{path}: found no frame there, expected a time in the video")
     return image
+
+
+_IN_VIDEO = re.compile(r"(.+)#t=(\d+(?:\.\d+)?)", re.S)
+_SINCE_1970 = re.compile(r"(?<![\d.])(1\d{9})(?:\.(\d+)|(\d{3}|\d{6}|\d{9}))?(?![\d])")
+"""Seconds from 2001 to 2033, then decimals, or the digits of milli-, micro- or nanoseconds."""
+
+
+class Moment(NamedTuple):
+    """A time on some clock: moments of two clocks say nothing of each other."""
+
+    clock: str
+    """The video or camera that the time is of; "" is seconds since 1970."""
+    seconds: float
+
+
+def moment_of(name: str | os.PathLike[str]) -> Moment | None:
+    """Read the moment in an image's name; None where it has none, or several.
+
+    Example:
+        >>> moment_of("walk.mp4#t=12.500")
+        Moment(clock='walk.mp4', seconds=12.5)
+        >>> moment_of("left/1403636579763555584.png").seconds  # of EuRoC: nanoseconds
+        1403636579.7635555
+        >>> moment_of("0001.png")
+    """
+    if match := _IN_VIDEO.fullmatch(os.fspath(name)):
+        return Moment(match[1], float(match[2]))
+    found = _SINCE_1970.findall(pathlib.PurePath(name).stem)
+    if len(found) != 1:
+        return None
+    whole, decimals, digits = found[0]
+    return Moment("", float(f"{whole}.{decimals or digits or 0}"))

@@ -8,7 +8,7 @@ from typing import Any
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.loader import OnBadImage
-from crisalad_jax.data.own_places import TABLE
+from crisalad_jax.data.named_places import TABLE
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.data.query_set import QuerySet, read_query_set
 from crisalad_jax.experiments.report import training_curves
@@ -39,7 +39,6 @@ def train(
     weights: Path | None = None,
     backbone: Path | None = None,
     on_bad_image: OnBadImage = "stop",
-    num_workers: int = 0,
     num_threads: int | None = None,
     shard_state: bool = False,
     quiet: bool = False,
@@ -64,8 +63,7 @@ def train(
             trained and saved; `recipe(model=load(weights).config)` has the file's.
         backbone: a checkpoint to start the backbone from, or a published model's name.
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
-        num_workers: number of processes that read the training images; 0 for threads.
-        num_threads: number of threads that read them; None for one a usable core.
+        num_threads: number of threads that read the training images; None for one a usable core.
         shard_state: keep what trains and its moments in shards, one a device.
         quiet: no progress bars.
         say: called with each line to print.
@@ -134,7 +132,6 @@ def train(
         validation=benchmark,
         initial=initial,
         on_bad_image=on_bad_image,
-        num_workers=num_workers,
         num_threads=num_threads,
         shard_state=shard_state,
         quiet=quiet,

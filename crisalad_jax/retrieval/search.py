@@ -14,7 +14,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Float32, Int32
 
 from crisalad_jax.config.checks import check_count
-from crisalad_jax.data.read_ahead import one_ahead
+from crisalad_jax.data.loader import one_ahead
 from crisalad_jax.retrieval.chunks import (
     WIDE,
     Block,

@@ -27,9 +27,8 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from crisalad_jax.data.exif import exif_position
 from crisalad_jax.data.images import IMAGE_SUFFIXES, decode_image
-from crisalad_jax.data.positions import AXES, MOST_METRES, Positions, utm_positions
+from crisalad_jax.data.positions import AXES, MOST_METRES, Positions, exif_position, utm_positions
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.maps.map import Answer

@@ -195,7 +195,7 @@ def _check_start(
                 f"{out}: the run started from other {what} than are given now; expected the same, "
                 "or another folder"
             )
-    changed = changed_sources(config, saved["sources"], same_version=False)
+    changed = changed_sources(config, saved["sources"])
     if changed:
         raise InputError(
             f"{out}: found another source of {', '.join(changed)} than the run began with; "

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from crisalad_jax.data.loader import ImageBatch
-from crisalad_jax.data.read_ahead import one_ahead
+from crisalad_jax.data.loader import ImageBatch, one_ahead
 from crisalad_jax.nn.model import Crisalad, cast_params, init_crisalad
 from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 from jaxtyping import Array, Bool, Int
 
-from crisalad_jax.config.checks import require, require_choice, require_positive
+from crisalad_jax.config.checks import require, require_positive
 from crisalad_jax.config.part import OrName, Part
 from crisalad_jax.config.registry import Registry, part_field, resolve_names
 from crisalad_jax.config.short_repr import short_repr
@@ -79,7 +79,6 @@ class SinkhornConfig:
     def __post_init__(self) -> None:
         """Check the ranges, and that the parts go together."""
         resolve_names(self)
-        require_choice(self, "domain")
         require_positive(self, "iterations")
         if self.tolerance is not None:
             require_positive(self, "tolerance")

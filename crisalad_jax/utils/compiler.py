@@ -4,11 +4,12 @@ import contextlib
 import functools
 import os
 from collections.abc import Callable, Sequence
-from typing import Any, ParamSpec, Protocol, TypeVar, cast
+from typing import Any, NamedTuple, ParamSpec, Protocol, TypeVar, cast
 
 import jax
 from jax.extend.core import get_opaque_trace_state
 
+from crisalad_jax.utils.executable_cache import cached_executable
 from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.output import warn
@@ -95,7 +96,7 @@ def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) 
                     return jitted.lower(*args, **kwargs).compile()
 
                 static = options.get("static_argnames", ())
-                program = kept(function, compile, args, kwargs, static)
+                program = cached_executable(function, compile, args, kwargs, static)
                 if program is not None:
                     return program()
             return jitted(*args, **kwargs)
@@ -132,14 +133,49 @@ def _precision_of(leaves: Sequence[Any]) -> contextlib.AbstractContextManager[No
     return jax.default_matmul_precision(word)
 
 
-def set_up() -> None:
-    """Set up virtual devices and the compile cache of a program, before it uses JAX.
+class Session(NamedTuple):
+    """What JAX computes on, and where it caches compiled programs."""
 
-    The CPU becomes one device for each core, so that a batch can be sharded over them
-    (`devices_for`). That is faster than using all cores for every product. Compiled programs are
-    stored in the `user_cache`, if it is writable. The environment variables JAX_NUM_CPU_DEVICES,
-    XLA_FLAGS and JAX_COMPILATION_CACHE_DIR take precedence.
+    platform: str
+    """cpu, gpu or tpu."""
+    devices: int
+    """Number of devices; a CPU is one for each core."""
+    cache: str | None
+    """Folder of compiled programs; None where none can be written."""
+
+    def __repr__(self) -> str:
+        """Return one line for a notebook."""
+        cached = f"compiled programs in {self.cache}" if self.cache else "no compile cache"
+        plural = "" if self.devices == 1 else "s"
+        return f"{self.devices} {self.platform} device{plural}; {cached}"
+
+
+def set_up() -> Session:
+    """Set up devices and the compile cache, as the command line does.
+
+    Call it first in a notebook or a program, before JAX is used. The CPU becomes one device for
+    each core, which `describe` shards a batch over: that is faster than using all cores for every
+    product. Programs that took long to compile are stored in the folder that CRISALAD_CACHE names
+    (by default `~/.cache/crisalad-jax`), if it is writable, so that the next start takes them from
+    there. The environment variables JAX_NUM_CPU_DEVICES, XLA_FLAGS and JAX_COMPILATION_CACHE_DIR
+    take precedence.
+
+    Returns:
+        The devices and the cache; once JAX is used, devices stay as they are.
+
+    Example:
+        >>> session = set_up()
+        >>> session.devices >= 1
+        True
     """
+    configure()
+    devices = jax.devices()
+    cache = jax.config.jax_compilation_cache_dir  # pyright: ignore
+    return Session(devices[0].platform, len(devices), cache)
+
+
+def configure() -> None:
+    """Configure devices and the compile cache of `set_up`, and start no device."""
     told = "JAX_NUM_CPU_DEVICES" in os.environ or "host_platform_device_count" in os.environ.get(
         "XLA_FLAGS", ""
     )

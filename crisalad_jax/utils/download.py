@@ -6,13 +6,12 @@ import http.client
 import itertools
 import os
 import pathlib
-import re
 import shutil
 import ssl
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from crisalad_jax.utils.errors import InputError
@@ -28,8 +27,8 @@ _GONE = (404, 410)
 
 
 @dataclasses.dataclass(frozen=True)
-class Patience:
-    """How long a download bears with a server."""
+class RetryPolicy:
+    """Timeouts and retries of a download."""
 
     timeout: float = 30.0
     """Seconds without an answer, or with less than `least` bytes, before a server is given up."""
@@ -38,7 +37,7 @@ class Patience:
     attempts: int = 5
     """Attempts in a row that bring less than `progress` bytes."""
     progress: int = 2**20
-    """Bytes that an attempt has to bring for the count to begin anew."""
+    """Bytes that an attempt has to bring for the count to begin again."""
     pause: float = 1.0
     """Seconds before the second attempt; each further one waits twice as long."""
 
@@ -61,12 +60,12 @@ def download(
     *,
     label: str,
     quiet: bool = False,
-    patience: Patience | None = None,
+    policy: RetryPolicy | None = None,
 ) -> None:
     """Download a file to `target`, which appears when it is whole.
 
-    The beginning of an unfinished file stays beside it, as `target`.part, with what the server
-    says of it. The next call goes on from there if the server still has the same file: the same
+    The beginning of an unfinished file stays next to it, as `target`.part, with what the server
+    says of it. The next call resumes from there if the server still has the same file: the same
     length, and the same ETag or time of change. A server that names neither starts again.
 
     Proxies are those of the environment: `http_proxy`, `https_proxy`, `no_proxy`.
@@ -74,9 +73,9 @@ def download(
     Args:
         url: the address, of http, https or file.
         target: the file, in a folder that is there and that no other process writes to.
-        label: what stands beside the progress bar.
+        label: what is written in front of the progress bar.
         quiet: no progress bar.
-        patience: how long to bear with the server; None is the default.
+        policy: timeouts and retries; None is the default.
 
     Raises:
         MissingFileError: there is no such file.
@@ -90,23 +89,29 @@ def download(
         >>> target.read_text()
         'all of it'
     """
-    patience = patience or Patience()
-    transfer = _Transfer(url, target, label, quiet, patience)
+    policy = policy or RetryPolicy()
+    part = _Part(target)
     failures = 0
     while True:
-        before = transfer.size()
+        before = part.size()
+        begun = part.begun(url)
         try:
-            transfer.attempt()
+            try:
+                _fetch(url, part, begun, label, quiet, policy)
+            except _OtherFile:
+                _fetch(url, part, None, label, quiet, policy)
             break
         except _PassingFault as fault:
-            failures = 1 if transfer.size() - before >= patience.progress else failures + 1
-            if failures >= patience.attempts:
+            failures = 1 if part.size() - before >= policy.progress else failures + 1
+            if failures >= policy.attempts:
                 raise InputError(
                     f"{url}: {fault}, expected the whole file (attempts: {failures}; the same "
                     "command goes on from there)"
                 ) from fault
-            time.sleep(patience.pause * 2 ** (failures - 1))
-    transfer.finish()
+            time.sleep(policy.pause * 2 ** (failures - 1))
+    with wrap_os_errors(target):
+        os.replace(part.path, target)
+        part.note.unlink(missing_ok=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,130 +124,97 @@ class _Remote:
     """Only a strong one: weak tags are of equal meanings, and not of equal bytes."""
     modified: str | None
 
-    def is_recognisable(self) -> bool:
-        """Return whether another file at the same address would be noticed."""
-        return self.length is not None and (self.etag, self.modified) != (None, None)
 
-    def may_be(self, begun: "_Remote") -> bool:
-        """Return whether a part of this file goes on with one; parts need not tell the time."""
-        same = (self.length, self.etag) == (begun.length, begun.etag)
-        return same and self.modified in (None, begun.modified)
+class _Part:
+    """An unfinished file, and the note of whose beginning it is."""
 
-
-class _Transfer:
-    """The download of one file, over several attempts."""
-
-    def __init__(
-        self, url: str, target: pathlib.Path, label: str, quiet: bool, patience: Patience
-    ) -> None:
-        self._url, self._target, self._label = url, target, label
-        self._quiet, self._patience = quiet, patience
-        self._part = target.with_name(f"{target.name}.part")
-        self._note = target.with_name(f"{target.name}.part.json")
+    def __init__(self, target: pathlib.Path) -> None:
+        self.target = target
+        self.path = target.with_name(f"{target.name}.part")
+        self.note = target.with_name(f"{target.name}.part.json")
 
     def size(self) -> int:
-        """Return the size of the unfinished file."""
-        return self._part.stat().st_size if self._part.is_file() else 0
+        return self.path.stat().st_size if self.path.is_file() else 0
 
-    def _discard(self) -> None:
-        """Remove the unfinished file."""
-        self._part.unlink(missing_ok=True)
-        self._note.unlink(missing_ok=True)
+    def discard(self) -> None:
+        self.path.unlink(missing_ok=True)
+        self.note.unlink(missing_ok=True)
 
-    def finish(self) -> None:
-        """Give the whole file its name."""
-        with wrap_os_errors(self._target):
-            os.replace(self._part, self._target)
-            self._note.unlink(missing_ok=True)
-
-    def attempt(self) -> None:
-        """Fetch what is missing.
-
-        Raises:
-            _PassingFault: it did not all arrive.
-            InputError: what `download` raises.
-        """
-        begun = self._begun()
-        if begun is not None and self.size() == begun.length:
-            return
+    def begun(self, url: str) -> _Remote | None:
+        """Return whose beginning this is; None where another file would not be noticed."""
         try:
-            self._fetch(begun)
-        except _OtherFile:
-            self._fetch(None)
-
-    def _begun(self) -> _Remote | None:
-        """Return whose beginning the unfinished file is; None where it cannot be gone on with."""
-        if not self.size():
-            return None
-        try:
-            begun = _Remote(**read_json(self._note, "a note of a download"))
+            begun = _Remote(**read_json(self.note, "a note of a download"))
         except (InputError, TypeError):
             return None
-        fits = begun.length is not None and self.size() <= begun.length
-        return begun if begun.url == self._url and begun.is_recognisable() and fits else None
+        if begun.url != url or begun.length is None or (begun.etag, begun.modified) == (None, None):
+            return None
+        return begun if 0 < self.size() <= begun.length else None
 
-    def _fetch(self, begun: _Remote | None) -> None:
-        """Fetch the file, or what is missing after its beginning."""
-        start = 0 if begun is None else self.size()
-        headers = {"User-Agent": f"crisalad-jax/{VERSION}", "Accept-Encoding": "identity"}
-        if begun is not None:
-            headers |= {"Range": f"bytes={start}-", "If-Range": begun.etag or begun.modified or ""}
-        with _opened(self._url, headers, self._patience.timeout) as response:
-            remote = _remote(self._url, response)
-            if getattr(response, "status", None) == 206:
-                if begun is None or _first_byte(response) != start or not remote.may_be(begun):
-                    raise _OtherFile
-                self._receive(response, begun, start)
-            else:  # the whole file, whether or not its beginning is here
-                self._receive(response, remote, 0)
 
-    def _receive(self, response: Any, remote: _Remote, start: int) -> None:
-        """Write what arrives behind the first `start` bytes."""
-        missing = None if remote.length is None else remote.length - start
-        chunks = _chunks(response, self._patience)
+def _fetch(
+    url: str, part: _Part, begun: _Remote | None, label: str, quiet: bool, policy: RetryPolicy
+) -> None:
+    """Fetch the file, or what is missing after its beginning.
+
+    Raises:
+        _PassingFault: it did not all arrive.
+        _OtherFile: the server has another file than `begun`.
+        InputError: what `download` raises.
+    """
+    start = 0 if begun is None else part.size()
+    if begun is not None and start == begun.length:
+        return
+    headers = {"User-Agent": f"crisalad-jax/{VERSION}", "Accept-Encoding": "identity"}
+    if begun is not None:
+        headers |= {"Range": f"bytes={start}-", "If-Range": begun.etag or begun.modified or ""}
+    with _opened(url, headers, policy.timeout) as response:
+        remote = _remote(url, response)
+        if getattr(response, "status", None) != 206:
+            start = 0  # the whole file, whether or not its beginning is here
+        elif begun is None or not _continues(response, remote, begun, start):
+            raise _OtherFile
+        chunks = _chunks(response, policy)
         first = next(chunks, b"")
-        if start == 0:
-            self._check_no_page(response, first)
-        free = shutil.disk_usage(self._target.parent).free
-        if missing is not None and missing > free:
+        is_page = response.headers.get_content_type() == "text/html" or is_html(first)
+        if start == 0 and is_page:
             raise InputError(
-                f"{self._target}: found {free:,} bytes free on the disk, expected {missing:,}"
+                f"{url}: found a page of HTML, expected the file {part.target.name} (some hosts "
+                "send one after too many downloads, or where a file was removed)"
+            )
+        missing = (remote.length or start) - start
+        if missing > (free := shutil.disk_usage(part.target.parent).free):
+            raise InputError(
+                f"{part.target}: found {free:,} bytes free on the disk, expected {missing:,}"
             )
         try:
-            with wrap_os_errors(self._target):
+            with wrap_os_errors(part.target):
                 if start == 0:
-                    self._discard()  # first: a note is of the bytes beside it
-                    write_json(self._note, dataclasses.asdict(remote))
-                self._write(itertools.chain((first,), chunks), remote, start)
+                    part.discard()  # first: a note is of the bytes next to it
+                    write_json(part.note, dataclasses.asdict(remote))
+                whole, done = (remote.length or 0) / _MEGABYTE, start / _MEGABYTE
+                with (
+                    part.path.open("ab") as file,
+                    progress_bar(label, whole, "MB", quiet=quiet, done=done) as bar,
+                ):
+                    for chunk in itertools.chain((first,), chunks):
+                        file.write(chunk)
+                        file.flush()  # what has arrived outlives a kill
+                        bar.advance(len(chunk) / _MEGABYTE)
+                    os.fsync(file.fileno())
         except InputError:
-            self._discard()
+            part.discard()
             raise
-        if remote.length is not None and self.size() != remote.length:
-            raise _PassingFault(
-                f"found {self.size():,} bytes of {remote.length:,}, then the end of the connection"
-            )
+    if remote.length is not None and part.size() != remote.length:
+        raise _PassingFault(
+            f"found {part.size():,} bytes of {remote.length:,}, then the end of the connection"
+        )
 
-    def _write(self, chunks: Iterable[bytes], remote: _Remote, start: int) -> None:
-        """Append chunks to the unfinished file, with a progress bar."""
-        whole, done = (remote.length or 0) / _MEGABYTE, start / _MEGABYTE
-        with (
-            self._part.open("ab") as file,
-            progress_bar(self._label, whole, "MB", quiet=self._quiet, done=done) as bar,
-        ):
-            for chunk in chunks:
-                file.write(chunk)
-                file.flush()  # what has arrived outlives a kill
-                bar.advance(len(chunk) / _MEGABYTE)
-            os.fsync(file.fileno())
 
-    def _check_no_page(self, response: Any, first: bytes) -> None:
-        """Raise InputError where a page of HTML comes in place of the file."""
-        kind = response.headers.get_content_type()
-        if kind == "text/html" or is_html(first):
-            raise InputError(
-                f"{self._url}: found a page of HTML, expected the file {self._target.name} (some "
-                "hosts send one after too many downloads, or where a file was removed)"
-            )
+def _continues(response: Any, remote: _Remote, begun: _Remote, start: int) -> bool:
+    """Return whether a partial answer goes on with a file; it need not tell the time of change."""
+    spans = response.headers.get("Content-Range", "").startswith(f"bytes {start}-")
+    same = (remote.length, remote.etag) == (begun.length, begun.etag)
+    return spans and same and remote.modified in (None, begun.modified)
 
 
 def _remote(url: str, response: Any) -> _Remote:
@@ -259,12 +231,6 @@ def _remote(url: str, response: Any) -> _Remote:
         None if etag is None or etag.startswith("W/") else etag,
         headers.get("Last-Modified"),
     )
-
-
-def _first_byte(response: Any) -> int | None:
-    """Return where a partial answer begins."""
-    match = re.fullmatch(r"bytes (\d+)-\d+/.*", response.headers.get("Content-Range", ""))
-    return None if match is None else int(match[1])
 
 
 @contextlib.contextmanager
@@ -303,11 +269,11 @@ def _opened(url: str, headers: Mapping[str, str], timeout: float) -> Iterator[An
         yield response
 
 
-def _chunks(response: Any, patience: Patience) -> Iterator[bytes]:
+def _chunks(response: Any, policy: RetryPolicy) -> Iterator[bytes]:
     """Yield what arrives, until it ends.
 
     Raises:
-        _PassingFault: the connection breaks, stalls, or is slower than `patience` bears.
+        _PassingFault: the connection breaks, stalls, or is slower than the policy allows.
     """
     since, arrived = time.monotonic(), 0
     while True:
@@ -320,8 +286,8 @@ def _chunks(response: Any, patience: Patience) -> Iterator[bytes]:
         arrived += len(chunk)
         yield chunk
         now = time.monotonic()
-        if now - since > patience.timeout:
-            if arrived < patience.least:
+        if now - since > policy.timeout:
+            if arrived < policy.least:
                 raise _PassingFault(f"found {arrived} bytes in {now - since:.0f} s")
             since, arrived = now, 0
 

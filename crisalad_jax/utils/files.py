@@ -288,9 +288,9 @@ def wrap_os_errors(path: pathlib.Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def atomic_path(
-    path: str | os.PathLike[str], within: pathlib.Path | None = None
+    path: str | os.PathLike[str], within: pathlib.Path | None = None, *, durable: bool = False
 ) -> Iterator[pathlib.Path]:
-    """Yield a temporary path beside `path`; rename it to `path` on success, remove it on any error.
+    """Yield a temporary path next to `path`; rename it to `path` on success, else remove it.
 
     The temporary name keeps the suffix, for writers that choose a format by it. Parent folders are
     made as needed.
@@ -299,6 +299,7 @@ def atomic_path(
         path: the file.
         within: a folder on the same disk for the temporary file, which its owner clears; None is
             the folder of `path`.
+        durable: whether to sync the file to disk, safe from power failure.
 
     Raises:
         InputError: what `check_target` raises; or the disk is full, or fails.
@@ -309,22 +310,11 @@ def atomic_path(
         temporary = temporary_beside(path if within is None else within / path.name)
         with in_use(temporary):
             yield temporary
+            if durable:
+                _sync(temporary)
             os.replace(temporary, path)
-
-
-@contextlib.contextmanager
-def atomic_path(path: str | os.PathLike[str], durable=True) -> Iterator[pathlib.Path]:
-    """Yield a temporary path as `atomic_path`, and sync the file to disk, safe from power failure.
-
-    Raises:
-        InputError: as `atomic_path`.
-    """
-    path = pathlib.Path(path)
-    with atomic_path(path) as temporary:
-        yield temporary
-        _sync(temporary)
-    with wrap_os_errors(path):
-        _sync(path.parent)
+        if durable:
+            _sync(path.parent)
 
 
 def _sync(path: pathlib.Path) -> None:
@@ -356,7 +346,7 @@ def npy_header(dtype: np.dtype, shape: tuple[int, ...]) -> bytes:
     return file.getvalue()
 
 
-def around(page: pathlib.Path, name: str) -> tuple[str, str]:
+def split_markers(page: pathlib.Path, name: str) -> tuple[str, str]:
     """Split a page around the place `name`, which two comments enclose.
 
     Raises:

@@ -25,48 +25,43 @@ class BusyFolderError(InputError):
 
 
 @contextlib.contextmanager
-def lock(folder: str | os.PathLike[str]) -> Iterator[None]:
+def lock(
+    folder: str | os.PathLike[str], *, wait: bool = False, quiet: bool = False
+) -> Iterator[None]:
     """Hold the lock of a folder, which is made if needed, while the block writes into it.
 
     The kernel releases the lock at the end of the process at the latest, so a killed process never
     blocks the next one.
+
+    Args:
+        folder: the folder.
+        wait: whether to wait for another process that holds it, with a note.
+        quiet: whether to wait without a note.
 
     Raises:
         BusyFolderError: another process holds it; the message says which, on which host.
         InputError: the folder cannot be made or written to.
     """
     folder = pathlib.Path(folder)
-    with contextlib.ExitStack() as stack:
-        with block_signals():
-            stack.enter_context(made_folder(folder))
-            descriptor = _locked(folder, stack)
-            stack.enter_context(in_use(_lock_of(folder)))
-        _sign(descriptor)
-        yield
-
-
-@contextlib.contextmanager
-def lock(folder: str | os.PathLike[str], *, quiet: bool = False, wait=True) -> Iterator[None]:
-    """Hold the lock of a folder as `lock`, after the process that holds it now.
-
-    Args:
-        folder: the folder.
-        quiet: whether to tell nothing of the wait.
-
-    Raises:
-        InputError: the folder cannot be made or written to.
-    """
-    with contextlib.ExitStack() as stack:
-        waits = False
+    with contextlib.ExitStack() as held:
         while True:
             try:
-                stack.enter_context(lock(folder))
+                with block_signals(), contextlib.ExitStack() as attempt:
+                    attempt.enter_context(made_folder(folder))
+                    descriptor = _locked(folder, attempt)
+                    attempt.enter_context(in_use(_lock_of(folder)))
+                    held.enter_context(attempt.pop_all())
                 break
             except BusyFolderError:
-                if not waits and not quiet:
+                if not wait:
+                    raise
+                if not quiet:
                     warn(f"{folder}: waiting for another process{_holder(_lock_of(folder))}")
-                waits = True
+                    quiet = True
                 time.sleep(POLL)
+        with contextlib.suppress(OSError):  # a full disk has no room for that
+            os.ftruncate(descriptor, 0)
+            os.write(descriptor, f"{_signature()}\n".encode())
         yield
 
 
@@ -140,13 +135,6 @@ def staged_folder(out: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
             yield temporary
             for path in sorted(temporary.iterdir(), key=lambda path: path.suffix == ".html"):
                 os.replace(path, out / path.name)
-
-
-def _sign(descriptor: int) -> None:
-    """Write who holds a lock into its file, for messages; a full disk has no room for that."""
-    with contextlib.suppress(OSError):
-        os.ftruncate(descriptor, 0)
-        os.write(descriptor, f"{_signature()}\n".encode())
 
 
 def _holder(path: pathlib.Path) -> str:

@@ -136,7 +136,7 @@ class SignalState:
 
     @contextlib.contextmanager
     def at_once(self) -> Iterator[None]:
-        """Raise `Interrupted` as soon as a signal arrives, in a block that leaves nothing half done."""
+        """Raise `Interrupted` as a signal arrives, in a block that leaves nothing half done."""
         self._at_once = True
         try:
             self.check()

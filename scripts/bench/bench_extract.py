@@ -354,7 +354,7 @@ def main() -> None:
     parser.add_argument("--batch", type=count, default=16)
     parser.add_argument("--rounds", type=count, default=3)
     arguments = read(parser, "bench_extract")
-    compiler.set_up()
+    compiler.configure()
     # The workers that are forked do not use JAX.
     warnings.filterwarnings("ignore", r"os\.fork\(\) was called")
     values = []

@@ -116,7 +116,7 @@ def main() -> None:
     arguments = read(parser, "bench_memory")
     if arguments.images % 4 or any(arguments.images % n for n in arguments.micro_batches):
         parser.error(f"found {arguments.images} images, expected a multiple of 4 and micro-batches")
-    compiler.set_up()
+    compiler.configure()
     config = recipe(arguments.preset, "crisalad")
     values: dict[str, Any] = {}
     if arguments.take:

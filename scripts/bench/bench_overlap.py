@@ -81,7 +81,7 @@ def main() -> None:
             f"found {arguments.steps} steps of {arguments.batch} images, expected more than "
             f"{LEFT_OUT} steps, of a multiple of {IMAGES_PER_PLACE}"
         )
-    compiler.set_up()
+    compiler.configure()
     with tempfile.TemporaryDirectory(prefix="overlap-") as temporary:
         root = pathlib.Path(temporary)
         write_tree(root, arguments.steps * arguments.batch, SIZES[0])

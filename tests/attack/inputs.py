@@ -404,7 +404,7 @@ VALUES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("train", "--min-images", ("0", "-1", HUGE)),
     ("train", "--patience", ("-1", "x")),
     ("train", "--save-top-k", ("-1",)),
-    ("train", "--num-workers", ("-1", "x")),
+    ("train", "--num-threads", ("-1", "x")),
     ("train", "--optimiser.learning-rate", ("-1", "nan", "inf", "x")),
     ("train", "--model.aggregator", ("x",)),
     ("train", "--model.backbone.heads", ("0", "3", "-1", HUGE)),

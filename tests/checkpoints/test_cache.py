@@ -34,7 +34,7 @@ from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import parameter_shapes
-from crisalad_jax.utils.download import Patience
+from crisalad_jax.utils.download import RetryPolicy
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import CACHE, user_cache
 from crisalad_jax.utils.output import Note
@@ -56,7 +56,7 @@ MIT, GPL = (
 )
 NO_LICENCE = Licence("no licence file")
 # Long enough for loopback on a loaded machine where nothing stalls.
-QUICK = Patience(timeout=5.0, least=1, attempts=2, pause=0.01)
+QUICK = RetryPolicy(timeout=5.0, least=1, attempts=2, pause=0.01)
 
 
 def state_bytes(seed: int, config: ModelConfig = CONFIG) -> bytes:
@@ -88,7 +88,7 @@ def model(server: FileServer, tmp_path: pathlib.Path, monkeypatch: pytest.Monkey
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     # The stalls and pauses of the default would last for minutes.
-    monkeypatch.setattr(crisalad_jax.utils.download, "Patience", lambda: QUICK)
+    monkeypatch.setattr(crisalad_jax.utils.download, "RetryPolicy", lambda: QUICK)
     tiny = Published(
         name="tiny-model",
         format="huggingface",

@@ -241,7 +241,7 @@ def test_a_refusal_leaves_no_width_behind(capfd, monkeypatch):
         (None, "found no such file, expected a configuration"),
         ("{", "found no JSON"),
         ('{"epochs": 3, "colour": "red"}', "colour"),
-        ('{"epochs": "three"}', "expected int"),
+        ('{"epochs": "three"}', "expected a whole number"),
         ('{"model": {"image_size": [100, 98]}}', "found 100 x 98"),
     ],
 )

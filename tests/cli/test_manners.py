@@ -22,7 +22,7 @@ from crisalad_jax.cli import main
 from crisalad_jax.cli.common import console
 from crisalad_jax.cli.completion import completion_script
 from crisalad_jax.data.benchmarks import open_benchmark
-from crisalad_jax.data.benchmarks.readable import leave_out_unreadable
+from crisalad_jax.data.benchmarks.benchmark import leave_out_unreadable
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
@@ -77,7 +77,7 @@ def test_all_that_is_cached_is_in_one_folder(tmp_path, shared):
     environment |= {"HOME": str(home), "CRISALAD_CACHE": str(cache), "PYTHONPATH": str(ROOT)}
     images = shared / "town" / "images" / "test"
     given = ("--images", images, "--weights", shared / "weights.safetensors", "--out", "d.npy")
-    resizes = "from crisalad_jax.data import resize; resize._compiled()"  # as for many images
+    resizes = "from crisalad_jax.data import resize; resize._machine_code(True)"  # for many images
     for program in (["-m", "crisalad_jax", "extract", *map(str, given)], ["-c", resizes]):
         command = [sys.executable, *program]
         subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)

@@ -643,7 +643,7 @@ class Described:
 
 def test_a_field_called_config_is_said_once():
     """A map's description has one."""
-    words = r"^map\.json: found 'two', expected int @ config\.layers$"
+    words = r"^map\.json: found 'two', expected a whole number @ config\.layers$"
     with pytest.raises(InputError, match=words):
         from_plain(Described, {"config": {"layers": "two"}}, source="map.json")
 

@@ -1,5 +1,6 @@
 """Classes and groups against what their definitions ask of every pair, and cells by hand."""
 
+import dataclasses
 import itertools
 from collections import Counter
 from pathlib import Path
@@ -9,14 +10,14 @@ import pytest
 
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.data.class_groups import (
-    Classes,
+    Views,
     cell_classes,
     class_groups,
     focal_classes,
     focal_points,
+    views_of,
 )
 from crisalad_jax.data.places import Places
-from crisalad_jax.data.views import Views, views_of
 from crisalad_jax.utils.errors import InputError
 
 COSPLACE = ClassesConfig(kind="cells")
@@ -33,10 +34,6 @@ def street(count: int, side: float, seed: int = 0) -> tuple[Views, np.ndarray]:
     return views, generator.integers(0, 2, count)
 
 
-def members(classes: Classes) -> list[np.ndarray]:
-    return [classes.images[a:b] for a, b in itertools.pairwise(classes.start)]
-
-
 def test_cells_are_squares_and_sectors():
     views, city = street(3000, 40.0)
     classes = cell_classes(views, city, COSPLACE, min_images=3)
@@ -46,18 +43,18 @@ def test_cells_are_squares_and_sectors():
         return int(city[image]), e, n, h
 
     counts = Counter(map(key, range(len(city))))
-    found = {key(images[0]): images for images in members(classes)}
+    found = {key(images[0]): images for images, _ in classes}
     assert found.keys() == {name for name, count in counts.items() if count >= 3}
     assert 0 < len(found) < len(counts)
     for name, images in found.items():
         assert {key(image) for image in images} == {name}
         assert len(set(images.tolist())) == counts[name]
-    assert len(classes.group) == len(found)
+    assert len(classes) == len(found)
     # The paper's G_uvw: 5 x 5 x 2 groups, of the cells that agree modulo these.
-    for images, group in zip(members(classes), classes.group, strict=True):
+    for images, group in classes:
         _, e, n, h = key(images[0])
         assert group == (e % 5 * 5 + n % 5) * 2 + h % 2
-    assert len(set(classes.group.tolist())) == 50
+    assert len({each.group for each in classes}) == 50
 
 
 def test_classes_of_a_group_are_no_neighbours():
@@ -66,9 +63,7 @@ def test_classes_of_a_group_are_no_neighbours():
     classes = cell_classes(views, city, COSPLACE, min_images=1)
     checked = 0
     for group in range(0, 50, 7):
-        mine = [
-            images for images, g in zip(members(classes), classes.group, strict=True) if g == group
-        ]
+        mine = [images for images, its_group in classes if its_group == group]
         for one, other in itertools.combinations(mine, 2):
             if city[one[0]] != city[other[0]]:
                 continue
@@ -110,19 +105,18 @@ def test_a_class_looks_at_its_focal_point():
     views = Views(*np.array(rows).T, np.ones(1, bool))
     city = np.zeros(len(rows), int)
     lateral, frontal = focal_classes(views, city, EIGENPLACES, min_images=3)
-    assert [sorted(images.tolist()) for images in members(lateral)] == [[0, 1, 2, 6]]
-    assert [sorted(images.tolist()) for images in members(frontal)] == [[4, 5, 6]]
-    assert lateral.group.tolist() == frontal.group.tolist() == [0]
+    assert [(sorted(images.tolist()), group) for images, group in lateral] == [([0, 1, 2, 6], 0)]
+    assert [(sorted(images.tolist()), group) for images, group in frontal] == [([4, 5, 6], 0)]
     lateral, frontal = focal_classes(views, city, EIGENPLACES, min_images=4)
-    assert (len(lateral.group), len(frontal.group)) == (1, 0)
+    assert (len(lateral), len(frontal)) == (1, 0)
 
 
 def test_viewpoints_of_a_city_are_what_their_definition_says():
     views, city = street(1500, 45.0, seed=2)
     both = focal_classes(views, city, EIGENPLACES, min_images=3)
     for side, classes in enumerate(both):
-        assert len(classes.group) > 10
-        for images, group in zip(members(classes), classes.group, strict=True):
+        assert len(classes) > 10
+        for images, group in classes:
             e, n = views.east[images[0]] // 15, views.north[images[0]] // 15
             assert group == e % 3 * 3 + n % 3
             cell = (views.east // 15 == e) & (views.north // 15 == n) & (city == city[images[0]])
@@ -235,7 +229,7 @@ def test_lateral_and_frontal_groups_take_turns():
     assert len(groups) == 4
     for turn, group in enumerate(groups):
         classes = sets[turn % 2]
-        possible = {tuple(sorted(places.files[i] for i in images)) for images in members(classes)}
+        possible = {tuple(sorted(places.files[i] for i in images)) for images, _ in classes}
         for a, b in itertools.pairwise(group.place_start):
             assert tuple(sorted(group.files[a:b])) in possible
 
@@ -246,16 +240,16 @@ def test_lateral_and_frontal_groups_take_turns():
         (
             {"kind": "cells"},
             1,
-            "root: found at most 4 images in one cell of 10 m and 30 degrees, expected classes of "
-            "at least 5; --loss.kind.classes.kind places takes its places for classes",
+            "root: found at most 4 images in one cell and sector, expected classes of at least 5; "
+            "--loss.kind.classes.kind places takes its places for classes",
         ),
         (
             {"kind": "viewpoints"},
             1,
-            "found at most [0-4] images that look at the lateral focal point of one cell of 10 m, "
-            "expected classes of at least 5",
+            "found at most [0-4] images of one cell that look at one of its focal points, expected "
+            "classes of at least 5",
         ),
-        ({}, 1, "root: found no place with at least 5 images; the largest has 4"),
+        ({}, 1, "root: found at most 4 images of one place, expected classes of at least 5$"),
     ],
 )
 def test_no_class_with_enough_images_is_told(changes, batch, words):
@@ -279,8 +273,72 @@ def test_fewer_classes_than_a_batch_asks_for_are_told():
 def test_positions_that_are_asked_for_and_missing_are_told(classes):
     places = city_of([(0.0, 0.0)] * 4, [1] * 4)
     words = (
-        r"root: found one position \(lat, lon\) for all images of city0, expected where each was "
-        rf"taken, which loss.kind.classes.kind '{classes}' asks for; --loss.kind.classes.kind "
+        r"root: found one position \(lat, lon\) for all images of city0, which "
+        rf"loss.kind.classes.kind '{classes}' cannot use, expected where each was taken; --loss"
     )
     with pytest.raises(InputError, match=words):
         class_groups(places, ClassesConfig(kind=classes), min_images=1, places_per_batch=1)
+
+
+def named(*positions: tuple[str, str, str], cities: int = 1) -> Places:
+    """One place with an image for each (northdeg, lat, lon); the last city has one of its own."""
+    files = tuple(
+        f"Images/C_1/C_1_0000001_2020_05_{north}_{lat}_{lon}_a_pano_0000001_2020_05_001_9_9_.jpg"
+        for north, lat, lon in positions
+    )
+    count = len(files)
+    return Places(
+        root=Path("root"),
+        cities=tuple(f"city{i}" for i in range(cities)),
+        files=files,
+        image_place=np.zeros(count, np.int32),
+        place_city=np.zeros(1, np.int32),
+        place_id=np.ones(1, np.int64),
+        place_start=np.array([0, count]),
+    )
+
+
+def test_names_tell_positions_and_headings():
+    """The names of cities and panoramas have underlines too; degrees are as the CSV has them."""
+    views = views_of(named(("005", "37.78752", "-122.41454"), ("360", "37.70275", "-122.48609")))
+    np.testing.assert_array_equal(views.heading, [5, 0])
+    np.testing.assert_allclose(views.east, [551550.00, 545301.59], atol=0.8)
+    np.testing.assert_allclose(views.north, [4182401.73, 4172959.59], atol=0.8)
+    assert views.known.tolist() == [True]
+
+
+def test_one_position_for_all_stands_for_none():
+    assert not views_of(named(("005", "0.0", "0.0"), ("100", "0.0", "0"))).known[0]
+    assert not views_of(named(("005", "1.5", "2.5"))).known[0]
+
+
+def test_a_city_has_one_zone_even_across_its_edge_and_across_180_degrees():
+    """100 m apart on the ground stay so, to the scale's 0.1 %: zones have other eastings."""
+    degrees = 100 / 111_319.49  # along the equator
+    for middle in (6.0, 180.0):
+        west, east = middle - degrees / 2, middle + degrees / 2
+        east = east - 360 if east > 180 else east
+        views = views_of(named(("000", "0.0", f"{west:.9f}"), ("000", "0.0", f"{east:.9f}")))
+        assert views.east[1] - views.east[0] == pytest.approx(100, rel=2e-3)
+
+
+def test_a_city_as_wide_as_the_world_is_refused():
+    places = named(("000", "0.0", "-60.0"), ("000", "0.0", "100.0"))
+    with pytest.raises(InputError, match="found the images of city0 over 160 degrees of longitude"):
+        views_of(places)
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        "Images/C/3.jpg",
+        "C_0000001_2020_05_001_north_2.5_pano.jpg",
+        "C_0000001_2020_05_001_91.0_2.5_pano.jpg",
+        "C_0000001_2020_05_001_1.0_200_pano.jpg",
+        "C_0000001_2020_05_001_nan_2.5_pano.jpg",
+    ],
+)
+def test_a_name_without_a_position_is_told(file: str):
+    places = dataclasses.replace(named(("005", "1.0", "2.5")), files=(file,))
+    with pytest.raises(InputError, match=f"root/{file}: found a name without .*, expected city_"):
+        views_of(places)

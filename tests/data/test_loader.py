@@ -6,7 +6,6 @@ import gc
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -176,43 +175,6 @@ def test_opencv_has_one_thread_while_batches_are_read(places):
         cv2.setNumThreads(before)
 
 
-def test_processes_read_the_same_and_name_what_they_cannot(places):
-    options = {"augmentation": RandAugmentConfig(), "start_step": 1}
-    whole = train(places, **options)
-    assert_same(train(places, num_workers=2, cache=ImageCache(), **options), whole)
-    path = places.path(int(whole[1].indices[2]))
-    path.write_bytes(b"no image")
-    with pytest.raises(InputError, match=f"^{path}: found 8 bytes"):
-        train(places, num_workers=1, **options)
-
-
-READER = """
-import sys
-from crisalad_jax.data.augmentations import NoAugmentation
-from crisalad_jax.data.loader import training_batches
-from crisalad_jax.data.places import read_places
-
-if __name__ == "__main__":
-    for epoch in range(2):
-        for batch in training_batches(
-            read_places(sys.argv[1], min_images=3), image_size=(224, 224), places_per_batch=2,
-            images_per_place=3, order="within-city", augmentation=NoAugmentation(), seed=1,
-            epoch=epoch, num_workers=2
-        ):
-            assert batch.valid.all()
-"""
-
-
-@pytest.mark.slow
-def test_processes_that_read_leave_without_a_word(places, tmp_path):
-    program = tmp_path / "program.py"
-    program.write_text(READER)
-    done = subprocess.run(
-        [sys.executable, str(program), str(places.root)], capture_output=True, text=True
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-
-
 def test_parts_of_a_batch_are_the_whole(places):
     """For processes, each of which reads one: also on from the middle of an epoch."""
     options = {"augmentation": RandAugmentConfig(), "start_step": 1}
@@ -242,60 +204,6 @@ def test_batches_of_any_size_are_the_images_one_by_one(places, batch_size, threa
     indices = np.concatenate([batch.indices for batch in batches])
     padding = -47 % batch_size
     np.testing.assert_array_equal(indices, [*range(47), *[-1] * padding])
-
-
-SLOW_READER = """
-import sys, time
-import numpy as np
-from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.data import loader
-from crisalad_jax.data.augmentations import NoAugmentation
-from crisalad_jax.data.places import read_places
-
-def read(path, how, *, quickly):
-    time.sleep(1)
-    return np.zeros((*how.image_size, 3), np.uint8)
-
-if __name__ == "__main__":
-    loader._read = read
-    batches = loader.training_batches(
-        read_places(sys.argv[1], min_images=3), image_size=(28, 28), places_per_batch=2,
-        images_per_place=3, order="within-city", augmentation=NoAugmentation(), seed=1,
-        epoch=1, num_workers=2
-    )
-    next(batches)
-    print("reading", flush=True)
-    time.sleep(600)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_processes_that_read_end_with_the_one_they_read_for(places, tmp_path):
-    program = tmp_path / "program.py"
-    program.write_text(SLOW_READER)
-    process = subprocess.Popen(
-        [sys.executable, str(program), str(places.root)], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "reading\n"
-    tasks = Path(f"/proc/{process.pid}/task").iterdir()
-    children = [child for task in tasks for child in (task / "children").read_text().split()]
-    assert len(children) >= 2
-    process.kill()
-    process.communicate()
-    deadline = time.monotonic() + 60
-    while any(map(is_running, children)) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not any(map(is_running, children))
-
-
-def is_running(process: str) -> bool:
-    """No zombie either, where nobody waits for those whose parent was killed."""
-    try:
-        return "\nState:\tZ" not in Path(f"/proc/{process}/status").read_text()
-    except FileNotFoundError:
-        return False
 
 
 def test_augmentation_draws_from_seed_epoch_step_and_slot(places):
@@ -495,7 +403,6 @@ def test_an_abandoned_iterator_does_not_hold_up_the_exit(places):
         ({"start_step": -1}, "start_step: found -1"),
         ({"on_bad_image": "black"}, "on_bad_image: found 'black', expected one of skip, stop"),
         ({"threads": -1}, "threads: found -1"),
-        ({"num_workers": -1}, "num_workers: found -1"),
         ({"image_size": (0, 14)}, "image_size"),
         ({"images_per_place": 4}, "place 0 of A has 3 images"),
     ],

@@ -194,7 +194,10 @@ def test_a_field_that_is_no_number(two_cities, column, text):
     row[COLUMNS.index(column)] = text
     with (two_cities / "Dataframes" / "A.csv").open("a") as file:
         file.write(",".join(row) + "\n")
-    with pytest.raises(InputError, match=rf"A\.csv: line 14: {column}: found '{text}'"):
+    with pytest.raises(
+        InputError,
+        match=rf"A\.csv: line 14: found .*{text}.*, expected whole",
+    ):
         read_places(two_cities)
 
 

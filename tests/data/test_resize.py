@@ -241,7 +241,7 @@ def test_where_nothing_can_be_kept_it_compiles_all_the_same(monkeypatch, error):
         (np.zeros((4, 5), np.uint8), (2, 2), r"image: found uint8 of shape \(4, 5\), expected"),
         (np.zeros((4, 5, 4), np.uint8), (2, 2), r"image: found uint8 of shape \(4, 5, 4\)"),
         (np.zeros((0, 5, 3), np.uint8), (2, 2), r"image: found uint8 of shape \(0, 5, 3\)"),
-        (np.zeros((4, 5, 3), np.uint8), (0, 2), r"image_size: found \(0, 2\), expected sides"),
+        (np.zeros((4, 5, 3), np.uint8), (0, 2), r"image_size: found \(0, 2\), expected two whole"),
     ],
 )
 def test_what_is_no_picture(image, image_size, message):

@@ -10,11 +10,10 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from crisalad_jax.data.exif import exif_position
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.live import Camera
 from crisalad_jax.data.loader import image_batches
-from crisalad_jax.data.positions import Positions, read_positions
+from crisalad_jax.data.positions import Positions, exif_position, read_positions
 from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import file_of, frame_time, list_frames
 from crisalad_jax.utils.errors import InputError
@@ -150,13 +149,17 @@ def test_a_table_of_positions_has_the_same_forms(tmp_path):
         ("a.txt", "b.png\n", "a.txt: line 1: .*b.png: found no such file, expected an image file"),
         ("a.txt", "\n{run}/left/0.png\n{run}/right/../left/0.png", "line 3: .*on line 2 too, exp"),
         ("a.txt", "{run}\n", "a.txt: line 1: .*run: found a folder, expected an image file"),
-        ("a.csv", "", "a.csv: found columns none, expected one called name"),
-        ("a.csv", "file,lat,lon\n", "found columns file, lat, lon, expected one called name"),
+        ("a.csv", "", "a.csv: found columns none; missing name"),
+        ("a.csv", "file,lat,lon\n", "found columns file, lat, lon; missing name"),
         ("a.csv", "name\n", "a.csv: found no image, expected a path a line"),
         ("a.csv", "name,year\n,1\n", "line 2: found no name, expected an image's"),
         ("a.csv", "name,lat,lon\n{run}/left/0.png,1,5,2,5\n", "line 2: found 5 fields, expected 3"),
-        ("a.csv", "name;lat;lon\n{run}/left/0.png;1.000,5;2\n", "expected two finite numbers"),
-        ("a.csv", "name,lat,lon\n{run}/left/0.png,1,\n", "line 2: .*expected two finite numbers"),
+        ("a.csv", "name;lat;lon\n{run}/left/0.png;1.000,5;2\n", "lat: found '1.000,5', expected"),
+        (
+            "a.csv",
+            "name,lat,lon\n{run}/left/0.png,1,\n",
+            "line 2: lon: found '', expected",
+        ),
         ("a.csv", "name,x,x,y\n", "found the column x twice, expected it once"),
         ("a.csv", "name,x,y\n{run}/walk.avi,1,2\n", "found a video, expected an image file, or a"),
         (

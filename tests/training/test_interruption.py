@@ -35,9 +35,8 @@ from crisalad_jax.utils.errors import InputError, Interrupted
 from tests.training.test_interruption import CONFIG
 
 city, town, out = map(pathlib.Path, sys.argv[1:4])
-compiler.set_up()
+compiler.configure()
 crisalad_jax.training.run_files.SAVE_SECONDS = -1.0
-workers = 0
 for statement in sys.argv[4:]:
     exec(statement)
 try:
@@ -46,7 +45,6 @@ try:
         read_places(city, min_images=2),
         out,
         validation=open_benchmark(town),
-        num_workers=workers,
         quiet=True,
     )
 except InputError as error:
@@ -149,26 +147,6 @@ def test_a_signal_saves_first_and_the_same_command_goes_on(start, whole, tmp_pat
     step = metrics_of(out)[-1]["step"]
     assert f"after step {step}; the same command goes on" in said
     assert max(int(path.name) for path in (out / "state").iterdir()) == step
-    program = start(out)
-    _, errors = program.communicate()
-    assert program.returncode == 0, errors
-    assert_same_end(out, whole)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seconds", [0.0, 0.5, 2.0, 4.0])
-def test_a_signal_to_all_processes_saves_first_even_while_readers_start(
-    start, whole, tmp_path, seconds
-):
-    """As a scheduler sends it: to those that read images too, which start anew each epoch."""
-    out = tmp_path / "run"
-    program = start(out, "workers = 2", start_new_session=True)
-    wait_for_lines(program, out, 2)  # steps of the first epoch
-    time.sleep(seconds)
-    os.killpg(program.pid, signal.SIGTERM)
-    said, errors = program.communicate()
-    assert program.returncode == 128 + signal.SIGTERM, errors
-    assert "the same command goes on" in said
     program = start(out)
     _, errors = program.communicate()
     assert program.returncode == 0, errors

@@ -412,12 +412,10 @@ def test_nothing_is_compiled_after_the_first_step_and_validation(
     assert len(compiled) == after_step[2]
 
 
-def test_without_validation_there_is_no_best_and_images_may_come_from_a_process(
-    tmp_path, places, params, run
-):
-    result = fit(RECIPE, places, tmp_path, initial=params, num_workers=1, quiet=True)
+def test_without_validation_there_is_no_best(tmp_path, places, params, run):
+    result = fit(RECIPE, places, tmp_path, initial=params, quiet=True)
     assert (result.steps, result.best_recall, result.stopped_early) == (STEPS, None, False)
-    # As a run that is validated and reads by threads, to the bit.
+    # As a run that is validated, to the bit.
     assert_same_params(result.params, load_weights(run / "last.safetensors")[0])
     assert not (tmp_path / "best.safetensors").exists()
 
@@ -529,7 +527,7 @@ def test_a_plan_without_mass_has_no_statistics_and_ends_nothing(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"num_workers": -1}, "num_workers: found -1, expected at least 0"),
+        ({"num_threads": -1}, "num_threads: found -1, expected at least 0"),
         ({"shard_state": True}, "shard_state: found one device"),
     ],
 )

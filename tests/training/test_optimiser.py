@@ -9,8 +9,8 @@ import numpy as np
 import optax
 import pytest
 import torch
-from crisalad_jax.config.registry import REGISTRIES
 
+from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.data.places import read_places
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.model import init_crisalad, parameter_shapes

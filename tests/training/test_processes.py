@@ -313,7 +313,7 @@ def test_where_one_process_is_killed_the_other_ends_and_both_go_on(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("both", [(), ("--shard-state", "--num-workers", "1")], ids=str)
+@pytest.mark.parametrize("both", [(), ("--shard-state", "--num-threads", "1")], ids=str)
 def test_a_signal_to_one_process_stops_all_and_all_go_on(shared, by_devices, tmp_path, both):
     out = tmp_path / "run"
     programs = start(shared, out, both=both)

@@ -109,7 +109,7 @@ def test_arguments_can_be_donated() -> None:
 SPREAD = """
 import sys, jax, jax.numpy as jnp, numpy as np
 from crisalad_jax.utils import compiler
-compiler.set_up()
+compiler.configure()
 from crisalad_jax.utils.devices import devices_for
 from tests.conftest import MODEL, random_params
 from crisalad_jax.nn.model import extract_tokens
@@ -169,7 +169,7 @@ import os, jax
 if os.environ.get("FEWER"):
     os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
 from crisalad_jax.utils import compiler
-compiler.set_up()
+compiler.configure()
 print(len(jax.devices()), len(os.sched_getaffinity(0)), jax.config.jax_compilation_cache_dir)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 def squared(x):

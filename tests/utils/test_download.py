@@ -9,14 +9,14 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from crisalad_jax.utils.download import MissingFileError, Patience, download
+from crisalad_jax.utils.download import MissingFileError, RetryPolicy, download
 from crisalad_jax.utils.errors import InputError
 from tests.file_server import FileServer, file_server
 
 DATA = np.random.default_rng(0).bytes(300_000)
 OTHER = np.random.default_rng(1).bytes(300_000)
 # Long enough for loopback on a loaded machine where nothing stalls.
-QUICK = Patience(timeout=5.0, least=1, attempts=3, progress=2**20, pause=0.01)
+QUICK = RetryPolicy(timeout=5.0, least=1, attempts=3, progress=2**20, pause=0.01)
 
 
 @pytest.fixture
@@ -33,17 +33,17 @@ def _no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name.upper(), raising=False)
 
 
-def fetch(server: FileServer, folder: pathlib.Path, patience: Patience = QUICK) -> pathlib.Path:
-    download(server.url("/file"), folder / "here", label="file", quiet=True, patience=patience)
+def fetch(server: FileServer, folder: pathlib.Path, policy: RetryPolicy = QUICK) -> pathlib.Path:
+    download(server.url("/file"), folder / "here", label="file", quiet=True, policy=policy)
     assert sorted(os.listdir(folder)) == ["here"]
     return folder / "here"
 
 
 def fails(
-    server: FileServer, folder: pathlib.Path, words: str, patience: Patience = QUICK
+    server: FileServer, folder: pathlib.Path, words: str, policy: RetryPolicy = QUICK
 ) -> InputError:
     with pytest.raises(InputError, match=words) as error:
-        fetch(server, folder, patience)
+        fetch(server, folder, policy)
     assert not (folder / "here").exists()
     assert str(error.value).startswith(f"{server.url('/file')}: ")
     assert "\n" not in str(error.value)
@@ -53,7 +53,7 @@ def fails(
 def cut_short(server: FileServer, folder: pathlib.Path, size: int) -> None:
     """Leave the beginning of a file, as if the program had ended there."""
     server.cuts = [size]
-    fails(server, folder, f"found {size:,} bytes of 300,000", Patience(attempts=1))
+    fails(server, folder, f"found {size:,} bytes of 300,000", RetryPolicy(attempts=1))
     assert (folder / "here.part").read_bytes() == DATA[:size]
     server.asked.clear()
 
@@ -140,8 +140,8 @@ def test_a_length_that_never_comes(server, tmp_path):
 
 def test_progress_begins_the_count_anew(server, tmp_path):
     server.cuts = [50_000] * 5
-    patience = Patience(attempts=2, progress=50_000, pause=0.01)
-    assert fetch(server, tmp_path, patience).read_bytes() == DATA
+    policy = RetryPolicy(attempts=2, progress=50_000, pause=0.01)
+    assert fetch(server, tmp_path, policy).read_bytes() == DATA
 
 
 def test_no_such_file_is_told_at_once(server, tmp_path):
@@ -168,21 +168,21 @@ def test_a_refusal_is_told_at_once(server, tmp_path):
 
 def test_a_stalled_server_is_given_up_and_asked_again(server, tmp_path):
     server.stalls = 1
-    patience = Patience(timeout=0.3, attempts=2, pause=0.01)
-    assert fetch(server, tmp_path, patience).read_bytes() == DATA
+    policy = RetryPolicy(timeout=0.3, attempts=2, pause=0.01)
+    assert fetch(server, tmp_path, policy).read_bytes() == DATA
     assert server.asked[1] == ("/file", "bytes=10-")
 
 
 def test_a_server_that_only_stalls(server, tmp_path):
     server.stalls = 9
-    patience = Patience(timeout=0.2, attempts=2, pause=0.01)
-    fails(server, tmp_path, "found a broken connection .*attempts: 2", patience)
+    policy = RetryPolicy(timeout=0.2, attempts=2, pause=0.01)
+    fails(server, tmp_path, "found a broken connection .*attempts: 2", policy)
 
 
 def test_a_server_that_crawls(server, tmp_path):
     server.crawls = True
-    patience = Patience(timeout=0.2, least=2**14, attempts=1)
-    fails(server, tmp_path, r"found \d+ bytes in 0 s", patience)
+    policy = RetryPolicy(timeout=0.2, least=2**14, attempts=1)
+    fails(server, tmp_path, r"found \d+ bytes in 0 s", policy)
 
 
 def test_a_page_in_place_of_the_file(server, tmp_path):
@@ -206,7 +206,7 @@ def test_a_proxy_of_the_environment_is_used(server, tmp_path, monkeypatch):
     monkeypatch.setenv("http_proxy", server.url(""))
     address = "http://models.invalid/file"
     server.files[address] = OTHER
-    download(address, tmp_path / "here", label="file", quiet=True, patience=QUICK)
+    download(address, tmp_path / "here", label="file", quiet=True, policy=QUICK)
     assert (tmp_path / "here").read_bytes() == OTHER
     assert server.asked == [(address, None)]
 
@@ -214,8 +214,8 @@ def test_a_proxy_of_the_environment_is_used(server, tmp_path, monkeypatch):
 def test_no_server(tmp_path):
     with file_server() as gone:
         pass
-    patience = Patience(attempts=2, pause=0.01)
-    fails(gone, tmp_path, "found no answer .*attempts: 2", patience)
+    policy = RetryPolicy(attempts=2, pause=0.01)
+    fails(gone, tmp_path, "found no answer .*attempts: 2", policy)
     assert os.listdir(tmp_path) == []
 
 
@@ -255,6 +255,6 @@ def test_a_disk_that_gets_full_leaves_nothing(server, tmp_path):
 
 
 def test_the_bar_shows_megabytes(server, tmp_path, capfd):
-    download(server.url("/file"), tmp_path / "here", label="a model", patience=QUICK)
+    download(server.url("/file"), tmp_path / "here", label="a model", policy=QUICK)
     assert "a model" in (shown := capfd.readouterr().err)
     assert "MB/s" in shown

@@ -6,7 +6,7 @@ import math
 import cv2
 import numpy as np
 
-from crisalad_jax.config.checks import require, require_fraction
+from crisalad_jax.config.checks import require_fraction, require_range
 from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Image
 from crisalad_jax.data.augmentations.light import LightAugmentConfig, light_augment
 
@@ -41,15 +41,8 @@ class CameraAugmentConfig(LightAugmentConfig):
         """Check the ranges."""
         super().__post_init__()
         require_fraction(self, "perspective")
-        for name in ("texture", "noise"):
-            value = getattr(self, name)
-            require(value >= 0, f"CameraAugmentConfig.{name}: found {value}, expected at least 0")
-        for name in ("filters", "occlusion", "motion", "coarse", "jpeg"):
-            value = getattr(self, name)
-            require(
-                0 <= value <= 1,
-                f"CameraAugmentConfig.{name}: found {value}, expected a probability from 0 to 1",
-            )
+        require_range(self, 0, math.inf, "texture", "noise")
+        require_range(self, 0, 1, "filters", "occlusion", "motion", "coarse", "jpeg")
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator

@@ -10,7 +10,7 @@ import math
 import cv2
 import numpy as np
 
-from crisalad_jax.config.checks import require, require_fraction
+from crisalad_jax.config.checks import require_fraction, require_range
 from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.utils.shapes import Float32
@@ -42,10 +42,8 @@ class ColourCropConfig(Augmentation):
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for name in ("brightness", "contrast", "saturation"):
-            value = getattr(self, name)
-            require(value >= 0, f"ColourCropConfig.{name}: found {value}, expected at least 0")
-        require(0 <= self.hue <= 0.5, f"ColourCropConfig.hue: found {self.hue}, expected 0 to 0.5")
+        require_range(self, 0, math.inf, "brightness", "contrast", "saturation")
+        require_range(self, 0, 0.5, "hue")
         require_fraction(self, "crop")
 
     def apply(
@@ -59,35 +57,17 @@ class ColourCropConfig(Augmentation):
         ]
         turn = generator.uniform(-self.hue, self.hue)
         for number in generator.permutation(4):
-            pixels = (
-                _turned(pixels, turn)
-                if number == 3
-                else _CHANGES[number](pixels, strengths[number])
-            )
+            if number == 3:
+                pixels = _turned(pixels, turn)
+                continue
+            grey = (pixels @ _LUMA)[..., None]
+            other = (0.0, float(grey.mean()), grey)[number]
+            mixed = strengths[number] * pixels + (1 - strengths[number]) * other
+            pixels = np.clip(mixed, 0, 1).astype(np.float32)
         top, left, height, width = _crop(image.shape[0], image.shape[1], self.crop, generator)
         part = np.ascontiguousarray(pixels[top : top + height, left : left + width])
         resized = resize_image(part, image.shape[:2], pixels="floats")
         return np.clip(np.round(255 * resized), 0, 255).astype(np.uint8)
-
-
-def _blended(pixels: _Floats, other: np.ndarray | float, strength: float) -> _Floats:
-    mixed = strength * pixels + (1 - strength) * other
-    return np.clip(mixed, 0, 1).astype(np.float32)
-
-
-def _brightened(pixels: _Floats, strength: float) -> _Floats:
-    return _blended(pixels, 0.0, strength)
-
-
-def _contrasted(pixels: _Floats, strength: float) -> _Floats:
-    return _blended(pixels, float((pixels @ _LUMA).mean()), strength)
-
-
-def _saturated(pixels: _Floats, strength: float) -> _Floats:
-    return _blended(pixels, (pixels @ _LUMA)[..., None], strength)
-
-
-_CHANGES = (_brightened, _contrasted, _saturated)
 
 
 def _turned(pixels: _Floats, turn: float) -> _Floats:

@@ -6,7 +6,7 @@ import math
 import cv2
 import numpy as np
 
-from crisalad_jax.config.checks import require, require_fraction
+from crisalad_jax.config.checks import require_fraction, require_range
 from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
 
 # ITU-R BT.601 luma.
@@ -40,15 +40,8 @@ class LightAugmentConfig(Augmentation):
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_fraction(self, "crop", "shift", "colour")
-        for name in ("rotation", "blur", "gamma", "illumination"):
-            value = getattr(self, name)
-            require(value >= 0, f"LightAugmentConfig.{name}: found {value}, expected at least 0")
-        for name in ("flip", "grey"):
-            value = getattr(self, name)
-            require(
-                0 <= value <= 1,
-                f"LightAugmentConfig.{name}: found {value}, expected a probability from 0 to 1",
-            )
+        require_range(self, 0, math.inf, "rotation", "blur", "gamma", "illumination")
+        require_range(self, 0, 1, "flip", "grey")
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator

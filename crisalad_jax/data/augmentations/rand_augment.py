@@ -9,7 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from crisalad_jax.config.checks import require
+from crisalad_jax.config.checks import require_range
 from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
 from crisalad_jax.utils.shapes import Bool, Int64, UInt8
 
@@ -32,14 +32,8 @@ class RandAugmentConfig(Augmentation):
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require(
-            self.operations >= 0,
-            f"RandAugmentConfig.operations: found {self.operations}, expected at least 0",
-        )
-        require(
-            0 <= self.magnitude < MAGNITUDE_BINS,
-            f"RandAugmentConfig.magnitude: found {self.magnitude}, expected 0 to 30",
-        )
+        require_range(self, 0, math.inf, "operations")
+        require_range(self, 0, MAGNITUDE_BINS - 1, "magnitude")
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
@@ -111,12 +105,7 @@ def _shear_y(image: Image, slope: float) -> Image:
 
 
 def _translate_x(image: Image, pixels: float) -> Image:
-    moved, by = np.zeros_like(image), int(pixels)
-    if by < 0:
-        moved[:, :by] = image[:, -by:]
-    else:
-        moved[:, by:] = image[:, : image.shape[1] - by]
-    return moved
+    return _translate_y(image.swapaxes(0, 1), pixels).swapaxes(0, 1)
 
 
 def _translate_y(image: Image, pixels: float) -> Image:
@@ -216,32 +205,24 @@ class Operation(NamedTuple):
     signed: bool
 
 
-def _none(level: float, height: int, width: int) -> float:
-    return 0.0
-
-
-def _slope(level: float, height: int, width: int) -> float:
-    return 0.3 * level
-
-
-def _enhancement(level: float, height: int, width: int) -> float:
-    return 0.9 * level
+def _scaled(most: float) -> Callable[[float, int, int], float]:
+    return lambda level, height, width: most * level
 
 
 OPERATIONS: dict[str, Operation] = {
-    "Identity": Operation(_identity, _none, signed=False),
-    "ShearX": Operation(_shear_x, _slope, signed=True),
-    "ShearY": Operation(_shear_y, _slope, signed=True),
+    "Identity": Operation(_identity, _scaled(0), signed=False),
+    "ShearX": Operation(_shear_x, _scaled(0.3), signed=True),
+    "ShearY": Operation(_shear_y, _scaled(0.3), signed=True),
     "TranslateX": Operation(_translate_x, lambda level, _, w: 150 / 331 * w * level, signed=True),
     "TranslateY": Operation(_translate_y, lambda level, h, _: 150 / 331 * h * level, signed=True),
-    "Rotate": Operation(_rotate, lambda level, _h, _w: 30 * level, signed=True),
-    "Brightness": Operation(_brightness, _enhancement, signed=True),
-    "Color": Operation(_color, _enhancement, signed=True),
-    "Contrast": Operation(_contrast, _enhancement, signed=True),
-    "Sharpness": Operation(_sharpness, _enhancement, signed=True),
+    "Rotate": Operation(_rotate, _scaled(30), signed=True),
+    "Brightness": Operation(_brightness, _scaled(0.9), signed=True),
+    "Color": Operation(_color, _scaled(0.9), signed=True),
+    "Contrast": Operation(_contrast, _scaled(0.9), signed=True),
+    "Sharpness": Operation(_sharpness, _scaled(0.9), signed=True),
     "Posterize": Operation(_posterize, lambda level, _h, _w: 8.0 - round(4 * level), signed=False),
     "Solarize": Operation(_solarize, lambda level, _h, _w: 255 * (1 - level), signed=False),
-    "AutoContrast": Operation(_autocontrast, _none, signed=False),
-    "Equalize": Operation(_equalize, _none, signed=False),
+    "AutoContrast": Operation(_autocontrast, _scaled(0), signed=False),
+    "Equalize": Operation(_equalize, _scaled(0), signed=False),
 }
 """The 14 operations by torchvision's names."""

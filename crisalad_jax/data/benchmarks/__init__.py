@@ -4,10 +4,9 @@ from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders import read_folders
 from crisalad_jax.data.benchmarks.msls import read_msls, read_msls_subtask
 from crisalad_jax.data.benchmarks.netvlad import read_netvlad
+from crisalad_jax.data.benchmarks.npy_lists import read_salad_lists, read_vpr_bench
 from crisalad_jax.data.benchmarks.open import LAYOUTS, open_benchmark
-from crisalad_jax.data.benchmarks.salad_lists import read_salad_lists
 from crisalad_jax.data.benchmarks.utm import read_utm
-from crisalad_jax.data.benchmarks.vpr_bench import read_vpr_bench
 
 __all__ = [
     "LAYOUTS",

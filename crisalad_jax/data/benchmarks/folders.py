@@ -1,24 +1,24 @@
 """Two plain folders, `database/` and `queries/`, with tables of matches or positions, or none."""
 
-import csv
 import os
 import pathlib
 import re
-from collections.abc import Iterator
 
 import numpy as np
 
-from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.folders_on_disk import find_split, list_part
-from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radius, within
-from crisalad_jax.data.benchmarks.tables_of_positions import positions_beside
-from crisalad_jax.data.names import matched
+from crisalad_jax.data.benchmarks.benchmark import DEFAULT_RADIUS, Benchmark, check_radius, within
+from crisalad_jax.data.benchmarks.on_disk import find_split, list_part
+from crisalad_jax.data.metres import comparable
+from crisalad_jax.data.positions import AXES, read_positions
+from crisalad_jax.data.tables import matched, read_table
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import LARGEST, check_source
-from crisalad_jax.utils.shapes import Int64
+from crisalad_jax.utils.shapes import Float64, Int64
 
 TRUTH = "ground_truth.csv"
+_POSITIONS = "positions.csv"
 _HEADER = ["query", "database"]
+_NO_MATCH = -1
+_Paths = tuple[pathlib.Path, ...]
 
 
 def read_folders(
@@ -30,10 +30,15 @@ def read_folders(
 ) -> Benchmark:
     """Read `database/` and `queries/`, whose images may have any names.
 
-    The ground truth is `ground_truth.csv` beside the folders, or `frames`, or the positions of a
-    table (`positions_beside`), or there is none. The table of matches has lines of
-    `query,database`, with paths relative to the two folders: one line for each match of a query, or
-    the line `query,` for a query without a match. Every query has a line.
+    The ground truth is `ground_truth.csv` in the same folder, or `frames`, or the positions of a
+    table, or there is none. The table of matches has lines of `query,database`, with paths
+    relative to the two folders: one line for each match of a query, or the line `query,` for a
+    query without a match. Every query has a line.
+
+    Positions are in `positions.csv`, which names images by their path, as `database/1.jpg`; or in
+    `database.csv` and `queries.csv`, which name them by their path in these folders. The columns
+    are `name,east,north` or `name,lat,lon`; degrees are projected to UTM if all are of one zone,
+    else they become points on the ellipsoid (`metres.comparable`).
 
     Args:
         root: the folder that holds the two, or one with `images/{test,val,train}` that do.
@@ -47,50 +52,40 @@ def read_folders(
     Raises:
         InputError: a folder is missing or without images; a table that names an image that is not
             there, leaves one out, or contradicts itself; a negative number of frames, folders of
-            different counts, `frames` beside a table, a radius without positions to measure, or
-            what `positions_beside` raises.
+            different counts, `frames` with a table, a radius without positions to measure, one
+            side's table of positions without the other's, or what `read_positions` raises.
     """
     root = pathlib.Path(root)
     folder, name = find_split(root, split)
     database, queries = (list_part(folder / part) for part in ("database", "queries"))
     table = folder / TRUTH
     if frames is not None:
-        if table.exists():
-            raise InputError(f"frames: found {frames} beside {table}, expected one of the two")
-        _refuse_radius(radius, "frames")
+        if radius is not None or table.exists():
+            given = "a radius" if radius is not None else table
+            raise InputError(f"frames: found {frames} and {given}, expected one of the two")
         return _by_frames(root, name, database, queries, frames)
-    places, asked = positions_beside(folder, database, queries)
-    if table.exists():
-        _refuse_radius(radius, table)
-        positives = _by_table(table, _numbers(folder, database), _numbers(folder, queries))
-        name, rule = f"{name} (two folders, {TRUTH})", f"the database images that {TRUTH} lists"
-    elif places is not None and asked is not None:
-        radius = DEFAULT_RADIUS if radius is None else radius
-        check_radius(radius)
-        positives = within(places, asked, radius)
-        name, rule = f"{name} (two folders, {radius:g} m)", f"a distance of at most {radius:g} m"
-    else:
-        _refuse_radius(radius, f"{root}, which has no positions (positions.csv)")
-        positives = None
-        name, rule = f"{name} (two folders, no ground truth)", "none: there is no ground truth"
+    places, asked = _read_positions(folder, database, queries)
+    if radius is not None and (table.exists() or places is None):
+        has = table if table.exists() else f"{root}, which has no positions ({_POSITIONS})"
+        raise InputError(
+            f"radius: found {radius:g} with {has}, expected it where positions are the ground truth"
+        )
     radius = DEFAULT_RADIUS if radius is None else radius
+    check_radius(radius)
+    if table.exists():
+        positives = _by_table(table, _numbers(folder, database), _numbers(folder, queries))
+        truth, rule = TRUTH, f"the database images that {TRUTH} lists"
+    elif places is not None and asked is not None:
+        positives = within(places, asked, radius)
+        truth, rule = f"{radius:g} m", f"a distance of at most {radius:g} m"
+    else:
+        positives, truth, rule = None, "no ground truth", "none: there is no ground truth"
+    name = f"{name} (two folders, {truth})"
     return Benchmark(name, root, database, queries, positives, rule, places, asked, radius)
 
 
-def _refuse_radius(radius: float | None, what: object) -> None:
-    if radius is not None:
-        raise InputError(
-            f"radius: found {radius:g} beside {what}, expected it where positions are the ground "
-            "truth"
-        )
-
-
 def _by_frames(
-    root: pathlib.Path,
-    name: str,
-    database: tuple[pathlib.Path, ...],
-    queries: tuple[pathlib.Path, ...],
-    frames: int,
+    root: pathlib.Path, name: str, database: _Paths, queries: _Paths, frames: int
 ) -> Benchmark:
     if frames < 0:
         raise InputError(f"frames: found {frames}, expected a number from 0")
@@ -122,63 +117,75 @@ def _in_numbers(path: pathlib.Path) -> list[str | int]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)]
 
 
-def _numbers(folder: pathlib.Path, paths: tuple[pathlib.Path, ...]) -> dict[str, int]:
+def _numbers(folder: pathlib.Path, paths: _Paths) -> dict[str, int]:
     """Number the images by their path below `database/` or `queries/`."""
     depth = len(folder.parts) + 1
     return {"/".join(path.parts[depth:]): number for number, path in enumerate(paths)}
 
 
 def _by_table(
-    table: pathlib.Path, database: dict[str, int], queries: dict[str, int]
+    path: pathlib.Path, database: dict[str, int], queries: dict[str, int]
 ) -> tuple[Int64[np.ndarray, " _"], ...]:
+    table = read_table(path)
+    rows = [] if table.columns == _HEADER else [(1, table.columns)]
+    rows += [(line, [field.strip() for field in fields]) for line, fields in table.lines]
+    lines = rows if len(table.columns) == 2 else []
+    asked = matched((query for _, (query, _) in lines), queries)
+    there = matched((match for _, (_, match) in lines), database)
     matches: dict[str, set[int]] = {}
-    without: set[str] = set()
-    rows = list(_rows(table))
-    asked = matched((query for _, query, _ in rows), queries)
-    there = matched((match for _, _, match in rows), database)
-    for line, query, match in rows:
-        for side, name, names in (("query", query, asked), ("database", match, there)):
-            if name not in names and (name or side == "query"):
-                folder = "queries" if side == "query" else "database"
+    for line, (query, match) in lines:
+        for side, name, known in (("queries", query, asked), ("database", match, there)):
+            if name not in known and (name or side == "queries"):
                 raise InputError(
-                    f"{table}: line {line}: found {side} {name!r}, expected the path of an image "
-                    f"below {table.parent / folder}"
+                    f"{path}: line {line}: found {name!r}, expected the path of an image below "
+                    f"{path.parent / side}"
                 )
-        query = asked[query]
-        matches.setdefault(query, set())
-        if match:
-            matches[query].add(database[there[match]])
-        else:
-            without.add(query)
-        if query in without and matches[query]:
+        found = matches.setdefault(asked[query], set())
+        found.add(database[there[match]] if match else _NO_MATCH)
+        if _NO_MATCH in found and len(found) > 1:
             raise InputError(
-                f"{table}: line {line}: found {query!r} with a match and without, expected either"
+                f"{path}: line {line}: found {query!r} with a match and without, expected either"
             )
     missing = queries.keys() - matches.keys()
     if missing:
         raise InputError(
-            f"{table}: found {len(missing)} of {len(queries)} queries without a line, expected all "
-            f"('{min(missing)},' where there is no match)"
+            f"{path}: found {len(missing)} of {len(queries)} queries without a line query,database"
+            f", expected all ('{min(missing)},' where there is no match)"
         )
-    return tuple(np.array(sorted(matches[query]), np.int64) for query in queries)
+    return tuple(np.array(sorted(matches[query] - {_NO_MATCH}), np.int64) for query in queries)
 
 
-def _rows(table: pathlib.Path) -> Iterator[tuple[int, str, str]]:
-    """Yield the line number, query and match of every row that is not blank."""
-    check_source(table, "a table of UTF-8 CSV", largest=LARGEST)
-    try:
-        # utf-8-sig: a spreadsheet's byte order mark would spoil the first name.
-        with table.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            for number, row in enumerate(reader):
-                row = [field.strip() for field in row]
-                if not row or (number == 0 and row == _HEADER):
-                    continue
-                if len(row) != 2:
-                    raise InputError(
-                        f"{table}: line {reader.line_num}: found {len(row)} fields, expected "
-                        "query,database"
-                    )
-                yield reader.line_num, row[0], row[1]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{table}: cannot be read as UTF-8 CSV: {error}") from error
+def _read_positions(
+    folder: pathlib.Path, database: _Paths, queries: _Paths
+) -> tuple[Float64[np.ndarray, "images axis"], Float64[np.ndarray, "q axis"]] | tuple[None, None]:
+    """Read where the images of two folders were taken, as points whose distances are metres."""
+    both, sides = folder / _POSITIONS, [folder / "database.csv", folder / "queries.csv"]
+    there = [table for table in (both, *sides) if table.exists()]
+    if not there:
+        return None, None
+    if there not in ([both], sides):
+        raise InputError(
+            f"{folder}: found {', '.join(table.name for table in there)}, expected {_POSITIONS}, "
+            "or database.csv and queries.csv"
+        )
+    tables = [read_positions(table) for table in there]
+    if len({table.axes for table in tables}) > 1:
+        raise InputError(
+            f"{there[0]}: found lat,lon in one table and east,north in the other, expected the same"
+        )
+    found = []
+    for number, images in enumerate((database, queries)):
+        table, root = (number, folder / sides[number].stem) if there == sides else (0, folder)
+        names = ["/".join(image.parts[len(root.parts) :]) for image in images]
+        of = tables[table].of
+        lines = matched(names, of)
+        missing = [name for name in names if name not in lines]
+        if missing:
+            raise InputError(
+                f"{there[table]}: found {len(missing)} of {len(names)} images of "
+                f"{sides[number].stem} without a line, expected all; the first is {missing[0]}"
+            )
+        found.append(np.array([of[lines[name]] for name in names], np.float64))
+    if tables[0].axes == AXES[1]:
+        found = np.split(comparable(*np.concatenate(found).T), [len(found[0])])
+    return found[0], found[1]

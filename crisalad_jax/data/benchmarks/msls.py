@@ -5,7 +5,6 @@ order: `raw.csv` (key, lon, lat, ca, captured_at, pano), `postprocessed.csv` (ke
 northing, ...) and `subtask_index.csv` (all, ...). `ca` is the compass angle in degrees.
 """
 
-import csv
 import os
 import pathlib
 from collections.abc import Collection
@@ -13,13 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.folders_on_disk import find_images, listing, shown
-from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radius, within
+from crisalad_jax.data.benchmarks.benchmark import DEFAULT_RADIUS, Benchmark, check_radius, within
+from crisalad_jax.data.benchmarks.on_disk import find_images, listing, shown
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.metres import on_ellipsoid
+from crisalad_jax.data.tables import Row, read_table
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import LARGEST, check_source, real_path
+from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.shapes import Float, Float64, Int64
 
 MSLS_CITIES = {
@@ -92,14 +91,12 @@ class _Side(NamedTuple):
     """The database or the queries of a city."""
 
     images: tuple[pathlib.Path, ...]
-    positions: Float64[np.ndarray, "images 2"]
+    metres: Float64[np.ndarray, "images 2"]
+    """East and north in the city's zone."""
     degrees: Float64[np.ndarray, "images 2"]
-    """Latitude and longitude; 0 where nothing asks for them."""
+    """Latitude and longitude."""
     headings: Float64[np.ndarray, " images"]
-
-    def only(self, chosen: Int64[np.ndarray, " _"]) -> "_Side":
-        images = tuple(self.images[i] for i in chosen)
-        return _Side(images, self.positions[chosen], self.degrees[chosen], self.headings[chosen])
+    """Compass angles in degrees; 0 where nothing asks for them."""
 
 
 def _read(
@@ -113,37 +110,28 @@ def _read(
 ) -> Benchmark:
     root = pathlib.Path(root)
     check_radius(radius)
-    turned = max_heading_difference is not None
-    if turned and not 0 <= max_heading_difference <= 180:
-        raise InputError(
-            f"max heading difference: found {max_heading_difference}, expected degrees from 0 to "
-            "180"
-        )
+    limit = max_heading_difference
+    if limit is not None and not 0 <= limit <= 180:
+        raise InputError(f"max heading difference: found {limit}, expected degrees from 0 to 180")
+    folders = _city_folders(root, split or "val")
     database: list[_Side] = []
     queries: list[_Side] = []
     positives: list[Int64[np.ndarray, " _"]] = []
-    folders = _city_folders(root, split or "val")
     start = 0
     for folder in folders:
         there, asked = (
-            _read_side(
-                folder / part,
-                on_bad_image,
-                degrees=len(folders) > 1,
-                headings=turned,
-                subtask=subtask,
-            )
+            _read_side(folder / part, on_bad_image, headings=limit is not None, subtask=subtask)
             for part in ("database", "query")
         )
-        near = within(there.positions, asked.positions, radius)
+        near = within(there.metres, asked.metres, radius)
         if subtask:
-            chosen = np.array([i for i, matches in enumerate(near) if matches.size], np.int64)
-            asked, near = asked.only(chosen), tuple(near[i] for i in chosen)
-        if max_heading_difference is not None:
+            chosen = [query for query, matches in enumerate(near) if matches.size]
+            images = tuple(asked.images[query] for query in chosen)
+            asked = _Side(images, *(part[chosen] for part in asked[1:]))
+            near = tuple(near[query] for query in chosen)
+        if limit is not None:
             near = tuple(
-                matches[
-                    heading_difference(there.headings[matches], heading) <= max_heading_difference
-                ]
+                matches[heading_difference(there.headings[matches], heading) <= limit]
                 for matches, heading in zip(near, asked.headings, strict=True)
             )
         positives += [matches + start for matches in near]
@@ -153,16 +141,16 @@ def _read(
     if not positives:
         raise InputError(f"{root}: found no query within {radius:g} m of the database")
 
-    angle = f" and {max_heading_difference:g} degrees" if turned else ""
-    title = msls_title([folder.name for folder in folders])
-    kind = ", subtask all" if subtask else ""
+    name = f"{msls_title([folder.name for folder in folders])}, raw{', subtask all' * subtask}"
+    name += f", {len(positives)} queries, {radius:g} m"
     rule = f"UTM distance of at most {radius:g} m"
-    if turned:
-        rule += f" and compass angles at most {max_heading_difference:g} degrees apart"
+    if limit is not None:
+        name += f" and {limit:g} degrees"
+        rule += f" and compass angles at most {limit:g} degrees apart"
     if subtask:
         rule += "; queries of the subtask all with a database image in that distance"
     return Benchmark(
-        name=f"{title}, raw{kind}, {len(positives)} queries, {radius:g} m{angle}",
+        name=name,
         root=root,
         database=tuple(path for side in database for path in side.images),
         queries=tuple(path for side in queries for path in side.images),
@@ -177,7 +165,7 @@ def _read(
 def _positions(sides: list[_Side]) -> Float64[np.ndarray, "images axis"]:
     """Return the metres of one city, or points of several, each of which has its own zone."""
     if len(sides) == 1:
-        return sides[0].positions
+        return sides[0].metres
     return on_ellipsoid(*np.concatenate([side.degrees for side in sides]).T)
 
 
@@ -211,88 +199,48 @@ def _city_folders(root: pathlib.Path, split: str) -> list[pathlib.Path]:
 
 
 def _read_side(
-    folder: pathlib.Path,
-    on_bad_image: OnBadImage,
-    *,
-    degrees: bool,
-    headings: bool,
-    subtask: bool,
+    folder: pathlib.Path, on_bad_image: OnBadImage, *, headings: bool, subtask: bool
 ) -> _Side:
-    """Read a folder's images that are no panoramas, in the order of the tables."""
-    more = ("lat", "lon") * degrees + ("ca",) * headings
-    raw = _read_table(folder / "raw.csv", ("key", "pano", *more))
-    columns = ("key", "easting", "northing")
-    tables = {"postprocessed.csv": _read_table(folder / "postprocessed.csv", columns)}
-    if subtask:
-        tables["subtask_index.csv"] = _read_table(folder / "subtask_index.csv", ("all",))
-    for name, table in tables.items():
-        keys = [row.get("key", first["key"]) for first, row in zip(raw, table, strict=False)]
-        if len(table) != len(raw) or keys != [row["key"] for row in raw]:
+    """Read a folder's images that are not panoramas, in the order of the tables."""
+    angles = ("ca",) * headings
+    raw = _read_rows(folder / "raw.csv", "key", "pano", "lat", "lon", *angles)
+    placed = _read_rows(folder / "postprocessed.csv", "key", "easting", "northing")
+    marked = _read_rows(folder / "subtask_index.csv", "all") if subtask else raw
+    expected = [row.fields["key"] for row in raw]
+    for name, rows in {"postprocessed.csv": placed, "subtask_index.csv": marked}.items():
+        keys = [row.fields.get("key", key) for row, key in zip(rows, expected, strict=False)]
+        if keys != expected or len(rows) != len(raw):
             raise InputError(
-                f"{folder / name}: found {len(table)} rows, expected the same {len(raw)} images as "
+                f"{folder / name}: found {len(rows)} rows, expected the same {len(raw)} images as "
                 "in raw.csv, in the same order"
             )
-    chosen = []
-    for row, first in enumerate(raw):
-        marked = not subtask or _truth(
-            folder / "subtask_index.csv", row, "all", tables["subtask_index.csv"]
-        )
-        if marked and not _truth(folder / "raw.csv", row, "pano", raw):
-            chosen.append((row, first["key"]))
+    chosen = [
+        number
+        for number, row in enumerate(raw)
+        if (not subtask or _truth(marked[number], "all")) and not _truth(row, "pano")
+    ]
     if not chosen:
         raise InputError(f"{folder}: found {len(raw)} images, expected some that are no panoramas")
-    names = [f"{key}.jpg" for _, key in chosen]
-    path = folder / "postprocessed.csv"
-    positions = [
-        [_number(path, row, name, tables[path.name]) for name in ("easting", "northing")]
-        for row, _ in chosen
-    ]
-    places = [
-        [_number(folder / "raw.csv", row, name, raw) if degrees else 0.0 for name in ("lat", "lon")]
-        for row, _ in chosen
-    ]
-    angles = [_number(folder / "raw.csv", row, "ca", raw) if headings else 0.0 for row, _ in chosen]
+
+    def numbers(rows: list[Row], *columns: str) -> Float64[np.ndarray, "images column"]:
+        values = [[rows[number].number(column) for column in columns] for number in chosen]
+        return np.array(values).reshape(len(chosen), -1)
+
+    names = [f"{expected[number]}.jpg" for number in chosen]
     return _Side(
         images=find_images(folder / "raw.csv", folder / "images", names, on_bad_image=on_bad_image),
-        positions=np.array(positions),
-        degrees=np.array(places),
-        headings=np.array(angles),
+        metres=numbers(placed, "easting", "northing"),
+        degrees=numbers(raw, "lat", "lon"),
+        headings=numbers(raw, "ca")[:, 0] if headings else np.zeros(len(chosen)),
     )
 
 
-_Table = list[dict[str, str]]
+def _read_rows(path: pathlib.Path, *columns: str) -> list[Row]:
+    return list(read_table(path, *columns).rows())
 
 
-def _read_table(path: pathlib.Path, columns: tuple[str, ...]) -> _Table:
-    check_source(path, "a table of UTF-8 CSV", largest=LARGEST)
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, restval="")
-            header = reader.fieldnames or []
-            missing = [name for name in columns if name not in header]
-            if missing:
-                raise InputError(
-                    f"{path}: found columns {', '.join(header) or 'none'}; missing "
-                    f"{', '.join(missing)}"
-                )
-            return list(reader)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read as UTF-8 CSV: {error}") from error
-
-
-def _truth(path: pathlib.Path, row: int, column: str, table: _Table) -> bool:
-    text = table[row][column]
+def _truth(row: Row, column: str) -> bool:
+    text = row.fields[column]
     if text not in ("True", "False"):
-        raise InputError(f"{path}: row {row + 1}: {column}: found {text!r}, expected True or False")
+        raise InputError(f"{row.where}: {column}: found {text!r}, expected True or False")
     return text == "True"
-
-
-def _number(path: pathlib.Path, row: int, column: str, table: _Table) -> float:
-    text = table[row][column]
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise InputError(f"{path}: row {row + 1}: {column}: found {text!r}, expected a number")
-    return value

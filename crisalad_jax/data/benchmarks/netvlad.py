@@ -4,25 +4,25 @@ A struct `dbStruct` with the fields whichSet, dbImage, utmDb (2 x N), qImage, ut
 posDistThr, and others that are not needed here.
 """
 
-import math
 import os
 import pathlib
 from typing import Any
 
 import numpy as np
 
-from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.folders_on_disk import find_image_root, find_images
-from crisalad_jax.data.benchmarks.ground_truth import check_radius, within
+from crisalad_jax.data.benchmarks.benchmark import Benchmark, check_radius, within
+from crisalad_jax.data.benchmarks.on_disk import find_image_root, find_images
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.mat_files import load_mat
-from crisalad_jax.utils.shapes import Float64
 
 _FIELDS = ("whichSet", "dbImage", "utmDb", "qImage", "utmQ", "numDb", "numQ", "posDistThr")
-_DATABASE_FOLDERS = (".", "images")
-# Look in the queries' folders first: a query may have the same name as a database image.
-_QUERY_FOLDERS = ("queries_real", "queries", "query", ".")
+_SIDES = (
+    ("dbImage", "utmDb", "numDb", (".", "images")),
+    # Look in the queries' folders first: a query may have the same name as a database image.
+    ("qImage", "utmQ", "numQ", ("queries_real", "queries", "query", ".")),
+)
+"""Fields of the names, positions and count of the database and the queries, and their folders."""
 
 
 def read_netvlad(
@@ -48,26 +48,24 @@ def read_netvlad(
     """
     path = pathlib.Path(path)
     struct = _read_struct(path)
-    radius = _number(path, struct, "posDistThr") if radius is None else radius
+    radius = float(_numbers(path, struct, "posDistThr").item()) if radius is None else radius
     check_radius(radius)
-    sides = []
-    for names, utm, count, folders in (
-        ("dbImage", "utmDb", "numDb", _DATABASE_FOLDERS),
-        ("qImage", "utmQ", "numQ", _QUERY_FOLDERS),
-    ):
-        listed = _names(path, struct, names)
-        expected = _number(path, struct, count)
-        if len(listed) != expected or not listed:
+    found = []
+    for field, utm, count, folders in _SIDES:
+        names = _names(path, struct, field)
+        expected = _numbers(path, struct, count).item()
+        if len(names) != expected or not names:
             raise InputError(
-                f"{path}: {names}: found {len(listed)} images, expected {count}, {expected:g}, and "
+                f"{path}: {field}: found {len(names)} images, expected {count}, {expected:g}, and "
                 "at least one"
             )
-        positions = _positions(path, struct, utm, len(listed))
-        root = find_image_root(path, images, listed, folders, on_bad_image=on_bad_image)
-        sides.append((find_images(path, root, listed, on_bad_image=on_bad_image), positions))
-    (database, places), (queries, asked) = sides
+        positions = np.ascontiguousarray(_numbers(path, struct, utm, len(names)).T, np.float64)
+        root = find_image_root(path, images, names, folders, on_bad_image=on_bad_image)
+        found.append((find_images(path, root, names, on_bad_image=on_bad_image), positions))
+    (database, places), (queries, asked) = found
+    which = " ".join(map(str, struct["whichSet"].reshape(-1)[:1]))
     return Benchmark(
-        name=f"{path.stem} (NetVLAD .mat, {_text(path, struct, 'whichSet')} set, {radius:g} m)",
+        name=f"{path.stem} (NetVLAD .mat, {which} set, {radius:g} m)",
         root=path,
         database=database,
         queries=queries,
@@ -91,44 +89,24 @@ def _read_struct(path: pathlib.Path) -> np.void:
     return struct.reshape(-1)[0]
 
 
-def _text(path: pathlib.Path, struct: np.void, field: str) -> str:
+def _numbers(
+    path: pathlib.Path, struct: np.void, field: str, images: int | None = None
+) -> np.ndarray:
+    """Return a field that holds one number, or two for each image."""
     value = struct[field]
-    if value.dtype.kind != "U" or value.size != 1:
-        raise InputError(f"{path}: {field}: found {_found(value)}, expected text")
-    return str(value.item())
-
-
-def _number(path: pathlib.Path, struct: np.void, field: str) -> float:
-    value = struct[field]
-    if value.dtype.kind not in "iuf" or value.size != 1:
-        raise InputError(f"{path}: {field}: found {_found(value)}, expected a number")
-    number = float(value.item())
-    if not math.isfinite(number):
-        raise InputError(f"{path}: {field}: found {number}, expected a finite number")
-    return number
+    right = value.size == 1 if images is None else value.shape == (2, images)
+    if not right or value.dtype.kind not in "iuf" or not np.isfinite(value).all():
+        expected = "a finite number" if images is None else f"2 x {images} numbers"
+        raise InputError(f"{path}: {field}: found {_found(value)}, expected {expected}")
+    return value
 
 
 def _names(path: pathlib.Path, struct: np.void, field: str) -> list[str]:
     cells = struct[field].reshape(-1)
-    if any(not isinstance(cell, np.ndarray) or cell.dtype.kind != "U" for cell in cells) or any(
-        cell.size != 1 for cell in cells
-    ):
+    if any(getattr(cell, "dtype", cells.dtype).kind != "U" or cell.size != 1 for cell in cells):
         raise InputError(f"{path}: {field}: found {_found(cells)}, expected names of images")
     return [str(cell.item()) for cell in cells]
 
 
-def _positions(
-    path: pathlib.Path, struct: np.void, field: str, count: int
-) -> Float64[np.ndarray, "images 2"]:
-    value = struct[field]
-    right = value.dtype.kind in "iuf" and value.shape == (2, count)
-    if not right or not np.isfinite(value).all():
-        raise InputError(
-            f"{path}: {field}: found {_found(value)}, expected 2 x {count} numbers, one pair for "
-            "each image"
-        )
-    return np.ascontiguousarray(value.T, dtype=np.float64)
-
-
 def _found(value: Any) -> str:
-    return f"an array of {value.shape} of {value.dtype}"
+    return str(value.item()) if value.size == 1 else f"an array of {value.shape} of {value.dtype}"

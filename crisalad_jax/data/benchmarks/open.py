@@ -1,23 +1,24 @@
 """Find the layout of an evaluation set, and read it with the layout's options."""
 
+import inspect
 import os
 import pathlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from crisalad_jax.config.checks import PATH, choose, takes
-from crisalad_jax.data.benchmarks import folders, vpr_bench
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.folders_on_disk import (
-    find_split,
-    has_sides,
-    has_split,
-    is_pair,
-    listing,
-)
+from crisalad_jax.data.benchmarks.folders import TRUTH, read_folders
 from crisalad_jax.data.benchmarks.msls import is_msls, read_msls, read_msls_subtask
 from crisalad_jax.data.benchmarks.netvlad import read_netvlad
-from crisalad_jax.data.benchmarks.salad_lists import has_lists, is_list, read_salad_lists
+from crisalad_jax.data.benchmarks.npy_lists import (
+    VPR_BENCH_TRUTH,
+    has_lists,
+    is_list,
+    read_salad_lists,
+    read_vpr_bench,
+)
+from crisalad_jax.data.benchmarks.on_disk import find_split, has_sides, has_split, listing
 from crisalad_jax.data.benchmarks.utm import QUERIES, has_utm_names, read_utm
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
@@ -29,29 +30,28 @@ class Layout(NamedTuple):
 
     words: str
     read: Callable[..., Benchmark]
-    options: tuple[str, ...] = ()
-    """Names of the options that the reader takes beside the path."""
-    names_images: bool = False
-    """Whether it names images, which may be missing; the reader takes `on_bad_image`."""
+
+    @property
+    def options(self) -> list[str]:
+        """Names of the options that the reader takes after the path."""
+        _, *options = inspect.signature(self.read).parameters
+        return [name for name in options if name != _ON_BAD_IMAGE]
+
+    @property
+    def names_images(self) -> bool:
+        """Whether files name images, which may be missing."""
+        return _ON_BAD_IMAGE in inspect.signature(self.read).parameters
 
 
+_ON_BAD_IMAGE = "on_bad_image"
 LAYOUTS = {
-    "utm": Layout(
-        "a folder of @UTM names", read_utm, ("split", "radius", "queries", "ignore_zones")
-    ),
-    "vpr-bench": Layout("a VPR-Bench folder", vpr_bench.read_vpr_bench),
-    "netvlad": Layout("a .mat file of NetVLAD", read_netvlad, ("radius", "images"), True),
-    "salad": Layout(
-        ".npy lists of GSV-Cities or SALAD", read_salad_lists, ("split", "images"), True
-    ),
-    "msls": Layout("raw MSLS", read_msls, ("split", "radius", "max_heading_difference"), True),
-    "msls-subtask": Layout(
-        "raw MSLS, subtask all",
-        read_msls_subtask,
-        ("split", "radius", "max_heading_difference"),
-        True,
-    ),
-    "folders": Layout("two plain folders", folders.read_folders, ("split", "radius", "frames")),
+    "utm": Layout("a folder of @UTM names", read_utm),
+    "vpr-bench": Layout("a VPR-Bench folder", read_vpr_bench),
+    "netvlad": Layout("a .mat file of NetVLAD", read_netvlad),
+    "salad": Layout(".npy lists of GSV-Cities or SALAD", read_salad_lists),
+    "msls": Layout("raw MSLS", read_msls),
+    "msls-subtask": Layout("raw MSLS, subtask all", read_msls_subtask),
+    "folders": Layout("two plain folders", read_folders),
 }
 """Layouts by the name that `open_benchmark` takes."""
 
@@ -125,7 +125,7 @@ def open_benchmark(
                 f"which takes {known}"
             )
     if chosen.names_images:
-        given["on_bad_image"] = on_bad_image
+        given[_ON_BAD_IMAGE] = on_bad_image
     return chosen.read(root, **given)
 
 
@@ -144,10 +144,11 @@ def _find_layout(root: pathlib.Path, split: str | None, queries: str | None) -> 
         return "msls"
     if has_split(root) or has_sides(root):
         folder, _ = find_split(root, split)
-        plain = (folder / folders.TRUTH).exists() or not has_utm_names(folder, queries or QUERIES)
+        plain = (folder / TRUTH).exists() or not has_utm_names(folder, queries or QUERIES)
         return "folders" if plain else "utm"
-    if is_pair(root, "ref", "query") and ((root / vpr_bench.TRUTH).exists() or not has_lists(root)):
-        return "vpr-bench"
+    if (root / "ref").is_dir() and (root / "query").is_dir():
+        has_truth = (root / VPR_BENCH_TRUTH).exists() or not has_lists(root)
+        return "vpr-bench" if has_truth else "salad"
     if has_lists(root):
         return "salad"
     raise InputError(

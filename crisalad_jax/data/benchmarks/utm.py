@@ -11,16 +11,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from crisalad_jax.data.benchmarks.benchmark import Benchmark
-from crisalad_jax.data.benchmarks.folders_on_disk import (
+from crisalad_jax.data.benchmarks.benchmark import DEFAULT_RADIUS, Benchmark, check_radius, within
+from crisalad_jax.data.benchmarks.msls import msls_title
+from crisalad_jax.data.benchmarks.on_disk import (
     find_database,
     find_split,
     list_part,
     listing,
     shown,
 )
-from crisalad_jax.data.benchmarks.ground_truth import DEFAULT_RADIUS, check_radius, within
-from crisalad_jax.data.benchmarks.msls import msls_title
 from crisalad_jax.data.metres import Zone, on_ellipsoid
 from crisalad_jax.data.positions import utm_degrees, utm_position, utm_zones
 from crisalad_jax.utils.errors import InputError
@@ -85,29 +84,23 @@ def read_utm(
         # Count in whole frames: the names' truncated decimals would make the radius inexact.
         frames = int(radius / metres + 1e-9)
         words = f"{frames} frame{'s' * (frames != 1)}"
-        return Benchmark(
-            name=f"{_NORDLANDS[metres]}{which}, +-{words}",
-            root=root,
-            database=database,
-            queries=asking,
-            positives=within(there, here, frames),
-            rule=f"at most {words} apart ({radius:g} m); it is Nordland by eastings of 0 and "
-            f"northings of {metres:.4g} m a frame",
+        name = f"{_NORDLANDS[metres]}{which}, +-{words}"
+        rule = (
+            f"at most {words} apart ({radius:g} m); it is Nordland by eastings of 0 and "
+            f"northings of {metres:.4g} m a frame"
         )
+        return Benchmark(name, root, database, asking, within(there, here, frames), rule)
 
     if radius < _PLACE_METRES and _are_placeholders(places, asked):
         known = _PAIRED.get(len(database)) if len(database) == len(asking) else None
-        return Benchmark(
-            name=f"{known or name}{which} (@UTM placeholders 1 km apart: a place matches itself "
-            "only)",
-            root=root,
-            database=database,
-            queries=asking,
-            positives=within(places, asked, radius),
-            rule="the same place; by eastings of 0 and northings of whole kilometres the "
-            "coordinates are placeholders"
-            + (f", and by {len(database)} places it is {known}" if known else ""),
+        name = f"{known or name}{which} (@UTM placeholders 1 km apart: a place matches itself only)"
+        rule = (
+            "the same place; by eastings of 0 and northings of whole kilometres the coordinates "
+            "are placeholders"
         )
+        if known:
+            rule += f", and by {len(database)} places it is {known}"
+        return Benchmark(name, root, database, asking, within(places, asked, radius), rule)
 
     rule = f"UTM distance of at most {radius:g} m"
     paths = [str(path) for path in (*database, *asking)]
@@ -122,8 +115,7 @@ def read_utm(
     if cities is None:
         name = f"{name}{which} (@UTM, {ending})"
     else:
-        title = f"{msls_title(cities)}{which}, downloader style"
-        name = f"{title}, {len(asking)} queries, {ending}"
+        name = f"{msls_title(cities)}{which}, downloader style, {len(asking)} queries, {ending}"
         rule += f"; by the notes in the names it is MSLS of {', '.join(sorted(cities))}"
     return Benchmark(name, root, database, asking, positives, rule, places, asked, radius)
 
@@ -177,15 +169,11 @@ def _list_queries(folder: pathlib.Path, queries: str) -> tuple[pathlib.Path, ...
 
 def _coordinates(paths: tuple[pathlib.Path, ...]) -> Float64[np.ndarray, "images 2"]:
     """Read each image's east and north in metres from its name."""
-    coordinates = np.empty((len(paths), 2))
-    for row, path in zip(coordinates, paths, strict=True):
-        position = utm_position(path.name)
-        if position is None:
-            raise InputError(
-                f"{path}: found no coordinates, expected a name @UTM_east@UTM_north@..."
-            )
-        row[:] = position
-    return coordinates
+    coordinates = [utm_position(path.name) for path in paths]
+    if None in coordinates:
+        path = paths[coordinates.index(None)]
+        raise InputError(f"{path}: found no coordinates, expected a name @UTM_east@UTM_north@...")
+    return np.array(coordinates, np.float64)
 
 
 def _nordland(

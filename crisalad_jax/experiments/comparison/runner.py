@@ -54,7 +54,11 @@ from crisalad_jax.training.loop import fit
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target, real_path, split_markers, write_json
-from crisalad_jax.utils.locks import POLL, BusyFolderError, lock
+from crisalad_jax.utils.locks import (
+    POLL,
+    BusyFolderError,
+    lock,
+)
 from crisalad_jax.utils.output import Note
 from crisalad_jax.utils.target import target
 from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries

@@ -6,7 +6,7 @@ import pathlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from crisalad_jax.data.moments import Moment, moment_of
+from crisalad_jax.data.video import Moment, moment_of
 
 if TYPE_CHECKING:
     from crisalad_jax.retrieval.maps.map import Map, MapImage

@@ -10,8 +10,8 @@ import numpy as np
 
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.metres import comparable
-from crisalad_jax.data.moments import moment_of
 from crisalad_jax.data.positions import AXES, utm_positions
+from crisalad_jax.data.video import moment_of
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.sequence import BayesFilter, SequenceState
 from crisalad_jax.utils.output import warn

@@ -4,9 +4,9 @@ import dataclasses
 import json
 
 import pytest
-from crisalad_jax.config.registry import REGISTRIES
 
 from crisalad_jax.cli import ablate, main
+from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.data.augmentations import AUGMENTATIONS
 from crisalad_jax.experiments.comparison import (
     METHODS,

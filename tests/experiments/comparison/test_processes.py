@@ -30,7 +30,7 @@ PRESETS["tiny"] = from_plain(ModelConfig, plain, source="test")
 
 @pytest.fixture
 def plugin(tmp_path, monkeypatch):
-    monkeypatch.setattr(plugins, "_PLUGINS", {})
+    monkeypatch.setattr(plugins, "_LOADED", {})
     path = tmp_path / "small.py"
     path.write_text(SMALL)
     return path

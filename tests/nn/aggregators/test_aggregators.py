@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch
-from crisalad_jax.config.registry import REGISTRIES
 
+from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.aggregators.base import to_descriptor
 from crisalad_jax.nn.aggregators.gem import Gem, GemPyramidConfig, gem_pyramid

@@ -133,7 +133,7 @@ PLAIN = json.loads(json.dumps(CHECK.as_json()))
         ({"programs": []}, "found 'config', expected the JSON"),
         (PLAIN | {"programs": [{"target": "v5e-8"}]}, "missing 16 required positional arguments"),
         (PLAIN | {"programs": [PLAIN["programs"][0] | {"speed": 3}]}, "keyword argument 'speed'"),
-        (PLAIN | {"config": 5}, "found int, expected an object"),
+        (PLAIN | {"config": 5}, "found 5, expected an object"),
     ],
 )
 def test_a_file_of_something_else(tmp_path: pathlib.Path, monkeypatch, value, words):

@@ -30,7 +30,7 @@ from crisalad_jax.utils.files import atomic_path, user_cache
 from crisalad_jax.utils.version import VERSION
 
 _MOST = 128
-"""Largest number of files that are kept: those used last."""
+"""Largest number of files that are cached: those used last."""
 _DIGEST = 32
 """Bytes of the digest that a file begins with."""
 _TRACED_WITH = ("jax", "jaxlib", "numpy", "optimistix", "lineax", "equinox")
@@ -41,16 +41,16 @@ _SETTINGS = ("JAX_", "XLA_")
 
 
 class _Folder:
-    """The folder of kept programs; None, and nothing is kept, until `keep_programs`."""
+    """The folder of cached programs; None, and nothing is cached, until `cache_executables`."""
 
     path: pathlib.Path | None = None
 
 
-def keep_programs() -> None:
-    """Keep compiled programs from now on, in a folder of the user's alone.
+def cache_executables() -> None:
+    """Cache compiled programs from now on, in a folder of the user's alone.
 
     A program that runs nothing but this package may call it: code that was changed while it ran, as
-    in a notebook, is not part of the key. Where there can be no such folder nothing is kept.
+    in a notebook, is not part of the key. Where there can be no such folder nothing is cached.
     """
     with contextlib.suppress(OSError, RuntimeError):  # no permission, or no home folder
         folder = user_cache() / "programs"
@@ -60,7 +60,7 @@ def keep_programs() -> None:
             _Folder.path = folder
 
 
-def kept(
+def cached_executable(
     function: Callable[..., Any],
     compile: Callable[..., Any],
     args: Sequence[Any],
@@ -77,7 +77,7 @@ def kept(
         static_argnames: names of those that are part of the program.
 
     Returns:
-        The call of the program; None where none is kept, as on accelerators.
+        The call of the program; None where none is cached, as on accelerators.
     """
     if _Folder.path is None or jax.default_backend() != "cpu" or jax.process_count() > 1:
         return None
@@ -109,7 +109,7 @@ def kept(
 
 @contextlib.contextmanager
 def _without_jaxs_cache() -> Iterator[None]:
-    """Compile anew: what comes from JAX's own cache lacks its functions once it is kept again."""
+    """Compile again: what comes from JAX's own cache lacks its functions when cached again."""
     before = jax.config.values[_ENABLED]
     jax.config.update(_ENABLED, False)
     compilation_cache.reset_cache()
@@ -208,7 +208,7 @@ def _is_ones_own(path: pathlib.Path) -> bool:
 
 
 def _read(path: pathlib.Path, tree: Any, devices: list[Any]) -> Any:
-    """Load a kept program; None where there is none that is whole and this user's own."""
+    """Load a cached program; None where there is none that is whole and this user's own."""
     try:
         data = path.read_bytes()
         if not _is_ones_own(path) or hashlib.sha256(data[_DIGEST:]).digest() != data[:_DIGEST]:
@@ -218,13 +218,13 @@ def _read(path: pathlib.Path, tree: Any, devices: list[Any]) -> Any:
             payload, tree, out_tree, execution_devices=devices
         )
         os.utime(path)
-    except Exception:  # of another jaxlib, cut short, or removed meanwhile: it is compiled anew
+    except Exception:  # of another jaxlib, cut short, or removed meanwhile: it is compiled again
         return None
     return program
 
 
 def _write(path: pathlib.Path, program: Any, tree: Any) -> None:
-    """Keep a program for the next process, and forget those that were not used for long."""
+    """Cache a program for the next process, and forget those that were not used for long."""
     try:
         payload, in_tree, out_tree = serialize_executable.serialize(program)
         if in_tree != tree:
@@ -235,5 +235,5 @@ def _write(path: pathlib.Path, program: Any, tree: Any) -> None:
         others = sorted(path.parent.glob("*"), key=lambda each: each.stat().st_mtime)
         for each in others[:-_MOST]:
             each.unlink(missing_ok=True)
-    except Exception:  # a program that cannot be kept, or a full disk: it is compiled the next time
+    except Exception:  # it cannot be cached, or the disk is full: it is compiled the next time
         return

@@ -1,5 +1,6 @@
 """Pixels of any depth as 8-bit RGB, by hand."""
 
+import threading
 import warnings
 
 import numpy as np
@@ -7,17 +8,16 @@ import pytest
 from PIL import Image
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.data import depth
-from crisalad_jax.data.depth import as_rgb
+from crisalad_jax.data import prepare
 from crisalad_jax.data.images import read_image
-from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.data.prepare import Preparation, as_rgb
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 
 
 @pytest.fixture(autouse=True)
 def nothing_noted(monkeypatch):
-    monkeypatch.setattr(depth, "_noted", set())
+    monkeypatch.setattr(prepare, "_noted", threading.Lock())
 
 
 @pytest.mark.parametrize("shape", [(4, 6), (4, 6, 1)])

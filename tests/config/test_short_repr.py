@@ -10,13 +10,13 @@ import sys
 
 import numpy as np
 import pytest
-from crisalad_jax.config.part import Part
-from crisalad_jax.config.registry import REGISTRIES
-from crisalad_jax.config.short_repr import concise_repr, field_docs
 
 import crisalad_jax as cj
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.classes import ClassesConfig
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import REGISTRIES
+from crisalad_jax.config.short_repr import concise_repr, field_docs
 from crisalad_jax.data.live import Frame
 from crisalad_jax.data.loader import ImageBatch
 from crisalad_jax.data.places import Places

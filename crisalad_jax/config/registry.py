@@ -1,97 +1,23 @@
-"""Swappable parts: frozen dataclasses registered by name, both built-in and of plug-ins.
-
-A part's fields are its settings, and its methods are its behaviour. Each kind of part has a base
-class, which defines the methods, and a registry, which maps names to classes.
-"""
+"""Registries of parts by name: built-in parts, and those of plug-ins."""
 
 import dataclasses
 import functools
-import importlib
 import inspect
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 from crisalad_jax.config.checks import REGISTRY, check_types
-from crisalad_jax.config.concise import concise_repr, in_one_line
-from crisalad_jax.config.field_docs import with_field_docs
-from crisalad_jax.config.plugins import load_entry_points, load_plugin, plugin_of
+from crisalad_jax.config.io import from_plain, to_plain
+from crisalad_jax.config.part import P, Part
+from crisalad_jax.config.plugins import load_entry_points
+from crisalad_jax.config.short_repr import in_one_line, with_field_docs
 from crisalad_jax.utils.errors import InputError
-
-
-@dataclasses.dataclass(frozen=True)
-class Part:
-    """Base class of everything that can be swapped without changing this package."""
-
-    registry: ClassVar["Registry[Any]"]
-    part_name: ClassVar[str]
-
-    def __post_init__(self) -> None:
-        """Check that the fields hold values of their types."""
-        check_types(self)
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        """Print what differs, and check fields before the class's own `__post_init__`."""
-        super().__init_subclass__(**options)
-        if "__repr__" not in vars(cls):
-            cls.__repr__ = concise_repr  # pyright: ignore[reportAttributeAccessIssue]
-        own = vars(cls).get("__post_init__")
-        if own is None:
-            return
-
-        @functools.wraps(own)
-        def check_first(self: Part) -> None:
-            check_types(self)
-            own(self)
-
-        cls.__post_init__ = check_first
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle by name, so that another process finds a part of a plug-in file."""
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        module = type(self).__module__
-        return _restore, (self.registry.base, self.part_name, fields, module, plugin_of(module))
-
-
-P = TypeVar("P", bound=Part)
-
-if TYPE_CHECKING:
-
-    class OrName(Generic[P]):
-        """A field that takes a part or its name, and has the part."""
-
-        def __get__(self, instance: object, owner: Any = None) -> P:
-            """Return the part."""
-            ...
-
-        def __set__(self, instance: object, value: P | str) -> None:
-            """Take a part or its name."""
-            ...
-
-else:
-
-    class OrName:
-        """The type of a field for a part; a name given for it is replaced by the part."""
-
-        def __class_getitem__(cls, kind: type[Part]) -> Any:
-            """Return the type of the values that the field accepts."""
-            return kind | str
-
 
 _C = TypeVar("_C", bound=Callable[..., Any])
 REGISTRIES: dict[str, "Registry[Any]"] = {}
 """All registries by kind."""
-
-
-def _restore(
-    base: type[Part], name: str, fields: Mapping[str, Any], module: str, plugin: str | None
-) -> Part:
-    registry = base.registry
-    if name not in registry.names():  # a new process: what registers the part was not imported yet
-        if plugin is None:
-            importlib.import_module(module)
-        else:
-            load_plugin(plugin)
-    return registry.find(name)(**fields)
+_RESERVED = ("name", "plugin")
+"""Fields in which files keep a part's own name and plug-in."""
 
 
 class Registry(Generic[P]):
@@ -130,105 +56,88 @@ class Registry(Generic[P]):
             InputError: when it decorates: the name is taken, or the part is no frozen dataclass of
                 this kind.
         """
+        where = f"register_{self.kind}"
+        if not isinstance(name, str) or not name or set(name) & set(":,") or name != name.strip():
+            raise InputError(
+                f"{where}: found {name!r}, expected a name without ':' and ',': @{where}('...')"
+            )
 
         def decorate(part: _C) -> _C:
-            made = self._class_of(name, part)
-            self._add(name, made, presets)
             try:
-                self._check_settings(name, made, presets)
-            except InputError:
-                del self._parts[name], self._presets[name]
-                raise
+                self._add(name, self._class_of(part), presets)
+            except InputError as error:
+                raise InputError(f"{where} {name!r}: {error}") from error
             return part
 
-        where = f"register_{self.kind}"
-        if not isinstance(name, str):
-            raise InputError(f"{where}: found {name!r}, expected a name: @{where}('...')")
-        if not name or set(name) & set(":,") or name != name.strip():
-            raise InputError(f"{where}: found the name {name!r}, expected one without ':' and ','")
         return decorate
 
-    def _check_settings(self, name: str, part: type[P], presets: Mapping[str, Any]) -> None:
-        """Check that files can keep the settings, and that the presets' fields are there."""
-        from crisalad_jax.config.io import from_plain, to_plain
-
-        where = f"register_{self.kind} {name!r}"
-        fields = [field.name for field in dataclasses.fields(part)]
-        unknown = [each for preset in presets.values() for each in preset if each not in fields]
-        if unknown:
-            raise InputError(
-                f"{where}: found {', '.join(unknown)} in a preset, expected {', '.join(fields)}"
-            )
-        from_plain(self.base, to_plain(part()), source=where)
-
-    def _class_of(self, name: str, part: Callable[..., Any]) -> type[P]:
-        where = f"register_{self.kind} {name!r}"
+    def _class_of(self, part: Callable[..., Any]) -> type[P]:
+        """Return a part's class, that of a plain function included."""
         if not inspect.isclass(part):
             if self._of_function is None or not callable(part):
                 raise InputError(
-                    f"{where}: found {type(part).__name__}, expected a frozen dataclass that "
-                    f"inherits from {self.base.__name__}"
+                    f"found {type(part).__name__}, expected a frozen dataclass that inherits from "
+                    f"{self.base.__name__}"
                 )
-            return self._made_of(part)
+            members = {
+                "__doc__": part.__doc__ or f"The {self.kind} {part.__name__}.",
+                "__module__": part.__module__,
+                "__qualname__": part.__qualname__,
+                **self._of_function(part),
+            }
+            made = type(part.__name__, (self.base,), members)
+            return cast(type[P], dataclasses.dataclass(frozen=True)(made))
         parameters = part.__dict__.get("__dataclass_params__")
         if parameters is None or not parameters.frozen:
             raise InputError(
-                f"{where}: found {part.__qualname__}, which is no frozen dataclass, expected "
+                f"found {part.__qualname__}, which is no frozen dataclass, expected "
                 "@dataclasses.dataclass(frozen=True) below the registration"
             )
         if not issubclass(part, self.base):
             raise InputError(
-                f"{where}: found {part.__qualname__}, expected a subclass of {self.base.__name__}"
+                f"found {part.__qualname__}, expected a subclass of {self.base.__name__}"
             )
-        fields = [field.name for field in dataclasses.fields(part)]
-        for reserved in {"name", "plugin"} & set(fields):
-            raise InputError(
-                f"{where}: found a field {reserved!r}, which files keep the part's own in"
-            )
-        hidden = [name for name in fields if callable(getattr(self.base, name, None))]
-        if hidden:
-            raise InputError(f"{where}: found a field {hidden[0]!r}, which is the name of a method")
-        missing = sorted(getattr(part, "__abstractmethods__", ()))
-        if missing:
-            raise InputError(f"{where}: found no method {', '.join(missing)}, expected it")
+        for field in dataclasses.fields(part):
+            if field.name in _RESERVED or callable(getattr(self.base, field.name, None)):
+                raise InputError(f"found a field {field.name!r}, which has another meaning here")
+        if missing := sorted(getattr(part, "__abstractmethods__", ())):
+            raise InputError(f"found no method {', '.join(missing)}, expected it")
         try:
             hash(part())
         except TypeError as error:
             raise InputError(
-                f"{where}: {error}; expected a default for every field, and values that can be "
-                "hashed, such as tuples for lists"
+                f"{error}; expected a default for every field, and values that can be hashed, such "
+                "as tuples for lists"
             ) from error
         return part
-
-    def _made_of(self, function: Callable[..., Any]) -> type[P]:
-        """Wrap a plain function in a part without settings."""
-        assert self._of_function is not None
-        members = {
-            "__doc__": function.__doc__ or f"The {self.kind} {function.__name__}.",
-            "__module__": function.__module__,
-            "__qualname__": function.__qualname__,
-            **self._of_function(function),
-        }
-        made = type(function.__name__, (self.base,), members)
-        return cast(type[P], dataclasses.dataclass(frozen=True)(made))
 
     def _add(self, name: str, part: type[P], presets: Mapping[str, Mapping[str, Any]]) -> None:
         there = self._parts.get(name)
         # A notebook's cell or a plug-in's file that runs again registers the same part.
         if there is not None and _home(there) != _home(part):
             raise InputError(
-                f"register_{self.kind}: found the name {name!r} taken by {there.__module__}."
-                f"{there.__qualname__}, expected another name for {part.__qualname__}"
+                f"found the name taken by {there.__module__}.{there.__qualname__}, expected "
+                f"another name for {part.__qualname__}"
             )
         earlier = vars(part).get("part_name", name)
         if earlier != name:
             raise InputError(
-                f"register_{self.kind} {name!r}: found {part.__qualname__} registered as "
-                f"{earlier!r}, expected one name for a class"
+                f"found {part.__qualname__} registered as {earlier!r}, expected one name for a "
+                "class"
+            )
+        fields = [field.name for field in dataclasses.fields(part)]
+        unknown = [each for preset in presets.values() for each in preset if each not in fields]
+        if unknown:
+            raise InputError(
+                f"found {', '.join(unknown)} in a preset, expected {', '.join(fields)}"
             )
         part.part_name = name
-        self._parts[name] = with_field_docs(part)
-        self._presets[name] = presets
+        self._parts[name], self._presets[name] = with_field_docs(part), presets
+        try:
+            from_plain(self.base, to_plain(part()), source="settings")  # files can keep them
+        except InputError:
+            del self._parts[name], self._presets[name]
+            raise
 
     def names(self) -> list[str]:
         """Return the names of all parts, in order."""
@@ -250,7 +159,7 @@ class Registry(Generic[P]):
             plugin: the plug-in that registered it, where that is known.
 
         Raises:
-            InputError: there is none; the message lists those there are.
+            InputError: there is none; the message lists all parts.
         """
         # A file may have any value in the place of a name, even an unhashable one.
         if name not in self.names():
@@ -302,6 +211,10 @@ class Registry(Generic[P]):
         return value
 
 
+def _home(part: type[Part]) -> tuple[str, str]:
+    return part.__module__, part.__qualname__
+
+
 def part_field(registry: Registry[P], default: str | type[P]) -> Any:
     """Return a dataclass field for a part, by default the one with this name, or of this class."""
     make: Any = functools.partial(registry.make, default) if isinstance(default, str) else default
@@ -351,19 +264,3 @@ def count_arguments(function: Callable[..., Any], *offered: str) -> int:
             f"expected at most {', '.join(offered)}"
         )
     return count
-
-
-def _home(part: type[Part]) -> tuple[str, str]:
-    return part.__module__, part.__qualname__
-
-
-def parts_of(config: Any, prefix: str = "") -> dict[str, Part]:
-    """Return all parts in a configuration by the dotted names of their fields."""
-    parts: dict[str, Part] = {}
-    if isinstance(config, Part):
-        parts[prefix] = config
-    if dataclasses.is_dataclass(config):
-        for field in dataclasses.fields(config):
-            name = f"{prefix}.{field.name}" if prefix else field.name
-            parts |= parts_of(getattr(config, field.name), name)
-    return parts

@@ -5,16 +5,11 @@ import pathlib
 from collections.abc import Iterable, Sequence
 
 from crisalad_jax.data.images import OnBadImage, list_images
-from crisalad_jax.data.names import Disk
+from crisalad_jax.data.tables import Disk
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 
 SPLITS = ("test", "val", "train")
-
-
-def is_pair(root: pathlib.Path, *parts: str) -> bool:
-    """Return whether all `parts` are folders in `root`."""
-    return all((root / part).is_dir() for part in parts)
 
 
 def find_database(folder: pathlib.Path) -> pathlib.Path:

@@ -1,25 +1,28 @@
-"""How public classes print: their `repr`, and their HTML in a notebook."""
+"""How public classes print: their `repr`, their HTML in a notebook, and their `help`."""
 
+import ast
 import dataclasses
+import functools
+import html
+import inspect
 import itertools
 import math
 import pathlib
+import textwrap
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, TypeVar
-
-from crisalad_jax.config.field_docs import with_field_docs
+from typing import Any, Self, SupportsIndex, TypeVar
 
 _T = TypeVar("_T")
 _WIDTH = 88
 """Characters of a line, at most: as a notebook shows without a scroll bar."""
 _FEW = 4
 """Number of items in a collection that is shown whole; of a larger one the first is shown."""
-_SWITCH = "__concise_switch__"
-_ALWAYS = "__concise_always__"
-_BRIEF = "__concise_brief__"
+_SWITCH = "__short_repr_switch__"
+_ALWAYS = "__short_repr_always__"
+_BRIEF = "__short_repr_brief__"
 
 
-def concise(*always: str, switch: tuple[Any, ...] = ()) -> Callable[[type[_T]], type[_T]]:
+def short_repr(*always: str, switch: tuple[Any, ...] = ()) -> Callable[[type[_T]], type[_T]]:
     """Return a decorator that gives a configuration the `repr` of `concise_repr`.
 
     Its `help` shows the texts below its fields.
@@ -98,8 +101,7 @@ def _write(value: Any, before: str, indent: int, width: float) -> str:
     name = getattr(value, "part_name", None)
     if before and name and not shown:
         return f"{before}{name!r}"
-    opening = f"{before}{type(value).__qualname__}("
-    inner = indent + 4
+    opening, inner = f"{before}{type(value).__qualname__}(", indent + 4
     if hasattr(value, _BRIEF):
         texts = [f"{field}={_short(each)}" for field, each in shown]
         lines = [_clipped(text, _WIDTH - inner) for text in texts]
@@ -147,8 +149,6 @@ def _clipped(text: str, width: int) -> str:
 
 
 def _html(self: Any) -> str:
-    import html
-
     rows = (
         f"<tr><th>{field}</th><td>{html.escape(_clipped(_short(value), _WIDTH))}</td></tr>"
         for field, value in _shown(self)
@@ -158,16 +158,25 @@ def _html(self: Any) -> str:
 
 def _shown(value: Any) -> Iterator[tuple[str, Any]]:
     """Yield name and value of the fields that are printed."""
-    if not dataclasses.is_dataclass(value):
-        for name in value._fields:
-            if getattr(value, name) is not value._field_defaults.get(name, dataclasses.MISSING):
-                yield name, getattr(value, name)
-        return
-    always = getattr(value, _ALWAYS, ())
-    for field in fields_in_use(value):
-        each = getattr(value, field.name)
-        if field.name in always or not _is_default(field, each):
-            yield field.name, each
+    if dataclasses.is_dataclass(value):
+        always = getattr(value, _ALWAYS, ())
+        defaults = {field.name: default_of(field) for field in fields_in_use(value)}
+    else:
+        always = ()
+        defaults = dict.fromkeys(value._fields, dataclasses.MISSING) | value._field_defaults
+    for name, default in defaults.items():
+        each = getattr(value, name)
+        # Arrays have no truth value.
+        same = each is default or (not hasattr(each, "shape") and each == default)
+        if name in always or not same:
+            yield name, each
+
+
+def default_of(field: dataclasses.Field[Any]) -> Any:
+    """Return the default of a field; `dataclasses.MISSING` without one."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return field.default
 
 
 def fields_in_use(config: Any) -> list[dataclasses.Field[Any]]:
@@ -185,9 +194,55 @@ def fields_in_use(config: Any) -> list[dataclasses.Field[Any]]:
     return [f for f in fields if f.name not in unused and (unused or f.name == name)]
 
 
-def _is_default(field: dataclasses.Field[Any], value: Any) -> bool:
-    if field.default_factory is not dataclasses.MISSING:
-        return value == field.default_factory()
-    if field.default is dataclasses.MISSING:
-        return False
-    return value is field.default or (not hasattr(value, "shape") and value == field.default)
+def with_field_docs(cls: type[_T]) -> type[_T]:
+    """Let a class's docstring end with the texts below its fields."""
+    cls.__doc__ = _Doc(cls.__doc__ or "", cls)
+    return cls
+
+
+class _Doc(str):
+    """A docstring that is put together when it is read: to read sources would slow an import.
+
+    `help` takes the docstring of an abstract class out of its namespace, without `__get__`, and
+    begins with `expandtabs`.
+    """
+
+    def __new__(cls, text: str, kind: type) -> Self:
+        doc = super().__new__(cls, text)
+        doc.kind = kind
+        return doc
+
+    kind: type
+
+    def expandtabs(self, tabsize: SupportsIndex = 8) -> str:
+        return self.__get__(None, self.kind).expandtabs(tabsize)
+
+    def __get__(self, instance: Any, owner: type) -> str:
+        names = getattr(self.kind, "_fields", None)
+        if names is None:
+            names = [field.name for field in dataclasses.fields(self.kind)]
+        texts = field_docs(self.kind)
+        lines = (f"    {name}: {texts[name]}" for name in names if name in texts)
+        fields = [line.replace("\n", "\n" + 8 * " ") for line in lines]
+        if not fields:
+            return str(self)
+        return "\n".join([inspect.cleandoc(str(self)), "", "Attributes:", *fields])
+
+
+@functools.cache
+def field_docs(kind: type) -> Mapping[str, str]:
+    """Read the texts below the fields of a dataclass or NamedTuple and of its base classes."""
+    docs: dict[str, str] = {}
+    for each in reversed(kind.__mro__):
+        if not dataclasses.is_dataclass(each) and not hasattr(each, "_fields"):
+            continue
+        try:
+            source = textwrap.dedent(inspect.getsource(each))
+        except (OSError, TypeError):  # made in a console
+            continue
+        (node,) = ast.parse(source).body
+        for line, below in itertools.pairwise(getattr(node, "body", ())):
+            text = below.value if isinstance(below, ast.Expr) else None
+            if isinstance(line, ast.AnnAssign) and isinstance(text, ast.Constant):
+                docs[ast.unparse(line.target)] = inspect.cleandoc(str(text.value))
+    return docs

@@ -1,14 +1,21 @@
-"""The .npy lists of GSV-Cities and SALAD."""
+"""Sets with .npy files: VPR-Bench's folders, and the lists of GSV-Cities and SALAD."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from crisalad_jax.data.benchmarks import open_benchmark, read_salad_lists
+from crisalad_jax.data.benchmarks import open_benchmark, read_salad_lists, read_vpr_bench
 from crisalad_jax.utils.errors import InputError
-from tests.data.benchmarks.trees import every_tenth, lists_of, ragged, touch
+from crisalad_jax.utils.output import Note
+from tests.data.benchmarks.trees import (
+    every_tenth,
+    lists_of,
+    ragged,
+    touch,
+    truth_rows,
+    write_vpr_bench,
+)
 
 DATABASE = [f"00{i}/{i:06d}_pitch1_yaw1.jpg" for i in range(5)]
 QUERIES = [f"00{i}/{i:06d}_pitch1_yaw2.jpg" for i in range(3)]
@@ -140,25 +147,8 @@ def test_a_folder_of_several_sets(tmp_path):
     assert chosen.name == "pitts30k_test (SALAD's lists)"
     with pytest.raises(InputError, match="and split 'train', expected those of one"):
         read_salad_lists(tmp_path, "train")
-    with pytest.raises(InputError, match="found lists of no set, expected"):
+    with pytest.raises(InputError, match=r"Images\.npy: found lists of pitts30k_test, .*expected"):
         read_salad_lists(tmp_path / "pitts250k_test_qImages.npy")
-
-
-class Payload:
-    def __init__(self, target: Path) -> None:
-        self.target = target
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.target),)
-
-
-def test_no_code_is_run(tmp_path):
-    write_images(tmp_path, DATABASE + QUERIES)
-    truth = ragged([0], Payload(tmp_path / "ran"), [1])
-    write_lists(tmp_path, "a_", dbImages=DATABASE, qImages=QUERIES, gt=truth)
-    with pytest.raises(InputError, match=r"a_gt.npy: cannot be read as .* asks for"):
-        read_salad_lists(tmp_path)
-    assert not (tmp_path / "ran").exists()
 
 
 @pytest.mark.parametrize(
@@ -171,7 +161,10 @@ def test_no_code_is_run(tmp_path):
         ({"qIdx": np.array([0, 3, 1])}, "a_qIdx.npy: found 3 indices, expected some from 0 to 2"),
         ({"qIdx": np.array([0, 0, 1])}, "a_qIdx.npy: found 3 indices, .*each once"),
         ({"qIdx": np.array([], int)}, "a_qIdx.npy: found 0 indices"),
-        ({"qIdx": np.array([0.0])}, "a_qIdx.npy: found values of type float64, expected indices"),
+        (
+            {"qIdx": np.array([0.0])},
+            "a_qIdx.npy: row 0: found values of type float64",
+        ),
         ({"pIdx": TRUTH}, "a_gt.npy, a_pIdx.npy, .*expected a_qImages.npy, and one of"),
         ({"dbImages": np.arange(5)}, "a_dbImages.npy: found an array of .*, expected names"),
         ({"dbImages": np.empty(0, "<U3")}, "a_dbImages.npy: (found|cannot)"),
@@ -195,3 +188,112 @@ def test_missing_images_stay_in_the_set_to_be_skipped(tmp_path):
     found = open_benchmark(tmp_path, on_bad_image="skip")
     assert found.queries == tuple(tmp_path / name for name in QUERIES)
     assert found.database == tuple(tmp_path / name for name in DATABASE)
+
+
+@pytest.mark.parametrize("as_array", [False, True])
+def test_vpr_bench(tmp_path, as_array):
+    wrap = np.array if as_array else list
+    truth = truth_rows((2, wrap([3, 1])), (0, wrap([-1])), (1, wrap([0])))
+    benchmark = read_vpr_bench(write_vpr_bench(tmp_path / "hall", truth))
+    assert benchmark.name == "hall (VPR-Bench)"
+    assert [path.name for path in benchmark.queries] == [f"{i:07d}.jpg" for i in range(3)]
+    assert lists_of(benchmark.positives) == [[], [0], [1, 3]]
+
+
+def test_vpr_bench_reads_plain_integers(tmp_path):
+    root = write_vpr_bench(tmp_path, np.array([[0, 3], [1, -1], [2, 0]]))
+    assert lists_of(read_vpr_bench(root).positives) == [[3], [], [0]]
+
+
+def test_vpr_bench_sorts_by_number(tmp_path):
+    truth = truth_rows((0, [10]), (1, [9]), (2, [2]))
+    root = write_vpr_bench(tmp_path, truth, references=0)
+    for i in range(12):
+        touch(root / "ref" / f"{i}.jpg")
+    benchmark = read_vpr_bench(root)
+    matched = [benchmark.database[p[0]].name for p in benchmark.ground_truth()]
+    assert matched == ["10.jpg", "9.jpg", "2.jpg"]
+
+
+def test_vpr_bench_refuses_a_gap_in_the_numbers(tmp_path):
+    root = write_vpr_bench(tmp_path, truth_rows((0, [0]), (1, [1]), (2, [2])))
+    (root / "ref" / "0000001.jpg").unlink()
+    with pytest.raises(
+        InputError, match=r"ref/0000002.jpg: found after number 0, expected number 1"
+    ):
+        read_vpr_bench(root)
+
+
+def test_vpr_bench_leaves_out_references_after_the_last_image(tmp_path):
+    """As published for GardensPointWalking, whose query 199 has 197 to 201 of 200 references."""
+    rows = truth_rows((0, [0, 1]), (1, [2, 3, 4]), (2, [3, 4, 5]))
+    root = write_vpr_bench(tmp_path, rows)
+    with pytest.warns(Note, match=r"found 3 references after the last of 4 images, .* left out"):
+        benchmark = read_vpr_bench(root)
+    assert lists_of(benchmark.positives) == [[0, 1], [2, 3], [3]]
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([(0, [0]), (1, [4]), (2, [0])], "row 1: found reference indices 4 to 4, expected 0 to 3"),
+        ([(0, [-2]), (1, [1]), (2, [0])], "row 0: found reference indices -2 to -2"),
+        ([(0, [0]), (3, [1]), (2, [0])], r"found queries \[0, 3, 2\].*, expected each from 0 to 2"),
+        ([(0, [0]), (0, [1]), (2, [0])], r"found queries \[0, 0, 2\].*, expected each"),
+        ([(0, [0]), (1, [1])], r"found shape \(2, 2\), expected \(3, 2\)"),
+        ([(0, [0]), (1, ["a"]), (2, [0])], "row 1: .*expected whole numbers"),
+        (
+            [(0, [0]), (1, [0.5]), (2, [0])],
+            "row 1: found values of type float, expected whole",
+        ),
+        (
+            [(0, [0]), (1, [True]), (2, [0])],
+            "row 1: found values of type bool, expected whole numbers",
+        ),
+        ([(0, [0]), (1, [[1], [2, 3]]), (2, [0])], "row 1: .*expected whole numbers"),
+        ([(0, [0]), (1, None), (2, [0])], "row 1: .*expected whole numbers"),
+    ],
+)
+def test_vpr_bench_bad_indices(tmp_path, rows, message):
+    root = write_vpr_bench(tmp_path, truth_rows(*rows))
+    with pytest.raises(InputError, match=message) as caught:
+        read_vpr_bench(root)
+    assert "ground_truth_new.npy" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_vpr_bench_missing_folder(tmp_path):
+    touch(tmp_path / "ref" / "0000000.jpg")
+    with pytest.raises(InputError, match="found ref/, expected a folder query"):
+        read_vpr_bench(tmp_path)
+
+
+@pytest.mark.parametrize(("queries", "database"), [(3, 22), (3, 21), (12, 120)])
+def test_nordland_star_is_told_by_its_ground_truth(tmp_path, queries, database):
+    truth = truth_rows(*enumerate(every_tenth(queries, database)))
+    # As published: the first query has a -1, which is no index.
+    truth[0, 1] = [-1, 0, 1]
+    benchmark = read_vpr_bench(write_vpr_bench(tmp_path / "any", truth, database, queries))
+    assert benchmark.name == "Nordland*, winter database, summer queries (VPR-Bench)"
+    assert "10i - 1, 10i and 10i + 1" in benchmark.rule
+    assert (len(benchmark.database), len(benchmark.queries)) == (database, queries)
+    assert lists_of(benchmark.positives) == every_tenth(queries, database)
+    assert benchmark.database_positions is None
+
+
+def test_what_only_resembles_nordland_star_is_not_called_so(tmp_path):
+    matches = every_tenth(3, 30)
+    matches[2] = [19, 20, 21, 22]
+    truth = truth_rows(*enumerate(matches))
+    assert read_vpr_bench(write_vpr_bench(tmp_path / "hall", truth, 30)).name == "hall (VPR-Bench)"
+
+
+def test_vpr_bench_flattens_no_lists_in_lists(tmp_path):
+    """Forty lists of the one before, twice each, are a few hundred bytes and 2**40 numbers."""
+    bomb: list = [0]
+    for _ in range(40):
+        bomb = [bomb, bomb]
+    root = write_vpr_bench(tmp_path, truth_rows((0, bomb)), queries=1)
+    assert (root / "ground_truth_new.npy").stat().st_size < 1000
+    with pytest.raises(InputError, match="row 0: found values of type list, expected"):
+        read_vpr_bench(root)

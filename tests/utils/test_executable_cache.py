@@ -18,15 +18,15 @@ from crisalad_jax.utils import compiler, executable_cache
 def folder(tmp_path, monkeypatch):
     """The folder of kept programs, as a program of its own sets it."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(kept._Folder, "path", None)
+    monkeypatch.setattr(executable_cache._Folder, "path", None)
     executable_cache.cache_executables()
-    assert kept._Folder.path == tmp_path / "crisalad-jax" / "programs"
-    return kept._Folder.path
+    assert executable_cache._Folder.path == tmp_path / "crisalad-jax" / "programs"
+    return executable_cache._Folder.path
 
 
 def next_process(monkeypatch):
     """Forget the programs of this one."""
-    monkeypatch.setattr(kept, "_programs", {})
+    monkeypatch.setattr(executable_cache, "_programs", {})
 
 
 def counting():
@@ -82,21 +82,21 @@ def test_another_call_is_another_program(folder, call):
 
 def test_every_field_of_a_configuration_counts():
     config = PRESETS["tiny"]
-    assert "iterations" in kept._whole(config)  # which its repr leaves out, as a default
-    assert kept._whole(config) != kept._whole(PRESETS["s14"])
+    assert "iterations" in executable_cache._whole(config)  # a default, which its repr lacks
+    assert executable_cache._whole(config) != executable_cache._whole(PRESETS["s14"])
 
 
 @pytest.mark.parametrize("name", ["JAX_ENABLE_X64", "XLA_FLAGS"])
 def test_surroundings_count(monkeypatch, name):
-    before = kept._surroundings.__wrapped__()
-    assert kept._surroundings.__wrapped__() == before
+    before = executable_cache._surroundings.__wrapped__()
+    assert executable_cache._surroundings.__wrapped__() == before
     monkeypatch.setenv(name, "anything")
-    assert kept._surroundings.__wrapped__() != before
+    assert executable_cache._surroundings.__wrapped__() != before
 
 
 def test_the_code_counts(tmp_path, monkeypatch):
-    before = kept._surroundings.__wrapped__()
-    root = pathlib.Path(kept.__file__).parent.parent
+    before = executable_cache._surroundings.__wrapped__()
+    root = pathlib.Path(executable_cache.__file__).parent.parent
     read_bytes = pathlib.Path.read_bytes
 
     def changed(path):
@@ -104,7 +104,7 @@ def test_the_code_counts(tmp_path, monkeypatch):
         return data + b" " if path == root / "nn" / "layers.py" else data
 
     monkeypatch.setattr(pathlib.Path, "read_bytes", changed)
-    assert kept._surroundings.__wrapped__() != before
+    assert executable_cache._surroundings.__wrapped__() != before
 
 
 @pytest.mark.parametrize("damage", [lambda data: data[:-1], lambda data: data[:40] + b"?" * 60])
@@ -128,15 +128,15 @@ def test_what_others_may_write_is_not_run(folder, monkeypatch):
     function(TREE, factor=3)
     (path,) = programs(folder)
     path.chmod(0o666)
-    assert kept._read(path, None, []) is None
+    assert executable_cache._read(path, None, []) is None
     folder.chmod(0o777)
-    monkeypatch.setattr(kept._Folder, "path", None)
+    monkeypatch.setattr(executable_cache._Folder, "path", None)
     executable_cache.cache_executables()
-    assert kept._Folder.path is None
+    assert executable_cache._Folder.path is None
 
 
 def test_only_the_latest_are_kept(folder, monkeypatch):
-    monkeypatch.setattr(kept, "_MOST", 2)
+    monkeypatch.setattr(executable_cache, "_MOST", 2)
     function, _ = counting()
     for factor in range(4):
         function(TREE, factor=factor)
@@ -146,9 +146,10 @@ def test_only_the_latest_are_kept(folder, monkeypatch):
 
 
 def test_nothing_is_kept_unasked(tmp_path, monkeypatch):
-    monkeypatch.setattr(kept._Folder, "path", None)
+    monkeypatch.setattr(executable_cache._Folder, "path", None)
     function, traces = counting()
-    assert kept.kept(function, None, (TREE,), {"factor": 1}, "factor") is None  # pyright: ignore
+    unasked = executable_cache.cached_executable(function, None, (TREE,), {"factor": 1}, "factor")
+    assert unasked is None
     np.testing.assert_array_equal(function(TREE, factor=1)["total"], [2, 3, 4])
     assert traces == [1]
 

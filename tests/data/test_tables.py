@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.benchmarks import open_benchmark
-from crisalad_jax.data.names import Disk, matched
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.positions import positions_of
 from crisalad_jax.data.sources import open_source
+from crisalad_jax.data.tables import Disk, matched
 from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.test_netvlad import write as write_mat
 from tests.data.benchmarks.trees import lists_of, touch

@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from crisalad_jax.data.benchmarks.ground_truth import within
+from crisalad_jax.data.benchmarks.benchmark import within
 
 
 @pytest.mark.parametrize("axis", [0, 1])

@@ -1,0 +1,302 @@
+"""Sets whose ground truth is in `.npy` files: VPR-Bench's folders, GSV-Cities' and SALAD's lists.
+
+VPR-Bench (Zaffar et al., IJCV 2021): `ref/`, `query/`, `ground_truth_new.npy`.
+
+The lists: `pitts30k_test_dbImages.npy`, `..._qImages.npy` and `..._gt.npy`. MSLS has
+`..._qIdx.npy` (indices of the evaluated queries) and `..._pIdx.npy` (their matches) in place of
+`gt`.
+"""
+
+import os
+import pathlib
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from crisalad_jax.data.benchmarks.benchmark import Benchmark
+from crisalad_jax.data.benchmarks.msls import msls_title
+from crisalad_jax.data.benchmarks.on_disk import find_image_root, find_images, list_part, listing
+from crisalad_jax.data.benchmarks.safe_npy import read_npy
+from crisalad_jax.data.images import OnBadImage
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import real_path
+from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.shapes import Int64
+
+VPR_BENCH_TRUTH = "ground_truth_new.npy"
+_FILE = re.compile(r"(?P<prefix>(?:.*_)?)(?P<kind>dbImages|qImages|gt|qIdx|pIdx)\.npy")
+_MSLS_IMAGE = re.compile(r"train_val/([^/]+)/(?:database|query)/images/[^/]+")
+# Look in the queries' folders first: a query may have the same name as a database image.
+_FOLDERS = {"dbImages": (".",), "qImages": ("queries_real", ".")}
+_NORDLAND_RULE = ", which are 10i - 1, 10i and 10i + 1 for query i: by that it is Nordland*"
+
+_Lists = dict[str, pathlib.Path]
+"""The files of a set, by their kind."""
+_Matches = tuple[Int64[np.ndarray, " _"], ...]
+
+
+def read_vpr_bench(root: str | os.PathLike[str]) -> Benchmark:
+    """Read a VPR-Bench folder: `ref/`, `query/`, `ground_truth_new.npy`.
+
+    The file holds one row for each query: its index and a list of reference indices, [-1] where
+    there is no match. An index is a position among the images in the order of their numbers. No
+    code in the file is run.
+
+    The published lists of GardensPointWalking and 17places are windows of frames, and the last ones
+    end after the last image. Such references are left out, and a note counts them.
+
+    Raises:
+        InputError: a folder or the file is missing, a number is skipped among the images' names,
+            the file holds anything but plain arrays, lists and numbers, all references of a query
+            are out of range, a query has no row or two.
+    """
+    root = pathlib.Path(root)
+    database, queries = (_numbered(list_part(root / part)) for part in ("ref", "query"))
+    path = root / VPR_BENCH_TRUTH
+    rows = read_npy(path)
+    if rows.shape != (len(queries), 2):
+        raise InputError(
+            f"{path}: found shape {rows.shape}, expected ({len(queries)}, 2): one row for each "
+            "query"
+        )
+    asked = [index for row in _rows(path, rows[:, 0]) for index in row.tolist()]
+    if sorted(asked) != [*range(len(queries))]:
+        raise InputError(
+            f"{path}: found queries {asked[:8]}..., expected each from 0 to {len(queries) - 1} in "
+            "one row"
+        )
+    truth = _read_matches(path, rows[:, 1], len(database), windows=True)
+    positives = tuple(truth[row] for row in np.argsort(asked))
+    name = f"{real_path(root).name} (VPR-Bench)"
+    rule = f"the reference images that {VPR_BENCH_TRUTH} lists"
+    if _is_nordland_star(positives, len(database)):
+        name = "Nordland*, winter database, summer queries (VPR-Bench)"
+        rule += _NORDLAND_RULE
+    return Benchmark(name, root, database, queries, positives, rule)
+
+
+def _numbered(paths: tuple[pathlib.Path, ...]) -> tuple[pathlib.Path, ...]:
+    """Sort paths by number where all names are numbers: 10.jpg follows 9.jpg, not 1.jpg."""
+    if not all(path.stem.isdecimal() for path in paths):
+        return paths
+    paths = tuple(sorted(paths, key=lambda path: int(path.stem)))
+    for number, path in enumerate(paths, int(paths[0].stem)):
+        # A gap would silently shift every later position against the ground truth.
+        if int(path.stem) != number:
+            raise InputError(
+                f"{path}: found after number {number - 1}, expected number {number}: the ground "
+                "truth counts positions"
+            )
+    return paths
+
+
+def read_salad_lists(
+    root: str | os.PathLike[str],
+    split: str | None = None,
+    *,
+    images: str | os.PathLike[str] | None = None,
+    on_bad_image: OnBadImage = "stop",
+) -> Benchmark:
+    """Read the `.npy` lists of GSV-Cities and SALAD. No code in the files is run.
+
+    Args:
+        root: a folder with such lists, or one of the files.
+        split: part of a set's name, such as `val`, where the folder has the lists of several sets.
+        images: the folder to which the names are relative; None looks beside the files and one
+            folder further up.
+        on_bad_image: "skip" lets images be missing, for whoever reads them to leave out.
+
+    Raises:
+        InputError: not the lists of just one set, a file that holds anything but names or indices,
+            counts that do not fit, an index that is out of range, images that are missing.
+    """
+    root = pathlib.Path(root)
+    prefix, files = _choose(root, split)
+    names = {kind: _names(files[kind]) for kind in _FOLDERS}
+    count = len(names["dbImages"])
+    if "qIdx" in files:
+        chosen = _chosen(files["qIdx"], len(names["qImages"]))
+        names["qImages"] = [names["qImages"][query] for query in chosen]
+    asked = len(names["qImages"])
+    truth = files.get("gt", files.get("pIdx"))
+    positives, rule = None, "none: there is no ground truth beside the lists"
+    if truth is not None:
+        rows = read_npy(truth)
+        if rows.ndim == 0 or len(rows) != asked:
+            raise InputError(
+                f"{truth}: found shape {rows.shape}, expected a row for each of {asked} queries"
+            )
+        positives = _read_matches(truth, rows, count)
+        rule = f"the database images that {truth.name} lists"
+    found = []
+    for kind, folders in _FOLDERS.items():
+        folder = find_image_root(
+            files[kind], images, names[kind], folders, on_bad_image=on_bad_image
+        )
+        found.append(find_images(files[kind], folder, names[kind], on_bad_image=on_bad_image))
+    cities = [_MSLS_IMAGE.fullmatch(name) for kind in names for name in names[kind]]
+    if positives is not None and _is_nordland_star(positives, count):
+        name = "Nordland*, winter database, summer queries (SALAD's lists)"
+        rule += _NORDLAND_RULE
+    elif None not in cities:
+        name = msls_title({match[1] for match in cities if match})
+        name = f"{name}, {asked} queries (SALAD's list)"
+    else:
+        name = f"{prefix.strip('_') or real_path(files['dbImages']).parent.name} (SALAD's lists)"
+    database, queries = found
+    return Benchmark(name, root, database, queries, positives, rule)
+
+
+def is_list(path: pathlib.Path) -> bool:
+    """Return whether a file has the name of one of the lists."""
+    return path.is_file() and _FILE.fullmatch(path.name) is not None
+
+
+def has_lists(folder: pathlib.Path) -> bool:
+    """Return whether a folder holds the lists of any set."""
+    return folder.is_dir() and bool(_find(folder))
+
+
+def _find(folder: pathlib.Path) -> dict[str, _Lists]:
+    """Find the files of every set that lists a database, by the prefix of their names."""
+    sets: dict[str, _Lists] = {}
+    for path in sorted(folder.glob("*.npy")):
+        parts = _FILE.fullmatch(path.name)
+        if parts is not None:
+            sets.setdefault(parts["prefix"], {})[parts["kind"]] = path
+    return {prefix: files for prefix, files in sets.items() if "dbImages" in files}
+
+
+def _choose(root: pathlib.Path, split: str | None) -> tuple[str, _Lists]:
+    """Find the lists of the one set that a file or a split names."""
+    parts = _FILE.fullmatch(root.name) if root.is_file() else None
+    folder = root if parts is None else root.parent
+    if not folder.is_dir():
+        raise InputError(f"{root}: found {listing(root)}, expected a folder with ..._dbImages.npy")
+    there = _find(folder)
+    sets = {
+        prefix: files
+        for prefix, files in there.items()
+        if (parts is None or prefix == parts["prefix"])
+        and (split is None or split in prefix.split("_"))
+    }
+    if len(sets) != 1:
+        names = ", ".join(prefix.strip("_") or "dbImages.npy" for prefix in there) or "no set"
+        asked = "" if split is None else f" and split {split!r}"
+        raise InputError(
+            f"{root}: found lists of {names}{asked}, expected those of one: name a "
+            "..._dbImages.npy, or a split that one of them has in its name"
+        )
+    ((prefix, files),) = sets.items()
+    if "qImages" not in files or {"gt", "pIdx"} <= files.keys():
+        raise InputError(
+            f"{folder}: found {', '.join(path.name for path in files.values())}, expected "
+            f"{prefix}qImages.npy, and one of {prefix}gt.npy and {prefix}pIdx.npy"
+        )
+    return prefix, files
+
+
+def _names(path: pathlib.Path) -> list[str]:
+    array = read_npy(path)
+    names = array.reshape(-1).tolist()
+    if array.ndim != 1 or not names or not all(isinstance(name, str) for name in names):
+        raise InputError(
+            f"{path}: found an array of {array.shape} of {array.dtype}, expected names of images"
+        )
+    return names
+
+
+def _chosen(path: pathlib.Path, queries: int) -> Int64[np.ndarray, " _"]:
+    """Read the indices of the queries that are evaluated."""
+    (chosen,) = _rows(path, [read_npy(path)])
+    unlike = len(np.unique(chosen)) == len(chosen) > 0
+    if not unlike or not 0 <= chosen.min() <= chosen.max() < queries:
+        raise InputError(
+            f"{path}: found {len(chosen)} indices, expected some from 0 to {queries - 1}, each once"
+        )
+    return chosen
+
+
+def _rows(path: pathlib.Path, rows: Iterable[Any]) -> _Matches:
+    """Convert the rows of a file to indices.
+
+    Raises:
+        InputError: a row is no number, flat list or array of integers.
+    """
+    found = []
+    for number, row in enumerate(rows):
+        try:
+            found.append(_indices(row))
+        except (TypeError, OverflowError) as error:
+            raise InputError(
+                f"{path}: row {number}: found {error}, expected whole numbers"
+            ) from error
+    return tuple(found)
+
+
+def _indices(value: Any) -> Int64[np.ndarray, " _"]:
+    """Convert a number, flat list or integer array to indices.
+
+    Nested lists are refused, not flattened: a pickle of a few hundred bytes can hold nested lists
+    of any size.
+    """
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        if value.size and value.dtype.kind not in "iu":
+            raise TypeError(f"values of type {value.dtype}")
+        return np.asarray(value).reshape(-1).astype(np.int64)
+    items = value.reshape(-1) if isinstance(value, np.ndarray) else value
+    items = items if isinstance(items, list | tuple | np.ndarray) else (items,)
+    for item in items:
+        if isinstance(item, bool | np.bool_) or not isinstance(item, int | np.integer):
+            raise TypeError(f"values of type {type(item).__name__}")
+    return np.array([int(item) for item in items], np.int64)
+
+
+def _read_matches(
+    path: pathlib.Path, rows: Iterable[Any], database: int, *, windows: bool = False
+) -> _Matches:
+    """Return the unique database indices of each row, ascending.
+
+    An index of -1 stands for no match (VPR-Bench) and is dropped.
+
+    Args:
+        path: the file, for messages.
+        rows: its rows: numbers, flat lists or integer arrays.
+        database: the number of images.
+        windows: whether indices after the last image are dropped too, where others are left.
+
+    Raises:
+        InputError: a row holds anything but indices of images.
+    """
+    matches, beyond = [], 0
+    for number, row in enumerate(_rows(path, rows)):
+        found = np.unique(row[row != -1])
+        if windows and found.size and 0 <= found[0] < database:
+            beyond += int((row >= database).sum())
+            found = found[found < database]
+        if found.size and not 0 <= found[0] <= found[-1] < database:
+            raise InputError(
+                f"{path}: row {number}: found reference indices {found[0]} to {found[-1]}, "
+                f"expected 0 to {database - 1}, or -1 for no match"
+            )
+        matches.append(found)
+    if beyond:
+        warn(
+            f"{path}: found {beyond} references after the last of {database} images, where windows "
+            "of frames end; left out"
+        )
+    return tuple(matches)
+
+
+def _is_nordland_star(positives: Sequence[Int64[np.ndarray, " _"]], database: int) -> bool:
+    """Return whether this is VPR-Bench's Nordland: query i matches 10i - 1, 10i and 10i + 1.
+
+    Its queries (2,760, summer) are every tenth frame of its database (27,592, winter).
+    """
+    return len(positives) > 1 and all(
+        references.tolist()
+        == [i for i in range(10 * query - 1, 10 * query + 2) if 0 <= i < database]
+        for query, references in enumerate(positives)
+    )

@@ -1,0 +1,191 @@
+"""Read CSV tables, and match the names of images in tables and lists with files.
+
+Windows writes backslashes between folders, and macOS accents as letters of their own (NFD).
+"""
+
+import csv
+import math
+import os
+import pathlib
+import unicodedata
+from collections.abc import Collection, Iterable, Iterator
+from typing import Any, NamedTuple
+
+from crisalad_jax.data.video import spelled
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import LARGEST, check_source
+
+
+class Row(NamedTuple):
+    """A row of a `Table`, with its fields by column."""
+
+    path: pathlib.Path
+    line: int
+    fields: dict[str, str]
+    has_commas: bool
+    """Whether decimals may have commas, because semicolons separate the fields."""
+
+    @property
+    def where(self) -> str:
+        """What a message about the row begins with: the file and the line."""
+        return f"{self.path}: line {self.line}"
+
+    def number(self, column: str, most: float = math.inf) -> float:
+        """Return a finite number of at most this size; next to a point, commas mean thousands.
+
+        Raises:
+            InputError: the field is not such a number.
+        """
+        text = self.fields[column]
+        try:
+            value = float(text.replace(",", ".") if self.has_commas and "." not in text else text)
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and abs(value) <= most):
+            limits = f" from -{most:g} to {most:g}" if most < math.inf else ""
+            raise InputError(f"{self.where}: {column}: found {text!r}, expected a number{limits}")
+        return value
+
+
+class Table(NamedTuple):
+    """A CSV file without its blank rows."""
+
+    path: pathlib.Path
+    columns: list[str]
+    """The first row, without spaces around its fields."""
+    lines: Iterator[tuple[int, list[str]]]
+    """Number and fields of every further row, as many as there are columns; they are read once."""
+    has_commas: bool
+
+    def rows(self) -> Iterator[Row]:
+        """Yield the rows with their fields by column, without spaces around them."""
+        for line, fields in self.lines:
+            texts = map(str.strip, fields)
+            by_column = dict(zip(self.columns, texts, strict=True))
+            yield Row(self.path, line, by_column, self.has_commas)
+
+    def named_rows(self) -> Iterator[tuple[str, Row]]:
+        """Yield the image's name and the row; a frame of a video is written as in `data.video`.
+
+        Raises:
+            InputError: a row has no name, or one that an earlier row has, however it is spelled.
+        """
+        lines: dict[str, int] = {}
+        for row in self.rows():
+            name = spelled(row.fields["name"])
+            if not name:
+                raise InputError(f"{row.where}: found no name, expected an image's")
+            if (before := lines.setdefault(normal_name(name), row.line)) != row.line:
+                raise InputError(
+                    f"{row.where}: found {name!r} twice, on line {before} too, expected it once"
+                )
+            yield name, row
+
+
+def read_table(path: pathlib.Path, *needed: str) -> Table:
+    """Read a table whose first row has the names of the columns.
+
+    The separator is a comma or, where the header has more of them, a semicolon. A spreadsheet's
+    byte order mark is dropped.
+
+    Args:
+        path: the file.
+        *needed: columns that it must have; without any, the first row may be one like the others.
+
+    Raises:
+        InputError: the file cannot be read, lacks a column or has one twice, or a row has other
+            than as many fields as the header.
+    """
+    check_source(path, "a table of UTF-8 CSV", largest=LARGEST)
+    lines = _lines(path)
+    separator, columns = next(lines)
+    missing = [name for name in needed if name not in columns]
+    if missing:
+        found = ", ".join(columns) or "none"
+        raise InputError(f"{path}: found columns {found}; missing {', '.join(missing)}")
+    twice = [name for name in columns if name and columns.count(name) > 1]
+    if twice and needed:
+        raise InputError(f"{path}: found the column {twice[0]} twice, expected it once")
+    return Table(path, columns, lines, separator == ";")
+
+
+def _lines(path: pathlib.Path) -> Iterator[tuple[Any, list[str]]]:
+    """Yield the separator and the columns, then the number and the fields of every row."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            first = file.readline()
+            file.seek(0)
+            separator = ";" if first.count(";") > first.count(",") else ","
+            reader = csv.reader(file, delimiter=separator)
+            columns = [column.strip() for column in next(filter(None, reader), [])]
+            yield separator, columns
+            for row in filter(None, reader):
+                if len(row) != len(columns):
+                    comma = len(row) > len(columns) and separator == ","
+                    hint = "; between commas a decimal is written with a point" if comma else ""
+                    raise InputError(
+                        f"{path}: line {reader.line_num}: found {len(row)} fields, expected "
+                        f"{len(columns)} ({separator.join(columns)}{hint})"
+                    )
+                yield reader.line_num, row
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read as UTF-8 CSV: {error}") from error
+
+
+def normal_name(name: str) -> str:
+    r"""Return a name with slashes, in normal form C.
+
+    Example:
+        >>> normal_name("caf" + "e\u0301" + "\\" + "1.jpg")
+        'café/1.jpg'
+    """
+    return unicodedata.normalize("NFC", name.replace("\\", "/"))
+
+
+def matched(names: Iterable[str], there: Collection[str]) -> dict[str, str]:
+    """Map each name to the existing name that it means; a name that means none is left out.
+
+    That is the name itself, or else one that differs only in slashes or its normal form.
+    """
+    found = {name: name for name in names}
+    if strange := [name for name in found if name not in there]:
+        by_normal_name = {normal_name(name): name for name in there}
+        for name in strange:
+            if (meant := by_normal_name.get(normal_name(name))) is None:
+                del found[name]
+            else:
+                found[name] = meant
+    return found
+
+
+class Disk:
+    """Finds files by names; each folder is listed once, as to stat each file is slow far away."""
+
+    def __init__(self) -> None:
+        """Begin without any listing."""
+        self._listings: dict[pathlib.Path, dict[str, str]] = {}
+
+    def find(self, root: pathlib.Path, name: str) -> pathlib.Path | None:
+        """Return the path below `root` that a name means; None where there is none."""
+        path = root / name
+        if (there := self.names(path.parent).get(path.name)) is not None:
+            return path.with_name(there)
+        path = root
+        for part in pathlib.PurePosixPath(normal_name(name)).parts:
+            if part not in ("/", ".."):
+                listing = self.names(path)
+                if (part := listing.get(part, "")) == "":
+                    return None
+            path = path / part
+        return path
+
+    def names(self, folder: pathlib.Path) -> dict[str, str]:
+        """Return the names in a folder, by themselves and by their `normal_name`."""
+        if folder not in self._listings:
+            try:
+                names = os.listdir(folder)
+            except OSError:
+                names = []
+            by_name = {name: name for name in names}
+            self._listings[folder] = {normal_name(name): name for name in names} | by_name
+        return self._listings[folder]
