@@ -11,11 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from crisalad_jax.checkpoints.safetensors_io import (
-    read_safetensors,
-    unseal,
-    write_sealed,
-)
+from crisalad_jax.checkpoints.safetensors_io import read_safetensors, unseal, write_sealed
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.part import fingerprint_fields, with_non_semantic_fields_of
 from crisalad_jax.config.plugins import changed_sources, sources_of
@@ -48,8 +44,6 @@ class Header:
     """Version of this package that wrote it."""
     parts: dict
     """Name and source's digest of every part."""
-    source_bytes: dict
-    """Digest of the bytes of every part's source."""
     aggregator: dict
     """What the aggregator keeps besides arrays."""
     model_sha256: str
@@ -199,8 +193,7 @@ def unpack_weights(
     params = _fill(config, arrays, path)
     own = config.aggregator.with_metadata(params.aggregator, header.aggregator)
     config.aggregator.check_backbone(own, params.backbone, str(path))
-    same_version = header.version == VERSION
-    changed = changed_sources(config, header.parts, same_version, header.source_bytes)
+    changed = changed_sources(config, header.parts)
     if changed:
         warn(
             f"{path}: found another source of {', '.join(changed)} than these weights were written "

@@ -26,7 +26,7 @@ from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.shapes import Bool, Float32, Int, Int32, Int64, UInt8
 
 if TYPE_CHECKING:  # who only reads images starts sooner without them
-    from crisalad_jax.data.augmentations import Augmentation
+    from crisalad_jax.data.augmentations.base import Augmentation
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -258,7 +258,7 @@ def batches_of_groups(
     if not 0 <= number < parts or batch_size % parts:
         raise InputError(f"part: found {part}, expected the i-th of n, which divides {batch_size}")
     how = Preparation(image_size, preprocessing.for_training())
-    from crisalad_jax.data.augmentations import AUGMENTATIONS
+    from crisalad_jax.data.augmentations.base import AUGMENTATIONS
 
     if any("#t=" in file for file in files.files):
         threads = min(threads, 1)  # more would read a video each, from its beginning

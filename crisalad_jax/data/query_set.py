@@ -8,10 +8,10 @@ import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
-from crisalad_jax.data.benchmarks.benchmark import check_radius, within
+from crisalad_jax.data.benchmarks.benchmark import Benchmark, check_radius, within
 from crisalad_jax.data.benchmarks.msls import is_msls, read_msls
 from crisalad_jax.data.benchmarks.on_disk import has_split
+from crisalad_jax.data.benchmarks.open import open_benchmark
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Int64

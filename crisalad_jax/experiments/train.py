@@ -7,7 +7,7 @@ from typing import Any
 
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.data.benchmarks import open_benchmark
-from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.named_places import TABLE
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.data.query_set import QuerySet, read_query_set

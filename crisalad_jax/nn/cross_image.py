@@ -13,17 +13,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from crisalad_jax.config.checks import check_types, require, require_fraction, require_positive
 from crisalad_jax.config.part import non_semantic_field
 from crisalad_jax.config.short_repr import short_repr
-from crisalad_jax.nn.attention import (
-    Attention,
-    dot_product_attention,
-)
-from crisalad_jax.nn.layers import (
-    at_least_float32,
-    dropout,
-    gelu,
-    linear,
-    split_key,
-)
+from crisalad_jax.nn.attention import Attention, dot_product_attention
+from crisalad_jax.nn.layers import at_least_float32, dropout, gelu, linear, split_key
 from crisalad_jax.nn.torch_layers import EncoderLayer, encoder_layer, init_encoder_layer
 from crisalad_jax.utils.devices import IMAGE, image_mesh
 from crisalad_jax.utils.pytree import pytree_dataclass

@@ -9,7 +9,6 @@ import numpy as np
 
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.loader import one_ahead, read_ahead
-from crisalad_jax.data.read_ahead import one_ahead, read_ahead
 from crisalad_jax.retrieval.chunks import UNIT_TOLERANCE, Block
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.shapes import Float, Float32, Int, Int64

@@ -19,7 +19,8 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.plugins import sources_of
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.loader import THREADS, ImageCache, OnBadImage
+from crisalad_jax.data.images import OnBadImage
+from crisalad_jax.data.loader import THREADS, ImageCache
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad
@@ -70,6 +71,7 @@ def fit(
     validation: Benchmark | None = None,
     initial: Crisalad | None = None,
     on_bad_image: OnBadImage = "stop",
+    num_workers: int = 0,
     num_threads: int | None = None,
     shard_state: bool = False,
     quiet: bool = False,
@@ -95,8 +97,8 @@ def fit(
         initial: parameters to start from; None starts from `init_crisalad` with the run's seed.
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them; validations
             leave them out.
-        num_threads: number of threads that read the training images; None is one for each core that
-            this process may use.
+        num_workers: processes that read the training images; 0 reads them by threads of this one.
+        num_threads: number of those threads; None is one for each core that this process may use.
         shard_state: keep what trains and its moments in shards, one a device, not whole on each.
         quiet: no progress bar.
 
@@ -119,8 +121,9 @@ def fit(
     """
     check_learns(config)
     threads = THREADS if num_threads is None else num_threads
-    if threads < 0:
-        raise InputError(f"num_threads: found {threads}, expected at least 0")
+    for name, count in (("num_workers", num_workers), ("num_threads", threads)):
+        if count < 0:
+            raise InputError(f"{name}: found {count}, expected at least 0")
     # What does not fit raises in all processes, before the first file is written.
     checksums = {
         "places": checksum_of_places(places),
@@ -136,6 +139,7 @@ def fit(
         *(config, places),
         part=(jax.process_index(), jax.process_count()),
         on_bad_image=on_bad_image,
+        num_workers=num_workers,
         threads=threads,
         cache=cache,
     )

@@ -8,7 +8,7 @@ import jax
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.public import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad, init_crisalad

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.loader import ImageCache, OnBadImage
+from crisalad_jax.data.images import OnBadImage
+from crisalad_jax.data.loader import ImageCache
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate

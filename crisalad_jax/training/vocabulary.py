@@ -20,7 +20,7 @@ from crisalad_jax.checkpoints.public import with_backbone_of
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config.checks import check_count, check_seed
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source

@@ -11,8 +11,6 @@ from jaxtyping import Array, Bool, Float, Int
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.transport.checks import (
-from crisalad_jax.transport.config import SinkhornConfig
-from crisalad_jax.transport.diagnose import (
     check_init,
     check_inputs,
     check_solution,

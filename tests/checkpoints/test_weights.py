@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import pathlib
+import re
 import struct
 import typing
 import warnings
@@ -18,11 +19,8 @@ import safetensors.numpy
 import crisalad_jax
 from crisalad_jax.checkpoints import weights
 from crisalad_jax.checkpoints.safetensors_io import write_sealed
-from crisalad_jax.checkpoints.weights import (
-    load_weights,
-    model_hash,
-    save_weights,
-)
+from crisalad_jax.checkpoints.weights import load_weights, model_hash, save_weights
+from crisalad_jax.config import source
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.plugins import load_plugin
@@ -80,7 +78,9 @@ def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
         "aggregator.sinkhorn.step": "sinkhorn",
         "aggregator.sinkhorn.gradient": "unrolled",
     }
-    assert {digest for _, digest in told["parts"].values()} == {None}  # the version says it
+    assert all(re.fullmatch("[0-9a-f]{64}", digest) for _, digest in told["parts"].values())
+    assert told["source_bytes"].keys() == told["parts"].keys()
+    assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in told["source_bytes"].values())
     assert header.keys() == named_leaves(params).keys()
     entry = header["aggregator.score.fc1.weight"]
     assert (entry["dtype"], entry["shape"]) == ("F32", [32, 16])
@@ -422,6 +422,12 @@ def brightest(features):
 '''
 
 
+def clear_digests() -> None:
+    """Read sources anew, as a later process does."""
+    source._file_digest.cache_clear()
+    source._bytes_digest.cache_clear()
+
+
 def save_brightest(path: pathlib.Path) -> ModelConfig:
     """Write a model of the plug-in's aggregator."""
     config = dataclasses.replace(WITHOUT_ENCODER, aggregator="brightest")
@@ -466,13 +472,18 @@ def notes_of(path: pathlib.Path) -> list[str]:
 
 
 @pytest.mark.usefixtures("_own_parts")
-def test_a_plug_in_whose_source_changed_is_told(tmp_path):
+def test_a_plug_in_whose_source_changed_is_told(tmp_path, monkeypatch):
     plugin, path = tmp_path / "plugin.py", tmp_path / "w.safetensors"
     plugin.write_text(PLUGIN)
     load_plugin(str(plugin))
     save_brightest(path)
     assert notes_of(path) == []
+    # A later process reads the file anew. Comments, docstrings and layout are no other source.
+    plugin.write_text("# Mine.\n" + PLUGIN.replace("The largest of all", "Maximum of") + "\n\n")
+    clear_digests()
+    assert notes_of(path) == []
     plugin.write_text(PLUGIN.replace("max(", "min("))
+    clear_digests()
     (note,) = notes_of(path)
     assert note == (
         f"{path}: found another source of aggregator brightest than these weights were written "

@@ -23,8 +23,7 @@ from crisalad_jax.checkpoints.public import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.config.checks import PATH, check_count, takes
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.data.images import read_pixels
-from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.images import OnBadImage, read_pixels
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.comparison.costs import (
@@ -54,11 +53,7 @@ from crisalad_jax.training.loop import fit
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target, real_path, split_markers, write_json
-from crisalad_jax.utils.locks import (
-    POLL,
-    BusyFolderError,
-    lock,
-)
+from crisalad_jax.utils.locks import POLL, BusyFolderError, lock
 from crisalad_jax.utils.output import Note
 from crisalad_jax.utils.target import target
 from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries

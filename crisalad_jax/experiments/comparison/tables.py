@@ -8,10 +8,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from crisalad_jax.evaluation.results import percent
-from crisalad_jax.experiments.comparison.ablation import AdapterCost
 from crisalad_jax.experiments.comparison.costs import AdapterCost
 from crisalad_jax.experiments.comparison.results import KS, Recall, Row, Summary
-from crisalad_jax.experiments.comparison.summary import KS, Recall, Row, Summary
 from crisalad_jax.experiments.report.page import PAGE, render
 from crisalad_jax.experiments.report.style import (
     COLOURS,

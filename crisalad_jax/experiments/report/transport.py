@@ -14,8 +14,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.patches import Patch
 
 from crisalad_jax.config.checks import takes
-from crisalad_jax.data.depth import as_rgb
 from crisalad_jax.data.images import read_pixels
+from crisalad_jax.data.prepare import as_rgb
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.experiments.report.gallery import thumbnail
 from crisalad_jax.experiments.report.style import GREY, INK, Picture

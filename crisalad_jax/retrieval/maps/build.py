@@ -13,7 +13,6 @@ import numpy as np
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.exif import exif_positions
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import ImageSource, check_rate_used, open_source

@@ -12,7 +12,7 @@ import numpy as np
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count, takes
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.loader import OnBadImage
+from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
