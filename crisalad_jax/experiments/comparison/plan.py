@@ -18,7 +18,8 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.part import parts_of
 from crisalad_jax.config.plugins import source_digest
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.benchmarks import Benchmark, leave_out_unreadable, open_benchmark
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.benchmarks.benchmark import leave_out_unreadable
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.experiments.comparison.methods import (
