@@ -71,7 +71,6 @@ def fit(
     validation: Benchmark | None = None,
     initial: Crisalad | None = None,
     on_bad_image: OnBadImage = "stop",
-    num_workers: int = 0,
     num_threads: int | None = None,
     shard_state: bool = False,
     quiet: bool = False,
@@ -97,7 +96,6 @@ def fit(
         initial: parameters to start from; None starts from `init_crisalad` with the run's seed.
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them; validations
             leave them out.
-        num_workers: processes that read the training images; 0 reads them by threads of this one.
         num_threads: number of those threads; None is one for each core that this process may use.
         shard_state: keep what trains and its moments in shards, one a device, not whole on each.
         quiet: no progress bar.
@@ -121,9 +119,8 @@ def fit(
     """
     check_learns(config)
     threads = THREADS if num_threads is None else num_threads
-    for name, count in (("num_workers", num_workers), ("num_threads", threads)):
-        if count < 0:
-            raise InputError(f"{name}: found {count}, expected at least 0")
+    if threads < 0:
+        raise InputError(f"num_threads: found {threads}, expected at least 0")
     # What does not fit raises in all processes, before the first file is written.
     checksums = {
         "places": checksum_of_places(places),
@@ -139,7 +136,6 @@ def fit(
         *(config, places),
         part=(jax.process_index(), jax.process_count()),
         on_bad_image=on_bad_image,
-        num_workers=num_workers,
         threads=threads,
         cache=cache,
     )

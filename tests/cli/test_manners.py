@@ -21,7 +21,8 @@ from crisalad_jax.cli import help as helping
 from crisalad_jax.cli import main
 from crisalad_jax.cli.common import console
 from crisalad_jax.cli.completion import completion_script
-from crisalad_jax.data.benchmarks import leave_out_unreadable, open_benchmark
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.benchmarks.benchmark import leave_out_unreadable
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate

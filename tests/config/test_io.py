@@ -96,8 +96,8 @@ def test_fields_left_out_take_their_defaults():
         ({"patience": "x"}, ["'x'", "config.patience"]),
         ({"cities": "Rome"}, ["'Rome'", "tuple, each text", "config.cities"]),
         (
-            {"loss": {"match_pml_zero": "no"}},
-            ["'no'", "True or False", "loss.match_pml_zero"],
+            {"loss": {"pml_compat": "no"}},
+            ["'no'", "True or False", "loss.pml_compat"],
         ),
         ({"model": {"aggregator": ["gem"]}}, ["['gem']", "config.model.aggregator"]),
         ({"model": {"aggregator": {"name": ["gem"]}}}, ["['gem']", "config.model.aggregator"]),

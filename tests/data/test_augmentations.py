@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 
 from crisalad_jax.data.augmentations import Augmentation, NoAugmentation
+from crisalad_jax.data.augmentations import rand_augment as module
 from crisalad_jax.data.augmentations.camera import CameraAugmentConfig
 from crisalad_jax.data.augmentations.light import LightAugmentConfig, light_augment
 from crisalad_jax.data.augmentations.rand_augment import (
@@ -13,7 +14,6 @@ from crisalad_jax.data.augmentations.rand_augment import (
     RandAugmentConfig,
     rand_augment,
 )
-from crisalad_jax.data.augmentations.rand_augment import rand_augment as module
 from crisalad_jax.utils.errors import InputError
 from parity.reference.augment import OPERATIONS as PILLOWS
 from parity.reference.augment import strengths as torchvisions

@@ -284,7 +284,7 @@ class AnyLocConfig(VladConfig):
         """Use the centroids as words."""
         return AnyLoc(centroids)
 
-    def bind(self, params: AnyLoc, backbone: Any) -> AnyLoc:
+    def attach_backbone_hash(self, params: AnyLoc, backbone: Any) -> AnyLoc:
         """Return the vocabulary with its backbone's digest."""
         return AnyLoc(params.words, _digest(backbone))
 

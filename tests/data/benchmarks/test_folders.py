@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crisalad_jax.data.benchmarks import open_benchmark
-from crisalad_jax.data.benchmarks.folders import read_folders
+from crisalad_jax.data.benchmarks import open_benchmark, read_folders
 from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import lists_of, touch, touch_all
 

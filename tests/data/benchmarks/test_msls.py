@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crisalad_jax.data.benchmarks import open_benchmark
-from crisalad_jax.data.benchmarks.msls import heading_difference, read_msls, read_msls_subtask
+from crisalad_jax.data.benchmarks import open_benchmark, read_msls, read_msls_subtask
+from crisalad_jax.data.benchmarks.msls import heading_difference
 from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import lists_of, touch
 

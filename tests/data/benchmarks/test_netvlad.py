@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from crisalad_jax.data.benchmarks import open_benchmark
-from crisalad_jax.data.benchmarks.netvlad import read_netvlad
+from crisalad_jax.data.benchmarks import open_benchmark, read_netvlad
 from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import lists_of, touch
 

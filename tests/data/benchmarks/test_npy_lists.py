@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crisalad_jax.data.benchmarks import open_benchmark
-from crisalad_jax.data.benchmarks.npy_lists import read_salad_lists, read_vpr_bench
+from crisalad_jax.data.benchmarks import open_benchmark, read_salad_lists, read_vpr_bench
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.data.benchmarks.trees import (

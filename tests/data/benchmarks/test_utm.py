@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crisalad_jax.data.benchmarks.utm import read_utm
+from crisalad_jax.data.benchmarks import read_utm
 from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import lists_of, touch, touch_all, utm_name, write_utm
 

@@ -4,8 +4,7 @@ import numpy as np
 import pyproj
 import pytest
 
-from crisalad_jax.data.benchmarks import open_benchmark
-from crisalad_jax.data.benchmarks.utm import read_utm
+from crisalad_jax.data.benchmarks import open_benchmark, read_utm
 from crisalad_jax.data.query_set import read_query_set
 from crisalad_jax.evaluation.leakage import near
 from crisalad_jax.utils.errors import InputError
