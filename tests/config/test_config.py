@@ -454,8 +454,7 @@ def test_one_patch_more_than_clusters_is_enough():
         (
             ModelConfig,
             {"aggregator": "gem-pyramid", "cross_image": CrossImageConfig(heads=5)},
-            "aggregator gem-pyramid: found tokens of 768 numbers, expected a multiple of the "
-            "cross-image encoder's 5 heads",
+            "CrossImageConfig.heads: found 5, expected a divisor of the 768 numbers of a token",
         ),
         (ModelConfig, {"aggregator": "class-token", "image_size": (28, 57)}, "found 28 x 57"),
         (NetVladConfig, {"clusters": 1}, "NetVladConfig.clusters: found 1, expected at least 2"),
@@ -514,12 +513,12 @@ def test_one_patch_more_than_clusters_is_enough():
         (
             ModelConfig,
             {"cross_image": CrossImageConfig(heads=12)},
-            "SaladConfig.cluster_dim: found 128, expected a multiple of .* 12 heads",
+            "CrossImageConfig.heads: found 12, expected a divisor of the 128 numbers of a token",
         ),
         (
             ModelConfig,
             {"aggregator": SaladConfig(token_dim=200)},
-            "SaladConfig.token_dim: found 200, expected a multiple of cluster_dim 128",
+            "whose global token has 200 numbers, expected a multiple of a local one's 128",
         ),
         (MultiSimilarityConfig, {"beta": 0.0}, "MultiSimilarityConfig.beta: found 0.0"),
         (LossConfig, {"miner_margin": -0.1}, "LossConfig.miner_margin: found -0.1"),
@@ -678,5 +677,5 @@ def test_a_model_without_adapters_cannot_train_them():
 def test_without_an_encoder_its_widths_need_not_fit():
     config = ModelConfig(cross_image=CrossImageConfig(layers=0, heads=7))
     assert config.descriptor_dim == 8448
-    with pytest.raises(InputError, match="7 heads"):
+    with pytest.raises(InputError, match="CrossImageConfig.heads: found 7"):
         dataclasses.replace(config, cross_image=CrossImageConfig(heads=7))

@@ -85,6 +85,8 @@ def test_a_model_rounds_where_its_backbone_needs_it() -> None:
 def test_a_backbone_of_any_size_is_not_rounded() -> None:
     @dataclasses.dataclass(frozen=True)
     class AnySize(ViTConfig):
+        any_size = True
+
         def grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
             return -(-image_size[0] // 16), -(-image_size[1] // 16)
 
