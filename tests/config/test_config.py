@@ -677,5 +677,5 @@ def test_a_model_without_adapters_cannot_train_them():
 def test_without_an_encoder_its_widths_need_not_fit():
     config = ModelConfig(cross_image=CrossImageConfig(layers=0, heads=7))
     assert config.descriptor_dim == 8448
-    with pytest.raises(InputError, match="CrossImageConfig.heads: found 7"):
+    with pytest.raises(InputError, match=r"CrossImageConfig\.heads: found 7"):
         dataclasses.replace(config, cross_image=CrossImageConfig(heads=7))
