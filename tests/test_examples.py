@@ -38,7 +38,7 @@ def example(name: str) -> ModuleType:
     """Load an example as --plugin does."""
     path = (EXAMPLES / f"{name}.py").resolve()
     plugins.load_plugin(str(path))
-    return next(sys.modules[module] for module, file in plugins._FILES.items() if file == path)
+    return sys.modules[plugins._LOADED[str(path)]]
 
 
 def plan_of(result: SinkhornResult) -> np.ndarray:

@@ -174,7 +174,7 @@ def dot_product_attention(
     values: Float[Array, "*batch key head dim"],
     *,
     mask: Bool[Array, "query key"] | None = None,
-    dropout_mask: Float[Array, "*batch head key query"] | None = None,
+    dropout_mask: Float[Array, "*#batch head key query"] | None = None,
 ) -> Float[Array, "*batch query head dim"]:
     """Average the values for every query, weighted by its scores' softmax times the dropout mask.
 

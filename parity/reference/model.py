@@ -184,8 +184,8 @@ def _aggregation(config: ModelConfig) -> nn.Module | None:
         return CosPlace(config.backbone.dim, found.dim)
     if isinstance(found, SuperVladConfig):
         return SuperVlad(config.backbone.dim, found.clusters, found.ghosts)
-    if isinstance(found, GemConfig):
-        return nn.Sequential(UnitPatches(), GeM())
     if isinstance(found, GemPyramidConfig):
         return nn.Sequential(UnitPatches(), GemPyramid())
+    if isinstance(found, GemConfig):
+        return nn.Sequential(UnitPatches(), GeM())
     return None

@@ -96,13 +96,14 @@ def _state_like(world: World) -> Any:
     import jax
 
     from crisalad_jax.checkpoints.weights import load_weights
+    from crisalad_jax.training.run_files import RunState
     from crisalad_jax.training.step import StepConfig, init_train_state
     from tests.conftest import RECIPE
 
     params, config = load_weights(world.weights)
     step = StepConfig(config, RECIPE.loss, RECIPE.optimiser, 6, 2, None, None, ())
     state, _ = init_train_state(params, RECIPE.trainable, step, key=jax.random.key(0))
-    return state
+    return RunState(state, None)
 
 
 def make_rest(folder: pathlib.Path) -> None:

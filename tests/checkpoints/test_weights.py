@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import pathlib
-import re
 import struct
 import typing
 import warnings
@@ -75,7 +74,8 @@ def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
         "aggregator.sinkhorn.step": "sinkhorn",
         "aggregator.sinkhorn.gradient": "unrolled",
     }
-    assert all(re.fullmatch("[0-9a-f]{64}", digest) for _, digest in told["parts"].values())
+    # Only a part from a user's file has a digest.
+    assert {digest for _, digest in told["parts"].values()} == {None}
     assert header.keys() == named_leaves(params).keys()
     entry = header["aggregator.score.fc1.weight"]
     assert (entry["dtype"], entry["shape"]) == ("F32", [32, 16])

@@ -187,8 +187,8 @@ def test_training_from_another_size_or_kind(capfd: Capture, tmp_path: pathlib.Pa
         ),
     )
     resnet = save(tmp_path / "cosplace.pth", cosplace())
-    words = "found a backbone resnet, expected vit"
-    with pytest.raises(InputError, match=f"^{resnet}: {words}$"):
+    words = "this backbone is another than the model's: backbone: found resnet, expected vit"
+    with pytest.raises(InputError, match=f"^{resnet}: {words}"):
         read_backbone(resnet, SALAD.backbone, None)
     assert not (tmp_path / "run").exists()
 

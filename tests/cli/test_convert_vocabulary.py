@@ -68,7 +68,7 @@ def test_what_does_not_belong_together(files, capfd, tmp_path: pathlib.Path) -> 
         read_vocabulary(words, backbone, {"layer": 5})
     with pytest.raises(InputError, match=r"dinov2.pth: found dict, expected one tensor"):
         read_vocabulary(backbone, backbone)
-    with pytest.raises(InputError, match=r"one tensor by itself, of shape .3, 64., .*--backbone"):
+    with pytest.raises(InputError, match=r"one tensor by itself, of shape .3, 64. .*--backbone"):
         read_checkpoint(words)
     torch.save(torch.full((3, 64), torch.nan), wide)
     with pytest.raises(InputError, match=r"wide.pt: the vocabulary holds NaN or infinity"):

@@ -125,7 +125,8 @@ def test_a_flag_that_is_not_common_still_parses_and_stands_in_the_whole_help(cap
     assert "--model.aggregator.sinkhorn" not in succeeds(capfd, "train", *part, "--help-all")
 
 
-def test_a_text_is_cut_after_a_clause_and_keeps_its_default(capfd):
+def test_a_text_is_cut_after_a_clause_and_keeps_its_default(capfd, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
     out = succeeds(capfd, "evaluate", "--help")
     assert "or hog, a baseline that learns nothing" in " ".join(out.split())
     assert "... (single,shuffled,sequential,window/single) --batch-size INT" in out

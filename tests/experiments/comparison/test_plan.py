@@ -175,7 +175,7 @@ def test_an_encoder_that_does_not_fit_one_of_them(flags, capfd, tmp_path, monkey
     )
     monkeypatch.setitem(PRESETS, "tiny", twelve)
     methods = ("--methods", "crisalad,cricavpr")
-    words = ("aggregator gem-pyramid: found tokens of 32 numbers", "encoder's 3 heads")
+    words = "CrossImageConfig.heads: found 3, expected a divisor of the 32 numbers of a token"
     fails(capfd, *flags, *methods, "--out", tmp_path / "out", words=words)
     assert not list(tmp_path.iterdir())
 

@@ -213,7 +213,7 @@ def test_a_published_file_comes_back_bit_for_bit(biases: bool) -> None:
     state = published_state(biases)
     assert infer(state, source="file") == ("dinov3", BACKBONE)
     params, extras = to_params(state, BACKBONE, "dinov3", source="file")
-    check_holds(BACKBONE, "dinov3", extras)
+    check_holds(BACKBONE, "dinov3")
     back = to_state(params, BACKBONE, "dinov3", extras)
     assert list(back) == list(state)
     for name, array in state.items():
@@ -246,5 +246,5 @@ def test_each_generation_keeps_to_its_layouts() -> None:
             check_holds(BACKBONE, layout)
     with pytest.raises(InputError, match="expected aggregator class-token, backbone dinov3,"):
         check_holds(dataclasses.replace(BACKBONE, backbone="vit"), "huggingface-dinov3")
-    with pytest.raises(InputError, match="expected a backbone vit, resnet or vgg"):
+    with pytest.raises(InputError, match="expected aggregator any, backbone vit or resnet or vgg"):
         check_holds(BACKBONE, "reference")

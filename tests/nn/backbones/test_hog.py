@@ -45,8 +45,7 @@ def test_its_file_is_its_configuration():
     assert config == CONFIG
     header = read_header(find_weights("hog"))
     assert header["model_sha256"] == model_hash(params, config)
-    # It has no weights to go with a state of the code.
-    assert header["parts"] == {}
+    assert header["parts"] == {"backbone": ["hog", None], "aggregator": ["class-token", None]}
 
 
 def _grey_picture(grey):
