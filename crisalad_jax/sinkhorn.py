@@ -1,4 +1,4 @@
-"""Entropic optimal transport for aggregation: the public face of `crisalad_jax.transport`.
+"""Entropic optimal transport for aggregation: the public face of `crisalad_jax.nn.transport`.
 
 The problem is that of Cuturi (NeurIPS 2013), in the form that SALAD (Izquierdo and Civera, CVPR
 2024) took from SuperGlue (Sarlin et al., CVPR 2020). Arrays are laid out (..., N, K): N rows
@@ -15,10 +15,10 @@ A step, a dustbin or a gradient of your own is registered as the built-in ones a
     solve(scores, log_mu, log_nu, config=SinkhornConfig(step="capacity"))
 """
 
-from crisalad_jax.transport.checks import marginal_error
-from crisalad_jax.transport.config import GRADIENTS, Gradient, SinkhornConfig, Solution
-from crisalad_jax.transport.differentiate import Implicit, Optimistix, Stop, Unrolled
-from crisalad_jax.transport.dustbin import (
+from crisalad_jax.nn.transport.checks import marginal_error
+from crisalad_jax.nn.transport.config import GRADIENTS, Gradient, SinkhornConfig, Solution
+from crisalad_jax.nn.transport.differentiate import Implicit, Optimistix, Stop, Unrolled
+from crisalad_jax.nn.transport.dustbin import (
     DUSTBINS,
     ColumnDustbin,
     Dustbin,
@@ -30,10 +30,10 @@ from crisalad_jax.transport.dustbin import (
     append_dustbin,
     log_marginals,
 )
-from crisalad_jax.transport.iterate import iterate
-from crisalad_jax.transport.problem import SCALING_RANGE, Potentials, Problem
-from crisalad_jax.transport.solve import SinkhornResult, assign_with_dustbin, solve
-from crisalad_jax.transport.steps import (
+from crisalad_jax.nn.transport.iterate import iterate
+from crisalad_jax.nn.transport.problem import SCALING_RANGE, Potentials, Problem
+from crisalad_jax.nn.transport.solve import SinkhornResult, assign_with_dustbin, solve
+from crisalad_jax.nn.transport.steps import (
     STEPS,
     DualSoftmaxStep,
     NewtonStep,

@@ -34,8 +34,6 @@ from transformers import (
 from crisalad_jax.checkpoints.formats import to_state
 from crisalad_jax.checkpoints.formats.format import encoder_lines
 from crisalad_jax.checkpoints.public import read_checkpoint, write_checkpoint
-from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig, vit
@@ -43,6 +41,8 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig, cross_image_encoder, init_cross_image
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.training.config import OptimiserConfig
+from crisalad_jax.training.losses import LossConfig
+from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.training.step import StepConfig, init_train_state, train_step
 from crisalad_jax.training.trainable import merge_params
 from parity.test_goldens import (

@@ -22,8 +22,6 @@ from pytorch_metric_learning.miners import MultiSimilarityMiner
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
@@ -34,6 +32,8 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.losses import LossConfig
+from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.utils.errors import InputError
 from parity.reference.adapter import ConvNorm, MultiResolutionAdapter
 from parity.reference.cross_image import CrossImageEncoder

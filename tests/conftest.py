@@ -29,8 +29,6 @@ from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import COLUMNS, read_places
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -40,6 +38,8 @@ from crisalad_jax.retrieval.describe import group, read_tokens
 from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.loop import fit
+from crisalad_jax.training.losses import LossConfig
+from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.pytree import named_leaves

@@ -129,7 +129,7 @@ def test_the_losss_gradient_is_finite_without_pairs() -> None:
     config = example("loss").cj.LossConfig(kind="soft-triplet")
 
     def loss(units: Any) -> Any:
-        from crisalad_jax.losses import metric_loss
+        from crisalad_jax.training.losses import metric_loss
 
         return metric_loss(units, jnp.arange(3), config).loss
 

@@ -21,9 +21,9 @@ from crisalad_jax.config import plugins
 from crisalad_jax.config.io import read_config, to_plain
 from crisalad_jax.config.plugins import load_plugin
 from crisalad_jax.config.registry import REGISTRIES
-from crisalad_jax.losses import LossConfig, metric_loss
 from crisalad_jax.nn.model import Model, describe
 from crisalad_jax.sinkhorn import SinkhornConfig, solve
+from crisalad_jax.training.losses import LossConfig, metric_loss
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.pytree import named_leaves
@@ -74,7 +74,7 @@ import crisalad_jax as cj
 @cj.register_step("newton")
 def mine(problem, potentials):
     return potentials
-""", "register_step 'newton': found the name taken by crisalad_jax.transport.steps.NewtonStep, "
+""", "register_step 'newton': found the name taken by crisalad_jax.nn.transport.steps.NewtonStep, "
         "expected another name for mine"),
     "thawed": ("""
 import dataclasses
@@ -501,7 +501,7 @@ def test_files_that_need_a_part_that_is_not_there_name_its_plug_in(
 @pytest.mark.parametrize(
     ("module", "home"),
     [
-        ("crisalad_jax.transport.steps", None),
+        ("crisalad_jax.nn.transport.steps", None),
         ("vpr_parts.gem", "vpr_parts.gem"),
         ("crisalad_jax_more.gem", "crisalad_jax_more.gem"),
         ("__main__", "train_mine.py"),

@@ -5,7 +5,7 @@ import os
 import pathlib
 
 from crisalad_jax.cli.common import find_given, say
-from crisalad_jax.serve import serve_map
+from crisalad_jax.retrieval.serve import serve_map
 from crisalad_jax.utils.files import read_text
 
 EXAMPLE = "crisalad serve --map corridor.map --port 8000"

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
-from crisalad_jax.losses import Loss
+from crisalad_jax.training.losses import Loss
 from crisalad_jax.utils.pytree import check_drawn
 
 

@@ -17,8 +17,8 @@ from crisalad_jax.config.part import OrName
 from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.data.augmentations import AUGMENTATIONS, Augmentation
-from crisalad_jax.losses import LossConfig
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.trainable import EXPECTED, TRAINABLE
 
 

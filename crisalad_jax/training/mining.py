@@ -14,8 +14,8 @@ from jaxtyping import Float, Int, Int32, Int64
 
 from crisalad_jax.data.loader import ImageBatch, batches_of_groups
 from crisalad_jax.data.query_set import QuerySet
-from crisalad_jax.losses.pairs import Role, tuple_labels
 from crisalad_jax.training.config import MiningConfig, TrainConfig
+from crisalad_jax.training.losses.pairs import Role, tuple_labels
 from crisalad_jax.utils.errors import InputError
 
 Describe = Callable[[Int[np.ndarray, " n"]], Float[np.ndarray, "n descriptor"]]

@@ -15,15 +15,6 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
 from crisalad_jax.config.checks import takes
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.losses import (
-    Loss,
-    LossConfig,
-    LossResult,
-    LossValue,
-    metric_loss,
-    tuple_pairs,
-)
-from crisalad_jax.losses.base import call_loss, check_value
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import split_key, split_statistics
 from crisalad_jax.nn.model import (
@@ -36,6 +27,15 @@ from crisalad_jax.nn.pixels import check_pixels
 from crisalad_jax.nn.tokens import TransportStatistics
 from crisalad_jax.training.classifier import Classifiers, init_classifiers, update_classifiers
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.losses import (
+    Loss,
+    LossConfig,
+    LossResult,
+    LossValue,
+    metric_loss,
+    tuple_pairs,
+)
+from crisalad_jax.training.losses.base import call_loss, check_value
 from crisalad_jax.training.optimiser import (
     count_steps,
     learning_rate_schedule,

@@ -11,8 +11,6 @@ import jax
 import torch
 from torch import Tensor
 
-from crisalad_jax.losses import LossConfig, all_pairs, metric_loss, mine
-from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.attention import attention
 from crisalad_jax.nn.backbones import Features
@@ -29,6 +27,8 @@ from crisalad_jax.nn.cross_image import cross_image_encoder
 from crisalad_jax.nn.model import Crisalad, describe
 from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.sinkhorn import assign_with_dustbin
+from crisalad_jax.training.losses import LossConfig, all_pairs, metric_loss, mine
+from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from parity.reference import losses as torch_losses
 from parity.reference import sinkhorn as torch_sinkhorn
 from parity.reference.model import Crisalad as TorchCrisalad

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.pairwise import MultiSimilarityConfig
+from crisalad_jax.training.losses import LossConfig
+from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from parity.reference.layers import at_least_float32
 
 

@@ -41,10 +41,10 @@ import jax  # isort: skip
 import jax.numpy as jnp  # isort: skip
 import torch  # isort: skip
 
-from crisalad_jax.losses import metric_loss
 from crisalad_jax.nn.costs import part_costs
 from crisalad_jax.nn.model import describe
 from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.losses import metric_loss
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.training.step import StepConfig, init_train_state, train_step
 from crisalad_jax.training.trainable import shards_batch

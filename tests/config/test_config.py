@@ -18,16 +18,6 @@ from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.experiments.demo import DemoConfig
-from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.large_margin_cosine import LargeMarginCosineConfig
-from crisalad_jax.losses.pairwise import (
-    CircleConfig,
-    ContrastiveConfig,
-    FastAPConfig,
-    MultiSimilarityConfig,
-    SupConConfig,
-    TripletConfig,
-)
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
@@ -45,6 +35,16 @@ from crisalad_jax.retrieval.pca import PcaConfig
 from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.synthetic import SyntheticCityConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.losses import LossConfig
+from crisalad_jax.training.losses.large_margin_cosine import LargeMarginCosineConfig
+from crisalad_jax.training.losses.pairwise import (
+    CircleConfig,
+    ContrastiveConfig,
+    FastAPConfig,
+    MultiSimilarityConfig,
+    SupConConfig,
+    TripletConfig,
+)
 from crisalad_jax.training.recipes import RECIPES, from_scratch, recipe
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note

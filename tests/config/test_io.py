@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from crisalad_jax.config.io import differences, from_plain, read_config, to_plain
-from crisalad_jax.losses import LOSSES
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.losses import LOSSES
 from crisalad_jax.training.recipes import RECIPES, recipe
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json

@@ -23,6 +23,7 @@ from crisalad_jax.data.places import Places
 from crisalad_jax.evaluation.metrics import PrecisionRecall
 from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.nn.model import parameter_shapes
+from crisalad_jax.nn.transport.solve import SinkhornResult
 from crisalad_jax.retrieval.extract import Extracted
 from crisalad_jax.retrieval.maps.build import Indexed
 from crisalad_jax.retrieval.maps.live import LiveAnswer
@@ -33,7 +34,6 @@ from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.training.recipes import RECIPES
 from crisalad_jax.training.summary import ModelSummary
 from crisalad_jax.training.vocabulary import Vocabulary
-from crisalad_jax.transport.solve import SinkhornResult
 from crisalad_jax.utils.pytree import summary
 
 NAMES = {

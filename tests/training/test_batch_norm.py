@@ -13,13 +13,13 @@ import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.places import read_places
-from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.model import describe, init_crisalad, tokens_and_statistics
 from crisalad_jax.training import run_files
 from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.training.loop import fit
+from crisalad_jax.training.losses import LossConfig
+from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.training.step import StepConfig, init_train_state, train_step
 from crisalad_jax.training.trainable import count_trainable, merge_params
 from crisalad_jax.utils.pytree import named_leaves

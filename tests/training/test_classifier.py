@@ -17,17 +17,17 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.places import Places, read_places
-from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.large_margin_cosine import (
-    LargeMarginCosineConfig,
-    large_margin_cosine_loss,
-)
 from crisalad_jax.nn.config import with_aggregator
 from crisalad_jax.nn.model import describe
 from crisalad_jax.training import run_files
 from crisalad_jax.training.classifier import init_classifiers, update_classifiers
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
+from crisalad_jax.training.losses import LossConfig
+from crisalad_jax.training.losses.large_margin_cosine import (
+    LargeMarginCosineConfig,
+    large_margin_cosine_loss,
+)
 from crisalad_jax.training.step import StepConfig, init_train_state, train_step
 from crisalad_jax.training.trainable import merge_params
 from crisalad_jax.utils.errors import InputError

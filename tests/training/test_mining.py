@@ -18,13 +18,13 @@ from crisalad_jax.data.loader import image_batches
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.query_set import QuerySet, read_query_set
 from crisalad_jax.experiments.train import train
-from crisalad_jax.losses import LossConfig, Role, metric_loss, tuple_labels, tuple_pairs
-from crisalad_jax.losses.pairwise import SelaVprLoss, TripletConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.model import describe
 from crisalad_jax.training import run_files
 from crisalad_jax.training.config import MiningConfig, TrainConfig
 from crisalad_jax.training.loop import fit
+from crisalad_jax.training.losses import LossConfig, Role, metric_loss, tuple_labels, tuple_pairs
+from crisalad_jax.training.losses.pairwise import SelaVprLoss, TripletConfig
 from crisalad_jax.training.mining import (
     Mined,
     Miner,

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.losses import LossConfig, metric_loss
-from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.queries import BoqConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -26,6 +24,8 @@ from crisalad_jax.nn.model import (
 )
 from crisalad_jax.sinkhorn import SinkhornConfig, SinkhornStep
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.losses import LossConfig, metric_loss
+from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.training.optimiser import learning_rate_schedule, make_optimiser
 from crisalad_jax.training.step import (
     StepConfig,

@@ -22,8 +22,6 @@ from crisalad_jax.checkpoints.load import load
 from crisalad_jax.checkpoints.starter import FILE
 from crisalad_jax.checkpoints.weights import load_weights, model_hash, save_weights
 from crisalad_jax.data.places import read_places
-from crisalad_jax.losses import LOSSES, LossConfig, metric_loss
-from crisalad_jax.losses.large_margin_cosine import large_margin_cosine_loss
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.aggregators.base import TokenShape
 from crisalad_jax.nn.config import PRESETS, ModelConfig, with_aggregator
@@ -31,6 +29,8 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, check_params, describe, init_crisalad, parameter_shapes
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.training.loop import fit
+from crisalad_jax.training.losses import LOSSES, LossConfig, metric_loss
+from crisalad_jax.training.losses.large_margin_cosine import large_margin_cosine_loss
 from crisalad_jax.training.optimiser import make_optimiser
 from crisalad_jax.training.step import init_train_state, make_train_step, step_config
 from crisalad_jax.training.vocabulary import with_vocabulary

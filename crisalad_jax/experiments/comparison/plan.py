@@ -31,12 +31,12 @@ from crisalad_jax.experiments.comparison.methods import (
     is_method,
     parse_row,
 )
-from crisalad_jax.losses import LossConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import parse_groupings
 from crisalad_jax.retrieval.reranking import parse_reranking
 from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.optimiser import count_steps, warmup_length, with_short_warmup
 from crisalad_jax.training.run_files import checksum_of_places
 from crisalad_jax.training.trainable import count_trainable

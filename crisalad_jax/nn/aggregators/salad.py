@@ -28,13 +28,9 @@ from crisalad_jax.nn.layers import (
     split_key,
 )
 from crisalad_jax.nn.tokens import Tokens, TransportStatistics
-from crisalad_jax.sinkhorn import (
-    DUSTBINS,
-    Dustbin,
-    SinkhornConfig,
-    SinkhornResult,
-    assign_with_dustbin,
-)
+from crisalad_jax.nn.transport.config import SinkhornConfig
+from crisalad_jax.nn.transport.dustbin import DUSTBINS, Dustbin
+from crisalad_jax.nn.transport.solve import SinkhornResult, assign_with_dustbin
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 

@@ -8,12 +8,12 @@ from typing import Any
 
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
-from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.large_margin_cosine import LargeMarginCosineConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.losses import LossConfig
+from crisalad_jax.training.losses.large_margin_cosine import LargeMarginCosineConfig
 from crisalad_jax.training.recipes.base import register_recipe
 from crisalad_jax.training.recipes.convolutional import model_over
 

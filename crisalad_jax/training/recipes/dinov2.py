@@ -9,12 +9,12 @@ from typing import Any
 
 from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
-from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.pairwise import SelaVprLoss
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import MiningConfig, OptimiserConfig, TrainConfig
+from crisalad_jax.training.losses import LossConfig
+from crisalad_jax.training.losses.pairwise import SelaVprLoss
 from crisalad_jax.training.recipes.base import register_recipe, resized, validation_size
 
 NO_ADAPTER = AdapterConfig(kind="none")

@@ -3,12 +3,12 @@
 import dataclasses
 
 from crisalad_jax.data.augmentations import NoAugmentation
-from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.pairwise import TripletConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import MiningConfig, OptimiserConfig, TrainConfig
+from crisalad_jax.training.losses import LossConfig
+from crisalad_jax.training.losses.pairwise import TripletConfig
 from crisalad_jax.training.recipes.base import register_recipe
 from crisalad_jax.training.recipes.convolutional import model_over
 

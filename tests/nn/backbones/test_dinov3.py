@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.formats import check_holds, infer, public_shapes, to_params, to_state
-from crisalad_jax.losses import LossConfig
-from crisalad_jax.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.attention import rotate
@@ -20,6 +18,8 @@ from crisalad_jax.nn.backbones.vit import ViT, vit
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.training.config import OptimiserConfig
+from crisalad_jax.training.losses import LossConfig
+from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.training.step import StepConfig, init_train_state, train_step
 from crisalad_jax.training.trainable import merge_params
 from crisalad_jax.utils.errors import InputError

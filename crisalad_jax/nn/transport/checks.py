@@ -10,8 +10,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.transport.config import SinkhornConfig, Solution
-from crisalad_jax.transport.problem import LOG_ZERO, Matrix, Potentials, Problem
+from crisalad_jax.nn.transport.config import SinkhornConfig, Solution
+from crisalad_jax.nn.transport.problem import LOG_ZERO, Matrix, Potentials, Problem
 from crisalad_jax.utils.pytree import expect_like
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from crisalad_jax.config.checks import require, require_fraction, require_positive
-from crisalad_jax.losses.base import (
+from crisalad_jax.training.losses.base import (
     LOSSES,
     Loss,
     LossBatch,

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from crisalad_jax.losses.base import Pairs, Similarities
+from crisalad_jax.training.losses.base import Pairs, Similarities
 
 
 def all_pairs(labels: Int[Array, " image"], *, valid: Bool[Array, " image"] | None = None) -> Pairs:

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.transport.config import GRADIENTS, Gradient, SinkhornConfig, Solution
-from crisalad_jax.transport.iterate import iterate
-from crisalad_jax.transport.problem import Potentials, Problem, ScalingProblem, product
-from crisalad_jax.transport.steps import solve_columns
+from crisalad_jax.nn.transport.config import GRADIENTS, Gradient, SinkhornConfig, Solution
+from crisalad_jax.nn.transport.iterate import iterate
+from crisalad_jax.nn.transport.problem import Potentials, Problem, ScalingProblem, product
+from crisalad_jax.nn.transport.steps import solve_columns
 from crisalad_jax.utils.target import target
 
 

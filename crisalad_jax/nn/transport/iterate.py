@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from crisalad_jax.transport.config import SinkhornConfig, Solution
-from crisalad_jax.transport.problem import (
+from crisalad_jax.nn.transport.config import SinkhornConfig, Solution
+from crisalad_jax.nn.transport.problem import (
     Potentials,
     Problem,
     ScalingProblem,

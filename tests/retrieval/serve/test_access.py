@@ -3,8 +3,8 @@
 import pytest
 
 from crisalad_jax.cli import main
-from crisalad_jax.serve import serve_map
-from crisalad_jax.serve.server import is_loopback
+from crisalad_jax.retrieval.serve import serve_map
+from crisalad_jax.retrieval.serve.server import is_loopback
 from crisalad_jax.utils.errors import InputError
 
 TOKEN = "0123456789abcdef"

@@ -12,9 +12,9 @@ from crisalad_jax.config.checks import require, takes
 from crisalad_jax.config.part import OrName
 from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.config.short_repr import short_repr
-from crisalad_jax.losses.base import LOSSES, Loss, LossBatch, Pairs, check_value
-from crisalad_jax.losses.pairs import all_pairs, mine
-from crisalad_jax.losses.pairwise import MultiSimilarityConfig
+from crisalad_jax.training.losses.base import LOSSES, Loss, LossBatch, Pairs, check_value
+from crisalad_jax.training.losses.pairs import all_pairs, mine
+from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 
 
 @short_repr("kind")

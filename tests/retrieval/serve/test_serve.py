@@ -28,12 +28,12 @@ from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.calibration import Calibration, write_calibration
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.query import answer_fields, query
-from crisalad_jax.serve.worker import ADDED
+from crisalad_jax.retrieval.serve.worker import ADDED
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.conftest import BATCH, MODEL, read_options, write_video
 from tests.data.test_sources import write_jpeg
-from tests.serve.conftest import LIMIT, serving
+from tests.retrieval.serve.conftest import LIMIT, serving
 
 # Batches of other sizes round otherwise; similarities are printed with six digits.
 ROUNDING = 5e-6
@@ -244,7 +244,9 @@ def test_a_picture_is_added_where_its_exif_data_says(shared, params, tmp_path, a
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 @pytest.mark.parametrize(("width", "height"), [(600, 350), (60, 350), (600, 60), (64, 76)])
 def test_the_map_is_drawn_in_any_window(width, height):
-    page = importlib.resources.files("crisalad_jax.serve").joinpath("page.html").read_text()
+    page = (
+        importlib.resources.files("crisalad_jax.retrieval.serve").joinpath("page.html").read_text()
+    )
     functions = re.findall(r"^function (?:plane|drawMap)\(.*?^}$", page, re.DOTALL | re.MULTILINE)
     assert len(functions) == 2
     program = f"""
@@ -333,7 +335,7 @@ def test_a_stale_search_is_told_at_the_start_and_by_health(own_map, params, pict
 def test_the_page_holds_all_it_shows(service):
     reply = service.ask("GET", "/")
     page = reply.data.decode()
-    file = importlib.resources.files("crisalad_jax.serve").joinpath("page.html")
+    file = importlib.resources.files("crisalad_jax.retrieval.serve").joinpath("page.html")
     suffixes = ",".join(IMAGE_SUFFIXES)
     assert page == file.read_text().replace("IMAGE_SUFFIXES", suffixes)
     assert f'accept="{suffixes}"' in page

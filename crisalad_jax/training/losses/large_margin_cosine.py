@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_fraction, require_positive
 from crisalad_jax.config.classes import ClassesConfig
-from crisalad_jax.losses.base import LOSSES, Loss, LossBatch, LossValue
+from crisalad_jax.training.losses.base import LOSSES, Loss, LossBatch, LossValue
 
 
 @LOSSES.register("large-margin-cosine")

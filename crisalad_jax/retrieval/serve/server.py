@@ -12,8 +12,8 @@ from starlette.types import ASGIApp
 
 from crisalad_jax.config.checks import check_count, require
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
-from crisalad_jax.serve.app import HEADERS, MOST_ANSWERS, bracketed, make_app
-from crisalad_jax.serve.worker import MapWorker
+from crisalad_jax.retrieval.serve.app import HEADERS, MOST_ANSWERS, bracketed, make_app
+from crisalad_jax.retrieval.serve.worker import MapWorker
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.signals import SignalState, defer_signals
 

@@ -14,7 +14,7 @@ from crisalad_jax.data.images import read_image
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.data.video import file_of
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.serve.worker import ADDED
+from crisalad_jax.retrieval.serve.worker import ADDED
 from crisalad_jax.utils.errors import InputError
 
 _PATIENCE = 60.0

@@ -24,9 +24,9 @@ from pytorch_metric_learning.losses import (
 )
 from pytorch_metric_learning.miners import MultiSimilarityMiner
 
-from crisalad_jax.losses import LossConfig, all_pairs, metric_loss, mine
-from crisalad_jax.losses.large_margin_cosine import large_margin_cosine_loss
-from crisalad_jax.losses.pairwise import (
+from crisalad_jax.training.losses import LossConfig, all_pairs, metric_loss, mine
+from crisalad_jax.training.losses.large_margin_cosine import large_margin_cosine_loss
+from crisalad_jax.training.losses.pairwise import (
     CircleConfig,
     ContrastiveConfig,
     FastAPConfig,

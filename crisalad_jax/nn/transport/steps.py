@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.registry import Registry, count_arguments
-from crisalad_jax.transport.problem import (
+from crisalad_jax.nn.transport.problem import (
     Columns,
     Matrix,
     Potentials,

@@ -33,8 +33,14 @@ from crisalad_jax.data.resize import Pixels
 from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.maps.map import Answer
 from crisalad_jax.retrieval.maps.query import answer_fields, position_fields
-from crisalad_jax.serve.pictures import check_new_name, read_thumbnail, receive_picture
-from crisalad_jax.serve.worker import Addition, MapFailedError, MapWorker, NameTakenError, Question
+from crisalad_jax.retrieval.serve.pictures import check_new_name, read_thumbnail, receive_picture
+from crisalad_jax.retrieval.serve.worker import (
+    Addition,
+    MapFailedError,
+    MapWorker,
+    NameTakenError,
+    Question,
+)
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.output import one_line, printable

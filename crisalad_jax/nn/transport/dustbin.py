@@ -13,7 +13,7 @@ from crisalad_jax.config.checks import require
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.registry import Registry
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.transport.problem import Matrix, Rows
+from crisalad_jax.nn.transport.problem import Matrix, Rows
 
 
 @brief

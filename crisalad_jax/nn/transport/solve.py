@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.transport.checks import (
+from crisalad_jax.nn.transport.checks import (
     check_init,
     check_inputs,
     check_solution,
@@ -19,10 +19,10 @@ from crisalad_jax.transport.checks import (
     marginal_error,
     wide_dtype,
 )
-from crisalad_jax.transport.config import SinkhornConfig
-from crisalad_jax.transport.differentiate import centred
-from crisalad_jax.transport.dustbin import DUSTBINS, Dustbin, check_marginals
-from crisalad_jax.transport.problem import Matrix, Potentials, Problem, zero_potentials
+from crisalad_jax.nn.transport.config import SinkhornConfig
+from crisalad_jax.nn.transport.differentiate import centred
+from crisalad_jax.nn.transport.dustbin import DUSTBINS, Dustbin, check_marginals
+from crisalad_jax.nn.transport.problem import Matrix, Potentials, Problem, zero_potentials
 from crisalad_jax.utils.errors import InputError
 
 

@@ -10,8 +10,8 @@ from crisalad_jax.config.checks import require, require_positive
 from crisalad_jax.config.part import OrName, Part
 from crisalad_jax.config.registry import Registry, part_field, resolve_names
 from crisalad_jax.config.short_repr import short_repr
-from crisalad_jax.transport.problem import Potentials, Problem
-from crisalad_jax.transport.steps import STEPS, Step
+from crisalad_jax.nn.transport.problem import Potentials, Problem
+from crisalad_jax.nn.transport.steps import STEPS, Step
 
 
 class Solution(NamedTuple):
