@@ -393,6 +393,6 @@ def test_annealing_that_never_cools_is_told() -> None:
 
 def test_a_step_that_learns_asks_for_its_parameters() -> None:
     example("plugins/learnt_epsilon")
-    words = "^step learnt-epsilon: found no step_params, expected those of its init_params, {'log_e"
+    words = "^step learnt-epsilon: found no step_params, expected those of its init_params"
     with pytest.raises(InputError, match=words):
         solve(*problem_of(), config=SinkhornConfig(step="learnt-epsilon"))
