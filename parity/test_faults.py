@@ -13,7 +13,7 @@ import pytest
 
 import crisalad_jax.nn.adapter
 import crisalad_jax.nn.backbones.vit
-import crisalad_jax.nn.cross_image
+import crisalad_jax.nn.torch_layers
 import parity.cases.case
 import parity.cases.parts
 import parity.cases.run
@@ -166,7 +166,7 @@ FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
     "epsilon of the encoder's norms": (
         "cross-image encoder",
         FORWARD,
-        replace(crisalad_jax.nn.cross_image, "NORM_EPSILON", lambda _: 1e-6),
+        replace(crisalad_jax.nn.torch_layers, "NORM_EPSILON", lambda _: 1e-6),
     ),
     "epsilon of batch norm": (
         "block, multi-resolution adapter",
