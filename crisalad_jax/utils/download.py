@@ -1,13 +1,10 @@
 """Download a file: tried again after a fault, resumed after a cut, and never half a file."""
 
-import contextlib
 import dataclasses
 import http.client
 import itertools
 import os
 import pathlib
-import shutil
-import ssl
 import time
 import urllib.error
 import urllib.request
@@ -24,6 +21,7 @@ _MEGABYTE = 1e6
 _PASSING = (408, 425, 429, 500, 502, 503, 504)
 """Codes of HTTP after which the same request may succeed."""
 _GONE = (404, 410)
+_PARTIAL, _NO_SUCH_RANGE = 206, 416
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,13 +29,9 @@ class RetryPolicy:
     """Timeouts and retries of a download."""
 
     timeout: float = 30.0
-    """Seconds without an answer, or with less than `least` bytes, before a server is given up."""
-    least: int = 2**14
-    """Bytes that have to arrive in that time."""
+    """Seconds without an answer before a server is given up."""
     attempts: int = 5
-    """Attempts in a row that bring less than `progress` bytes."""
-    progress: int = 2**20
-    """Bytes that an attempt has to bring for the count to begin again."""
+    """Attempts in a row that bring less than a megabyte."""
     pause: float = 1.0
     """Seconds before the second attempt; each further one waits twice as long."""
 
@@ -90,19 +84,16 @@ def download(
         'all of it'
     """
     policy = policy or RetryPolicy()
-    part = _Part(target)
-    failures = 0
+    part, failures = _Part(target), 0
     while True:
         before = part.size()
-        begun = part.begun(url)
         try:
-            try:
-                _fetch(url, part, begun, label, quiet, policy)
-            except _OtherFile:
-                _fetch(url, part, None, label, quiet, policy)
+            _fetch(url, part, label, quiet, policy.timeout)
             break
+        except _OtherFile:
+            part.discard()
         except _PassingFault as fault:
-            failures = 1 if part.size() - before >= policy.progress else failures + 1
+            failures = 1 if part.size() - before >= _MEGABYTE else failures + 1
             if failures >= policy.attempts:
                 raise InputError(
                     f"{url}: {fault}, expected the whole file (attempts: {failures}; the same "
@@ -111,7 +102,7 @@ def download(
             time.sleep(policy.pause * 2 ** (failures - 1))
     with wrap_os_errors(target):
         os.replace(part.path, target)
-        part.note.unlink(missing_ok=True)
+        part.discard()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,9 +111,8 @@ class _Remote:
 
     url: str
     length: int | None
-    etag: str | None
-    """Only a strong one: weak tags are of equal meanings, and not of equal bytes."""
-    modified: str | None
+    validator: str | None
+    """Its strong ETag (equal weak ones may be of unequal bytes), else its time of change."""
 
 
 class _Part:
@@ -131,49 +121,51 @@ class _Part:
     def __init__(self, target: pathlib.Path) -> None:
         self.target = target
         self.path = target.with_name(f"{target.name}.part")
-        self.note = target.with_name(f"{target.name}.part.json")
+        self._note = target.with_name(f"{target.name}.part.json")
 
     def size(self) -> int:
         return self.path.stat().st_size if self.path.is_file() else 0
 
+    def begin(self, remote: _Remote) -> None:
+        self.discard()  # first: a note is of the bytes next to it
+        write_json(self._note, dataclasses.asdict(remote))
+
     def discard(self) -> None:
         self.path.unlink(missing_ok=True)
-        self.note.unlink(missing_ok=True)
+        self._note.unlink(missing_ok=True)
 
     def begun(self, url: str) -> _Remote | None:
         """Return whose beginning this is; None where another file would not be noticed."""
         try:
-            begun = _Remote(**read_json(self.note, "a note of a download"))
-        except (InputError, TypeError):
+            begun = _Remote(**read_json(self._note, "a note of a download"))
+        except InputError:
             return None
-        if begun.url != url or begun.length is None or (begun.etag, begun.modified) == (None, None):
-            return None
-        return begun if 0 < self.size() <= begun.length else None
+        known = begun.url == url and begun.length and begun.validator
+        return begun if known and 0 < self.size() <= begun.length else None
 
 
-def _fetch(
-    url: str, part: _Part, begun: _Remote | None, label: str, quiet: bool, policy: RetryPolicy
-) -> None:
+def _fetch(url: str, part: _Part, label: str, quiet: bool, timeout: float) -> None:
     """Fetch the file, or what is missing after its beginning.
 
     Raises:
         _PassingFault: it did not all arrive.
-        _OtherFile: the server has another file than `begun`.
+        _OtherFile: the server has another file than the one that was begun.
         InputError: what `download` raises.
     """
-    start = 0 if begun is None else part.size()
-    if begun is not None and start == begun.length:
+    begun = part.begun(url)
+    start = part.size() if begun else 0
+    if begun and start == begun.length:
         return
     headers = {"User-Agent": f"crisalad-jax/{VERSION}", "Accept-Encoding": "identity"}
-    if begun is not None:
-        headers |= {"Range": f"bytes={start}-", "If-Range": begun.etag or begun.modified or ""}
-    with _opened(url, headers, policy.timeout) as response:
-        remote = _remote(url, response)
-        if getattr(response, "status", None) != 206:
-            start = 0  # the whole file, whether or not its beginning is here
-        elif begun is None or not _continues(response, remote, begun, start):
-            raise _OtherFile
-        chunks = _chunks(response, policy)
+    if begun:
+        headers |= {"Range": f"bytes={start}-", "If-Range": str(begun.validator)}
+    with _open(url, headers, timeout) as response:
+        if begun and response.status == _PARTIAL:
+            _check_continues(response.headers, begun, start)
+            remote = begun
+        else:  # the whole file, whether or not its beginning is here
+            start, remote = 0, _remote(url, response.headers)
+        chunks = _chunks(response)
         first = next(chunks, b"")
         is_page = response.headers.get_content_type() == "text/html" or is_html(first)
         if start == 0 and is_page:
@@ -181,17 +173,11 @@ def _fetch(
                 f"{url}: found a page of HTML, expected the file {part.target.name} (some hosts "
                 "send one after too many downloads, or where a file was removed)"
             )
-        missing = (remote.length or start) - start
-        if missing > (free := shutil.disk_usage(part.target.parent).free):
-            raise InputError(
-                f"{part.target}: found {free:,} bytes free on the disk, expected {missing:,}"
-            )
+        whole, done = (remote.length or 0) / _MEGABYTE, start / _MEGABYTE
         try:
             with wrap_os_errors(part.target):
                 if start == 0:
-                    part.discard()  # first: a note is of the bytes next to it
-                    write_json(part.note, dataclasses.asdict(remote))
-                whole, done = (remote.length or 0) / _MEGABYTE, start / _MEGABYTE
+                    part.begin(remote)
                 with (
                     part.path.open("ab") as file,
                     progress_bar(label, whole, "MB", quiet=quiet, done=done) as bar,
@@ -210,31 +196,27 @@ def _fetch(
         )
 
 
-def _continues(response: Any, remote: _Remote, begun: _Remote, start: int) -> bool:
-    """Return whether a partial answer goes on with a file; it need not tell the time of change."""
-    spans = response.headers.get("Content-Range", "").startswith(f"bytes {start}-")
-    same = (remote.length, remote.etag) == (begun.length, begun.etag)
-    return spans and same and remote.modified in (None, begun.modified)
-
-
-def _remote(url: str, response: Any) -> _Remote:
+def _remote(url: str, headers: Mapping[str, str]) -> _Remote:
     """Read what a server says of the whole file."""
-    headers: Mapping[str, str] = response.headers
-    length = headers.get("Content-Length")
-    if getattr(response, "status", None) == 206:
-        length = headers.get("Content-Range", "").rpartition("/")[2]
-    known = length is not None and length.isdecimal()
-    etag = headers.get("ETag")
-    return _Remote(
-        url,
-        int(length or 0) if known else None,
-        None if etag is None or etag.startswith("W/") else etag,
-        headers.get("Last-Modified"),
-    )
+    length, etag = headers.get("Content-Length", ""), headers.get("ETag", "W/")
+    validator = headers.get("Last-Modified") if etag.startswith("W/") else etag
+    return _Remote(url, int(length) if length.isdecimal() else None, validator)
 
 
-@contextlib.contextmanager
-def _opened(url: str, headers: Mapping[str, str], timeout: float) -> Iterator[Any]:
+def _check_continues(headers: Mapping[str, str], begun: _Remote, start: int) -> None:
+    """Check that a partial answer resumes the file that was begun.
+
+    Raises:
+        _OtherFile: it does not.
+    """
+    span = headers.get("Content-Range", "")
+    same = span.startswith(f"bytes {start}-") and span.endswith(f"/{begun.length}")
+    # An answer to `If-Range` need not repeat the time of change.
+    if not same or _remote(begun.url, headers).validator not in (None, begun.validator):
+        raise _OtherFile
+
+
+def _open(url: str, headers: dict[str, str], timeout: float) -> Any:
     """Open an address, and sort what may go wrong there.
 
     Raises:
@@ -242,54 +224,37 @@ def _opened(url: str, headers: Mapping[str, str], timeout: float) -> Iterator[An
         _OtherFile: the file is shorter than its beginning here.
         InputError: it will not succeed.
     """
-    with contextlib.ExitStack() as stack:
-        try:
-            request = urllib.request.Request(url, headers=dict(headers))
-            opener = urllib.request.build_opener()  # anew, for the environment's proxies of today
-            response = stack.enter_context(opener.open(request, timeout=timeout))
-        except urllib.error.HTTPError as error:
-            error.close()
-            said = f"HTTP {error.code} {error.reason}"
-            if error.code in _PASSING:
-                raise _PassingFault(f"found {said}") from error
-            if error.code == 416 and "Range" in headers:
-                raise _OtherFile from error
-            kind = MissingFileError if error.code in _GONE else InputError
-            raise kind(f"{url}: found {said}, expected the file") from error
-        except urllib.error.URLError as error:
-            if url.startswith("file:"):
-                raise MissingFileError(f"{url}: found no such file, expected one") from error
-            if isinstance(error.reason, ssl.SSLCertVerificationError):
-                raise InputError(f"{url}: found a certificate that does not hold") from error
-            raise _PassingFault(f"found no answer ({_reason(error.reason)})") from error
-        except (OSError, http.client.HTTPException) as error:
-            raise _PassingFault(f"found no answer ({_reason(error)})") from error
-        except ValueError as error:
-            raise InputError(f"{url}: found no address ({error}), expected one") from error
-        yield response
+    # A new opener reads the environment's proxies of today.
+    opener = urllib.request.build_opener()
+    try:
+        return opener.open(urllib.request.Request(url, headers=headers), timeout=timeout)
+    except urllib.error.HTTPError as error:
+        error.close()
+        said = f"HTTP {error.code} {error.reason}"
+        if error.code in _PASSING:
+            raise _PassingFault(f"found {said}") from error
+        if error.code == _NO_SUCH_RANGE and "Range" in headers:
+            raise _OtherFile from error
+        kind = MissingFileError if error.code in _GONE else InputError
+        raise kind(f"{url}: found {said}, expected the file") from error
+    except (OSError, http.client.HTTPException) as error:
+        if url.startswith("file:"):
+            raise MissingFileError(f"{url}: found no such file, expected one") from error
+        reason = _reason(getattr(error, "reason", error))
+        raise _PassingFault(f"found no answer ({reason})") from error
 
 
-def _chunks(response: Any, policy: RetryPolicy) -> Iterator[bytes]:
+def _chunks(response: Any) -> Iterator[bytes]:
     """Yield what arrives, until it ends.
 
     Raises:
-        _PassingFault: the connection breaks, stalls, or is slower than the policy allows.
+        _PassingFault: the connection breaks or stalls.
     """
-    since, arrived = time.monotonic(), 0
-    while True:
-        try:
-            chunk = response.read1(_CHUNK)
-        except (OSError, http.client.HTTPException) as error:
-            raise _PassingFault(f"found a broken connection ({_reason(error)})") from error
-        if not chunk:
-            return
-        arrived += len(chunk)
-        yield chunk
-        now = time.monotonic()
-        if now - since > policy.timeout:
-            if arrived < policy.least:
-                raise _PassingFault(f"found {arrived} bytes in {now - since:.0f} s")
-            since, arrived = now, 0
+    try:
+        while chunk := response.read1(_CHUNK):
+            yield chunk
+    except (OSError, http.client.HTTPException) as error:
+        raise _PassingFault(f"found a broken connection ({_reason(error)})") from error
 
 
 def _reason(error: object) -> str:

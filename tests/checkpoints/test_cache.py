@@ -56,7 +56,7 @@ MIT, GPL = (
 )
 NO_LICENCE = Licence("no licence file")
 # Long enough for loopback on a loaded machine where nothing stalls.
-QUICK = RetryPolicy(timeout=5.0, least=1, attempts=2, pause=0.01)
+QUICK = RetryPolicy(timeout=5.0, attempts=2, pause=0.01)
 
 
 def state_bytes(seed: int, config: ModelConfig = CONFIG) -> bytes:
