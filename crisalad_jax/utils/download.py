@@ -140,8 +140,8 @@ class _Part:
             begun = _Remote(**read_json(self._note, "a note of a download"))
         except InputError:
             return None
-        known = begun.url == url and begun.length and begun.validator
-        return begun if known and 0 < self.size() <= begun.length else None
+        known = begun.url == url and begun.validator
+        return begun if known and 0 < self.size() <= (begun.length or 0) else None
 
 
 def _fetch(url: str, part: _Part, label: str, quiet: bool, timeout: float) -> None:
