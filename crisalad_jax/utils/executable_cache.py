@@ -62,7 +62,7 @@ def cache_executables() -> None:
 
 def cached_executable(
     function: Callable[..., Any],
-    compile: Callable[..., Any],
+    jitted: Any,
     args: Sequence[Any],
     kwargs: Mapping[str, Any],
     static_argnames: str | Sequence[str] = (),
@@ -71,27 +71,28 @@ def cached_executable(
 
     Args:
         function: what is traced, outside of other transformations, for this machine.
-        compile: compiles it for these arguments; returns a `jax.stages.Compiled`.
+        jitted: the same by `jax.jit`.
         args: positional arguments of the call.
         kwargs: arguments by name.
         static_argnames: names of those that are part of the program.
 
     Returns:
-        The call of the program; None where none is cached, as on accelerators.
+        The call of the program; None where none is cached: on accelerators, and of a function that
+        was made within another or has no name, since the key lacks what it has from there.
     """
     if _Folder.path is None or jax.default_backend() != "cpu" or jax.process_count() > 1:
         return None
-    names = {static_argnames} if isinstance(static_argnames, str) else set(static_argnames)
-    places = list(zip(_parameters(function), args, strict=False))
-    static = {n: each for n, each in (*places, *kwargs.items()) if n in names}
-    traced = tuple(each for n, each in places if n not in names)
-    by_name = {n: each for n, each in kwargs.items() if n not in names}
-    leaves, tree = jax.tree.flatten((traced, by_name))
+    if "<" in function.__qualname__:  # <locals>, <lambda>
+        return None
+    given = _signature(function).bind(*args, **kwargs).arguments
+    names = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
+    static = {name: given.pop(name) for name in sorted(names) if name in given}
+    leaves, tree = jax.tree.flatten(((), given))  # positional arguments, and those by name
     arrays = [_as_array(leaf) for leaf in leaves]
-    traced, by_name = jax.tree.unflatten(tree, arrays)
+    _, given = jax.tree.unflatten(tree, arrays)
     signature = (
         function,
-        tuple(sorted(static.items())),
+        tuple(static.items()),
         tree,
         tuple((leaf.aval, leaf.sharding, leaf.committed) for leaf in arrays),
     )
@@ -101,10 +102,10 @@ def cached_executable(
         program = _read(path, tree, _devices(arrays))
         if program is None:
             with _without_jaxs_cache():
-                program = compile(*args, **kwargs)
+                program = jitted.lower(**given, **static).compile()
             _write(path, program, tree)
         _programs[signature] = program
-    return functools.partial(program, *traced, **by_name)
+    return functools.partial(program, **given)
 
 
 @contextlib.contextmanager
@@ -127,13 +128,9 @@ def _as_array(leaf: Any) -> jax.Array:
     return leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf)
 
 
+_signature = functools.cache(inspect.signature)
 _programs: dict[Hashable, Any] = {}
 """Programs of this process, by all that they depend on."""
-
-
-@functools.cache
-def _parameters(function: Callable[..., Any]) -> tuple[str, ...]:
-    return tuple(inspect.signature(function).parameters)
 
 
 def _devices(arrays: Sequence[jax.Array]) -> list[Any]:
@@ -151,7 +148,7 @@ def _key(
 ) -> str:
     """Digest all that a program depends on: the same in every process."""
     words = [f"{function.__module__}.{function.__qualname__}", repr(tree)]
-    words += [f"{name}={_whole(value)}" for name, value in sorted(static.items())]
+    words += [f"{name}={_whole(value)}" for name, value in static.items()]
     words += [
         f"{leaf.aval.str_short()} {leaf.aval.weak_type} {leaf.committed} {leaf.sharding!r} "
         f"{sorted(device.id for device in leaf.sharding.device_set)}"
