@@ -158,7 +158,9 @@ def run_on_primary(work: Callable[[], _T]) -> _T:
     """
     if jax.process_count() == 1:
         return work()
-    error, value, message = None, None, {}
+    error: BaseException | None = None
+    value: Any = None
+    message: dict[str, Any] = {}
     if is_primary():
         try:
             value = work()

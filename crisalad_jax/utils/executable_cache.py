@@ -26,6 +26,7 @@ import numpy as np
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 
+from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.files import atomic_path, user_cache
 from crisalad_jax.utils.version import VERSION
 
@@ -147,17 +148,18 @@ def _key(
     arrays: Sequence[jax.Array],
 ) -> str:
     """Digest all that a program depends on: the same in every process."""
-    words = [f"{function.__module__}.{function.__qualname__}", repr(tree)]
-    words += [f"{name}={_whole(value)}" for name, value in static.items()]
-    words += [
-        f"{leaf.aval.str_short()} {leaf.aval.weak_type} {leaf.committed} {leaf.sharding!r} "
-        f"{sorted(device.id for device in leaf.sharding.device_set)}"
+    arguments = [
+        (leaf.aval.str_short(), leaf.aval.weak_type, leaf.committed, leaf.sharding, _ids(leaf))
         for leaf in arrays
     ]
-    digest = hashlib.sha256(_surroundings())
-    for word in words:
-        digest.update(f"{len(word)} {word}".encode())
-    return digest.hexdigest()
+    fixed = {name: _whole(value) for name, value in static.items()}
+    name = f"{function.__module__}.{function.__qualname__}"
+    words = repr((_surroundings(), name, tree, fixed, arguments))
+    return hashlib.sha256(words.encode()).hexdigest()
+
+
+def _ids(array: jax.Array) -> list[int]:
+    return sorted(device.id for device in array.sharding.device_set)
 
 
 def _whole(value: Any) -> str:
@@ -172,19 +174,15 @@ def _whole(value: Any) -> str:
 
 
 @functools.cache
-def _surroundings() -> bytes:
+def _surroundings() -> str:
     """Digest what all programs of a process depend on: code, versions, settings, processor."""
-    digest = hashlib.sha256()
-    root = pathlib.Path(__file__).parent.parent
-    for path in sorted(root.rglob("*.py")):
-        digest.update(f"{path.relative_to(root)} {path.stat().st_size} ".encode())
-        digest.update(path.read_bytes())
-    words = [VERSION, sys.version, *(importlib.metadata.version(name) for name in _TRACED_WITH)]
+    code = pathlib.Path(__file__).parent.parent
+    words = [f"{path.relative_to(code)} {sha256_of(path)}" for path in sorted(code.rglob("*.py"))]
+    words += [VERSION, sys.version, *(importlib.metadata.version(name) for name in _TRACED_WITH)]
     words += [f"{k}={v}" for k, v in sorted(os.environ.items()) if k.startswith(_SETTINGS)]
     words += [f"{k}={v}" for k, v in sorted(jax.config.values.items(), key=lambda pair: pair[0])]
     words += [str(jax.devices()), *_processor()]
-    digest.update("\n".join(words).encode())
-    return digest.digest()
+    return hashlib.sha256("\n".join(words).encode()).hexdigest()
 
 
 def _processor() -> list[str]:
