@@ -21,9 +21,10 @@ import safetensors.numpy
 import torch
 
 import crisalad_jax as cj
-import crisalad_jax.utils.download
+import crisalad_jax.checkpoints.download
 from crisalad_jax.checkpoints import cache
 from crisalad_jax.checkpoints.cache import cached_weights, is_cached
+from crisalad_jax.checkpoints.download import RetryPolicy
 from crisalad_jax.checkpoints.formats import VOCABULARY, public_shapes
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.public import read_checkpoint
@@ -34,7 +35,6 @@ from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import parameter_shapes
-from crisalad_jax.utils.download import RetryPolicy
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import CACHE, user_cache
 from crisalad_jax.utils.output import Note
@@ -88,7 +88,7 @@ def model(server: FileServer, tmp_path: pathlib.Path, monkeypatch: pytest.Monkey
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     # The stalls and pauses of the default would last for minutes.
-    monkeypatch.setattr(crisalad_jax.utils.download, "RetryPolicy", lambda: QUICK)
+    monkeypatch.setattr(crisalad_jax.checkpoints.download, "RetryPolicy", lambda: QUICK)
     tiny = Published(
         name="tiny-model",
         format="huggingface",

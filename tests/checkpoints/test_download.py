@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from crisalad_jax.utils.download import MissingFileError, RetryPolicy, download
+from crisalad_jax.checkpoints.download import MissingFileError, RetryPolicy, download
 from crisalad_jax.utils.errors import InputError
 from tests.file_server import FileServer, file_server
 
