@@ -32,7 +32,7 @@ def checksummed_json(value: Mapping[str, Any], indent: int | None = None) -> byt
     return data.replace(_BLANK.encode(), hashlib.sha256(data).hexdigest().encode(), 1)
 
 
-def check_sealed(data: bytes, digest: Any, path: object) -> None:
+def check_checksum(data: bytes, digest: Any, path: object) -> None:
     """Check that a file's bytes have the checksum that stands in them.
 
     Args:

@@ -15,7 +15,7 @@ from numpy.lib.format import dtype_to_descr, write_array_header_1_0
 
 from crisalad_jax.utils.checksums import (
     CHECKSUM,
-    check_sealed,
+    check_checksum,
     checksummed_json,
 )
 from crisalad_jax.utils.errors import InputError
@@ -194,7 +194,7 @@ def read_json(path: str | os.PathLike[str], expected: str, *, sealed: bool = Tru
     data = read_bytes(path, expected)
     value = parse_json(data, str(path), expected)
     if isinstance(value, dict) and CHECKSUM in value:
-        check_sealed(data, value.pop(CHECKSUM), path)
+        check_checksum(data, value.pop(CHECKSUM), path)
     elif sealed:
         raise InputError(f"{path}: found no checksum, expected {expected}")
     return value
