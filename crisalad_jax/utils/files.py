@@ -289,15 +289,21 @@ def atomic_path(
     """
     path = pathlib.Path(path)
     check_target(path)
-    with made_folder(path.parent), wrap_os_errors(path):
-        temporary = temporary_beside(path if within is None else within / path.name)
-        with in_use(temporary):
-            yield temporary
-            if durable:
-                _sync(temporary)
-            os.replace(temporary, path)
+    temporary = temporary_beside(path if within is None else within / path.name)
+    with _renamed_to(path, temporary):
+        yield temporary
         if durable:
-            _sync(path.parent)
+            _sync(temporary)
+    if durable:
+        _sync(path.parent)
+
+
+@contextlib.contextmanager
+def _renamed_to(path: pathlib.Path, temporary: pathlib.Path) -> Iterator[None]:
+    """Rename what the block makes as `temporary` to `path` on success, else remove it."""
+    with made_folder(path.parent), wrap_os_errors(path), in_use(temporary):
+        yield
+        os.replace(temporary, path)
 
 
 def _sync(path: pathlib.Path) -> None:
@@ -353,12 +359,10 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """
     path = pathlib.Path(path)
     check_new_folder(path)
-    with made_folder(path.parent), wrap_os_errors(path):
-        temporary = temporary_beside(path)
-        with in_use(temporary):
-            temporary.mkdir()
-            yield temporary
-            os.replace(temporary, path)
+    temporary = temporary_beside(path)
+    with _renamed_to(path, temporary):
+        temporary.mkdir()
+        yield temporary
 
 
 def check_new_folder(path: str | os.PathLike[str]) -> None:
