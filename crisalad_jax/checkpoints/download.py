@@ -22,18 +22,12 @@ _PASSING = (408, 425, 429, 500, 502, 503, 504)
 """Codes of HTTP after which the same request may succeed."""
 _GONE = (404, 410)
 _PARTIAL, _NO_SUCH_RANGE = 206, 416
-
-
-@dataclasses.dataclass(frozen=True)
-class RetryPolicy:
-    """Timeouts and retries of a download."""
-
-    timeout: float = 30.0
-    """Seconds without an answer before a server is given up."""
-    attempts: int = 5
-    """Attempts in a row that bring less than a megabyte."""
-    pause: float = 1.0
-    """Seconds before the second attempt; each further one waits twice as long."""
+_TIMEOUT = 30.0
+"""Seconds without an answer before a server is given up."""
+_ATTEMPTS = 5
+"""Attempts in a row that bring less than a megabyte."""
+_PAUSE = 1.0
+"""Seconds before the second attempt; each further one waits twice as long."""
 
 
 class MissingFileError(InputError):
@@ -48,14 +42,7 @@ class _OtherFile(Exception):
     """What is at an address is not the file whose beginning is here."""
 
 
-def download(
-    url: str,
-    target: pathlib.Path,
-    *,
-    label: str,
-    quiet: bool = False,
-    policy: RetryPolicy | None = None,
-) -> None:
+def download(url: str, target: pathlib.Path, *, label: str, quiet: bool = False) -> None:
     """Download a file to `target`, which appears when it is whole.
 
     The beginning of an unfinished file stays next to it, as `target`.part, with what the server
@@ -69,7 +56,6 @@ def download(
         target: the file, in a folder that is there and that no other process writes to.
         label: what is written in front of the progress bar.
         quiet: no progress bar.
-        policy: timeouts and retries; None is the default.
 
     Raises:
         MissingFileError: there is no such file.
@@ -83,23 +69,22 @@ def download(
         >>> target.read_text()
         'all of it'
     """
-    policy = policy or RetryPolicy()
     part, failures = _Part(target), 0
     while True:
         before = part.size()
         try:
-            _fetch(url, part, label, quiet, policy.timeout)
+            _fetch(url, part, label, quiet)
             break
         except _OtherFile:
             part.discard()
         except _PassingFault as fault:
             failures = 1 if part.size() - before >= _MEGABYTE else failures + 1
-            if failures >= policy.attempts:
+            if failures >= _ATTEMPTS:
                 raise InputError(
                     f"{url}: {fault}, expected the whole file (attempts: {failures}; the same "
                     "command goes on from there)"
                 ) from fault
-            time.sleep(policy.pause * 2 ** (failures - 1))
+            time.sleep(_PAUSE * 2 ** (failures - 1))
     with wrap_os_errors(target):
         os.replace(part.path, target)
         part.discard()
@@ -144,7 +129,7 @@ class _Part:
         return begun if known and 0 < self.size() <= (begun.length or 0) else None
 
 
-def _fetch(url: str, part: _Part, label: str, quiet: bool, timeout: float) -> None:
+def _fetch(url: str, part: _Part, label: str, quiet: bool) -> None:
     """Fetch the file, or what is missing after its beginning.
 
     Raises:
@@ -159,7 +144,7 @@ def _fetch(url: str, part: _Part, label: str, quiet: bool, timeout: float) -> No
     headers = {"User-Agent": f"crisalad-jax/{VERSION}", "Accept-Encoding": "identity"}
     if begun:
         headers |= {"Range": f"bytes={start}-", "If-Range": str(begun.validator)}
-    with _open(url, headers, timeout) as response:
+    with _open(url, headers) as response:
         if begun and response.status == _PARTIAL:
             _check_continues(response.headers, begun, start)
             remote = begun
@@ -216,7 +201,7 @@ def _check_continues(headers: Mapping[str, str], begun: _Remote, start: int) -> 
         raise _OtherFile
 
 
-def _open(url: str, headers: dict[str, str], timeout: float) -> Any:
+def _open(url: str, headers: dict[str, str]) -> Any:
     """Open an address, and sort what may go wrong there.
 
     Raises:
@@ -227,7 +212,7 @@ def _open(url: str, headers: dict[str, str], timeout: float) -> Any:
     # A new opener reads the environment's proxies of today.
     opener = urllib.request.build_opener()
     try:
-        return opener.open(urllib.request.Request(url, headers=headers), timeout=timeout)
+        return opener.open(urllib.request.Request(url, headers=headers), timeout=_TIMEOUT)
     except urllib.error.HTTPError as error:
         error.close()
         said = f"HTTP {error.code} {error.reason}"
