@@ -7,7 +7,6 @@ byte of the file counts.
 import hashlib
 import json
 import os
-import pathlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -62,36 +61,3 @@ class ChangedFileError(InputError):
 def tell_unchecked(path: object, missing: str = "no checksum") -> None:
     """Tell that a file, as of another program, has no checksum."""
     warn(f"{path}: found {missing}, as of other programs; not checked")
-
-
-_APPENDED = b"\nsha256 "
-_APPENDED_SIZE = len(_APPENDED) + 64 + 1
-
-
-def append_checksum(path: pathlib.Path) -> None:
-    """Append a line with the digest of the bytes before it, where readers of the format stop."""
-    line = _APPENDED + sha256_of(path).encode() + b"\n"
-    with path.open("ab") as file:
-        file.write(line)
-
-
-def check_appended(path: pathlib.Path) -> None:
-    """Check the line that `append_checksum` wrote; a note tells of a file without one.
-
-    Raises:
-        InputError: the file has other bytes than the line says.
-    """
-    with path.open("rb") as file:
-        size = max(0, os.fstat(file.fileno()).st_size - _APPENDED_SIZE)
-        file.seek(size)
-        line = file.read()
-        if not line.startswith(_APPENDED):
-            tell_unchecked(path)
-            return
-        file.seek(0)
-        digester = hashlib.sha256()
-        while size and (data := file.read(min(size, 2**20))):
-            digester.update(data)
-            size -= len(data)
-    if line != _APPENDED + digester.hexdigest().encode() + b"\n":
-        raise ChangedFileError(path)

@@ -86,23 +86,21 @@ def test_every_field_of_a_configuration_counts():
     assert executable_cache._whole(config) != executable_cache._whole(PRESETS["s14"])
 
 
-@pytest.mark.parametrize("name", ["JAX_ENABLE_X64", "XLA_FLAGS"])
-def test_surroundings_count(monkeypatch, name):
-    before = executable_cache._surroundings.__wrapped__()
-    assert executable_cache._surroundings.__wrapped__() == before
-    monkeypatch.setenv(name, "anything")
-    assert executable_cache._surroundings.__wrapped__() != before
-
-
-def test_the_code_counts(monkeypatch):
-    before = executable_cache._surroundings.__wrapped__()
-    digest = executable_cache.sha256_of
+def test_surroundings_count(monkeypatch):
+    def digest():
+        return executable_cache._surroundings.__wrapped__()
 
     def changed(path):
-        return digest(path) if path.name != "layers.py" else "another"
+        return "another" if path.name == "layers.py" else real(path)
 
+    found, real = [digest()], executable_cache.sha256_of
+    assert digest() == found[0]
+    for name in ("JAX_ENABLE_X64", "XLA_FLAGS"):
+        monkeypatch.setenv(name, "anything")
+        found.append(digest())
     monkeypatch.setattr(executable_cache, "sha256_of", changed)
-    assert executable_cache._surroundings.__wrapped__() != before
+    found.append(digest())
+    assert len(set(found)) == 4
 
 
 @pytest.mark.parametrize("damage", [lambda data: data[:-1], lambda data: data[:40] + b"?" * 60])
@@ -126,7 +124,10 @@ def test_what_others_may_write_is_not_run(folder, monkeypatch):
     function(TREE, factor=3)
     (path,) = programs(folder)
     path.chmod(0o666)
-    assert executable_cache._read(path, None, []) is None
+    next_process(monkeypatch)
+    again, traces = counting()
+    again(TREE, factor=3)
+    assert traces == [3]
     folder.chmod(0o777)
     monkeypatch.setattr(executable_cache._Folder, "path", None)
     executable_cache.cache_executables()
