@@ -1,6 +1,6 @@
 """Checksums: a file that this package writes holds the SHA-256 of its own bytes.
 
-The digest stands in the file's text, and is computed as if its digits were zeros there. So every
+The digest is part of the file's text, and is computed as if its digits were zeros there. So every
 byte of the file counts.
 """
 
@@ -32,7 +32,7 @@ def checksummed_json(value: Mapping[str, Any], indent: int | None = None) -> byt
 
 
 def check_checksum(data: bytes, digest: Any, path: object) -> None:
-    """Check that a file's bytes have the checksum that stands in them.
+    """Check that a file's bytes have the checksum that is among them.
 
     Args:
         data: the bytes.
@@ -59,5 +59,5 @@ class ChangedFileError(InputError):
 
 
 def tell_unchecked(path: object, missing: str = "no checksum") -> None:
-    """Tell that a file, as of another program, has no checksum."""
+    """Warn that a file, as of another program, has no checksum."""
     warn(f"{path}: found {missing}, as of other programs; not checked")

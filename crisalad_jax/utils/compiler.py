@@ -172,10 +172,10 @@ def set_up() -> Session:
 
 def configure() -> None:
     """Configure devices and the compile cache of `set_up`, and start no device."""
-    told = "JAX_NUM_CPU_DEVICES" in os.environ or "host_platform_device_count" in os.environ.get(
+    is_set = "JAX_NUM_CPU_DEVICES" in os.environ or "host_platform_device_count" in os.environ.get(
         "XLA_FLAGS", ""
     )
-    if not told and jax.config.jax_num_cpu_devices < 1:  # pyright: ignore
+    if not is_set and jax.config.jax_num_cpu_devices < 1:  # pyright: ignore
         with contextlib.suppress(RuntimeError):  # JAX has been used already
             jax.config.update("jax_num_cpu_devices", usable_cores())
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore

@@ -148,7 +148,7 @@ def over_images(argument: str, position: int) -> Callable[[_F], _F]:
     """
 
     def decorate(function: _F) -> _F:
-        def told(call: Callable[..., Any]) -> Callable[..., Any]:
+        def with_mesh(call: Callable[..., Any]) -> Callable[..., Any]:
             @functools.wraps(call)
             def within(*args: Any, **options: Any) -> Any:
                 images = args[position] if len(args) > position else options.get(argument)
@@ -157,8 +157,8 @@ def over_images(argument: str, position: int) -> Callable[[_F], _F]:
 
             return within
 
-        wrapped = told(function)
-        wrapped.__dict__["lower"] = told(getattr(function, "lower"))  # noqa: B009
+        wrapped = with_mesh(function)
+        wrapped.__dict__["lower"] = with_mesh(getattr(function, "lower"))  # noqa: B009
         return cast(_F, wrapped)
 
     return decorate

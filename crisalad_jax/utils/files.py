@@ -369,7 +369,8 @@ def check_new_folder(path: str | os.PathLike[str]) -> None:
     """Check that a folder can be made at `path`, where there may be an empty one.
 
     Raises:
-        InputError: there is a file, or a folder that holds something; or as `check_target`.
+        InputError: there is a file, or a folder that holds something or that this runs in; or
+            nothing can be made there.
     """
     path = pathlib.Path(path)
     found = _found_instead(path) or "a file"
