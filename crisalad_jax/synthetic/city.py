@@ -120,7 +120,7 @@ def _train_images(config: SyntheticCityConfig, city: int) -> Iterator[TrainImage
     for place_id, index in enumerate(indices, start=1):
         spot = _Spot(place_seed(config, 0, index), index, config.train_places)
         seasons, hours = spot.rng.permutation(4), spot.rng.permutation(4)
-        order = list(zip(seasons, hours, strict=True))
+        order = zip(seasons, hours, strict=True)
         for view in [_draw_view(spot.rng, SEASONS[s], _HOURS[h]) for s, h in order]:
             east, north, northdeg = spot.pose(view)
             lat = f"{latitude + north / METRES_PER_DEGREE:.7f}"

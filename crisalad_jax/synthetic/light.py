@@ -45,10 +45,6 @@ _INDOORS: dict[Time, Light] = {
     "night": _light("72 71 69, 22 22 21, 6 6 10, 6 6 10", elevation=65.0, lit=0.8),
 }
 """Light indoors; the sky is what windows show."""
-_COMPASS: dict[Time, float] = {"noon": 180.0, "dusk": 270.0, "night": 180.0}
-"""Degrees clockwise from north of the sun."""
-
-
 _AIRS: dict[Weather, tuple[float, ...]] = {
     "clear": (1.0, 1.0, 0.0, 1.0, 900.0),
     "overcast": (0.12, 1.2, 0.8, 0.95, 500.0),
@@ -107,7 +103,7 @@ def light_of(view: View, place: Place, rng: Rng) -> Light:
             veil=horizon,
             visibility=visibility,
         )
-    compass = _COMPASS[view.time] + rng.uniform(-50, 50)
+    compass = (270.0 if view.time == "dusk" else 180.0) + rng.uniform(-50, 50)
     azimuth, elevation = np.deg2rad(compass - place.bearing), np.deg2rad(light.elevation)
     level = np.cos(elevation)
     to_sun = np.array((np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level))

@@ -43,13 +43,10 @@ The sun's place, the clouds and the white balance come of a picture's seed, whic
 VARIATIONS: tuple[Variation, ...] = get_args(Variation)
 _FIELDS: dict[Variation, tuple[str, ...]] = {
     "stand": ("lateral", "forward", "heading", "height", "pitch", "field"),
-    "season": ("season",),
-    "time": ("time",),
-    "weather": ("weather",),
     "traffic": ("occluders",),
     "exposure": ("exposure", "noise"),
 }
-"""Fields of `View` that are one variation."""
+"""Fields of `View` that are one variation, where that is not the field of its name."""
 _FILE = "world.json"
 _SCENES_PER_CITY = 12
 _SPACING = 100.0
@@ -174,8 +171,8 @@ def views(config: WorldConfig, seed: int, scenery: Scenery, station: int, rng: R
         field=camera.uniform(55.0, 95.0),
         pitch=camera.uniform(-4.0, 9.0),
     )
-    still = [name for one in _FIELDS if one not in config.varied for name in _FIELDS[one]]
-    fixed = {name: getattr(plain, name) for name in still}
+    still = [each for each in VARIATIONS if each not in config.varied]
+    fixed = {name: getattr(plain, name) for each in still for name in _FIELDS.get(each, (each,))}
     drawn = [_draw_view(plain, reach, config.repaint, rng) for _ in range(config.images_per_place)]
     return [dataclasses.replace(view, **fixed) for view in drawn]
 
