@@ -228,7 +228,7 @@ def _read_side(
 
     names = [f"{expected[number]}.jpg" for number in chosen]
     return _Side(
-        images=find_images(folder / "raw.csv", folder / "images", names, on_bad_image=on_bad_image),
+        images=find_images(folder / "raw.csv", names, [folder / "images"], on_bad_image),
         metres=numbers(placed, "easting", "northing"),
         degrees=numbers(raw, "lat", "lon"),
         headings=numbers(raw, "ca")[:, 0] if headings else np.zeros(len(chosen)),

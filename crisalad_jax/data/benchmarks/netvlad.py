@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark, check_radius, within
-from crisalad_jax.data.benchmarks.on_disk import find_image_root, find_images
+from crisalad_jax.data.benchmarks.on_disk import find_images, image_roots
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.mat_files import load_mat
@@ -60,8 +60,8 @@ def read_netvlad(
                 "at least one"
             )
         positions = np.ascontiguousarray(_numbers(path, struct, utm, len(names)).T, np.float64)
-        root = find_image_root(path, images, names, folders, on_bad_image=on_bad_image)
-        found.append((find_images(path, root, names, on_bad_image=on_bad_image), positions))
+        roots = image_roots(path, images, folders)
+        found.append((find_images(path, names, roots, on_bad_image), positions))
     (database, places), (queries, asked) = found
     which = " ".join(map(str, struct["whichSet"].reshape(-1)[:1]))
     return Benchmark(

@@ -17,7 +17,7 @@ import numpy as np
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.msls import msls_title
-from crisalad_jax.data.benchmarks.on_disk import find_image_root, find_images, list_part, listing
+from crisalad_jax.data.benchmarks.on_disk import find_images, image_roots, list_part, listing
 from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
@@ -132,10 +132,8 @@ def read_salad_lists(
         rule = f"the database images that {truth.name} lists"
     found = []
     for kind, folders in _FOLDERS.items():
-        folder = find_image_root(
-            files[kind], images, names[kind], folders, on_bad_image=on_bad_image
-        )
-        found.append(find_images(files[kind], folder, names[kind], on_bad_image=on_bad_image))
+        roots = image_roots(files[kind], images, folders)
+        found.append(find_images(files[kind], names[kind], roots, on_bad_image))
     cities = [_MSLS_IMAGE.fullmatch(name) for kind in names for name in names[kind]]
     if positives is not None and _is_nordland_star(positives, count):
         name = "Nordland*, winter database, summer queries (SALAD's lists)"
