@@ -383,7 +383,7 @@ def test_classes_by_position_say_what_they_lack(folders, table):
     if table:
         _table(folders, table)
     places = read_places(folders, min_images=1)
-    message = r"^.*mine: found no headings, or no positions .*'cells'; --loss[^\n]*$"
+    message = r"^.*mine: found no headings, or no positions, .*'cells'; --loss[^\n]*$"
     with pytest.raises(InputError, match=message):
         class_groups(places, ClassesConfig(kind="cells"), min_images=1, places_per_batch=1)
     # Classes that are the places need none.

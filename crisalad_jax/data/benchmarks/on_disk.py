@@ -107,16 +107,14 @@ def find_images(
     Args:
         named_by: the file.
         names: the images'.
-        roots: folders that names may be relative to: the first one that has the first image, or
-            under "skip" any.
+        roots: folders that names may be relative to, of which the first that has any is taken.
         on_bad_image: under "skip" some may be missing, and whoever reads them leaves them out.
 
     Raises:
         InputError: some are missing; how many, and which is the first.
     """
     disk = Disk()
-    sought = names if on_bad_image == "skip" else names[:1]
-    found = (root for root in roots if any(disk.find(root, name) is not None for name in sought))
+    found = (root for root in roots if any(disk.find(root, name) is not None for name in names))
     root = next(found, roots[0])
     paths = [disk.find(root, name) for name in names]
     missing = [name for name, path in zip(names, paths, strict=True) if path is None]
