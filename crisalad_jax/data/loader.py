@@ -20,7 +20,6 @@ from crisalad_jax.data.opencv import ONE_THREAD
 from crisalad_jax.data.places import Order, Places, epoch_batches
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.resize import Pixels
-from crisalad_jax.data.video import frame_time
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.shapes import Bool, Float32, Int, Int32, Int64, UInt8
@@ -274,7 +273,7 @@ def batches_of_groups(
             )
         return augmented
 
-    return _batches(
+    return read_batches(
         load,
         labels=labels.reshape(-1),
         indices=indices,
@@ -286,71 +285,7 @@ def batches_of_groups(
     )
 
 
-def image_batches(
-    paths: Sequence[str | os.PathLike[str]],
-    *,
-    image_size: Size,
-    batch_size: int,
-    preprocessing: PreprocessingConfig = PreprocessingConfig(),
-    side_multiple: int = 1,
-    check_size: Callable[[Size], None] | None = None,
-    on_bad_image: OnBadImage = "stop",
-    threads: int = THREADS,
-    cache: ImageCache | None = None,
-) -> Iterator[ImageBatch]:
-    """Yield batches of the images in `paths`, in order; the last one is padded to `batch_size`.
-
-    Where a rule gives images sizes of their own, consecutive images of one size make a batch, and
-    every change of size ends and pads one: then a `batch_size` of 1 saves work.
-
-    Under "skip" an image that cannot be read is not valid but keeps its index. The other arguments
-    are those of `training_batches`.
-
-    Args:
-        paths: image files.
-        image_size: height and width in pixels that images are resized to, or what the rule of
-            `preprocessing` takes from them.
-        batch_size: number of images of a batch.
-        preprocessing: how images are resized, and floats normalised.
-        side_multiple: number of pixels that sides are rounded to multiples of.
-        check_size: raises InputError for a height and width that no image may have.
-        on_bad_image: "stop" at an unreadable image, or "skip" it.
-        threads: how many decode ahead; 0 decodes in the caller's thread.
-        cache: holds decoded images.
-
-    Yields:
-        The batches: pixels, indices into `paths`, and which images are valid.
-
-    Raises:
-        InputError: at once for arguments out of range; while iterating under "stop" for an image
-            that cannot be read.
-
-    Example:
-        >>> paths = sorted(pictures.iterdir())
-        >>> batches = list(image_batches(paths, image_size=(98, 98), batch_size=3))
-        >>> [batch.valid.tolist() for batch in batches]
-        [[True, True, True], [True, False, False]]
-    """
-    if batch_size < 1:
-        raise InputError(f"batch_size: found {batch_size}, expected at least 1")
-    if any(frame_time(path) is not None for path in paths):
-        threads = min(threads, 1)  # more would read a video each, from its beginning
-    cache = cache or ImageCache(0)
-    how = Preparation(image_size, preprocessing, side_multiple)
-    indices = np.arange(len(paths))
-    return _batches(
-        lambda position: cache.read(paths[position], how, check_size),
-        labels=indices,
-        indices=indices,
-        positions=indices,
-        how=how,
-        batch_size=batch_size,
-        on_bad_image=on_bad_image,
-        threads=threads,
-    )
-
-
-def _batches(
+def read_batches(
     load: Callable[[int], Pixels],
     *,
     labels: np.ndarray,

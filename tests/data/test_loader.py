@@ -19,9 +19,10 @@ from crisalad_jax.data.augmentations import AUGMENTATIONS, NoAugmentation
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig, rand_augment
 from crisalad_jax.data.images import read_image
-from crisalad_jax.data.loader import ImageBatch, ImageCache, image_batches, training_batches
+from crisalad_jax.data.loader import ImageBatch, ImageCache, training_batches
 from crisalad_jax.data.places import Places, epoch_batches, read_places
 from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.data.reading import image_batches
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.utils.errors import InputError
 
@@ -379,7 +380,7 @@ def test_an_abandoned_iterator_stops_reading(places, monkeypatch):
 def test_an_abandoned_iterator_does_not_hold_up_the_exit(places):
     program = (
         "import sys\n"
-        "from crisalad_jax.data.loader import image_batches\n"
+        "from crisalad_jax.data.reading import image_batches\n"
         "batches = image_batches([sys.argv[1]] * 10**6, image_size=(28, 28), batch_size=4)\n"
         "next(batches)\n"
         "print('leaving')\n"

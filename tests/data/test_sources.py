@@ -12,8 +12,8 @@ from PIL.TiffImagePlugin import IFDRational
 
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.live import Camera
-from crisalad_jax.data.loader import image_batches
 from crisalad_jax.data.positions import Positions, exif_position, read_positions
+from crisalad_jax.data.reading import image_batches
 from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import file_of, frame_time, list_frames
 from crisalad_jax.utils.errors import InputError

@@ -14,9 +14,9 @@ import torch
 from crisalad_jax import recipe
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.augmentations import NoAugmentation
-from crisalad_jax.data.loader import image_batches
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.query_set import QuerySet, read_query_set
+from crisalad_jax.data.reading import image_batches
 from crisalad_jax.experiments.train import train
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.model import describe
