@@ -127,11 +127,11 @@ def joined(stream: Iterable[Block], size: int) -> Generator[Block, None, None]:
 def gathered(
     array: Float[np.ndarray, "n d"], places: Int[np.ndarray, " m"]
 ) -> Float[np.ndarray, "m d"]:
-    """Read the rows at some places in ascending order as float32, and release their pages."""
+    """Read the rows at some places in ascending order, and release their pages."""
     parts = []
     for start in range(0, len(places), _SCATTERED):
         some = places[start : start + _SCATTERED]
-        parts.append(_widened(array[some]))
+        parts.append(array[some])
         _let_go(array[some[0] : some[-1] + 1])
     return np.concatenate(parts)
 

@@ -53,7 +53,6 @@ class Describer(Protocol):
 
     def check_size(self, size: Size) -> None:
         """Raise InputError for a height and width that the model cannot describe."""
-        ...
 
     def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[Rows, ImageBatch]]:
         """Yield each batch with the tokens of its images, padding included, in order."""

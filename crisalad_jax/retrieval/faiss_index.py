@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import faiss as _faiss
 import numpy as np
 
-from crisalad_jax.config.checks import choose
+from crisalad_jax.config.checks import check_count, choose
 from crisalad_jax.retrieval.chunks import WIDE, as_rows, check_rows, sample
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.checksums import append_checksum, check_appended
@@ -80,9 +80,8 @@ class Index(NamedTuple):
             InputError: queries of another length, not finite or not of unit length; k or effort
                 below 1.
         """
-        for name, value in (("k", k), ("effort", effort)):
-            if value is not None and value < 1:
-                raise InputError(f"{name}: found {value}, expected at least 1")
+        check_count("k", k)
+        check_count("effort", 1 if effort is None else effort)
         queries = as_rows(queries, "queries")
         if queries.shape[1] != self.faiss_index.d:
             raise InputError(
@@ -229,7 +228,7 @@ def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
 
 
 def _first_line(error: BaseException) -> str:
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 def recall_against_exact(found: Int[np.ndarray, "q k"], exact: Int[np.ndarray, "q k"]) -> float:

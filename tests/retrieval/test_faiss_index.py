@@ -81,11 +81,6 @@ def test_the_parameters_are_those_that_are_documented(places, indexes):
     assert graph.hnsw.efConstruction == 128
 
 
-def test_another_seed_makes_other_lists(places, indexes):
-    other = build("ivf-pq", places[0], seed=4).search(places[1], 10)
-    assert not np.array_equal(other.similarities, indexes["ivf-pq"].search(places[1], 10)[1])
-
-
 def test_the_same_seed_makes_the_same_lists_of_a_memory_map(places, indexes, tmp_path, monkeypatch):
     np.save(tmp_path / "database.npy", places[0].astype(np.float16))
     mapped = np.load(tmp_path / "database.npy", mmap_mode="r")
@@ -114,13 +109,6 @@ def test_what_is_saved_comes_back(kind, places, indexes, tmp_path):
     ):
         np.testing.assert_array_equal(found, expected)
     assert [one.name for one in path.parent.iterdir()] == ["some.index"]
-
-
-def test_a_database_smaller_than_k_gives_what_it_has():
-    rows = np.eye(4, dtype=np.float32)
-    found = build("hnsw", rows).search(rows[:2], 20)
-    assert found.indices.shape == (2, 4)
-    np.testing.assert_array_equal(found.indices[:, 0], [0, 1])
 
 
 def test_neighbours_that_are_not_found_are_minus_one(places, indexes):

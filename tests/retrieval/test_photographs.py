@@ -155,11 +155,7 @@ def test_descriptors_of_all_sizes_in_order(folder: pathlib.Path, tmp_path: pathl
         reading=Reading(batch_size=2, quiet=True),
     )
     again = index(
-        Model(params, config),
-        folder,
-        place,
-        weights=weights,
-        reading=Reading(quiet=True),
+        Model(params, config), folder, place, weights=weights, reading=Reading(quiet=True)
     )
     assert (again.added, again.there) == (0, len(SHAPES))
     with pytest.raises(InputError, match=r"found images at 42 x 56, .* expected native size, "):
@@ -208,7 +204,7 @@ def test_local_features_need_a_fixed_size() -> None:
     config = dataclasses.replace(
         ALONE, image_size=(56, 56), aggregator=NetVladConfig(clusters=4)
     ).resized(None, ["native"])
-    words = "rerank: found a model with size rule native, expected fixed"
+    words = "rerank: found a model with aggregator netvlad and size rule native, expected"
     with pytest.raises(InputError, match=words):
         Reranking("patch-netvlad", 2).check(config)
 

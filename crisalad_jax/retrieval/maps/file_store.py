@@ -79,24 +79,13 @@ class FileStore:
     def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
         """Find the k most similar descriptors of each query; see `Store.search`."""
         queries = np.ascontiguousarray(queries, np.float32)
-        firsts = np.array([first for first in self._counts if first < count])
         size = max(1, _BLOCK // max(self._length, min(len(queries), QUERY_CHUNK)))
 
         def files() -> Iterator[Block]:
-            for first in firsts:
+            for first in [first for first in self._counts if first < count]:
                 yield from blocks(self._open(first), str(self._path(first)), size)
 
-        def read_rows(numbers: Int64[np.ndarray, " n"]) -> Float[np.ndarray, "n d"]:
-            segments = np.searchsorted(firsts, numbers, side="right") - 1
-            parts = [
-                gathered(
-                    self._open(firsts[segment]), numbers[segments == segment] - firsts[segment]
-                )
-                for segment in _distinct(segments)
-            ]
-            return np.concatenate(parts)
-
-        return nearest(lambda: joined(files(), size), queries, k, read_rows, 2 * size)
+        return nearest(lambda: joined(files(), size), queries, k, self.rows, 2 * size)
 
     def similarities(
         self, queries: Float32[np.ndarray, "q d"], numbers: Int64[np.ndarray, "q k"]
@@ -117,24 +106,19 @@ class FileStore:
             InputError: a file is damaged or gone.
         """
         firsts = np.array(list(self._counts))
-        wide = np.promote_types(self._dtype, np.float32)
-        rows = np.empty((len(numbers), self._length), wide)
-        segments = np.searchsorted(firsts, numbers, side="right") - 1
-        for segment in _distinct(segments):
-            places, first = np.flatnonzero(segments == segment), int(firsts[segment])
+        rows = np.empty((len(numbers), self._length), self._dtype)
+        files = firsts[np.searchsorted(firsts, numbers, side="right") - 1]
+        for first in sorted(set(files.tolist())):  # `np.unique` would import masked arrays
+            places = np.flatnonzero(files == first)
+            places = places[np.argsort(numbers[places], kind="stable")]
             mapped = self._mapped.get(first)
             if mapped is None:
                 if len(self._mapped) >= _MAPPED:
                     self._mapped.clear()
-                mapped = self._mapped[first] = self._open(first).view(np.ndarray)
-            rows[places] = mapped[numbers[places] - first]
+                mapped = self._mapped[first] = self._open(first)
+            rows[places] = gathered(mapped, numbers[places] - first)
         return rows
 
     def close(self) -> None:
         """Let go of files."""
         self._mapped.clear()
-
-
-def _distinct(numbers: Int64[np.ndarray, "*shape"]) -> list[int]:
-    """List each number once, in order; `np.unique` would import masked arrays into every query."""
-    return sorted(set(numbers.ravel().tolist()))

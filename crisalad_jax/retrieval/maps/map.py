@@ -10,9 +10,8 @@ import datetime
 import functools
 import os
 import pathlib
-import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, cast
 
 import numpy as np
 
@@ -30,15 +29,16 @@ from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import (
     Approximate,
     build_approximate,
+    check_search,
     open_approximate,
     stale_kind,
-    tell_stale,
 )
 from crisalad_jax.retrieval.maps.calibration import Calibration, read_calibration
 from crisalad_jax.retrieval.maps.contents import MapAddition, contents, with_addition
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.metadata import (
     COMPONENTS,
+    METADATA,
     SEGMENTS,
     MapMetadata,
     check_model,
@@ -46,17 +46,17 @@ from crisalad_jax.retrieval.maps.metadata import (
     model_config,
     read_components,
     read_metadata,
-    undone_without_images,
     weights_of,
     write_metadata,
 )
-from crisalad_jax.retrieval.maps.recovery import check_no_record_lost, remove_unrecorded
+from crisalad_jax.retrieval.maps.recovery import remove_unrecorded
 from crisalad_jax.retrieval.maps.store import open_store
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, save_pca
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import lock
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float, Float32
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
@@ -118,17 +118,15 @@ class Map:
         """The images by number."""
         self.additions: list[MapAddition] = []
         """What was appended, in order: from which folder, on which day, and how many images."""
-        self._numbers: dict[str, int] = {}
         self.axes: tuple[str, str] | None = None
         """Axes of the positions, see `positions.AXES`; None where no image has a position."""
         self.zone: Zone | None = None
         """Zone of UTM of all positions in metres east and north; None where it is unknown."""
-        self._segments = segments
-        self._close = weakref.finalize(self, segments.store.close)
         self.calibration: Calibration | None = None
         """What `calibrate` measured; None where it did not, or the map is open for appending."""
         self.components = read_components(folder, metadata)
         """The components that shorten descriptors, and those of queries; None is none."""
+        self._segments, self._numbers = segments, dict[str, int]()
         self._approximate: Approximate | None = None
         self._tells_stale = True
         """Whether the next search that is not asked to be exact tells why it is."""
@@ -170,20 +168,14 @@ class Map:
         metadata = read_metadata(folder)
         if metadata is None:
             raise InputError(
-                f"{folder}: found no map, expected a folder that `crisalad index` wrote"
+                f"{folder}: found no map, expected a folder that `crisalad index` put images into"
             )
-        if not has_images(folder):
-            raise InputError(f"{folder}: found a map without images, expected at least one")
         opened = cls._opened(folder, metadata)
-        try:
-            if calibrated:
-                opened.calibration = read_calibration(folder, metadata.model)
-            if verify and metadata.store == "files":
-                opened.verify()
-            opened._approximate = open_approximate(folder, opened._segments.spans, verify=verify)
-        except BaseException:
-            opened.close()
-            raise
+        if calibrated:
+            opened.calibration = read_calibration(folder, metadata.model)
+        if verify and metadata.store == "files":
+            opened.verify()
+        opened._approximate = open_approximate(folder, opened._segments.spans, verify=verify)
         return opened
 
     @classmethod
@@ -196,11 +188,7 @@ class Map:
             dtype=metadata.dtype,
             new=not has_images(folder),
         )
-        try:
-            return cls(folder, metadata, Segments(folder / SEGMENTS, store, metadata.dtype))
-        except BaseException:
-            store.close()
-            raise
+        return cls(folder, metadata, Segments(folder / SEGMENTS, store, metadata.dtype))
 
     def __enter__(self) -> Self:
         """Return the map itself."""
@@ -272,20 +260,22 @@ class Map:
             exact: whether to search exactly although the map has an approximate search.
 
         Raises:
-            InputError: no queries, none in the map, descriptors that are no unit vectors of the
-                map's length, k below 1; or the store is damaged or gone.
+            InputError: no queries, descriptors that are no unit vectors of the map's length, k
+                below 1; or the store is damaged or gone.
         """
         check_count("k", k)
-        if not len(self):
-            raise InputError(f"{self.folder}: found a map without images, expected at least one")
         self._check_descriptors("queries", queries)
         k = min(k, len(self))
         store = self._segments.store
         if self._approximate is not None and isinstance(store, FileStore) and not exact:
             return self._approximate.search(store, queries, k, len(self))
         if self._tells_stale and not exact:
-            tell_stale(self.folder, self._segments.spans)
             self._tells_stale = False
+            if (kind := self.stale_search) is not None:
+                warn(
+                    f"{self.folder}: found an approximate search of fewer or other images; the map "
+                    f"is searched exactly; `crisalad index --search {kind}` builds it anew"
+                )
         return store.search(queries, k, len(self))
 
     @property
@@ -316,14 +306,8 @@ class Map:
         Raises:
             InputError: an unknown kind, too few images, or a map in Milvus.
         """
-        self._approximate = build_approximate(
-            self.folder,
-            kind,
-            self._segments.spans,
-            self._segments.store,
-            self._segments.blocks,
-            quiet=quiet,
-        )
+        check_search(kind, self.metadata.store)
+        self._approximate = build_approximate(self.folder, kind, self._segments, quiet=quiet)
         return None if self._approximate is None else self._approximate.recall
 
     def locate(
@@ -368,7 +352,6 @@ class Map:
         """
         from crisalad_jax.retrieval.describe import describe_images
 
-        check_count("k", k)
         pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
         descriptor = describe_images(self.describer(model), [pixels])
         found = self.search(self.shorten(descriptor), k)
@@ -545,7 +528,7 @@ class Map:
                 any_grouping=set(groupings) != {"single"},
                 verify=verify,
             )
-            self._check_runtime(model, file)
+            self._check_describer(cast(Describer, model), file)
         self._describer = model, describer_of(model, groupings)
         return model
 
@@ -565,32 +548,25 @@ class Map:
         if model is None and self._describer is None:
             self.load_model(groupings=groupings)
         known = self._describer
-        if known is None or not (model is None or model is known[0]):
-            if isinstance(model, Runtime):
-                self._check_runtime(model, "the given model")
-                found = describer_of(model, groupings)
-            else:
-                if not isinstance(model, tuple):
-                    raise InputError(
-                        f"model: found {type(model).__name__}, expected a Model(params, config) or "
-                        "a Runtime"
-                    )
+        if known is None or (model is not None and model is not known[0]):
+            given: Any = model
+            if isinstance(model, tuple):
                 config = with_non_semantic_fields_of(self.config, model.config)
-                found = describer_of(model._replace(config=config), groupings)
-                check_model(self.metadata, self.folder, found.digest, "the given model")
-            known = self._describer = model, found
-        if isinstance(known[1], Runtime):
-            known[1].check_groupings(groupings)
-        return known[1]
+                given = model._replace(config=config)
+            known = model, describer_of(given, groupings)
+            self._check_describer(known[1], "the given model")
+            self._describer = known
+        return describer_of(known[1], groupings)
 
-    def _check_runtime(self, runtime: Runtime, given: object) -> None:
+    def _check_describer(self, describer: Describer, given: object) -> None:
+        quantised_from = getattr(describer, "quantised_from", None)
         check_model(
-            self.metadata, self.folder, runtime.digest, given, quantised_from=runtime.quantised_from
+            self.metadata, self.folder, describer.digest, given, quantised_from=quantised_from
         )
 
     def close(self) -> None:
-        """Close the store; a map that nothing refers to any more closes itself."""
-        self._close()
+        """Close the store; one that nothing refers to any more closes itself."""
+        self._segments.store.close()
 
 
 @contextlib.contextmanager
@@ -615,19 +591,28 @@ def open_for_appending(
         stack.enter_context(made_folder(folder / SEGMENTS))
         stack.enter_context(lock(folder))
         existing = read_metadata(folder)
+        if existing is not None and existing != metadata:
+            raise InputError(f"{folder}: found another map than was expected here")
         for each in (folder, folder / SEGMENTS):
             remove_temporaries(each)
-        check_no_record_lost(folder)  # first: what follows removes a map without images
-        stack.enter_context(undone_without_images(folder))
-        if existing != metadata:
-            if has_images(folder):
-                raise InputError(f"{folder}: found another map than was expected here")
-            if components is not None:
-                save_pca(folder / COMPONENTS, components)
-            write_metadata(folder, metadata)
-        opened = stack.enter_context(Map._opened(folder, metadata))
-        remove_unrecorded(folder, len(opened))
-        yield opened
+        if existing is None:
+            remove_unrecorded(folder, 0)
+        try:
+            if existing is None:
+                if components is not None:
+                    save_pca(folder / COMPONENTS, components)
+                write_metadata(folder, metadata)
+            opened = stack.enter_context(Map._opened(folder, existing or metadata))
+            if existing is not None:
+                remove_unrecorded(folder, len(opened))
+            yield opened
+        except BaseException:
+            if not has_images(folder):
+                for name in (METADATA, COMPONENTS):
+                    (folder / name).unlink(missing_ok=True)
+                for path in (folder / SEGMENTS).glob("[0-9]*.npy"):
+                    path.unlink()
+            raise
 
 
 def _inside(name: object) -> str:

@@ -20,6 +20,8 @@ from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL, read_options, write_video
 from tests.retrieval.maps.test_stores import ROUNDING
 
+QUIET = Reading(batch_size=BATCH, quiet=True)
+
 
 @pytest.fixture(scope="module")
 def folder(shared, params, tmp_path_factory):
@@ -27,13 +29,7 @@ def folder(shared, params, tmp_path_factory):
     out = tmp_path_factory.mktemp("live") / "map"
     images = shared / "town" / "images" / "test" / "database"
     weights = shared / "weights.safetensors"
-    index(
-        Model(params, MODEL),
-        images,
-        out,
-        weights=weights,
-        reading=Reading(batch_size=BATCH, quiet=True),
-    )
+    index(Model(params, MODEL), images, out, weights=weights, reading=QUIET)
     return out
 
 
@@ -63,7 +59,7 @@ def test_the_answers_are_those_of_query(folder, shared, params, window):
             model=Model(params, places.config),
             k=2,
             window=window,
-            reading=Reading(batch_size=BATCH, quiet=True),
+            reading=QUIET,
         )
         stream = query_live(
             places,
@@ -119,20 +115,9 @@ def test_a_map_of_a_video_tells_times(shared, params, tmp_path):
         assert {image.root for image in places.images} == {tmp_path.resolve().as_posix()}
         assert places.images[1].bytes == video.stat().st_size
         answers = query(
-            places,
-            list_frames(video, 1)[2],
-            model=Model(params, places.config),
-            k=1,
-            reading=Reading(batch_size=BATCH, quiet=True),
+            places, list_frames(video, 1)[2], model=Model(params, places.config), k=1, reading=QUIET
         )
-        whole = query(
-            places,
-            video,
-            model=Model(params, places.config),
-            fps=2,
-            k=1,
-            reading=Reading(batch_size=BATCH, quiet=True),
-        )
+        whole = query(places, video, model=Model(params, places.config), fps=2, k=1, reading=QUIET)
     (line,) = map(json.loads, json_lines(answers))
     assert (line["query"], line["time"]) == ("walk.avi#t=2.000", 2.0)
     assert line["neighbours"][0] == {
@@ -165,22 +150,14 @@ def test_a_filter_and_a_least_similarity_are_those_of_query(folder, shared, para
     with Map.open(folder) as places:
         options = {"k": 2, "sequence": BayesFilter(reach=1)}
         best = query(
-            places,
-            paths,
-            model=Model(params, places.config),
-            k=1,
-            reading=Reading(batch_size=BATCH, quiet=True),
+            places, paths, model=Model(params, places.config), k=1, reading=QUIET
         ).neighbours
         # In the widest gap between two of the queries: rounding does not decide.
         ordered = np.sort(best.similarities[:, 0])
         below = int(np.argmax(np.diff(ordered))) + 1
         options["min_similarity"] = float(ordered[below - 1] + ordered[below]) / 2
         expected = query(
-            places,
-            paths,
-            model=Model(params, places.config),
-            **options,
-            reading=Reading(batch_size=BATCH, quiet=True),
+            places, paths, model=Model(params, places.config), **options, reading=QUIET
         )
         found = list(
             query_live(places, Given(paths), model=Model(params, places.config), **options)
