@@ -151,10 +151,6 @@ def describe_images(
         (1, 576)
     """
     describer, reading = describer_of(model), Reading(batch_size=batch_size)
-    if isinstance(images, np.ndarray) and images.ndim in (2, 3):
-        raise InputError(
-            f"images: found one array of shape {images.shape}, expected a list of images"
-        )
     if not len(images):
         raise InputError("images: found none, expected at least one image")
     how = describer.preparation

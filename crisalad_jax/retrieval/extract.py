@@ -22,7 +22,7 @@ from crisalad_jax.data.images import check_lines, read_pixels
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import file_of, frame_time, name_frame
-from crisalad_jax.retrieval.chunks import check_all_rows, check_rows
+from crisalad_jax.retrieval.chunks import as_rows, check_all_rows, check_rows
 from crisalad_jax.retrieval.describe import described, grouped, joined, shown, token_rows
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.descriptor_files import (
@@ -521,10 +521,6 @@ def _others(
         return None
     listed, descriptors = read_descriptors(database, verify=verify)
     check_names(pairs, listed)
-    if descriptors.shape[1] != length:
-        raise InputError(
-            f"{database}: found descriptors of {descriptors.shape[1]} numbers, expected {length} "
-            "as of these images"
-        )
+    as_rows(descriptors, str(database), length)
     check_all_rows(descriptors, str(database), unit=True)
     return listed, descriptors

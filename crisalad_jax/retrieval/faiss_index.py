@@ -16,7 +16,7 @@ import faiss as _faiss
 import numpy as np
 
 from crisalad_jax.config.checks import check_count, choose
-from crisalad_jax.retrieval.chunks import WIDE, as_rows, check_rows, sample
+from crisalad_jax.retrieval.chunks import WIDE, as_rows, as_unit_rows, sample
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.checksums import append_checksum, check_appended
 from crisalad_jax.utils.errors import InputError
@@ -82,14 +82,7 @@ class Index(NamedTuple):
         """
         check_count("k", k)
         check_count("effort", 1 if effort is None else effort)
-        queries = as_rows(queries, "queries")
-        if queries.shape[1] != self.faiss_index.d:
-            raise InputError(
-                f"queries: found descriptors of length {queries.shape[1]}, expected "
-                f"{self.faiss_index.d} as in the index"
-            )
-        check_rows(queries, "queries", range(len(queries)), unit=True)
-        queries = np.ascontiguousarray(queries, WIDE)
+        queries = as_unit_rows(queries, "queries", self.faiss_index.d)
         k = min(k, self.size)
         if self.kind == "hnsw":
             chosen = faiss.SearchParametersHNSW(efSearch=effort or max(_LEAST_EFFORT, 2 * k))
@@ -133,15 +126,10 @@ def build(
     shapes = [part.shape for part in parts()]
     count, length = sum(rows for rows, _ in shapes), shapes[0][1]
     index = _graph(length, seed) if kind == "hnsw" else _trained_lists(count, length, parts, seed)
-    start = 0
     with progress_bar(kind, count, "rows", quiet=quiet) as bar:
         for part in parts():
-            with np.errstate(over="ignore"):  # what overflows is reported
-                wide = np.ascontiguousarray(part, WIDE)
-            check_rows(wide, "database", range(start, start + len(wide)), unit=True)
-            index.add(wide)
-            start += len(wide)
-            bar.advance(len(wide))
+            index.add(as_unit_rows(part, "database"))
+            bar.advance(len(part))
     return Index(kind, index)
 
 

@@ -75,8 +75,7 @@ class Pca(NamedTuple):
                 rows that are not finite; where they are to be unit vectors, one that lies at the
                 mean.
         """
-        descriptors = as_rows(descriptors, "descriptors")
-        self.check(descriptors.shape[1], "descriptors")
+        descriptors = as_rows(descriptors, "descriptors", len(self.mean))
         reduced = np.empty((len(descriptors), len(self.components)), np.float32)
         size = _rows_at_a_time(len(self.mean))
         for start, rows in blocks(descriptors, "descriptors", size, unit=False):

@@ -132,7 +132,7 @@ def test_bad_input_is_named(places, indexes, tmp_path):
         ),
         (
             lambda: indexes["hnsw"].search(queries[:, :5], 3),
-            "^queries: found descriptors of length 5, expected 16",
+            r"^queries: found shape \(50, 5\), expected \(images, 16\)",
         ),
         (lambda: indexes["hnsw"].search(queries, 0), "^k: found 0, expected at least 1"),
         (lambda: indexes["ivf-pq"].search(queries, 1, 0), "^effort: found 0, expected at least 1"),

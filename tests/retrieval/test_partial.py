@@ -5,7 +5,6 @@ import json
 import os
 import pathlib
 import shutil
-import signal
 import subprocess
 import sys
 import warnings
@@ -30,26 +29,6 @@ ROOT = pathlib.Path(__file__).parents[2]
 IMAGES = 12
 PARTS = IMAGES // BATCH
 
-KILLED_EXTRACTION = """
-import os, pathlib, signal, sys
-from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.retrieval import extract
-from crisalad_jax.retrieval.segments import Segments
-from tests.conftest import read_options
-
-append, left = Segments.append, int(sys.argv[4])
-
-def killed(*arguments):
-    global left
-    append(*arguments)
-    left -= 1
-    if not left:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-extract.SEGMENT, Segments.append = 1, killed
-weights, images, out = map(pathlib.Path, sys.argv[1:4])
-extract.extract(load_weights(weights), images, out, **read_options({}))
-"""
 # A child for each rename, which dies before it; prints how many there are.
 KILLED_WRITES = """
 import os, pathlib, signal, sys
@@ -186,18 +165,6 @@ def test_the_same_call_does_the_rest_with_the_same_bits(
     assert result.descriptors.tobytes() == np.load(out).tobytes()
 
 
-@pytest.mark.slow
-def test_a_killed_extraction_goes_on(shared, params, town, whole, described, tmp_path):
-    out = tmp_path / "d.npy"
-    program = [sys.executable, "-c", KILLED_EXTRACTION, shared / "weights.safetensors", town, out]
-    done = subprocess.run([*map(str, program), "2"], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == -signal.SIGKILL, done.stderr
-    assert segments(out) == ["0000000000.json", f"{BATCH:010d}.json"]
-    run(params, town, out)
-    assert described == names_from(town, 2 * BATCH)
-    assert contents(tmp_path) == whole
-
-
 def test_what_a_kill_leaves_within_the_folder_does_no_harm(
     params, town, whole, described, tmp_path, monkeypatch
 ):
@@ -259,42 +226,18 @@ def test_an_image_that_is_skipped_is_skipped_again(params, town, described, tmp_
 # Begun anew
 
 
-@pytest.mark.parametrize(
-    "other",
-    [
-        "model",
-        # Programs of their own are compiled.
-        *(pytest.param(other, marks=pytest.mark.slow) for other in ("config", "batch size")),
-    ],
-)
-def test_other_work_is_begun_anew_with_a_note(
-    params, town, described, tmp_path, monkeypatch, other
-):
-    images, out = tmp_path / "town", tmp_path / "d.npy"
-    shutil.copytree(town, images)
-    listed = list_images(images)
+def test_other_work_is_begun_anew_with_a_note(params, town, described, tmp_path, monkeypatch):
+    out, listed = tmp_path / "d.npy", list_images(town)
     cut_short(monkeypatch, params, listed, out, after=2)
-    options = {}
-    if other == "model":
-        params = jax.tree.map(lambda leaf: leaf * 0.9, params)
-    elif other == "config":
-        options["config"] = MODEL.resized((56, 56))
-    else:
-        options["batch_size"] = BATCH - 1
+    params = jax.tree.map(lambda leaf: leaf * 0.9, params)
     described.clear()
-
-    def again(out: pathlib.Path) -> Extracted:
-        config = options.get("config", MODEL)
-        size = options.get("batch_size", BATCH)
-        return extract(Model(params, config), listed, out, **read_options({"batch_size": size}))
-
     words = r"0000000000\.json: found work of another model, batch size or images, or damaged"
     with pytest.warns(Note, match=words) as told:
-        found = again(out)
+        found = run(params, listed, out)
     assert len(told) == 1
     assert described == [path.name for path in listed]
     assert not out.with_name("d.npy.partial").exists()
-    expected = again(tmp_path / "e.npy")
+    expected = run(params, listed, tmp_path / "e.npy")
     assert found.descriptors.tobytes() == expected.descriptors.tobytes()
 
 
@@ -402,24 +345,6 @@ def test_batches_of_the_same_images_are_kept(
     assert all("found work of another model, batch" in str(note.message) for note in told)
     alone = run(params, listed, tmp_path / "alone.npy")
     np.testing.assert_array_equal(found.descriptors, alone.descriptors)
-
-
-def test_a_failure_to_write_keeps_the_work(params, town, whole, described, tmp_path, monkeypatch):
-    out = tmp_path / "d.npy"
-
-    def full(*_: object, **__: object) -> None:
-        raise InputError("d.npy: cannot be written: No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(extract_module, "write_descriptors", full)
-        with pytest.raises(
-            InputError, match=r"No space left on device \(what is done is stored in"
-        ):
-            run(params, town, out)
-    described.clear()
-    run(params, town, out)
-    assert described == []
-    assert contents(tmp_path) == whole
 
 
 # The files of a set

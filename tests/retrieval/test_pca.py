@@ -58,14 +58,6 @@ def test_reduced_descriptors_are_coordinates_about_the_mean():
     np.testing.assert_allclose(found.apply(more), expected, atol=1e-5, rtol=0)
 
 
-def test_all_components_keep_all_distances():
-    rows = _descriptors(100, 12)
-    reduced = fit_pca(rows, 12, PLAIN).apply(rows)
-    before = np.linalg.norm(rows[:, None] - rows, axis=2)
-    after = np.linalg.norm(reduced[:, None] - reduced, axis=2)
-    np.testing.assert_allclose(after, before, atol=2e-5, rtol=0)  # float32, distances of about 5
-
-
 @pytest.mark.parametrize("count", [500, 15])
 def test_whitened_descriptors_have_the_identity_as_covariance(count):
     rows = _descriptors(count, 16)
@@ -125,7 +117,7 @@ def test_bad_descriptors_are_named():
         fit_pca(rows, 1, samples=20, seed=-3)
     found = fit_pca(rows, 3)
     with pytest.raises(
-        InputError, match=r"^descriptors: found descriptors of length 5, expected 1"
+        InputError, match=r"^descriptors: found shape \(30, 5\), expected \(images, 12"
     ):
         found.apply(rows[:, :5])
     with pytest.raises(InputError, match=r"^descriptors: row 1 lies at the mean"):
@@ -159,9 +151,6 @@ def test_files_of_something_else_are_named(tmp_path):
         load_pca(path)
     write_sealed(path, {}, "crisalad-jax pca 1", {"config": {}})
     with pytest.raises(InputError, match=r"^\S+pca\.safetensors: found .*'crisalad-jax pca 1'"):
-        load_pca(path)
-    write_sealed(path, {"mean": np.zeros(3, np.float32)}, pca.FORMAT, {"config": {}})
-    with pytest.raises(InputError, match=r"found arrays {'mean': \(3,\)}, expected {'mean': "):
         load_pca(path)
     for changes in (
         {"mean": found.mean[:7]},

@@ -111,14 +111,6 @@ def test_a_change_of_size_ends_a_batch(folder: pathlib.Path) -> None:
         list(batches_of(NATIVE, paths, batch_size=2))
 
 
-def test_images_that_nobody_could_read_have_the_models_size(folder: pathlib.Path) -> None:
-    for path in paths_in(folder)[:2]:
-        path.write_bytes(b"no image")
-    first, *_ = batches_of(NATIVE, paths_in(folder), batch_size=2, on_bad_image="skip")
-    assert first.images.shape == (2, *MODEL.image_size, 3)
-    assert not first.valid.any()
-
-
 def test_an_image_that_the_model_cannot_describe_is_named(folder: pathlib.Path) -> None:
     assert cv2.imwrite(str(folder / "8.png"), np.zeros((14, 14, 3), np.uint8))
     assert cv2.imwrite(str(folder / "9.png"), np.zeros((1, 4200, 3), np.uint8))

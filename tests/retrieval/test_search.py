@@ -305,7 +305,7 @@ def test_wrong_shapes_and_numbers_are_named():
     for arguments, message in [
         ((none, rows, 1), r"^database: found shape \(0, 4\)"),
         ((rows, none, 1), r"^queries: found shape \(0, 4\)"),
-        ((rows, _random_unit(1, 2, 5), 1), "^queries: found descriptors of length 5, expected 4"),
+        ((rows, _random_unit(1, 2, 5), 1), r"^queries: found shape .* expected \(images, 4\)"),
         ((rows, rows, 0), "^k: found 0"),
     ]:
         with pytest.raises(InputError, match=message):
@@ -343,5 +343,5 @@ def test_zeros_are_embedded() -> None:
 def test_bad_sides_are_named() -> None:
     with pytest.raises(InputError, match=r"^queries: row 1 is not finite, expected finite"):
         retrieval.to_unit_vectors(np.zeros((2, 2)), np.array([[0.0, 1.0], [np.nan, 0.0]]))
-    with pytest.raises(InputError, match=r"^queries: found descriptors of length 3"):
+    with pytest.raises(InputError, match=r"^queries: found shape \(2, 3\), expected \(images, 2\)"):
         retrieval.to_unit_vectors(np.zeros((2, 2)), np.zeros((2, 3)))

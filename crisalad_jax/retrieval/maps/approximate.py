@@ -64,9 +64,9 @@ class Approximate(NamedTuple):
         numbers = self.index.search(queries, min(count, max(least, each * k))).indices
         similarities = store.similarities(queries, np.maximum(numbers, 0))
         similarities[numbers < 0] = -np.inf
-        order = np.lexsort((numbers, -similarities))[:, :k]
-        numbers = np.take_along_axis(numbers, order, axis=1)
-        similarities = np.take_along_axis(similarities, order, axis=1)
+        numbers, similarities = (
+            part[:, :k] for part in Neighbours(numbers, similarities).in_order()
+        )
         few = np.flatnonzero(numbers[:, -1] < 0)
         if few.size:
             numbers[few], similarities[few] = store.search(queries[few], k, count)
@@ -87,9 +87,6 @@ def open_approximate(
     from crisalad_jax.retrieval.faiss_index import load_index
 
     index = load_index(path, verify=verify)
-    count = sum(count for _, count, _ in additions)
-    if index.size != count:
-        raise InputError(f"{path}: found {index.size} descriptors, expected {count} as in the map")
     return Approximate(index.kind, index, float(_record(path)["recall"]))
 
 

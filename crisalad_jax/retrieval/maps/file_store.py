@@ -78,7 +78,6 @@ class FileStore:
 
     def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
         """Find the k most similar descriptors of each query; see `Store.search`."""
-        queries = np.ascontiguousarray(queries, np.float32)
         size = max(1, _BLOCK // max(self._length, min(len(queries), QUERY_CHUNK)))
 
         def files() -> Iterator[Block]:
@@ -96,8 +95,7 @@ class FileStore:
             InputError: a file is damaged or gone.
         """
         query = np.repeat(np.arange(len(queries)), numbers.shape[1])
-        wide = np.ascontiguousarray(queries, np.float32)
-        return similarities_of(wide, query, numbers.ravel(), self.rows).reshape(numbers.shape)
+        return similarities_of(queries, query, numbers.ravel(), self.rows).reshape(numbers.shape)
 
     def rows(self, numbers: Int64[np.ndarray, " n"]) -> Float[np.ndarray, "n d"]:
         """Read the descriptors of these numbers; their files stay mapped into memory.

@@ -6,6 +6,7 @@ is as it was before the addition or after it. docs/maps.md has the format.
 """
 
 import contextlib
+import dataclasses
 import datetime
 import functools
 import os
@@ -24,7 +25,7 @@ from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import Positions
-from crisalad_jax.retrieval.chunks import check_rows
+from crisalad_jax.retrieval.chunks import as_unit_rows
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import (
     Approximate,
@@ -47,17 +48,16 @@ from crisalad_jax.retrieval.maps.metadata import (
     read_components,
     read_metadata,
     weights_of,
-    write_metadata,
 )
 from crisalad_jax.retrieval.maps.recovery import remove_unrecorded
 from crisalad_jax.retrieval.maps.store import open_store
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, save_pca
-from crisalad_jax.retrieval.segments import Segments
+from crisalad_jax.retrieval.segments import Segments, write_record
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.output import warn
-from crisalad_jax.utils.shapes import Float, Float32
+from crisalad_jax.utils.shapes import Float, Float32, Int64
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 if TYPE_CHECKING:  # a map is searched without JAX
@@ -89,6 +89,16 @@ class Answer(NamedTuple):
     """The image: its name, and where it was taken."""
     probability: float | None = None
     """Probability that the camera is there; None without a filter."""
+
+
+def ranked(
+    images: Sequence[MapImage],
+    numbers: Int64[np.ndarray, " k"],
+    similarities: Float32[np.ndarray, " k"],
+) -> list[Answer]:
+    """Return the answers to one query, of images by number."""
+    pairs = zip(numbers, similarities, strict=True)
+    return [Answer(rank, float(value), images[i]) for rank, (i, value) in enumerate(pairs, 1)]
 
 
 class Map:
@@ -264,7 +274,7 @@ class Map:
                 below 1; or the store is damaged or gone.
         """
         check_count("k", k)
-        self._check_descriptors("queries", queries)
+        queries = self._unit_rows("queries", queries)
         k = min(k, len(self))
         store = self._segments.store
         if self._approximate is not None and isinstance(store, FileStore) and not exact:
@@ -355,11 +365,7 @@ class Map:
         pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
         descriptor = describe_images(self.describer(model), [pixels])
         found = self.search(self.shorten(descriptor), k)
-        pairs = zip(found.indices[0], found.similarities[0], strict=True)
-        return [
-            Answer(rank, float(similarity), self.images[number])
-            for rank, (number, similarity) in enumerate(pairs, 1)
-        ]
+        return ranked(self.images, found.indices[0], found.similarities[0])
 
     def similarities(self, queries: Float32[np.ndarray, "q d"]) -> Float32[np.ndarray, "q n"]:
         """Compute the similarities of queries to all images, in the order of the images.
@@ -370,17 +376,12 @@ class Map:
         Raises:
             InputError: as `search`.
         """
-        self._check_descriptors("queries", queries)
+        queries = self._unit_rows("queries", queries)
         parts = [queries @ part.astype(np.float32, copy=False).T for part in self.descriptors]
         return np.concatenate(parts, axis=1)
 
-    def _check_descriptors(self, name: str, descriptors: Float[np.ndarray, "n d"]) -> None:
-        length = self.metadata.descriptor_length
-        if descriptors.ndim != 2 or not len(descriptors) or descriptors.shape[1] != length:
-            raise InputError(
-                f"{name}: found shape {descriptors.shape}, expected (images, {length})"
-            )
-        check_rows(descriptors, name, range(len(descriptors)), unit=True)
+    def _unit_rows(self, name: str, rows: Float[np.ndarray, "n d"]) -> Float32[np.ndarray, "n d"]:
+        return as_unit_rows(rows, name, self.metadata.descriptor_length)
 
     def fitted(self, names: Iterable[str], positions: Positions | None) -> Positions | None:
         """Return the positions of new images in the map's axes; None where none of them has one.
@@ -416,7 +417,7 @@ class Map:
             InputError: a name that is there already or twice, descriptors that are no unit vectors,
                 positions that have no place among the map's, or a store that cannot be written to.
         """
-        self._check_descriptors("descriptors", descriptors)
+        descriptors = self._unit_rows("descriptors", descriptors)
         if twice := len(names) - len(set(names) - self._numbers.keys()):
             raise InputError(
                 f"{self.folder}: found {twice} of {len(names)} names twice, or in the map already, "
@@ -601,7 +602,7 @@ def open_for_appending(
             if existing is None:
                 if components is not None:
                     save_pca(folder / COMPONENTS, components)
-                write_metadata(folder, metadata)
+                write_record(folder / METADATA, dataclasses.asdict(metadata), indent=2)
             opened = stack.enter_context(Map._opened(folder, existing or metadata))
             if existing is not None:
                 remove_unrecorded(folder, len(opened))

@@ -15,7 +15,6 @@ from crisalad_jax.checkpoints.starter import FILES, recorded, resolved
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.maps.store import check_store, store_name
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened_length
-from crisalad_jax.retrieval.segments import write_record
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.output import warn
@@ -104,15 +103,6 @@ def new_metadata(
         created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         pca="" if pca is None else pca_hash(pca),
     )
-
-
-def write_metadata(folder: pathlib.Path, metadata: MapMetadata) -> None:
-    """Write map.json, whole or not at all.
-
-    Raises:
-        InputError: the disk is full, or the folder cannot be written to.
-    """
-    write_record(folder / METADATA, dataclasses.asdict(metadata), indent=2)
 
 
 def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:

@@ -187,7 +187,7 @@ class MilvusStore:
             ]
             return Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
 
-        return break_ties(ask, np.ascontiguousarray(queries, np.float32), k, min(count, _MOST))
+        return break_ties(ask, queries, k, min(count, _MOST))
 
     def _ask(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
         with _one_line(self._address):
@@ -238,11 +238,7 @@ def break_ties(
     """
     asked = k + 1
     while True:
-        indices, similarities = ask(queries, min(asked, count))
-        order = np.lexsort((indices, -similarities))
-        indices, similarities = (
-            np.take_along_axis(part, order, axis=1) for part in (indices, similarities)
-        )
+        indices, similarities = ask(queries, min(asked, count)).in_order()
         if asked >= count or (similarities[:, k - 1] > similarities[:, -1]).all():
             return Neighbours(indices[:, :k], similarities[:, :k])
         asked *= 2

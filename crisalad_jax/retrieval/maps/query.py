@@ -19,7 +19,7 @@ from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import frame_time
 from crisalad_jax.retrieval.describe import check_window, described_sources, joined, shown
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
-from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage
+from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage, ranked
 from crisalad_jax.retrieval.maps.tracking import SequenceTracker, TrackResult
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
@@ -79,11 +79,7 @@ class Answers(NamedTuple):
         """Yield each query with its answers, best first."""
         chances = self.probabilities
         for number, query in enumerate(self.queries):
-            ranked = zip(*(part[number] for part in self.neighbours), strict=True)
-            answers = [
-                Answer(rank, float(similarity), self.images[index])
-                for rank, (index, similarity) in enumerate(ranked, 1)
-            ]
+            answers = ranked(self.images, *(part[number] for part in self.neighbours))
             if chances is not None:
                 pairs = zip(answers, chances[number], strict=True)
                 answers = [answer._replace(probability=float(chance)) for answer, chance in pairs]
@@ -277,11 +273,10 @@ def json_lines(answers: Answers) -> Iterator[str]:
 def json_rows(answers: Answers) -> Iterator[dict[str, Any]]:
     """Yield what `json_lines` writes of each query."""
     zone = {} if answers.zone is None else {"zone": str(answers.zone)}
-    for name, known, (path, ranked) in zip(
-        answers.names, answers.known, answers.rows(), strict=True
-    ):
+    columns = answers.names, answers.known, answers.rows()
+    for name, known, (path, found) in zip(*columns, strict=True):
         neighbours = [
-            answer_fields(answer, answers.axes) | _time(answer.image.name) for answer in ranked
+            answer_fields(answer, answers.axes) | _time(answer.image.name) for answer in found
         ]
         row = {"query": name, **_time(path), **zone, "neighbours": neighbours}
         yield row if answers.min_similarity is None else row | {"known": bool(known)}

@@ -26,37 +26,25 @@ from crisalad_jax.retrieval.maps.calibration import (
     write_calibration,
 )
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.retrieval.maps.query import Answers, json_lines, query
+from crisalad_jax.retrieval.maps.query import Answers, json_lines
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL, describe_single, random_params
+from tests.retrieval.maps.conftest import ask
 
 QUIET = Reading(batch_size=BATCH, quiet=True)
 
 
-@pytest.fixture(scope="module")
-def queries(shared) -> pathlib.Path:
-    return shared / "town" / "images" / "test" / "queries"
-
-
-@pytest.fixture(scope="module")
-def made(shared, params, tmp_path_factory) -> pathlib.Path:
-    """A map of the town's database in segments of five and two."""
-    out = tmp_path_factory.mktemp("maps") / "map"
-    images = shared / "town" / "images" / "test" / "database"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(crisalad_jax.retrieval.maps.build, "SEGMENT", 4)
-        index(
-            Model(params, MODEL), images, out, weights=shared / "weights.safetensors", reading=QUIET
-        )
-    return out
+@pytest.fixture
+def queries(sides) -> pathlib.Path:
+    return sides[1]
 
 
 @pytest.fixture
-def folder(made, tmp_path) -> pathlib.Path:
+def folder(town_map, tmp_path) -> pathlib.Path:
     """A copy to spoil."""
-    return shutil.copytree(made, tmp_path / "map")
+    return shutil.copytree(town_map, tmp_path / "map")
 
 
 def remembered(folder: pathlib.Path, **changes) -> Calibration:
@@ -81,11 +69,6 @@ def remembered(folder: pathlib.Path, **changes) -> Calibration:
     )
     write_calibration(folder, calibration)
     return calibration
-
-
-def ask(folder, params, images, **options) -> Answers:
-    with Map.open(folder) as places:
-        return query(places, images, model=Model(params, places.config), **options, reading=QUIET)
 
 
 # What is remembered
@@ -187,19 +170,6 @@ def test_a_calibration_that_is_not_this_maps_is_refused(folder):
         Map.open(folder)
 
 
-def test_a_damaged_calibration_is_named_and_may_be_left_out(folder, params, benchmark, queries):
-    plain = ask(folder, params, queries)
-    (folder / CALIBRATION).write_text('{"min_sim')
-    with pytest.raises(InputError, match=r"calibration\.json: .*; the file may be removed"):
-        Map.open(folder)
-    with Map.open(folder, calibrated=False) as places:
-        answers = query(places, queries, model=Model(params, places.config), reading=QUIET)
-        assert list(json_lines(answers)) == list(json_lines(plain))
-        calibrate(places, benchmark, 0.4, model=Model(params, places.config), reading=QUIET)
-    with Map.open(folder) as places:
-        assert places.calibration is not None
-
-
 def test_a_map_with_a_calibration_grows(folder, params, shared, queries):
     before = remembered(folder)
     grown = index(
@@ -244,8 +214,8 @@ def hand_made(min_similarity: float | None, images) -> Answers:
     return Answers(paths, neighbours, images, ("east", "north"), min_similarity=min_similarity)
 
 
-def test_unknown_places_in_json_and_in_the_table(made):
-    with Map.open(made) as places:
+def test_unknown_places_in_json_and_in_the_table(town_map):
+    with Map.open(town_map) as places:
         images = places.images
     lines = [json.loads(line) for line in json_lines(hand_made(0.5, images))]
     assert [line["known"] for line in lines] == [True, False]
@@ -270,13 +240,13 @@ def test_a_similarity_equal_to_the_least_is_known():
 
 
 @pytest.mark.parametrize("numbers", [14, 2**25])
-def test_a_followed_camera_is_that_of_the_filter(made, params, queries, monkeypatch, numbers):
+def test_a_followed_camera_is_that_of_the_filter(town_map, params, queries, monkeypatch, numbers):
     """In portions of two frames, and at once; the map has two segments. Names say @UTM positions,
     so that it moves in metres."""
     monkeypatch.setattr(crisalad_jax.retrieval.maps.tracking, "_NUMBERS", numbers)
     settings = BayesFilter(reach=1)
-    found = ask(made, params, queries, k=3, sequence=settings)
-    with Map.open(made) as places:
+    found = ask(town_map, params, queries, k=3, sequence=settings)
+    with Map.open(town_map) as places:
         rows = np.concatenate(list(places.descriptors)).astype(np.float64)
     asked = describe_single(Model(params, MODEL), list_images(queries)).astype(np.float64)
     similarities = asked @ rows.T

@@ -193,14 +193,6 @@ def test_a_map_that_lost_a_later_record_is_refused_where_a_search_tells_of_it(fo
     assert (folder / "segments" / "0000000003.npy").exists()
 
 
-def test_more_descriptors_without_a_record_than_a_kill_leaves_are_refused(folder):
-    for path in (folder / "segments").glob("*.json"):
-        path.unlink()
-    with pytest.raises(InputError, match="found 3 such files of descriptors without a record"):
-        append_until(folder, 7)
-    assert len(list((folder / "segments").glob("*.npy"))) == 3
-
-
 # What a map knows
 
 
@@ -239,11 +231,6 @@ def test_a_reader_sees_the_map_as_it_was_opened(folder):
         assert set(found.indices[0].tolist()) == set(range(7))
     with Map.open(folder) as after:
         assert after.search(rows(15, 1), 1).indices.tolist() == [[15]]
-
-
-def test_a_moved_map_is_the_same_map(folder, tmp_path):
-    folder.rename(tmp_path / "other")
-    assert killed_appends.check(tmp_path / "other") == 7
 
 
 def test_verify_names_the_descriptors_that_changed(folder):
@@ -296,7 +283,6 @@ def unsealed(path: pathlib.Path, **changes) -> None:
     [
         ({"names": ["/etc/passwd"]}, "found name '/etc/passwd', expected one below the folder"),
         ({"names": ["a/../../b.jpg"]}, "found name 'a/../../b.jpg', expected one below"),
-        ({"root": None}, "found root None, expected text"),
         ({"root": 3}, "found root 3, expected text"),
         ({"bytes": [math.inf]}, "cannot convert float infinity"),
     ],
@@ -308,13 +294,6 @@ def test_a_record_of_no_images_below_its_folder_is_refused(folder, fields, words
     path.write_bytes(checksummed_json(record))
     with pytest.raises(InputError, match=rf"0000000000\.json: not a whole record .*{words}"):
         Map.open(folder)
-
-
-def test_a_record_cannot_lose_its_checksum(folder):
-    unsealed(folder / "segments/0000000001.json")
-    words = r"0000000001\.json: found no checksum, expected a"
-    with pytest.raises(InputError, match=words), Map.open(folder):
-        pass
 
 
 def test_who_edits_the_description_removes_its_checksum(folder):
@@ -368,46 +347,27 @@ def test_one_process_appends_at_a_time(folder):
     append_until(folder, 8)
 
 
+RECORD = "segments/0000000001.json"
+
+
 @pytest.mark.parametrize("write", [False, True])
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
         (lambda m: reseal(m / "map.json", format=5), "found a map of format 5, expected 4: `cr"),
-        (lambda m: reseal(m / "map.json", format=3), "found a map of format 3, expected 4: `cr"),
         (lambda m: unsealed(m / "map.json", format=3), "found a map of format 3, expected 4: `cr"),
         (lambda m: edit(m / "map.json", format=3), "map.json: found other bytes than were written"),
         (lambda m: (m / "map.json").write_text('{"model'), "map.json: found no JSON (Unterminated"),
         (lambda m: reseal(m / "map.json", dtype="int3"), "map.json: dtype: found 'int3', expected"),
         (lambda m: reseal(m / "map.json", store="n"), "map.json: store: found 'n', expected files"),
-        (lambda m: edit(m / "map.json", store="n"), "map.json: found other bytes than were"),
-        (lambda m: (m / "map.json").write_text("[]"), "map.json: found a map of format None, exp"),
         (lambda m: (m / "map.json").unlink(), "map: found segments and no map.json"),
+        (lambda m: (m / RECORD).write_text("[]"), f"{RECORD}: found no checksum, expected a rec"),
+        (lambda m: reseal(m / RECORD, bytes=[7]), f"{RECORD}: not a whole record of images"),
+        (lambda m: reseal(m / RECORD, names=[]), f"{RECORD}: not a whole record of images"),
+        (lambda m: edit(m / RECORD, bytes=[7, 8]), f"{RECORD}: found other bytes than were writt"),
+        (lambda m: (m / RECORD).unlink(), "0000000003.json: expected 0000000001.json before it"),
         (
-            lambda m: (m / "segments" / "0000000001.json").write_text('{"root": "/im'),
-            "0000000001.json: found no JSON (Unterminated",
-        ),
-        (
-            lambda m: (m / "segments" / "0000000001.json").write_text("[]"),
-            "0000000001.json: found no checksum, expected a record of images",
-        ),
-        (
-            lambda m: reseal(m / "segments" / "0000000001.json", bytes=[7]),
-            "0000000001.json: not a whole record of images",
-        ),
-        (
-            lambda m: reseal(m / "segments" / "0000000001.json", names=[], bytes=[], positions=[]),
-            "0000000001.json: not a whole record of images",
-        ),
-        (
-            lambda m: edit(m / "segments" / "0000000001.json", bytes=[7, 8]),
-            "0000000001.json: found other bytes than were written",
-        ),
-        (
-            lambda m: (m / "segments" / "0000000001.json").unlink(),
-            "0000000003.json: expected 0000000001.json before it",
-        ),
-        (
-            lambda m: (m / "segments" / "0000000001.npy").unlink(),
+            lambda m: (m / RECORD).with_suffix(".npy").unlink(),
             "0000000001.npy: found no such file, expected a file of a map's descriptors",
         ),
     ],
@@ -442,7 +402,6 @@ def test_what_is_no_map_is_refused_and_left_alone(tmp_path):
 @pytest.mark.parametrize(
     ("new", "descriptors", "words"),
     [
-        (["7.jpg", "7.jpg"], rows(7, 2), "found 1 of 2 names twice, or in the map already"),
         (["7.jpg", "3.jpg"], rows(7, 2), "found 1 of 2 names twice, or in the map already"),
         (["7.jpg"], rows(7, 1)[:, :-1], r"found shape \(1, 47\), expected \(images, 48\)"),
         (
@@ -450,7 +409,6 @@ def test_what_is_no_map_is_refused_and_left_alone(tmp_path):
             2 * rows(7, 1),
             "descriptors: row 0 is of length 2, expected finite unit vectors",
         ),
-        (["7.jpg"], np.nan * rows(7, 1), "row 0 is not finite, expected finite unit vectors"),
         ([], rows(7, 1)[:0], r"found shape \(0, 48\)"),
     ],
 )
@@ -461,17 +419,6 @@ def test_what_cannot_be_appended_changes_nothing(folder, new, descriptors, words
         assert len(target) == 7
     assert killed_appends.check(folder) == 7
     append_until(folder, 12)
-
-
-def test_positions_of_a_map_are_of_one_kind(folder):
-    with open_for_appending(folder, metadata("files")) as target:
-        for number, axes in ((7, ("east", "north")), (8, ("lat", "lon"))):
-            where = Positions(axes, {f"{number}.jpg": (1.0, 2.0)})
-            if number == 8:
-                with pytest.raises(InputError, match="in lat, lon, expected east, north as in the"):
-                    target.append(names(8, 1), [7], rows(8, 1), root="/", positions=where)
-            else:
-                target.append(names(7, 1), [7], rows(7, 1), root="/", positions=where)
 
 
 FIRST = "@0499000.00@5411000.00@32@U@@@@@@@@@@@.jpg"
@@ -515,7 +462,6 @@ def test_a_map_has_metres_of_one_zone(folder):
     ("queries", "k", "words"),
     [
         (rows(0, 1), 0, "k: found 0, expected at least 1"),
-        (rows(0, 1)[:0], 1, r"queries: found shape \(0, 48\)"),
         (rows(0, 1)[:, 1:], 1, r"queries: found shape \(1, 47\)"),
         (3 * rows(0, 1), 1, "queries: row 0 is of length 3"),
     ],

@@ -1,12 +1,10 @@
 """Both stores against brute force in float64, and against each other."""
 
 import fcntl
-import os
 import pathlib
 import sys
 
 import numpy as np
-import pymilvus
 import pytest
 
 from crisalad_jax.retrieval.maps import milvus_store as milvus
@@ -153,23 +151,6 @@ def test_a_damaged_file_is_found_when_the_map_is_opened(tmp_path, spoil):
         store.check([(0, 3)])
 
 
-def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path):
-    """Opening a pipe would wait for a writer."""
-    store = opened(tmp_path, "files")
-    fill(store, unit_rows(3), (3,))
-    path = tmp_path / "segments" / "0000000000.npy"
-    path.unlink()
-    os.mkfifo(path)
-    with pytest.raises(
-        InputError, match=r"0000000000\.npy: found a pipe, expected a file of a map"
-    ):
-        store.check([(0, 3)])
-    path.unlink()
-    path.mkdir()
-    with pytest.raises(InputError, match=r"0000000000\.npy: found a folder, expected a file of a"):
-        store.check([(0, 3)])
-
-
 def test_files_give_the_bits_of_an_exact_search_whatever_else_is_asked(tmp_path):
     """Of copies in two segments, products in float32 differ with what else is multiplied."""
     generator = np.random.default_rng(0)
@@ -269,20 +250,6 @@ def test_a_server_that_does_not_answer_is_one_line(tmp_path, capfd):
     with pytest.raises(InputError, match=r"^http://127\.0\.0\.1:9: Milvus says: Fail connecting"):
         opened(tmp_path, "milvus:http://127.0.0.1:9")
     assert capfd.readouterr() == ("", "")
-
-
-def test_a_server_gets_the_token_of_the_environment(tmp_path, monkeypatch):
-    given = []
-
-    def refuse(*arguments, **options):
-        given.append((arguments, options))
-        raise pymilvus.MilvusException(message="auth\ncheck failure")
-
-    monkeypatch.setattr(pymilvus, "MilvusClient", refuse)
-    monkeypatch.setenv(milvus.TOKEN, "root:secret")
-    with pytest.raises(InputError, match=r"^https://a\.b:1: Milvus says: auth check failure$"):
-        opened(tmp_path, "milvus:https://a.b:1")
-    assert given == [(("https://a.b:1",), {"token": "root:secret"})]
 
 
 def test_milvus_is_asked_for_when_it_is_not_installed(tmp_path, monkeypatch):

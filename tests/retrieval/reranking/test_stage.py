@@ -207,12 +207,6 @@ def test_what_cannot_be_read_is_named(text: str, words: str) -> None:
         parse_reranking(text)
 
 
-def test_what_is_read() -> None:
-    assert parse_reranking("patch-netvlad:100") == Reranking("patch-netvlad", 100)
-    assert parse_reranking("patch-netvlad-ransac:7") == Reranking("patch-netvlad-ransac", 7)
-    assert parse_reranking("transvpr:20").label == "transvpr:20"
-
-
 @pytest.mark.parametrize(
     ("given", "config", "words"),
     [
