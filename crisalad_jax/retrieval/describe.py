@@ -8,7 +8,7 @@ import itertools
 import os
 import pathlib
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from crisalad_jax.utils.shapes import Float, Float32, Int64
 if TYPE_CHECKING:  # an engine describes images without JAX
     from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.model import Model
+    from crisalad_jax.retrieval.segments import Segments
 
 
 @brief
@@ -44,14 +45,6 @@ class Described(NamedTuple):
     def tried(self) -> int:
         """Number of images, readable or not."""
         return len(self.indices) + len(self.unreadable)
-
-
-class RowSource(Protocol):
-    """Rows that are read by number: an array in memory, or a folder of files."""
-
-    def __getitem__(self, numbers: Int64[np.ndarray, " n"], /) -> Rows:
-        """Return rows by number."""
-        ...
 
 
 def prepare_image(image: np.ndarray, config: "ModelConfig", name: str | None = None) -> Pixels:
@@ -79,6 +72,24 @@ def prepare_image(image: np.ndarray, config: "ModelConfig", name: str | None = N
         raise InputError(f"config: found {type(config).__name__}, expected ModelConfig")
     how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
     return how.prepare(image, config.check_image_size, name)
+
+
+def as_list(name: str, given: Any) -> list[Any]:
+    """Return what was given, a file or a list, as a list.
+
+    Raises:
+        InputError: the list is empty.
+    """
+    found = [given] if isinstance(given, str | os.PathLike) else list(given)
+    if not found:
+        raise InputError(f"{name}: found none, expected at least one image")
+    return found
+
+
+def check_readable(source: object, tried: int, readable: int) -> None:
+    """Raise InputError where none of a source's images could be read."""
+    if not readable:
+        raise InputError(f"{source}: found {tried} images, none of them readable")
 
 
 def describe_files(
@@ -112,10 +123,7 @@ def describe_files(
         (1, 576)
     """
     describer = describer_of(model)
-    given = [files] if isinstance(files, str | os.PathLike) else files
-    paths = [pathlib.Path(file) for file in given]
-    if not paths:
-        raise InputError("files: found none, expected at least one image file")
+    paths = [pathlib.Path(file) for file in as_list("files", files)]
     stream = described(describer, paths, reading.fitted(len(paths)))
     (found,) = joined(shown(stream, "images", len(paths), quiet=reading.quiet), len(paths))
     return found.descriptors
@@ -151,10 +159,8 @@ def describe_images(
         (1, 576)
     """
     describer, reading = describer_of(model), Reading(batch_size=batch_size)
-    if not len(images):
-        raise InputError("images: found none, expected at least one image")
-    how = describer.preparation
-    prepared = [how.prepare(image, describer.check_size) for image in images]
+    how, given = describer.preparation, as_list("images", images)
+    prepared = [how.prepare(image, describer.check_size) for image in given]
     return describe_prepared(describer, prepared, reading.batch_size)
 
 
@@ -301,7 +307,7 @@ def read_tokens(
 
 
 def group(
-    describer: Describer, rows: RowSource, count: int, grouping: str, **options: Any
+    describer: Describer, rows: "Rows | Segments", count: int, grouping: str, **options: Any
 ) -> Float[np.ndarray, "image descriptor"]:
     """Describe images, in their order, under one of `GROUPINGS`; options are those of `grouped`."""
     descriptors = np.empty((count, describer.config.descriptor_dim), np.float32)
@@ -312,7 +318,7 @@ def group(
 
 def grouped(
     describer: Describer,
-    rows: RowSource,
+    rows: "Rows | Segments",
     count: int,
     grouping: str,
     *,

@@ -23,7 +23,15 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import file_of, frame_time, name_frame
 from crisalad_jax.retrieval.chunks import as_rows, check_all_rows, check_rows
-from crisalad_jax.retrieval.describe import described, grouped, joined, shown, token_rows
+from crisalad_jax.retrieval.describe import (
+    as_list,
+    check_readable,
+    described,
+    grouped,
+    joined,
+    shown,
+    token_rows,
+)
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.descriptor_files import (
     Descriptors,
@@ -349,8 +357,7 @@ class _Work:
             InputError: there are no rows, or the disk is full.
         """
         stored, skipped = _names_of(parts, names)
-        if not stored:
-            raise InputError(f"{self.source}: found {len(names)} images, none of them readable")
+        check_readable(self.source, len(names), len(stored))
         file = temporary_beside(folder / "rows.npy")
         with in_use(file):
             with wrap_os_errors(folder):
@@ -497,9 +504,7 @@ def _listed(
         source = open_source(images, fps=fps, on_bad_image=reading.on_bad_image)
         inside = _inside(source.root, root) if root is not None else pathlib.PurePath()
         return source.paths, [(inside / name).as_posix() for name in source.names]
-    paths = [name_frame(pathlib.Path(path)) for path in images]
-    if not paths:
-        raise InputError("images: found none, expected at least one")
+    paths = [name_frame(pathlib.Path(path)) for path in as_list("images", images)]
     names = [(path if root is None else _inside(path, root)).as_posix() for path in paths]
     check_lines(names, "images")
     return paths, names

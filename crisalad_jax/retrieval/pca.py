@@ -72,8 +72,7 @@ class Pca(NamedTuple):
 
         Raises:
             InputError: descriptors of another length than those that were fitted, no matrix, or
-                rows that are not finite; where they are to be unit vectors, one that lies at the
-                mean.
+                rows that are not finite.
         """
         descriptors = as_rows(descriptors, "descriptors", len(self.mean))
         reduced = np.empty((len(descriptors), len(self.components)), np.float32)
@@ -81,13 +80,8 @@ class Pca(NamedTuple):
         for start, rows in blocks(descriptors, "descriptors", size, unit=False):
             part = (rows - self.mean) @ self.components.T / self._scale
             if self.config.renormalise:
-                lengths = np.linalg.norm(part, axis=1, keepdims=True)
-                if not lengths.all():
-                    raise InputError(
-                        f"descriptors: row {start + np.argmin(lengths)} lies at the mean, expected "
-                        "one with a direction from there"
-                    )
-                part /= lengths
+                with np.errstate(invalid="ignore"):  # one at the mean has no direction: NaN
+                    part /= np.linalg.norm(part, axis=1, keepdims=True)
             reduced[start : start + len(part)] = part
         return reduced
 

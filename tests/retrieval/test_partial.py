@@ -273,30 +273,6 @@ def test_what_is_damaged_is_described_again(
 # One at a time, and nothing left
 
 
-def test_a_second_extraction_to_the_same_file_is_refused(
-    params, town, whole, described, tmp_path, monkeypatch
-):
-    out, real, refused = tmp_path / "d.npy", Segments.append, []
-
-    def meanwhile(*arguments):
-        monkeypatch.setattr(Segments, "append", real)  # only after the first segment
-        real(*arguments)
-        before = contents(tmp_path)
-        with pytest.raises(InputError) as error:
-            run(params, town, out)
-        refused.append(str(error.value))
-        assert contents(tmp_path) == before
-        run(params, town, tmp_path / "other" / "d.npy")  # another file is another matter
-
-    monkeypatch.setattr(Segments, "append", meanwhile)
-    run(params, town, out)
-    assert refused == [
-        f"{out}.partial: found another process that writes here (process {os.getpid()} on "
-        f"{os.uname().nodename}), expected to be the only one"
-    ]
-    assert contents(tmp_path) == whole | {f"other/{name}": data for name, data in whole.items()}
-
-
 @pytest.mark.parametrize("there", [False, True])
 def test_a_failure_before_anything_is_done_leaves_nothing(params, town, tmp_path, there):
     images, out = tmp_path / "town", tmp_path / "new" / "deep" / "d.npy"

@@ -120,8 +120,7 @@ def test_bad_descriptors_are_named():
         InputError, match=r"^descriptors: found shape \(30, 5\), expected \(images, 12"
     ):
         found.apply(rows[:, :5])
-    with pytest.raises(InputError, match=r"^descriptors: row 1 lies at the mean"):
-        found.apply(np.stack([rows[0], found.mean]))
+    assert np.isnan(found.apply(np.stack([rows[0], found.mean]))[1]).all()
     rows[17, 3] = np.nan
     for call in (lambda: fit_pca(rows, 3), lambda: found.apply(rows)):
         with pytest.raises(

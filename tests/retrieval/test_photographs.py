@@ -171,27 +171,6 @@ def test_descriptors_of_all_sizes_in_order(folder: pathlib.Path, tmp_path: pathl
     assert answers.neighbours.indices.ravel().tolist() == [2, 3]
 
 
-def test_a_map_of_another_way_than_its_weights(
-    folder: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
-    """The same parameters: the map keeps its way, and is asked by it."""
-    params, weights, place = random_params(ALONE), tmp_path / "w.safetensors", tmp_path / "map"
-    save_weights(weights, Model(params, ALONE))
-    words = ["bicubic", "floats"]
-    index(
-        Model(params, ALONE.resized(None, words)),
-        folder,
-        place,
-        weights=weights,
-        reading=Reading(quiet=True),
-    )
-    with Map.open(place) as places:
-        assert places.config == ALONE.resized(None, words)
-        answers = query(places, folder, k=1, reading=Reading(quiet=True))
-    # In float32 a unit vector with itself.
-    np.testing.assert_allclose(answers.neighbours.similarities, 1, atol=1e-5)
-
-
 def test_local_features_need_a_fixed_size() -> None:
     config = dataclasses.replace(
         ALONE, image_size=(56, 56), aggregator=NetVladConfig(clusters=4)

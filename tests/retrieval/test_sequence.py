@@ -175,25 +175,6 @@ def walk(rate: float, seed: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
     return times, unit(exact + np.random.default_rng(seed).normal(0, noise, exact.shape))
 
 
-@pytest.mark.parametrize("noise", [0.6, 0.9, 1.2])
-@pytest.mark.parametrize(("of_map", "of_frames"), [(5, 1), (1, 5), (5, 5), (30, 1)])
-def test_frames_of_another_rate_than_the_map_find_more_than_single_ones(of_map, of_frames, noise):
-    """Within a second is right. Counting images, 1 a second in 5 a second halves the recall."""
-    there, database = walk(of_map, 2, 0.1)
-    when, queries = walk(of_frames, 3, noise)
-    similarities, common = queries @ database.T, database @ database.mean(axis=0)
-
-    def recall(places: np.ndarray) -> float:
-        return float(np.mean(np.abs(there[places] - when) <= 1))
-
-    single = recall(similarities.argmax(axis=1))
-    moved = np.full(len(queries), 1 / of_frames)
-    filtered = recall(BayesFilter().follow(similarities, common, there, moved).places)
-    assert filtered > single
-    if of_map > of_frames:  # the test can fail
-        assert recall(BayesFilter().follow(similarities, common).places) < single
-
-
 @pytest.mark.parametrize("along", [[0.0, 2.0, 1.0], [0.0, 1.0]])
 def test_a_way_that_does_not_fit_is_refused(along):
     with pytest.raises(InputError, match=r"along: found shape \(\d,\), expected \(3,\)"):

@@ -13,7 +13,7 @@ from crisalad_jax.data.positions import AXES, Positions, exif_positions, positio
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import ImageSource, check_rate_used, open_source
 from crisalad_jax.data.video import file_of, frame_time
-from crisalad_jax.retrieval.describe import described, joined, shown
+from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import check_search
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
@@ -277,9 +277,7 @@ class _Indexing:
 
     def _finish(self, target: Map) -> float | None:
         """Build the search that was asked for, and return its recall."""
-        if not len(target):
-            root, count = self.source.root, len(self.source.paths)
-            raise InputError(f"{root}: found {count} images, none of them readable")
+        check_readable(self.source.root, len(self.source.paths), len(target))
         if self.search is None:
             return None
         return target.build_search(self.search, quiet=self.reading.quiet)

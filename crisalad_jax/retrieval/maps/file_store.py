@@ -64,17 +64,14 @@ class FileStore:
         check_source(path, "a file of a map's descriptors")
         header = npy_header(self._dtype, shape)
         size = len(header) + math.prod(shape) * self._dtype.itemsize
-        try:
-            with path.open("rb") as file:
-                begins = file.read(len(header))
-            if begins != header or path.stat().st_size != size:
-                raise InputError(
-                    f"{path}: found other bytes than of {self._dtype} {shape}, expected the whole "
-                    ".npy file that was written"
-                )
-            return np.memmap(path, self._dtype, "r", len(header), shape)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        with path.open("rb") as file:
+            begins = file.read(len(header))
+        if begins != header or path.stat().st_size != size:
+            raise InputError(
+                f"{path}: found other bytes than of {self._dtype} {shape}, expected the whole .npy "
+                "file that was written"
+            )
+        return np.memmap(path, self._dtype, "r", len(header), shape)
 
     def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
         """Find the k most similar descriptors of each query; see `Store.search`."""

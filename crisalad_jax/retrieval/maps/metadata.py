@@ -111,14 +111,12 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
     A map without images, which a killed process left, counts as none.
 
     Raises:
-        InputError: the folder is a file or holds other things than a map, or the map is damaged or
-            of another format.
+        InputError: the folder holds other things than a map, or the map is damaged or of another
+            format.
     """
     folder = pathlib.Path(folder)
     path = folder / METADATA
     if not path.exists():
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"{folder}: found a file, expected a map's folder")
         # A process killed before it has made the map leaves its lock and temporary files behind.
         others = sorted(_other_files(folder, LOCK, SEGMENTS, COMPONENTS, SHARES))
         if _other_files(folder / SEGMENTS):

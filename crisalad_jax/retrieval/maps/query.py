@@ -17,13 +17,19 @@ from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import frame_time
-from crisalad_jax.retrieval.describe import check_window, described_sources, joined, shown
+from crisalad_jax.retrieval.describe import (
+    as_list,
+    check_readable,
+    check_window,
+    described_sources,
+    joined,
+    shown,
+)
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage, ranked
 from crisalad_jax.retrieval.maps.tracking import SequenceTracker, TrackResult
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.shapes import Bool, Float32, Float64
 
@@ -164,8 +170,7 @@ def query(
             frames = [paths[index] for index in part.indices]
             found.append(ask(part.descriptors, frames))
             asked += frames
-    if not found:
-        raise InputError(f"images: found {len(paths)}, none of them readable")
+    check_readable("images", len(paths), len(asked))
     return answers_of(places, asked, found, least, unreadable=unreadable, root=root)
 
 
@@ -217,9 +222,7 @@ def _listed(
     images: Any, fps: float | None, on_bad_image: OnBadImage
 ) -> tuple[pathlib.Path, list[list[pathlib.Path]]]:
     """List the images of each source, below a folder that holds all."""
-    given = [images] if isinstance(images, str | os.PathLike) else images
-    if not given:
-        raise InputError("images: found none, expected images or folders of them")
+    given = as_list("images", images)
     sources = [open_source(each, fps=fps, on_bad_image=on_bad_image) for each in given]
     roots = {source.root for source in sources}
     if len(roots) == 1:

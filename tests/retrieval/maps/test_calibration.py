@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import pathlib
-import re
 import shutil
 
 import jax
@@ -112,27 +111,6 @@ def test_a_precision_out_of_reach_leaves_what_was_there(folder, params, benchmar
         assert places.calibration == before
     with Map.open(folder) as places:
         assert places.calibration == before
-
-
-@pytest.mark.parametrize("precision", [0.99, 1.0])
-def test_a_similarity_that_rests_on_too_few_answers_is_not_remembered(
-    folder, params, benchmark, precision
-):
-    """One query that is right shows a precision of 5 %."""
-    one = dataclasses.replace(
-        benchmark,
-        queries=benchmark.queries[:1],
-        query_positions=None,
-        database_positions=None,
-        positives=(np.arange(7),),
-    )
-    where = re.escape(benchmark.name)
-    words = f"precision: found 1 answer of similarity .* on {where}, 1 right, .* at least 5.0 %"
-    with Map.open(folder) as places:
-        with pytest.raises(InputError, match=words):
-            calibrate(places, one, precision, model=Model(params, places.config), reading=QUIET)
-        assert places.calibration is None
-    assert not (folder / CALIBRATION).exists()
 
 
 def test_another_model_calibrates_nothing(folder, benchmark):

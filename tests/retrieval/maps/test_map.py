@@ -387,12 +387,19 @@ def test_what_is_no_map_is_refused_and_left_alone(tmp_path):
     (tmp_path / "file").write_text("x")
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_text("x")
-    for name, words in (("file", "found a file"), ("photos", r"found a\.jpg and no map\.json")):
-        with pytest.raises(InputError, match=f"{name}: {words}"):
-            Map.open(tmp_path / name)
-        opening = open_for_appending(tmp_path / name, metadata("files"))
-        with pytest.raises(InputError, match=f"{name}: {words}"), opening:
-            pass
+    words = r"photos: found a\.jpg and no map\.json"
+    with pytest.raises(InputError, match=words):
+        Map.open(tmp_path / "photos")
+    with (
+        pytest.raises(InputError, match=words),
+        open_for_appending(tmp_path / "photos", metadata("files")),
+    ):
+        pass
+    with (
+        pytest.raises(InputError, match="cannot make this folder"),
+        open_for_appending(tmp_path / "file", metadata("files")),
+    ):
+        pass
     assert os.listdir(tmp_path / "photos") == ["a.jpg"]
     with pytest.raises(InputError, match="none: found no map"), Map.open(tmp_path / "none"):
         pass

@@ -124,7 +124,7 @@ def test_lines_for_people(answers):
 @pytest.mark.parametrize(
     ("images", "options", "words"),
     [
-        ([], {}, "images: found none, expected images or folders of them"),
+        ([], {}, "images: found none, expected at least one image"),
         (["none.jpg"], {}, "none.jpg: found no such file"),
         (["none.jpg"], {"k": 0}, "k: found 0, expected at least 1"),
     ],
