@@ -145,7 +145,7 @@ def build_approximate(
     built = Approximate(index.kind, index, 0.0)
     places = sample(count, min(SAMPLE, count), _SEED)
     k = min(NEIGHBOURS + 1, count)
-    queries = store.rows(places)
+    queries = store.rows(places).astype(np.float32)
     sides = built.search(store, queries, k, count), store.search(queries, k, count)
     found, exact = (_others(places, side.indices) for side in sides)
     built = built._replace(recall=recall_against_exact(found, exact) if exact.size else 1.0)

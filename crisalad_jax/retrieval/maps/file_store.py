@@ -1,5 +1,6 @@
 """Descriptors in .npy files, one for each addition, searched exactly."""
 
+import functools
 import math
 import pathlib
 from collections.abc import Iterator, Sequence
@@ -81,7 +82,8 @@ class FileStore:
             for first in [first for first in self._counts if first < count]:
                 yield from blocks(self._open(first), str(self._path(first)), size)
 
-        return nearest(lambda: joined(files(), size), queries, k, self.rows, 2 * size)
+        read_rows = functools.partial(self.rows, release=True)
+        return nearest(lambda: joined(files(), size), queries, k, read_rows, 2 * size)
 
     def similarities(
         self, queries: Float32[np.ndarray, "q d"], numbers: Int64[np.ndarray, "q k"]
@@ -94,8 +96,14 @@ class FileStore:
         query = np.repeat(np.arange(len(queries)), numbers.shape[1])
         return similarities_of(queries, query, numbers.ravel(), self.rows).reshape(numbers.shape)
 
-    def rows(self, numbers: Int64[np.ndarray, " n"]) -> Float[np.ndarray, "n d"]:
+    def rows(
+        self, numbers: Int64[np.ndarray, " n"], *, release: bool = False
+    ) -> Float[np.ndarray, "n d"]:
         """Read the descriptors of these numbers; their files stay mapped into memory.
+
+        Args:
+            numbers: of descriptors, in any order.
+            release: whether to release the pages that are read; numbers are then in order.
 
         Raises:
             InputError: a file is damaged or gone.
@@ -105,13 +113,13 @@ class FileStore:
         files = firsts[np.searchsorted(firsts, numbers, side="right") - 1]
         for first in sorted(set(files.tolist())):  # `np.unique` would import masked arrays
             places = np.flatnonzero(files == first)
-            places = places[np.argsort(numbers[places], kind="stable")]
             mapped = self._mapped.get(first)
             if mapped is None:
                 if len(self._mapped) >= _MAPPED:
                     self._mapped.clear()
-                mapped = self._mapped[first] = self._open(first)
-            rows[places] = gathered(mapped, numbers[places] - first)
+                mapped = self._mapped[first] = self._open(first).view(np.ndarray)
+            here = numbers[places] - first
+            rows[places] = gathered(mapped, here) if release else mapped[here]
         return rows
 
     def close(self) -> None:

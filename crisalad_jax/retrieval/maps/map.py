@@ -11,6 +11,7 @@ import datetime
 import functools
 import os
 import pathlib
+import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, cast
 
@@ -137,6 +138,7 @@ class Map:
         self.components = read_components(folder, metadata)
         """The components that shorten descriptors, and those of queries; None is none."""
         self._segments, self._numbers = segments, dict[str, int]()
+        self._close = weakref.finalize(self, segments.store.close)
         self._approximate: Approximate | None = None
         self._tells_stale = True
         """Whether the next search that is not asked to be exact tells why it is."""
@@ -198,7 +200,11 @@ class Map:
             dtype=metadata.dtype,
             new=not has_images(folder),
         )
-        return cls(folder, metadata, Segments(folder / SEGMENTS, store, metadata.dtype))
+        try:
+            return cls(folder, metadata, Segments(folder / SEGMENTS, store, metadata.dtype))
+        except BaseException:
+            store.close()
+            raise
 
     def __enter__(self) -> Self:
         """Return the map itself."""
@@ -566,8 +572,8 @@ class Map:
         )
 
     def close(self) -> None:
-        """Close the store; one that nothing refers to any more closes itself."""
-        self._segments.store.close()
+        """Close the store; a map that nothing refers to any more closes itself."""
+        self._close()
 
 
 @contextlib.contextmanager

@@ -5,7 +5,6 @@ import logging
 import os
 import pathlib
 import urllib.parse
-import weakref
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -91,7 +90,6 @@ class MilvusStore:
             raise InputError(f"{address}: found nothing, expected the descriptors of this map")
         with _one_line(address):
             self._client = pymilvus.MilvusClient(address, token=os.environ.get(TOKEN, ""))
-            self._disconnect = weakref.finalize(self, _disconnect, self._client, address)
             if new:
                 self._client.drop_collection(collection)
                 self._create(length)
@@ -202,16 +200,12 @@ class MilvusStore:
 
     def close(self) -> None:
         """Disconnect; other processes may then open the file."""
-        self._disconnect()
+        with _one_line(self._address):
+            self._client.close()
+        if self._is_file:
+            from milvus_lite.server_manager import server_manager_instance
 
-
-def _disconnect(client: Any, address: str) -> None:
-    with _one_line(address):
-        client.close()
-    if not check_address(address):
-        from milvus_lite.server_manager import server_manager_instance
-
-        server_manager_instance.release_server(address)
+            server_manager_instance.release_server(self._address)
 
 
 def break_ties(

@@ -5,6 +5,7 @@ import pathlib
 import sys
 
 import numpy as np
+import pymilvus
 import pytest
 
 from crisalad_jax.retrieval.maps import milvus_store as milvus
@@ -248,6 +249,20 @@ def test_a_server_that_does_not_answer_is_one_line(tmp_path, capfd):
     with pytest.raises(InputError, match=r"^http://127\.0\.0\.1:9: Milvus says: Fail connecting"):
         opened(tmp_path, "milvus:http://127.0.0.1:9")
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_server_gets_the_token_of_the_environment(tmp_path, monkeypatch):
+    given = []
+
+    def refuse(*arguments, **options):
+        given.append((arguments, options))
+        raise pymilvus.MilvusException(message="auth\ncheck failure")
+
+    monkeypatch.setattr(pymilvus, "MilvusClient", refuse)
+    monkeypatch.setenv(milvus.TOKEN, "root:secret")
+    with pytest.raises(InputError, match=r"^https://a\.b:1: Milvus says: auth check failure$"):
+        opened(tmp_path, "milvus:https://a.b:1")
+    assert given == [(("https://a.b:1",), {"token": "root:secret"})]
 
 
 def test_milvus_is_asked_for_when_it_is_not_installed(tmp_path, monkeypatch):
