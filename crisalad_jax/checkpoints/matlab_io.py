@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from crisalad_jax.checkpoints.formats.cnn import vgg_numbers
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.mat_files import load_mat
 
 MATLAB_SUFFIX = ".mat"
 _EXPECTED = "a MATLAB file of NetVLAD: net.layers with weights, and its averageImage"
+CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
+"""Numbers of the layers of VGG-16 that have weights."""
 _SCORES, _WHITENING = 30, 33
 """Numbers of the layers of NetVLAD's clusters, and of the whitening."""
 
@@ -46,7 +47,7 @@ def read_matlab(path: pathlib.Path) -> MatlabNetwork:
         # hloc subtracts the first pixel from all, whatever the image's size.
         red, green, blue = map(_as_written, network.meta.normalization.averageImage[0, 0])
         state: dict[str, Any] = {}
-        for _, number in vgg_numbers():
+        for number in CONVOLUTIONS:
             kernel, bias = network.layers[number].weights
             state |= {
                 f"backbone.{number}.weight": kernel.transpose(3, 2, 0, 1),

@@ -242,8 +242,9 @@ def write_checkpoint(
         metadata = {} if text is None else {DECLARED: text}
         write_safetensors(path, state, {"format": "pt"} | metadata)
     else:
-        named = {f"{form.module}{name}": array for name, array in state.items()}
-        write_torch(path, named, under=form.under, bare=form.bare, declared=text)
+        under, _, module = form.inside.partition("/")
+        named = {f"{module}{name}": array for name, array in state.items()}
+        write_torch(path, named, under=under, bare=form.bare, declared=text)
 
 
 class Conversion(NamedTuple):

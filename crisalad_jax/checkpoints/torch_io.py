@@ -203,7 +203,7 @@ def write_torch(
     path: pathlib.Path,
     state: Mapping[str, np.ndarray],
     *,
-    under: str | None,
+    under: str,
     bare: bool,
     declared: str | None,
 ) -> None:
@@ -212,7 +212,7 @@ def write_torch(
     Args:
         path: the file.
         state: arrays by name.
-        under: key of the file's dictionary that holds the state; None: the file is the state.
+        under: key of the file's dictionary that holds the state; empty: the file is the state.
         bare: whether the file is the one tensor by itself.
         declared: see `Content`.
 
@@ -224,7 +224,7 @@ def write_torch(
     if declared is not None:
         content = collections.OrderedDict(content)
         content._metadata = {DECLARED: declared}
-    if under is not None:
+    if under:
         content = {under: content}
     if bare:
         (content,) = content.values()
