@@ -5,10 +5,11 @@ Names and axes of the result are those of hloc's own module.
 """
 
 import pathlib
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from crisalad_jax.checkpoints.torch_io import Content
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.mat_files import load_mat
 
@@ -20,16 +21,7 @@ _SCORES, _WHITENING = 30, 33
 """Numbers of the layers of NetVLAD's clusters, and of the whitening."""
 
 
-class MatlabNetwork(NamedTuple):
-    """What a file holds."""
-
-    state: dict[str, np.ndarray]
-    """Weights by the names of hloc's module."""
-    mean: tuple[float, ...]
-    """Red, green and blue that are subtracted from pixels of 0 to 255."""
-
-
-def read_matlab(path: pathlib.Path) -> MatlabNetwork:
+def read_matlab(path: pathlib.Path) -> Content:
     """Read the weights of a network, and the mean of its images.
 
     Raises:
@@ -67,7 +59,7 @@ def read_matlab(path: pathlib.Path) -> MatlabNetwork:
         raise InputError(
             f"{path}: found another network ({reason}), expected {_EXPECTED}"
         ) from error
-    return MatlabNetwork(arrays, (red, green, blue))
+    return Content(arrays, mean=(red / 255, green / 255, blue / 255))
 
 
 def _as_written(value: Any) -> float:

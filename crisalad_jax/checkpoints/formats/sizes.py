@@ -41,15 +41,14 @@ class Reader(NamedTuple):
         Raises:
             InputError: there is neither, or the array has no such axis.
         """
-        if not self.has(name):
-            if default is not None:
-                return default
-            raise InputError(f"found no {self.prefix}{name}, expected it among the others")
-        shape = self.state[self.prefix + name].shape
+        if default is not None and not self.has(name):
+            return default
+        shape = self.state[self.prefix + name].shape if self.has(name) else ()
         if len(shape) <= axis or not shape[axis]:
+            found = f"of shape {shape}" if self.has(name) else "nowhere"
             raise InputError(
-                f"{self.prefix}{name} found of shape {shape}, expected more than {axis} axes, none "
-                "of them empty"
+                f"{self.prefix}{name} found {found}, expected an array of more than {axis} axes, "
+                "none of them empty"
             )
         return shape[axis]
 
@@ -74,7 +73,7 @@ def infer_backbone(kinds: tuple[type[Any], ...], rows: Rows, read: Reader) -> Ba
     """Make the configuration of a backbone, one of `kinds`, from names and shapes.
 
     Raises:
-        InputError: it is of another kind, or has sizes that no configuration has.
+        InputError: it has sizes that no configuration has.
     """
     theirs = first_names(rows)
     if issubclass(kinds[0], VisionTransformer):
@@ -82,11 +81,8 @@ def infer_backbone(kinds: tuple[type[Any], ...], rows: Rows, read: Reader) -> Ba
     if kinds[0] is TransVprNetConfig:
         return _infer_transvpr(read)
     stem = next(iter(theirs.values()))
-    kind = ResNetConfig if read.size(stem, 2) == STEM_SIDE else VggConfig
-    if kind not in kinds:
-        wanted = " or ".join(each.part_name for each in kinds)
-        raise InputError(f"found backbone {kind.part_name}, expected {wanted}")
-    return VggConfig() if kind is VggConfig else _infer_resnet(theirs, read)
+    is_vgg = ResNetConfig not in kinds or (VggConfig in kinds and read.size(stem, 2) != STEM_SIDE)
+    return VggConfig() if is_vgg else _infer_resnet(theirs, read)
 
 
 def _infer_vit(kind: type[_V], theirs: dict[str, str], read: Reader) -> _V:
