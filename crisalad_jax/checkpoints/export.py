@@ -10,7 +10,6 @@ import dataclasses
 import hashlib
 import os
 import pathlib
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
 
@@ -334,8 +333,10 @@ def _write_onnx(
                 path, function, arrays, inputs, output, words=words, beside=beside
             )
         if calibration is not None:
+            from crisalad_jax.checkpoints.onnx_format.quantise import quantise
+
             # OpenVINO fails to move scales of columns past a reshape.
-            _quantise(path, calibration, products, per_channel=how.format == "onnx")
+            quantise(path, calibration, products, per_channel=how.format == "onnx")
         if how.format == "openvino":
             convert_to_openvino(path, path.with_suffix(".xml"))
             for suffix in SUFFIXES["onnx"]:
@@ -359,21 +360,6 @@ def _write_onnx(
         "products": "float32" if calibration is None else "int8",
         "checked": {"engine": engine, "largest_difference": difference},
     }
-
-
-def _quantise(
-    program: pathlib.Path, calibration: np.ndarray, products: list[str], *, per_channel: bool
-) -> None:
-    """Quantise a program in its place."""
-    from crisalad_jax.checkpoints.onnx_format.quantise import quantise
-
-    # It finds its weights by their name, so they keep it.
-    whole = program.parent / "float32"
-    whole.mkdir()
-    for each in (program, program.with_name(f"{program.name}.data")):
-        each.rename(whole / each.name)
-    quantise(whole / program.name, program, calibration, products, per_channel=per_channel)
-    shutil.rmtree(whole)
 
 
 def _halves(

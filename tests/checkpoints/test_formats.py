@@ -221,7 +221,7 @@ def without(state: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
         (lambda s: without(s, "pos_embed"), "found no pos_embed"),
         (
             lambda s: s | {"cls_token": np.zeros(64)},
-            "cls_token found of shape .64,., expected more",
+            "found cls_token of shape .64,., expected an",
         ),
         (
             lambda s: s | {"cls_token": np.zeros((1, 1, 48))},
@@ -233,7 +233,7 @@ def without(state: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
         ),
         (
             lambda s: {k: v for k, v in s.items() if not k.startswith("blocks.0.")},
-            "blocks.0.mlp.fc2.weight found nowhere, expected an array of more than 1 axes",
+            "found no blocks.0.mlp.fc2.weight, expected an array of more than 1 axes",
         ),
     ],
 )

@@ -467,7 +467,7 @@ BAD: dict[str, tuple[str, Callable[[], Any], str]] = {
     "no width": (
         ".pth",
         lambda: small(cls_token=torch.zeros(1, 1, 0)),
-        "cls_token found of shape .1, 1, 0., expected an array of more than 2 axes, none of",
+        "found cls_token of shape .1, 1, 0., expected an array of more than 2 axes, none of",
     ),
     "extra and missing": (
         ".pth",

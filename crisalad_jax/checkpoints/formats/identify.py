@@ -135,7 +135,7 @@ def _check_halves(state: State, source: str) -> None:
 
     Families share the names of their parts: the message has all that it may be of.
     """
-    formats = [each for each in FORMATS.values() if each.head.mark is not None]
+    formats = [each for each in FORMATS.values() if not each.has_head({})]
     heads = [each.holds for each in formats if each.has_head(state)]
     backbones = [each.holds for each in formats if each.has_backbone(state)]
     for here, families, missing in (("head", heads, "backbone"), ("backbone", backbones, "head")):

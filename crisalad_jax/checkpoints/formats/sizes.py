@@ -43,12 +43,12 @@ class Reader(NamedTuple):
         """
         if default is not None and not self.has(name):
             return default
-        shape = self.state[self.prefix + name].shape if self.has(name) else ()
+        whole = self.prefix + name
+        shape = self.state[whole].shape if whole in self.state else ()
         if len(shape) <= axis or not shape[axis]:
-            found = f"of shape {shape}" if self.has(name) else "nowhere"
+            found = f"{whole} of shape {shape}" if whole in self.state else f"no {whole}"
             raise InputError(
-                f"{self.prefix}{name} found {found}, expected an array of more than {axis} axes, "
-                "none of them empty"
+                f"found {found}, expected an array of more than {axis} axes, none of them empty"
             )
         return shape[axis]
 

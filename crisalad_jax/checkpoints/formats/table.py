@@ -52,7 +52,7 @@ def check_holds(config: ModelConfig, name: str) -> ModelConfig:
         InputError: what `table` raises; or a setting that no shape tells and that differs from the
             published one, which reading would take for it.
     """
-    state = _theirs(_blank(config), config, name, {})
+    state = _theirs(_blank(config), table(config, name), config, {})
     if name in (REFERENCE, VOCABULARY):  # which have the configuration, or no model
         return config
     read_back = FORMATS[name].infer(state)
@@ -87,7 +87,7 @@ def public_shapes(config: ModelConfig, name: str) -> dict[str, tuple[int, ...]]:
     Raises:
         InputError: what `table` raises.
     """
-    state = _theirs(_blank(config), config, name, {})
+    state = _theirs(_blank(config), table(config, name), config, {})
     return {theirs: array.shape for theirs, array in state.items()}
 
 
@@ -102,7 +102,8 @@ def to_params(
     Raises:
         InputError: naming `source` and the first names that are missing, unknown or misshaped.
     """
-    lines, shapes = table(config, name), public_shapes(config, name)
+    lines, blank = table(config, name), _blank(config)
+    shapes = {name: array.shape for name, array in _theirs(blank, lines, config, {}).items()}
     extras = {row.theirs[0] for row in lines if isinstance(row.form, Extra)}
     problems = [f"{theirs} missing" for theirs in shapes.keys() - state.keys() - extras]
     problems += [f"{theirs} unknown" for theirs in state.keys() - shapes.keys()]
@@ -116,13 +117,13 @@ def to_params(
             f"{source}: does not fit the format {name} of width {config.backbone.dim} and "
             f"{config.backbone.depth} blocks: {few(sorted(problems, key=_natural))}"
         )
-    blank, ours, read = _numbered(_blank(config)), {}, {}
+    ours, read = {}, {}
     for row in lines:
         arrays = [state[name] for name in row.theirs if name in state]
         if isinstance(row.form, Form):
             ours |= zip(row.ours, row.form.ours(*arrays), strict=True)
         elif isinstance(row.form, Absent):
-            ours[row.ours[0]] = np.full_like(blank[row.ours[0]], row.form.value)
+            ours[row.ours[0]] = np.full(blank[row.ours[0]].shape, row.form.value, np.float32)
         elif isinstance(row.form, Extra) and arrays:
             (read[row.ours[0]],) = row.form.form.ours(*arrays)
     return _from_numbered(ours, config), read
@@ -137,13 +138,15 @@ def to_state(
         InputError: the format has no place for a part of this model.
     """
     leaves = {leaf: np.asarray(array) for leaf, array in named_leaves(params).items()}
-    state = _theirs(leaves, config, name, extras)
+    state = _theirs(leaves, table(config, name), config, extras)
     return {theirs: np.ascontiguousarray(x).reshape(x.shape) for theirs, x in state.items()}
 
 
-def _theirs(leaves: State, config: ModelConfig, name: str, extras: State) -> dict[str, np.ndarray]:
+def _theirs(
+    leaves: State, lines: list[Row], config: ModelConfig, extras: State
+) -> dict[str, np.ndarray]:
     ours, state = _numbered(leaves), {}
-    for row in table(config, name):
+    for row in lines:
         if isinstance(row.form, Form):
             state |= zip(row.theirs, row.form.theirs(*map(ours.get, row.ours)), strict=True)
         elif isinstance(row.form, Extra):
