@@ -11,7 +11,7 @@ from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.named_places import TABLE
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.data.query_set import QuerySet, read_query_set
-from crisalad_jax.experiments.report import training_curves
+from crisalad_jax.experiments.report import save, training_curves
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import FitResult, check_learns, fit
@@ -137,7 +137,7 @@ def train(
         quiet=quiet,
     )
     if distributed.is_primary():
-        training_curves(out / "curves.png", read_metrics(out / "metrics.jsonl"))
+        save(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
     return result
 
 

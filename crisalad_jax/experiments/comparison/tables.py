@@ -16,10 +16,9 @@ from crisalad_jax.experiments.report.style import (
     GREY,
     INK,
     Drawing,
-    drawing,
+    chart,
     label_axes,
     new_figure,
-    save,
 )
 from crisalad_jax.experiments.report.tables import NOTHING, Cell, Table, no_formula, write_text
 from crisalad_jax.utils.files import split_markers, write_json
@@ -244,10 +243,8 @@ def _chart(summary: Summary, name: str, out: pathlib.Path, number: int) -> Drawi
     axes.set_ylim(len(titles) - 0.5, -0.5)
     axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter("{x:g} %")
-    path = out / f"recall_{number}.png"
-    save(figure, path)
     means = "; ".join(
         f"{title} {percent(row.recalls[name][1].mean)} %"
         for title, row in zip(titles, summary.rows, strict=True)
     )
-    return drawing(path, f"R@1 on {name}: {means}")
+    return chart(figure, out / f"recall_{number}.png", f"R@1 on {name}: {means}")

@@ -1,6 +1,6 @@
 """Reports of a run: tables, curves, galleries of predictions, and a page of an evaluation."""
 
-from crisalad_jax.experiments.report.curves import recall_curves, training_curves
+from crisalad_jax.experiments.report.charts import recall_curves, training_curves
 from crisalad_jax.experiments.report.gallery import show_retrievals, write_galleries
 from crisalad_jax.experiments.report.page import write_report
 from crisalad_jax.experiments.report.style import save

@@ -18,7 +18,7 @@ from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.metrics import Interval, precision_recall
 from crisalad_jax.evaluation.results import GroupingResult, Scores
 from crisalad_jax.experiments.report import write_report
-from crisalad_jax.experiments.report.charts import judge
+from crisalad_jax.experiments.report.charts import outcomes_of
 from crisalad_jax.experiments.report.page import Subject, page_rows, write_results
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad
@@ -130,7 +130,7 @@ def test_every_section_is_there_and_linked(page: Page):
             "queries",
             "right",
             "wrong",
-            "unmatched",
+            "no-positive",
             "map",
             "similarities",
             "transport",
@@ -251,7 +251,7 @@ def test_names_of_files_are_no_markup(
     assert set(shown) <= asked
     # Of what this model and set lack there is no section, nor a word.
     names = [e["id"] for e in page.all("section")]
-    assert names == ["recall", "queries", "right", "wrong", "unmatched", "settings"]
+    assert names == ["recall", "queries", "right", "wrong", "no-positive", "settings"]
     assert "No descriptor of this model" in " ".join(page.all("main")[0]["text"].split())
     assert [e["text"] for e in page.all("figcaption")][1].split() == ["✓", "1", "0.910"]
 
@@ -270,7 +270,7 @@ def test_a_page_without_results(benchmark: Benchmark, params: Crisalad, tmp_path
 
     with pytest.raises(InputError, match=r"^groupings: found none"):
         write([])
-    with pytest.raises(InputError, match=r"^single: found recall 33 at 1, expected a fraction"):
+    with pytest.raises(InputError, match=r"^groupings: found single: .1: 33., expected"):
         write([GroupingResult("single", {1: 33}, NEIGHBOURS)])
     assert not (tmp_path / "out").exists()
 
@@ -300,9 +300,9 @@ def test_a_row_for_every_query_and_grouping(benchmark, tmp_path: pathlib.Path):
         ("no positive", "", "d/1.jpg", "0.730000", "8960.00"),
     ]
     assert page_rows(subject, GROUPINGS[0]) == [
-        ["=1+1.jpg", 2, 1, "0.jpg", 0.91, 3.0],
-        ["b,\\x1b.jpg", 0, 3, "2.jpg", 0.82, 35.0],
-        ["c.jpg", 1, None, "1.jpg", 0.73, 8960.0],
+        ["a/=1+1.jpg", 2, 1, "d/0.jpg", 0.91, 3.0],
+        ["a/b,\\x1b.jpg", 0, 3, "d/2.jpg", 0.82, 35.0],
+        ["a/c.jpg", 1, None, "d/1.jpg", 0.73, 8960.0],
     ]
 
 
@@ -331,10 +331,10 @@ def test_the_most_confident_mistakes_come_first_and_right_ones_are_spread(benchm
     positives = (*[np.array([0])] * 10, np.array([], int))
     similarities = np.array([0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.2, 0.9, 0.2, 0.3, 0.1])
     neighbours = Neighbours(indices, similarities[:, None].astype(np.float32))
-    subject = Subject(benchmark, neighbours, judge(neighbours, positives), None)
+    subject = Subject(benchmark, neighbours, outcomes_of(neighbours, positives), None)
     # Of six right ones the first, the last, and one of the two in the middle. 6 and 8 are as
     # similar: file order.
-    shown = {"right": [0, 2, 5], "wrong": [7, 9, 6], "unmatched": [10]}
+    shown = {"right": [0, 2, 5], "wrong": [7, 9, 6], "no positive": [10]}
     assert subject.choose(3) == subject.choose(3) == shown
     assert subject.choose(50)["wrong"] == [7, 9, 6, 8]
     assert subject.choose(50)["right"] == [0, 1, 2, 3, 4, 5]
