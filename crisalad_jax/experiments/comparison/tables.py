@@ -9,7 +9,7 @@ from typing import Any
 
 from crisalad_jax.evaluation.results import percent
 from crisalad_jax.experiments.comparison.costs import AdapterCost
-from crisalad_jax.experiments.comparison.results import KS, Recall, Row, Summary
+from crisalad_jax.experiments.comparison.results import KS, Difference, Recall, Row, Summary
 from crisalad_jax.experiments.report.page import PAGE, render
 from crisalad_jax.experiments.report.style import (
     COLOURS,
@@ -68,8 +68,6 @@ def tables_of(summary: Summary) -> dict[str, Table]:
     """Make the tables of a comparison by name; those without a row are left out."""
     first, *described = summary.headers
     columns = [(name, k) for name in summary.sets for k in KS]
-    # A model's costs do not depend on the grouping.
-    one_of_each = list({row.name: row for row in reversed(summary.rows)}.values())[::-1]
     recalls = [
         [
             Cell(_title(row, summary.rows)),
@@ -79,17 +77,20 @@ def tables_of(summary: Summary) -> dict[str, Table]:
         for row in summary.rows
     ]
     differences = [
-        [
-            Cell(_title(row, summary.rows)),
-            *(_difference(row.recalls[name][k]) for name, k in columns),
-        ]
+        [Cell(_title(row, summary.rows))]
+        + [_difference(row.recalls[name][k].difference) for name, k in columns]
         for row in summary.rows
-        if any(recall.difference for by_k in row.recalls.values() for recall in by_k.values())
+        if any(row.recalls[name][k].difference for name, k in columns)
     ]
-    costs = [[row.labels[0], *costs_of(row)] for row in one_of_each]
-    at_k = [f"{name} R@{k}" for name, k in columns]
+    # A model's costs do not depend on the grouping.
+    one_of_each = {row.name: row for row in reversed(summary.rows)}
+    costs = [[row.labels[0], *costs_of(row)] for row in reversed(one_of_each.values())]
     tables = {
-        "recall": Table([first, *described, *at_k], recalls, labels=len(summary.headers)),
+        "recall": Table(
+            [first, *described, *(f"{name} R@{k}" for name, k in columns)],
+            recalls,
+            labels=len(summary.headers),
+        ),
         "differences": Table(
             [f"{first}, less {summary.reference}", *(f"{name} Δ R@{k}" for name, k in columns)],
             differences,
@@ -116,10 +117,10 @@ def _recall(recall: Recall, name: str, k: int, rows: Sequence[Row]) -> Cell:
     return Cell(percent(recall.mean), note, "best" if recall.mean == best else "")
 
 
-def _difference(recall: Recall) -> Cell:
-    if recall.difference is None:
+def _difference(difference: Difference | None) -> Cell:
+    if difference is None:
         return Cell(NOTHING)
-    mean, (low, high), verdict = recall.difference
+    mean, (low, high), verdict = difference
     kind = {"better": "right", "worse": "wrong"}.get(verdict, "")
     return Cell(_points(mean), f"({_points(low)} to {_points(high)})\n{verdict}", kind)
 
@@ -235,9 +236,9 @@ def _chart(summary: Summary, name: str, out: pathlib.Path, number: int) -> Drawi
         colour = COLOURS[0] if row.labels[0] == summary.reference else INK
         low, high = (100 * end for end in recall.interval)
         axes.plot((low, high), (place, place), color=colour, linewidth=1.6, alpha=0.55)
-        seeds = [100 * value for value in recall.by_seed]
         ring = {"markersize": 4, "markerfacecolor": "none", "markeredgewidth": 0.8}
-        axes.plot(seeds, [place] * len(seeds), "o", color=GREY, clip_on=False, **ring)
+        for value in recall.by_seed:
+            axes.plot(100 * value, place, "o", color=GREY, clip_on=False, **ring)
         axes.plot(100 * recall.mean, place, "o", color=colour, markersize=6, clip_on=False)
     axes.set_yticks(range(len(titles)), titles, fontsize=9)
     axes.set_ylim(len(titles) - 0.5, -0.5)

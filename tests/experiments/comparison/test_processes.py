@@ -150,7 +150,7 @@ def test_a_killed_process_leaves_its_run_to_the_other(flags, tmp_path, plugin):
     os.kill(workers_of(process.pid)[0], signal.SIGKILL)
     _, errors = process.communicate(timeout=500)
     assert process.returncode == 0, errors
-    assert "ended with code -9; the others go on" in errors
+    assert "ended with code -9; its runs are left to the others" in errors
     results = json.loads((out / "results.json").read_text())
     (recalls,) = results["rows"][0]["recalls"].values()
     assert len(recalls["R@1"]["by_seed"]) == 2

@@ -30,6 +30,7 @@ from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, init_crisalad
+from crisalad_jax.training import start
 from crisalad_jax.utils import locks, temporaries
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
@@ -281,7 +282,7 @@ def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeyp
             params, aggregator=jax.tree.map(lambda x: x + 1, params.aggregator)
         )
 
-    monkeypatch.setattr(runner, "with_vocabulary", with_vocabulary)
+    monkeypatch.setattr(start, "with_vocabulary", with_vocabulary)
     monkeypatch.delattr(runner, "fit")
     config = ComparisonConfig(**settings | {"names": ("anyloc",)})
     out = tmp_path / "out"
@@ -334,14 +335,15 @@ def test_rows_draw_seeds_together_where_they_share_them(finished, settings, shar
     )
     ranks = {0: [1] * 5, 1: [0] * 5}
     trained = training_of(finished / "crisalad" / "seed-0")
-    for each in runs_of(prepared, finished):
+    runs = runs_of(prepared, finished)
+    for each in runs:
         factor = 2 if each.variant.name == "salad" else 1
         result = each.read()
         result.training = trained | {"step_seconds": factor * trained["step_seconds"]}
         result.ranks = {each.evaluations[0].key: {"single": ranks[each.seed]}}
         result.write(each.folder)
     speed = read_json(finished / "speed.json", "times") | {"rounds": dict.fromkeys(names, (1.0,))}
-    _, same, alone = comparison.summarise(prepared, finished, speed).rows
+    _, same, alone = comparison.summarise(prepared, runs, speed).rows
     assert same.recalls["town"][1].difference.interval == (0, 0)
     assert (same.training, alone.training) == ((2, 2, 2), None)  # over the reference's
     # All queries hit or miss with their seed: two seeds miss both in a quarter of the resamples.
@@ -404,9 +406,9 @@ def test_runs_are_shared_with_another_process(finished, config, monkeypatch):
             other.close()
 
         monkeypatch.setattr(runner.time, "sleep", ended)
-        runner.take_runs(prepared, finished, say=lines.append)
+        runner.take_runs(prepared, runs, say=lines.append)
     assert one == [1]
-    assert lines[1:] == [
+    assert lines == [
         "crisalad, seed 1: 0 of 2 runs done",
         "waiting for the runs of other processes",
     ]
@@ -418,7 +420,8 @@ def test_the_run_of_a_killed_process_is_free(finished, config, monkeypatch):
     (folder / temporaries.LOCK).write_text(f"process 1 on {socket.gethostname()}\n")
     write_json(folder / "result.json", read_json(folder / "result.json", "it") | {"ranks": {}})
     monkeypatch.delattr(runner, "fit")
-    runner.take_runs(comparison.prepare(config), finished, say=print)
+    prepared = comparison.prepare(config)
+    runner.take_runs(prepared, runs_of(prepared, finished), say=print)
     assert not (folder / temporaries.LOCK).exists()
 
 
