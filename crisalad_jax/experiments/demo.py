@@ -117,23 +117,15 @@ def _run(config: DemoConfig, out: pathlib.Path, quiet: bool) -> DemoSummary:
         for model, of_model in results.items()
         for result in of_model
     ]
+    curves = {f"{r.model}, {r.grouping}": r.recalls for r in rows if r.grouping != "shuffled"}
+    titles = (
+        "Recall@K on places never seen in training",
+        "Queries and what the trained model finds, every image described independently",
+    )
     figures = {
-        "recall.png": recall_curves(
-            {
-                f"{row.model}, {row.grouping}": row.recalls
-                for row in rows
-                if row.grouping != "shuffled"
-            },
-            "Recall@K on places never seen in training",
-            wide=True,
-        ),
+        "recall.png": recall_curves(curves, titles[0], wide=True),
         "training.png": training_curves(read_metrics(out / "run" / "metrics.jsonl")),
-        "gallery.png": show_retrievals(
-            results["trained"][0],
-            benchmark,
-            rows=6,
-            title="Queries and what the trained model finds, every image described independently",
-        ),
+        "gallery.png": show_retrievals(results["trained"][0], benchmark, rows=6, title=titles[1]),
     }
     for name, figure in figures.items():
         save(figure, out / name)

@@ -1,6 +1,7 @@
 """What is compared: the methods of the paper's Table 1, the rows of its Table 2, custom rows."""
 
 import dataclasses
+import itertools
 import re
 import shlex
 from collections.abc import Mapping
@@ -168,6 +169,18 @@ class Ablation(NamedTuple):
         )
         return dataclasses.replace(config, optimiser=optimiser)
 
+    def words(self, training: TrainConfig) -> str:
+        """Say what the row changes, of CriSALAD itself its settings; `training` is its recipe."""
+        settings = {
+            "adapter": self.adapter,
+            "cross-image encoder": "yes" if self.encoder else "no",
+            "learning rate": f"{training.optimiser.learning_rate:.2g}",
+            "scheduler": self.schedule,
+        }
+        words = [f"{name} {setting}" for name, setting in settings.items()]
+        changed = [own != usual for own, usual in zip(self, Ablation(), strict=True)]
+        return ", ".join(itertools.compress(words, changed) if any(changed) else words)
+
 
 ABLATIONS: Mapping[str, Ablation] = {
     "crisalad": Ablation(),
@@ -181,24 +194,6 @@ ABLATIONS: Mapping[str, Ablation] = {
 }
 """The paper's rows, and one without any adapter, which the paper lacks. Its last row, printed with
 the step schedule, is also here with the linear one, which changes a single part."""
-
-
-def changes_of(name: str, preset: str, *, from_nothing: bool) -> str:
-    """Describe what a row of Table 2 changes; of CriSALAD itself, its settings."""
-    own, base = (
-        {
-            "adapter": adapter_kind(training.model),
-            "cross-image encoder": "yes" if training.model.cross_image.layers else "no",
-            "learning rate": f"{training.optimiser.learning_rate:.2g}",
-            "scheduler": training.optimiser.schedule,
-        }
-        for training in (
-            ABLATIONS[each].training(preset, from_nothing=from_nothing)
-            for each in (name, "crisalad")
-        )
-    )
-    changed = {each: word for each, word in own.items() if word != base[each]} or own
-    return ", ".join(f"{each} {word}" for each, word in changed.items())
 
 
 def adapter_kind(model: ModelConfig) -> str:

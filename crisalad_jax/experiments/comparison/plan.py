@@ -28,7 +28,6 @@ from crisalad_jax.experiments.comparison.methods import (
     METHODS,
     AblationRow,
     adapter_kind,
-    changes_of,
     is_method,
     method_of,
     method_training,
@@ -309,7 +308,8 @@ def _draft(
         changed, training = row.words, row.training(**size)
     elif name in ABLATIONS:
         title = METHODS[name].title if name in METHODS else name
-        changed, training = changes_of(name, **size), ABLATIONS[name].training(**size)
+        training = ABLATIONS[name].training(**size)
+        changed = ABLATIONS[name].words(training)
     else:
         title, run, rerank = method_of(name, config.preset, config.flag)
         changed, training = title, method_training(run, **size)

@@ -21,6 +21,7 @@ from crisalad_jax.experiments.comparison.plan import (
     file_name,
     short_names,
 )
+from crisalad_jax.experiments.report.page import render
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.training.run_files import checksum_of_benchmark
 from crisalad_jax.training.trainable import count_trainable
@@ -413,55 +414,25 @@ def _parameters(variant: Variant) -> tuple[int, int | None]:
 
 def _notes(prepared: Prepared, reference: Variant, speed: Mapping[str, Any]) -> list[str]:
     """Say how the numbers came about; docs/comparison.md says more."""
-    config, variants = prepared.config, prepared.variants
-    trained = [variant for variant in variants if variant.trains]
-    unlearnt = [v for v in variants if v.weights is None and not v.trains]
-    reranked = [variant for variant in variants if variant.rerank is not None]
-    over = "" if speed["absolute"] else f", over {reference.labels[0]}'s"
-    seeds = f"Seeds of all but models from files: {config.seeds}; weights after the last step."
-    notes = [
-        "Recalls in percent of all queries: the mean over the seeds ± their standard deviation, "
-        "and in brackets 95 % by bootstrap over the queries, as if they were independent. "
-        + (seeds if trained or unlearnt else "All models are from files."),
-        f"Images/s: describing batches of {speed['batch_size']}, each image alone, all models in "
-        f"turns, on {speed['device']}{over}.",
-    ]
-    if len(variants) > 1:
-        notes.append(
-            f"Δ: recall less {reference.labels[0]}'s in points, with 95 % by a paired bootstrap "
-            f"over queries and seeds, {RESAMPLES:,} resamples. Better or worse: the interval "
-            "excludes 0."
-        )
-    if trained:
-        start = "nothing, by the recipe scratch" if config.from_nothing else "a given backbone"
-        sizes: dict[str, list[str]] = {}
-        for variant in trained:
-            training = variant.training
-            batch = f"{training.places_per_batch} places x {training.images_per_place}"
-            size = f"{training.epochs} epochs, batches of {batch}"
-            sizes.setdefault(size, []).append(variant.labels[0])
-        words = [size if len(sizes) == 1 else f"{size}: {_listed(sizes[size])}" for size in sizes]
-        notes += [
-            f"Training time: steps x the median time of a step{over}, without compiling, of runs "
-            "that had their device to themselves, at least two: median and range.",
-            f"Trained from {start} on {pathlib.Path(config.train or '').name}. {'; '.join(words)}.",
-        ]
-    if config.grouping != "single":
-        notes.append(
-            f"A grouping other than single lets the {config.batch_size} images of a batch attend "
-            "to each other."
-        )
-    if reranked:
-        titles = _listed(variant.labels[0] for variant in reranked)
-        notes.append(
-            f"Re-ranked, the first {config.rerank} retrievals, which is not in images/s: {titles}."
-        )
-    if unlearnt:
-        start = ", here of random features" if config.from_nothing else ""
-        titles = _listed(variant.labels[0] for variant in unlearnt)
-        notes.append(f"Never trained, a vocabulary of features alone{start}: {titles}.")
-    return [*notes, *prepared.left_out]
+    variants, sizes = prepared.variants, {}
+    for variant in variants:
+        training = variant.training
+        size = training.epochs, training.places_per_batch, training.images_per_place
+        if variant.trains:
+            sizes.setdefault(size, {})[variant.labels[0]] = None
+    context = {
+        "config": prepared.config,
+        "variants": variants,
+        "reference": reference.labels[0],
+        "speed": speed,
+        "resamples": RESAMPLES,
+        "train": pathlib.Path(prepared.config.train or "").name,
+        "sizes": sizes,
+        "reranked": _titles(variant for variant in variants if variant.rerank is not None),
+        "unlearnt": _titles(v for v in variants if v.weights is None and not v.trains),
+    }
+    return [*render("notes.txt", context).splitlines(), *prepared.left_out]
 
 
-def _listed(titles: Iterable[str]) -> str:
-    return ", ".join(dict.fromkeys(titles))
+def _titles(variants: Iterable[Variant]) -> list[str]:
+    return list(dict.fromkeys(variant.labels[0] for variant in variants))

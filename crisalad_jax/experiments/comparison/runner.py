@@ -140,7 +140,7 @@ def carry_out(
     jobs: int = 1,
     beside: bool = False,
 ) -> tuple[Prepared, list[Run]]:
-    """Prepare a comparison, make `out` its folder, and take its runs until all are done.
+    """Prepare a comparison, make `out` its folder, and take all runs that nobody is at.
 
     Args:
         config: what to compare.
@@ -166,25 +166,8 @@ def carry_out(
     runs = runs_of(prepared, out)
     start = config.backbone or "nothing"
     say(f"{len(runs)} runs to compare; what is trained starts from {start}")
-    take_runs(prepared, runs, say=say, quiet=quiet, jobs=jobs, beside=beside)
-    return prepared, runs
-
-
-def take_runs(
-    prepared: Prepared,
-    runs: Sequence[Run],
-    *,
-    say: Say,
-    quiet: bool = False,
-    jobs: int = 1,
-    beside: bool = False,
-) -> None:
-    """Take runs that no other process is at, until all are done, by whomever.
-
-    The arguments are those of `carry_out`; raises as that.
-    """
-    waits, left = False, list(runs)
-    while left := [run for run in left if not run.is_done]:
+    waits = False
+    while left := [run for run in runs if not run.is_done]:
         began = False
         for run in left:
             with contextlib.suppress(BusyFolderError), lock(run.folder):
@@ -197,6 +180,7 @@ def take_runs(
                 say("waiting for the runs of other processes")
             waits = True
             time.sleep(POLL)
+    return prepared, runs
 
 
 def progress_words(run: Run, runs: Sequence[Run], jobs: int) -> str:

@@ -34,15 +34,7 @@ def write_tables(summary: Summary, out: pathlib.Path) -> None:
     charts = [_chart(summary, name, out, number) for number, name in enumerate(summary.sets)]
     context = {
         "title": _PAGE_TITLES[summary.kind],
-        "sets": list(summary.sets),
-        "facts": [
-            (
-                name,
-                f"{len(each.queries):,} queries, {len(each.database):,} database images, positive: "
-                f"{each.rule}",
-            )
-            for name, each in summary.sets.items()
-        ],
+        "sets": summary.sets,
         "reference": summary.reference,
         "charts": charts,
         "tables": tables_of(summary),
@@ -83,8 +75,7 @@ def tables_of(summary: Summary) -> dict[str, Table]:
         if any(row.recalls[name][k].difference for name, k in columns)
     ]
     # A model's costs do not depend on the grouping.
-    one_of_each = {row.name: row for row in reversed(summary.rows)}
-    costs = [[row.labels[0], *costs_of(row)] for row in reversed(one_of_each.values())]
+    of_each = {row.name: row for row in reversed(summary.rows)}.values()
     tables = {
         "recall": Table(
             [first, *described, *(f"{name} R@{k}" for name, k in columns)],
@@ -95,12 +86,15 @@ def tables_of(summary: Summary) -> dict[str, Table]:
             [f"{first}, less {summary.reference}", *(f"{name} Δ R@{k}" for name, k in columns)],
             differences,
         ),
-        "costs": Table([first, *_COSTS], [list(map(Cell, cells)) for cells in costs]),
-        "adapters": Table(
-            _ADAPTERS, [list(map(Cell, adapter_cells(cost))) for cost in summary.adapters]
-        ),
+        "costs": _table_of([{first: row.labels[0]} | costs_of(row) for row in reversed(of_each)]),
+        "adapters": _table_of(list(map(adapter_cells, summary.adapters))),
     }
     return {name: table for name, table in tables.items() if table.rows}
+
+
+def _table_of(rows: Sequence[Mapping[str, str]]) -> Table:
+    """Make a table whose headers are the names of the rows' texts."""
+    return Table(list(rows[0]) if rows else [], [list(map(Cell, row.values())) for row in rows])
 
 
 def _title(row: Row, rows: Sequence[Row]) -> str:
@@ -131,23 +125,23 @@ def _points(fraction: float) -> str:
     return f"{round(100 * fraction, 1) + 0:+.1f}"
 
 
-_COSTS = ("dimension", "images/s", "parameters", "trained", "training time")
-
-
-def costs_of(row: Row) -> list[str]:
-    """Format a row's costs, in the columns of `_COSTS`: times over the reference's on a CPU."""
-    training = NOTHING
+def costs_of(row: Row) -> dict[str, str]:
+    """Format a row's costs by their headers: times over the reference's on a CPU."""
     if row.images_per_second is None:
         speed = f"{row.speed:.2f} x"
-        if row.training is not None:
-            training = _ratios(row.training)
+        training = NOTHING if row.training is None else _ratios(row.training)
     else:
-        speed = f"{row.images_per_second:.0f}"
+        speed, training = f"{row.images_per_second:.0f}", NOTHING
         if row.training_seconds is not None:
             minutes = (seconds / 60 for seconds in row.training_seconds)
             training = "{:.1f} min ({:.1f} to {:.1f})".format(*minutes)
-    trained = NOTHING if row.trained is None else f"{row.trained:,}"
-    return [f"{row.dimension:,}", speed, f"{row.parameters:,}", trained, training]
+    return {
+        "dimension": f"{row.dimension:,}",
+        "images/s": speed,
+        "parameters": f"{row.parameters:,}",
+        "trained": NOTHING if row.trained is None else f"{row.trained:,}",
+        "training time": training,
+    }
 
 
 def _ratios(times: Sequence[float]) -> str:
@@ -155,30 +149,19 @@ def _ratios(times: Sequence[float]) -> str:
     return "{:.2f} x ({:.2f} to {:.2f})".format(*times)
 
 
-_ADAPTERS = (
-    "adapter",
-    "parameters, paper",
-    "parameters here",
-    "MACs, paper (M)",
-    "FLOPs, paper (M)",
-    "true MACs (M)",
-    "time",
-)
-
-
-def adapter_cells(cost: AdapterCost) -> list[str]:
-    """Format the cost of an adapter, in the columns of `_ADAPTERS`."""
+def adapter_cells(cost: AdapterCost) -> dict[str, str]:
+    """Format the cost of an adapter by its headers."""
     # The only figure of the paper that no way of counting gives.
     printed = " (printed: 2,356,080)" if cost.adapter == "mlp" else ""
-    return [
-        cost.adapter,
-        f"{cost.paper_parameters:,}{printed}",
-        f"{cost.parameters:,}",
-        f"{cost.paper_macs / 1e6:.3f}",
-        f"{2 * cost.paper_macs / 1e6:.3f}",
-        f"{cost.macs / 1e6:.1f}",
-        NOTHING if cost.time is None else _ratios(cost.time),
-    ]
+    return {
+        "adapter": cost.adapter,
+        "parameters, paper": f"{cost.paper_parameters:,}{printed}",
+        "parameters here": f"{cost.parameters:,}",
+        "MACs, paper (M)": f"{cost.paper_macs / 1e6:.3f}",
+        "FLOPs, paper (M)": f"{2 * cost.paper_macs / 1e6:.3f}",
+        "true MACs (M)": f"{cost.macs / 1e6:.1f}",
+        "time": NOTHING if cost.time is None else _ratios(cost.time),
+    }
 
 
 def as_json(summary: Summary) -> dict[str, Any]:

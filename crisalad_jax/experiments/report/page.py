@@ -92,25 +92,22 @@ def write_report(
         context = {
             "title": benchmark.name,
             "model_name": model_name,
-            "benchmark": benchmark,
+            "subject": subject,
             "config": config,
             "groupings": groupings,
             "main": main,
-            "unmatched": int((subject.outcomes == "no positive").sum()),
             "table": _table(groupings),
-            "points": [
-                (g.label, f"{100 * g.operating_point.asked:g}", caveats(g.operating_point))
-                for g in groupings
-                if g.operating_point is not None
-            ],
+            "caveats": caveats,
             "meanings": _meanings(groupings),
             "depends": params.cross_image is not None,
             "curves": _curves(folder, groupings),
-            "galleries": list(_galleries(subject, shown)),
+            "galleries": {
+                outcome: [_photographs(subject, query) for query in chosen]
+                for outcome, chosen in shown.items()
+                if chosen
+            },
             "results": page_rows(subject, main),
             "outcomes": OUTCOMES,
-            "kept": main.neighbours.indices.shape[1],
-            "placed": subject.placed,
             "map": _map(folder, subject),
             "transport": list(_transport(subject, shown, params, config)),
             "matrix": _matrix(folder, subject, similarities),
@@ -121,12 +118,12 @@ def write_report(
 
 
 def render(template: str, context: Mapping[str, Any]) -> str:
-    """Render a page from a template; everything in the context is escaped, names of files too."""
+    """Render a template; in a page everything in the context is escaped, names of files too."""
     import jinja2
 
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("crisalad_jax.experiments.report"),
-        autoescape=True,
+        autoescape=jinja2.select_autoescape(),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -249,90 +246,57 @@ def _curves(folder: pathlib.Path, groupings: Sequence[GroupingResult]) -> list[D
     return drawings
 
 
-class QueryResult(NamedTuple):
-    """What one query found under one grouping."""
+def query_results(subject: Subject, grouping: GroupingResult) -> Iterator[dict[str, Any]]:
+    """Yield what each query found under a grouping, in their order, as rows of results.csv.
 
-    query: str
-    """Its file, by the path in the set's folder."""
-    outcome: str
-    """One of `OUTCOMES`."""
-    rank: int | None
-    """Rank of the first right retrieval, from 1; None where none of those kept is right."""
-    retrieval: str
-    """File of the first retrieval."""
-    similarity: float
-    metres: float | None
-    """Metres from the query to the first retrieval; None without known positions of both."""
-
-
-def query_results(subject: Subject, grouping: GroupingResult) -> Iterator[QueryResult]:
-    """Yield the result of every query under a grouping, in the order of the queries."""
+    Files are named by their path in the set's folder, with control characters escaped.
+    """
     benchmark, neighbours = subject.benchmark, grouping.neighbours
     outcomes = outcomes_of(neighbours, benchmark.ground_truth()).tolist()
     ranks = first_right_ranks(neighbours, benchmark.ground_truth()).tolist()
     for query, path in enumerate(benchmark.queries):
         first = int(neighbours.indices[query, 0])
-        yield QueryResult(
-            printable(subject.name(path)),
-            outcomes[query],
-            ranks[query] or None,
-            printable(subject.name(benchmark.database[first])),
-            float(neighbours.similarities[query, 0]),
-            subject.metres(query, first),
-        )
+        metres = subject.metres(query, first)
+        yield {
+            "query": printable(subject.name(path)),
+            "grouping": grouping.grouping,
+            "rerank": grouping.rerank or "",
+            "outcome": outcomes[query],
+            "rank_of_first_positive": ranks[query] or None,
+            "first_retrieval": printable(subject.name(benchmark.database[first])),
+            "similarity": round(float(neighbours.similarities[query, 0]), 6),
+            "distance_m": None if metres is None else round(metres, 2),
+        }
 
 
 def write_results(
     path: pathlib.Path, subject: Subject, groupings: Sequence[GroupingResult]
 ) -> None:
-    """Write results.csv: a row for every query under every grouping, of the first seed.
-
-    Control characters in names are escaped, and no cell is a spreadsheet's formula.
-    """
+    """Write results.csv: a row for every query under every grouping, of the first seed."""
+    rows = [row for grouping in groupings for row in query_results(subject, grouping)]
     text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    writer.writerow(
-        (
-            *("query", "grouping", "rerank", "outcome", "rank_of_first_positive"),
-            *("first_retrieval", "similarity", "distance_m"),
-        )
-    )
-    for grouping in groupings:
-        for row in query_results(subject, grouping):
-            metres = "" if row.metres is None else f"{row.metres:.2f}"
-            names = no_formula(row.query), grouping.grouping, grouping.rerank or ""
-            found = no_formula(row.retrieval), f"{row.similarity:.6f}", metres
-            writer.writerow((*names, row.outcome, row.rank or "", *found))
+    writer = csv.DictWriter(text, list(rows[0]))
+    writer.writeheader()
+    for row in rows:
+        # No cell is a spreadsheet's formula.
+        names = {name: no_formula(row[name]) for name in ("query", "first_retrieval")}
+        writer.writerow(row | names)
     write_text(path, text.getvalue())
+
+
+_SHOWN_COLUMNS = ("rank_of_first_positive", "first_retrieval", "similarity", "distance_m")
 
 
 def page_rows(subject: Subject, grouping: GroupingResult) -> list[list[Any]]:
     """Return the rows of the page's table, as short as JSON allows; see queries.js."""
     return [
-        [
-            row.query,
-            OUTCOMES.index(row.outcome),
-            row.rank,
-            row.retrieval,
-            round(row.similarity, 4),
-            None if row.metres is None else round(row.metres, 1),
-        ]
+        [row["query"], OUTCOMES.index(row["outcome"]), *(row[name] for name in _SHOWN_COLUMNS)]
         for row in query_results(subject, grouping)
     ]
 
 
-def _galleries(subject: Subject, shown: Mapping[str, Sequence[int]]) -> Iterator[dict[str, Any]]:
-    """Yield the queries shown of each outcome, with what was retrieved for them."""
-    queries = subject.benchmark.queries
-    for outcome, chosen in shown.items():
-        if chosen:
-            found = [(subject.name(queries[each]), _photographs(subject, each)) for each in chosen]
-            total = int((subject.outcomes == outcome).sum())
-            yield {"outcome": outcome, "total": total, "retrievals": found}
-
-
-def _photographs(subject: Subject, query: int) -> list[Drawing]:
-    """Show a query and its first retrievals, and of a wrong one what should have come first."""
+def _photographs(subject: Subject, query: int) -> tuple[str, list[Drawing]]:
+    """Name a query, and show it and its first retrievals, and what should have come first."""
     benchmark = subject.benchmark
     positives = benchmark.ground_truth()[query]
     indices, similarities = (part[query] for part in subject.neighbours)
@@ -358,7 +322,7 @@ def _photographs(subject: Subject, query: int) -> list[Drawing]:
         lines = "would be right", rank, *_away(subject, query, index)
         words = f"right for the query, {rank}"
         photographs.append(show(benchmark.database[index], "expected", words, *lines))
-    return photographs
+    return subject.name(benchmark.queries[query]), photographs
 
 
 def _away(subject: Subject, query: int, index: int) -> tuple[str, ...]:

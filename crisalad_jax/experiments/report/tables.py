@@ -93,15 +93,15 @@ def check_recalls(what: str, curves: Mapping[str, Mapping[int, float]]) -> None:
     Raises:
         InputError: there are none, or one is outside 0 to 1.
     """
-    wrong = [f"{name}: {dict(c)}" for name, c in curves.items() if not _are_fractions(c)]
+    wrong = [
+        f"{name}: {dict(recalls)}"
+        for name, recalls in curves.items()
+        if not recalls or not all(0 <= value <= 1 for value in recalls.values())
+    ]
     if wrong or not curves:
         raise InputError(
             f"{what}: found {', '.join(wrong) or 'none'}, expected recalls as fractions, 0 to 1"
         )
-
-
-def _are_fractions(recalls: Mapping[int, float]) -> bool:
-    return bool(recalls) and all(0 <= value <= 1 for value in recalls.values())
 
 
 def no_formula(text: str) -> str:

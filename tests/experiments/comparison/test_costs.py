@@ -13,7 +13,6 @@ from crisalad_jax.experiments.comparison import (
     runner,
 )
 from crisalad_jax.experiments.comparison.costs import Spread, race, ratios
-from crisalad_jax.experiments.comparison.methods import changes_of
 from crisalad_jax.training.recipes import from_scratch, recipe
 from tests.cli.test_cli import fails, succeeds
 from tests.conftest import BATCH
@@ -67,7 +66,7 @@ def test_rows_change_one_thing_each():
         ("lr-1e-4", "learning rate 0.0001"),
         ("no-encoder-step", "cross-image encoder no, scheduler step"),
     ):
-        assert changes_of(name, "b14", from_nothing=False).startswith(words)
+        assert ABLATIONS[name].words(rows[name]).startswith(words)
 
 
 def test_from_nothing_rates_are_in_the_papers_proportion():

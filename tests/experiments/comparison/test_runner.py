@@ -406,9 +406,9 @@ def test_runs_are_shared_with_another_process(finished, config, monkeypatch):
             other.close()
 
         monkeypatch.setattr(runner.time, "sleep", ended)
-        runner.take_runs(prepared, runs, say=lines.append)
+        runner.carry_out(config, finished, "stop", say=lines.append, quiet=True)
     assert one == [1]
-    assert lines == [
+    assert lines[1:] == [
         "crisalad, seed 1: 0 of 2 runs done",
         "waiting for the runs of other processes",
     ]
@@ -420,8 +420,7 @@ def test_the_run_of_a_killed_process_is_free(finished, config, monkeypatch):
     (folder / temporaries.LOCK).write_text(f"process 1 on {socket.gethostname()}\n")
     write_json(folder / "result.json", read_json(folder / "result.json", "it") | {"ranks": {}})
     monkeypatch.delattr(runner, "fit")
-    prepared = comparison.prepare(config)
-    runner.take_runs(prepared, runs_of(prepared, finished), say=print)
+    runner.carry_out(config, finished, "stop", say=print, quiet=True)
     assert not (folder / temporaries.LOCK).exists()
 
 

@@ -295,9 +295,9 @@ def test_a_row_for_every_query_and_grouping(benchmark, tmp_path: pathlib.Path):
     # The first is right at once, the second's image 1 stands third, the third has none to find.
     # Queries are at 3, 45 and 9,000 m, and the database at 0, 40 and 80 m.
     assert found == [
-        ("right", "1", "d/0.jpg", "0.910000", "3.00"),
-        ("wrong", "3", "d/2.jpg", "0.820000", "35.00"),
-        ("no positive", "", "d/1.jpg", "0.730000", "8960.00"),
+        ("right", "1", "d/0.jpg", "0.91", "3.0"),
+        ("wrong", "3", "d/2.jpg", "0.82", "35.0"),
+        ("no positive", "", "d/1.jpg", "0.73", "8960.0"),
     ]
     assert page_rows(subject, GROUPINGS[0]) == [
         ["a/=1+1.jpg", 2, 1, "d/0.jpg", 0.91, 3.0],
