@@ -29,10 +29,10 @@ def row_training(name):
 
 
 def test_what_names_stand_for():
-    for name in METHODS:
-        assert method_of(name, "tiny") is METHODS[name]
-    for part in ("netvlad", "patch-netvlad"):
-        assert method_of(part, "tiny") is METHODS[f"crisalad+{part}"]
+    names = {name: name for name in METHODS}
+    names |= {part: f"crisalad+{part}" for part in ("netvlad", "patch-netvlad")}
+    for name, method in names.items():
+        assert method_of(name, "tiny") is METHODS[method]
     for name, whole in (
         ("crisalad-1e-4", "crisalad-1e-4"),
         ("step:newton", "crisalad+step:newton"),
@@ -86,14 +86,26 @@ def test_variants_of_parts(settings):
     assert ablation.variants[1].labels == ("step:newton", "crisalad+step:newton")
 
 
-def test_unknown_names_are_refused(flags, capfd, tmp_path):
-    rest = flags[flags.index("--preset") :]
-    for command, name, words in (
-        (("compare", "--methods"), "step:newtons", "--methods: found 'step:newtons', expected one"),
-        (("compare", "--methods"), "kind:newton", "kind of aggregator, step, dustbin, loss"),
-    ):
-        fails(capfd, *command, name, *rest, "--out", tmp_path / "out", words=(words,))
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (("--methods", "step:newtons"), "--methods: found 'step:newtons', expected one"),
+        (("--methods", "kind:newton"), "kind of aggregator, step, dustbin, loss"),
+        (("--reference", "salad"), "--reference: found salad, expected one of those compared, cri"),
+    ],
+)
+def test_unknown_names_are_refused(flags, capfd, tmp_path, given, words):
+    fails(capfd, *flags, *given, "--out", tmp_path / "out", words=(words,))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def registries(monkeypatch):
+    """Registries to add to."""
+    for kind in ("aggregator", "loss"):
+        for name in ("_parts", "_presets"):
+            parts = dict(getattr(REGISTRIES[kind], name))
+            monkeypatch.setattr(REGISTRIES[kind], name, parts)
 
 
 PLUGIN = '''
@@ -106,12 +118,9 @@ def average(features):
 '''
 
 
-@pytest.mark.usefixtures("quick")
+@pytest.mark.usefixtures("quick", "registries")
 def test_a_plug_ins_part_from_training_to_the_table(settings, tmp_path, monkeypatch):
     """In a folder of a safe name; another source behind its name is refused."""
-    registry = REGISTRIES["aggregator"]
-    for name in ("_parts", "_presets"):
-        monkeypatch.setattr(registry, name, dict(getattr(registry, name)))
     exec(compile(PLUGIN, "plugin.py", "exec"), {"__name__": "plugin"})
     name, out, lines = "aggregator:average", tmp_path / "out", []
     monkeypatch.setattr(plan, "source_digest", lambda part: "first")
@@ -244,10 +253,8 @@ def test_a_table_says_what_a_row_changes(ablation):
     ]
 
 
-def test_a_plug_ins_loss_and_its_settings(ablation, monkeypatch):
-    registry = REGISTRIES["loss"]
-    for name in ("_parts", "_presets"):
-        monkeypatch.setattr(registry, name, dict(getattr(registry, name)))
+@pytest.mark.usefixtures("registries")
+def test_a_plug_ins_loss_and_its_settings():
     source = """
 import dataclasses, crisalad_jax as cj
 @cj.register_loss("mine")
@@ -277,9 +284,3 @@ def test_the_command_line_takes_several(flags, monkeypatch, tmp_path):
     ]
     assert seen[0].rows == ("a: epochs=2", "b: loss.miner=none")
     assert seen[0].reference == "a"
-
-
-def test_an_unknown_reference(flags, capfd, tmp_path):
-    words = ("--reference: found salad, expected one of those compared, crisalad",)
-    fails(capfd, *flags, "--reference", "salad", "--out", tmp_path / "out", words=words)
-    assert not list(tmp_path.iterdir())
