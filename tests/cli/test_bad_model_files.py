@@ -135,13 +135,12 @@ def test_a_file_that_is_cut_short(
     assert [path.name for path in tmp_path.iterdir()] == [file.name]
 
 
-@pytest.mark.parametrize("verb", ["extract", "evaluate", "info"])
+@pytest.mark.parametrize("verb", ["extract", "info"])
 def test_public_files_are_told_from_ours_where_weights_are_asked_for(
     capfd: Capture, tmp_path: pathlib.Path, verb: str
 ) -> None:
     more = {
         "extract": ("--images", tmp_path, "--out", tmp_path / "d.npy"),
-        "evaluate": ("--data", tmp_path),
         "info": (),
     }[verb]
     public, old, matlab = (tmp_path / name for name in ("p.ckpt", "o.pth", "m.mat"))
@@ -168,7 +167,7 @@ def test_public_files_are_told_from_ours_where_weights_are_asked_for(
 def test_a_preset_beside_weights(capfd: Capture, tmp_path: pathlib.Path) -> None:
     ours = tmp_path / "ours.safetensors"
     succeeds(capfd, "convert", save(tmp_path / "p.ckpt", salad()), ours)
-    words = ("--preset: found beside --weights, expected only one of the two",)
+    words = ("--preset: found with --weights, expected only one of the two",)
     given = ("--weights", ours, "--preset", "l14")
     fails(capfd, "info", *given, words=words)
     fails(capfd, "evaluate", *given, "--data", tmp_path, words=words)

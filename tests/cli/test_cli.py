@@ -160,10 +160,9 @@ def test_no_command_prints_the_usage(capfd):
         ("info --preset b16", "preset: found 'b16', expected one of b14, g14, l14, s14, tiny"),
         ("train --data d --out o --preset b16", "preset: found 'b16'"),
         ("train --data d --out o --recipe dbow", "recipe: found 'dbow', expected one of anyloc"),
-        ("train --data d --out o --recipe salad --config c", "--recipe: found beside --config"),
+        ("train --data d --out o --recipe salad --config c", "--recipe: found with --config"),
         ("train --data d --out o --micro-batch 5", "micro_batch: found 5, expected a divisor of"),
         ("train --data d --out o --loss.kind fast-ap", "expected 'none': it ranks all images"),
-        ("evaluate --data d --preset b16", "preset: found 'b16'"),
         ("train --data d --out o --recipe tiny", "recipe: found 'tiny', expected one of anyloc"),
         ("info --preset boq", "preset: found 'boq', expected one of b14, g14"),
         ("info --colour red", "--colour"),
@@ -625,7 +624,7 @@ def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public):
     fails(
         capfd,
         *(*arguments, "--out", tmp_path / "r", "--weights", public),
-        words=("--backbone: found beside --weights",),
+        words=("--backbone: found with --weights",),
     )
     fails(
         capfd,

@@ -71,9 +71,9 @@ def test_bad_input_is_one_line(capfd, shared, tmp_path) -> None:
     for more, words in (
         ((tmp_path / "w.npy",), "w.npy: found the suffix '.npy', expected .safetensors"),
         ((out, "--weights", weights), "aggregator: found salad, which has no vocabulary"),
-        ((out, "--weights", weights, "--backbone", weights), "--backbone: found beside --weights"),
-        ((out, "--weights", weights, "--preset", "b14"), "--preset: found beside --weights"),
-        ((out, "--weights", weights, "--layer", 1), "--layer: found beside --weights"),
+        ((out, "--weights", weights, "--backbone", weights), "--backbone: found with --weights"),
+        ((out, "--weights", weights, "--preset", "b14"), "--preset: found with --weights"),
+        ((out, "--weights", weights, "--layer", 1), "--layer: found with --weights"),
         ((out, "--preset", "tiny", "--layer", 4), "layer: found 4, expected -4 to 3"),
         (
             (out, "--preset", "tiny", "--aggregator", "netvlad", "--facet", "key"),
