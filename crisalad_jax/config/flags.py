@@ -204,6 +204,11 @@ def _expected(metavar: str) -> str:
     return f"a {kind}" if len(parts) == 1 else f"{len(parts)} {kind}s"
 
 
+_NO_NUMBER = (
+    r"Error parsing (\S+): (?:invalid literal for|could not convert) .*?(int|float).*?: (.*)"
+)
+
+
 def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
     """Say in our words what tyro says; what we do not know stays as it is.
 
@@ -213,10 +218,9 @@ def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
     """
     said: list[str] = []
     for text in texts:
-        if found := re.match(r"Error parsing (\S+): invalid literal for int\(\).*?: (.*)", text):
-            said.append(f"{found[1]}: found {found[2]}, expected a whole number")
-        elif found := re.match(r"Error parsing (\S+): could not convert .* float: (.*)", text):
-            said.append(f"{found[1]}: found {found[2]}, expected a number")
+        if found := re.match(_NO_NUMBER, text):
+            kind = "a whole number" if found[2] == "int" else "a number"
+            said.append(f"{found[1]}: found {found[3]}, expected {kind}")
         elif found := re.match(
             r"Error parsing (\S+): no type matching (.+) could .*? (\[.*\])", text
         ):

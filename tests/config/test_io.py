@@ -20,6 +20,7 @@ from crisalad_jax.utils.files import write_json
 CHANGED = dataclasses.replace(
     recipe("tiny"), cities=("Aston", "Brill"), patience=4, augmentation=recipe("b14").augmentation
 )
+VIT = {"name": "vit"}
 RECIPES_OF_PRESETS = {
     f"{preset} {name}": recipe(preset, name)
     for preset in PRESETS
@@ -45,13 +46,6 @@ def test_every_recipe_of_every_preset_survives_json(config: TrainConfig):
     assert to_plain(found) == plain
     model = from_plain(ModelConfig, plain["model"], source="here")
     assert model == config.model
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_every_preset_survives_json(preset: str):
-    found = from_plain(ModelConfig, to_plain(PRESETS[preset]), source="here")
-    assert found == PRESETS[preset]
-    assert hash(found) == hash(PRESETS[preset])
 
 
 def test_plain_values_are_json_and_complete():
@@ -80,13 +74,10 @@ def test_fields_left_out_take_their_defaults():
         ({"model": {"image_size": [100, 98]}}, ["found 100 x 98", "nearest: 98 x 98"]),
         ({"model": {"image_size": [98]}}, ["config.model.image_size"]),
         (
-            {"model": {"backbone": {"name": "vit", "dim": "32"}}},
-            ["'32'", "expected a whole number", "config.model.backbone.dim"],
+            {"model": {"backbone": VIT | {"dim": "32"}}},
+            ["'32'", "expected a whole", "backbone.dim"],
         ),
-        (
-            {"model": {"backbone": {"name": "vit", "ffn": "relu"}}},
-            ["relu", "swiglu", "config.model.backbone.ffn"],
-        ),
+        ({"model": {"backbone": VIT | {"ffn": "relu"}}}, ["relu", "swiglu", "model.backbone.ffn"]),
         ({"model": {"backbone": {"dim": 32}}}, ["None", "config.model.backbone"]),
         ({"model": 3}, ["config.model"]),
         ({"model": None}, ["config.model"]),
@@ -95,20 +86,15 @@ def test_fields_left_out_take_their_defaults():
         ({"seed": True}, ["True", "expected a whole number", "config.seed"]),
         ({"patience": "x"}, ["'x'", "config.patience"]),
         ({"cities": "Rome"}, ["'Rome'", "tuple, each text", "config.cities"]),
-        (
-            {"loss": {"pml_compat": "no"}},
-            ["'no'", "True or False", "loss.pml_compat"],
-        ),
+        ({"loss": {"pml_compat": "no"}}, ["'no'", "True or False", "loss.pml_compat"]),
         ({"model": {"aggregator": ["gem"]}}, ["['gem']", "config.model.aggregator"]),
         ({"model": {"aggregator": {"name": ["gem"]}}}, ["['gem']", "config.model.aggregator"]),
         ({"model": {"aggregator": {"clusters": 32}}}, ["None", "config.model.aggregator"]),
         ({"model": {"aggregator": {"name": "gem", "clusters": 2}}}, ["found clusters"]),
         ({"model": {"aggregator": {"name": "gem"}, "gem": {}}}, ["found gem", "config.model"]),
         ({"model": {"remat": []}}, ["found []", "config.model.remat"]),
-        ({"model": {"remat": "some"}}, ["'some'", "dots", "config.model.remat"]),
         ({"augmentation": 3}, ["found 3", "config.augmentation"]),
         ({"augmentation": ["light"]}, ["['light']", "config.augmentation"]),
-        ({"epochs": 0.5}, ["config.epochs"]),
         ([], ["found []", "an object"]),
         (None, ["found None", "an object"]),
         ("b14", ["found 'b14'", "an object"]),
@@ -164,34 +150,14 @@ def test_a_configuration_that_a_user_wrote_is_read(tmp_path: pathlib.Path):
             "model.backbone",
         ),
         (
-            {"model": {"aggregator": {"name": "x", "size": 3}}},
-            "aggregator: found 'x', expected one of a",
-            "model.aggregator",
-        ),
-        (
-            {"model": {"aggregator": {"name": "salad", "dustbin": "x"}}},
-            "dustbin: found 'x', expected one of column, mass, ",
-            "model.aggregator.dustbin",
-        ),
-        (
             {"model": {"aggregator": {"name": "salad", "sinkhorn": {"step": {"name": "x"}}}}},
             "step: found 'x', expected one of dual-softmax, newton, ",
             "model.aggregator.sinkhorn.step",
         ),
         (
-            {"model": {"aggregator": {"name": "salad", "sinkhorn": {"gradient": "x"}}}},
-            "gradient: found 'x', expected one of implicit, optimistix, ",
-            "model.aggregator.sinkhorn.gradient",
-        ),
-        (
             {"loss": {"kind": {"name": "x", "size": 3}}},
             "loss: found 'x', expected one of circle, ",
             "loss.kind",
-        ),
-        (
-            {"augmentation": {"name": "x"}},
-            "augmentation: found 'x', expected one of camera, colour-crop, light, none, ",
-            "augmentation",
         ),
     ],
 )
@@ -208,13 +174,8 @@ def test_an_unknown_part_is_named_and_may_be_a_plug_ins(value: Any, words: str, 
 
 def test_differences_name_the_fields_in_full():
     b14 = recipe("b14")
-    other = dataclasses.replace(
-        b14,
-        seed=3,
-        model=dataclasses.replace(
-            b14.model, aggregator=dataclasses.replace(b14.model.aggregator, clusters=32)
-        ),
-    )
+    head = dataclasses.replace(b14.model.aggregator, clusters=32)
+    other = dataclasses.replace(b14, seed=3, model=dataclasses.replace(b14.model, aggregator=head))
     assert differences(b14, b14) == []
     assert differences(other, b14) == [
         "model.aggregator.clusters: found 32, expected 64",
