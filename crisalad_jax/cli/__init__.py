@@ -7,7 +7,6 @@ SIGTERM, 129 by SIGHUP, 1 anything else.
 import dataclasses
 import difflib
 import importlib
-import itertools
 import os
 import re
 import signal
@@ -82,13 +81,11 @@ def _usage() -> str:
 
 def _plugins(given: Sequence[str]) -> Iterator[str]:
     """Yield the plug-ins after each --plugin."""
-    for place, argument in enumerate(given):
-        flag, equals, value = argument.partition("=")
-        if flag == "--plugin":
-            after = itertools.takewhile(lambda each: not each.startswith("--"), given[place + 1 :])
-            names = [value] if equals else list(after)
-            require(bool(names), "--plugin: found no value, expected FILE.py or MODULE")
-            yield from names
+    from crisalad_jax.config.flags import flag_values
+
+    for names in flag_values(given, "--plugin"):
+        require(bool(names), "--plugin: found no value, expected FILE.py or MODULE")
+        yield from names
 
 
 def _limit_pixels(given: Sequence[str]) -> None:

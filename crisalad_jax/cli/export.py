@@ -30,10 +30,10 @@ class Export(ComputeFlags, PluginFlag, JsonFlag):
     batch_size: int | Literal["symbolic"] = "symbolic"
     """Images in a call, or symbolic: any number."""
     grouping: Literal["single", "batch", "any"] = "single"
-    """Every image described alone, or the images of a call looking at each other; any is two
-    programs of onnx or openvino, and a mask says who looks at whom."""
+    """Every image described independently, or the images of a call attending to each other; any is
+    two programs of onnx or openvino, and a mask says which image attends to which."""
     weights_inside: bool = False
-    """The weights as constants of the program, and no file of them beside it."""
+    """Store the weights as constants in the program, not in a file next to it."""
     pixels: Literal["bytes", "floats"] | None = None
     """Bytes, which the program normalises, or floats that already are; by default what the model
     resizes."""

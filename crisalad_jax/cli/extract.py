@@ -27,7 +27,7 @@ class Extract(ReadFlags, ModelFlags, JsonFlag):
     """Folder, searched with its subfolders; or a file, a pattern, a list, a table or a video
     (docs/how-to/image-sources.md)."""
     out: pathlib.Path
-    """descriptors.npy (names beside it in .names.txt) or features.h5 (hloc)."""
+    """descriptors.npy (with names in .names.txt) or features.h5 (hloc)."""
     fps: float | None = None
     """Frames a second taken of a video, by default 1."""
     grouping: str = "single"

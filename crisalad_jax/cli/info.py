@@ -31,7 +31,7 @@ class Info(SizeFlags, PluginFlag, JsonFlag):
     """head, adapters+head, last-N-blocks+head or all; by default the recipe's, of
     a file adapters+head, or head where it has no adapter."""
     batch_size: int = 16
-    """Images that look at each other in the cross-image encoder."""
+    """Images that attend to each other in the cross-image encoder."""
 
 
 def run(arguments: Info) -> dict[str, Any]:

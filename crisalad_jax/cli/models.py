@@ -20,10 +20,10 @@ EXAMPLE = "crisalad models salad"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Models(JsonFlag):
-    """List the models that others published, which --weights takes by name, or tell of one."""
+    """List the models that others published, which --weights takes by name, or describe one."""
 
     name: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="NAME")] = None
-    """Tell all that is known of this one."""
+    """Print all that is known of this one."""
 
 
 def run(arguments: Models) -> dict[str, Any]:

@@ -79,22 +79,25 @@ def config_of(flags: Any) -> Any:
     return kind(**values)
 
 
-def find_flag(arguments: Sequence[str], name: str) -> str | None:
-    """Return the value after the last occurrence of a flag; None where it is not given."""
-    last = None
-    for position, argument in enumerate(arguments):
+def flag_values(arguments: Sequence[str], name: str) -> list[list[str]]:
+    """List the values of each occurrence of a flag, as FLAG VALUE ... or FLAG=VALUE."""
+    found = []
+    for place, argument in enumerate(arguments, 1):
         flag, equals, value = argument.partition("=")
-        if not _same_flag(flag, name):
-            continue
-        if equals:
-            last = value
-        elif position + 1 < len(arguments):
-            last = arguments[position + 1]
-    return last
+        if flag.replace("_", "-") == name.replace("_", "-"):
+            after = itertools.takewhile(lambda each: not each.startswith("--"), arguments[place:])
+            found.append([value] if equals else list(after))
+    return found
 
 
-def _same_flag(given: str, name: str) -> bool:
-    return given.replace("_", "-") == name.replace("_", "-")
+def last_values(arguments: Sequence[str], name: str) -> list[str]:
+    """Return the values of the last occurrence of a flag; none where there is none."""
+    return (flag_values(arguments, name) or [[]])[-1]
+
+
+def find_flag(arguments: Sequence[str], name: str) -> str | None:
+    """Return the first value of the last occurrence of a flag; None where there is none."""
+    return next(iter(last_values(arguments, name)), None)
 
 
 def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str) -> Any:
@@ -230,7 +233,7 @@ def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
             names = ", ".join(name for name in ast.literal_eval(found[3]) if name != "None")
             said.append(f"{found[2]}: found {found[1]}, expected one of {names}")
         elif found := re.match(r"Missing value for argument '(.*)'. Expected (\d+) values", text):
-            values = " ".join(_values_after(found[1], arguments))
+            values = " ".join(last_values(arguments, found[1]))
             words = "a value" if found[2] == "1" else f"{found[2]} values"
             said.append(f"{found[1]}: found {_or_none(values)}, expected {words}")
         elif found := re.match(r"Missing from .*?: (-.*|[A-Z].*)", text):
@@ -250,13 +253,6 @@ def _or_none(values: str) -> str:
     return repr(values) if values else "none"
 
 
-def _values_after(flag: str, arguments: Sequence[str]) -> list[str]:
-    """Return the values after the last occurrence of a flag."""
-    places = [place for place, each in enumerate(arguments) if _same_flag(each, flag)]
-    after = arguments[places[-1] + 1 :] if places else ()
-    return list(itertools.takewhile(lambda each: not each.startswith("--"), after))
-
-
 def _unknown(tokens: Sequence[str], arguments: Sequence[str]) -> str:
     """Say what is wrong with arguments that tyro does not take: flags, or values too many."""
     if not tokens:  # with commas or spaces in them
@@ -268,7 +264,7 @@ def _unknown(tokens: Sequence[str], arguments: Sequence[str]) -> str:
     flag = next((each for each in reversed(list(before)) if each.startswith("--")), None)
     if flag is None:
         return f"found {tokens[0]!r} without a flag before it"
-    values = _values_after(flag, arguments)
+    values = last_values(arguments, flag)
     most = len(values) - sum(each in values for each in tokens)
     words = ("no value", "one value")[most] if most < 2 else f"{most} values"
     return f"{flag}: found {' '.join(values)!r}, expected {words}"

@@ -301,7 +301,7 @@ def test_a_classification_needs_no_second_image_of_a_place():
     # The published descriptors of b14: BoQ's, and 4,096 of MixVPR and Conv-AP.
     [("gem", 768), ("conv-ap", 4096), ("mixvpr", 4096), ("boq", 12_288)],
 )
-def test_methods_to_compare_differ_in_the_aggregator_alone(name: str, width: int):
+def test_methods_to_compare_differ_in_the_aggregator_alone(name, width):
     found, paper = recipe("b14", f"crisalad+{name}"), recipe("b14")
     assert found.model.aggregator == AGGREGATORS.find(name)()
     assert found.model.descriptor_dim == width
@@ -316,7 +316,7 @@ def test_methods_to_compare_differ_in_the_aggregator_alone(name: str, width: int
 @pytest.mark.parametrize(
     "name", [*RECIPES, *(f"crisalad+aggregator:{name}" for name in AGGREGATORS)]
 )
-def test_every_recipe_fits_every_preset(preset: str, name: str):
+def test_every_recipe_fits_every_preset(preset, name):
     found = recipe(preset, name)
     assert from_scratch(found).trainable == "all"
     if isinstance(found.model.backbone, ViTConfig):

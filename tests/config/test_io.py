@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import pathlib
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,7 @@ RECIPES_OF_PRESETS = {
 
 
 @pytest.mark.parametrize("config", [*map(recipe, PRESETS), CHANGED], ids=[*PRESETS, "changed"])
-def test_every_recipe_survives_a_file(tmp_path: pathlib.Path, config: TrainConfig):
+def test_every_recipe_survives_a_file(tmp_path, config):
     write_json(tmp_path / "config.json", to_plain(config))
     found = read_config(TrainConfig, tmp_path / "config.json")
     assert found == config
@@ -37,7 +36,7 @@ def test_every_recipe_survives_a_file(tmp_path: pathlib.Path, config: TrainConfi
 
 
 @pytest.mark.parametrize("config", RECIPES_OF_PRESETS.values(), ids=RECIPES_OF_PRESETS)
-def test_every_recipe_of_every_preset_survives_json(config: TrainConfig):
+def test_every_recipe_of_every_preset_survives_json(config):
     plain = to_plain(config)
     assert json.loads(json.dumps(plain)) == plain
     found = from_plain(TrainConfig, plain, source="here")
@@ -100,7 +99,7 @@ def test_fields_left_out_take_their_defaults():
         ("b14", ["found 'b14'", "an object"]),
     ],
 )
-def test_what_does_not_fit_is_named_in_one_line(value: Any, words: list[str]):
+def test_what_does_not_fit_is_named_in_one_line(value, words):
     with pytest.raises(InputError) as caught:
         from_plain(TrainConfig, value, source="some/config.json")
     message = str(caught.value)
@@ -111,7 +110,7 @@ def test_what_does_not_fit_is_named_in_one_line(value: Any, words: list[str]):
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b"[]", b'{"model": {'])
-def test_a_file_that_is_no_configuration_is_named(tmp_path: pathlib.Path, content: bytes):
+def test_a_file_that_is_no_configuration_is_named(tmp_path, content):
     path = tmp_path / "config.json"
     path.write_bytes(content)
     with pytest.raises(InputError, match=f"^{path}: ") as caught:
@@ -119,13 +118,13 @@ def test_a_file_that_is_no_configuration_is_named(tmp_path: pathlib.Path, conten
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_named(tmp_path: pathlib.Path):
+def test_a_missing_file_is_named(tmp_path):
     for path, found in ((tmp_path / "none.json", "no such file"), (tmp_path, "a folder")):
         with pytest.raises(InputError, match=f"^{path}: found {found}, expected a configuration"):
             read_config(ModelConfig, path)
 
 
-def test_a_written_configuration_that_was_changed_is_refused(tmp_path: pathlib.Path):
+def test_a_written_configuration_that_was_changed_is_refused(tmp_path):
     path = tmp_path / "config.json"
     write_json(path, to_plain(recipe("tiny")))
     text = path.read_text()
@@ -135,7 +134,7 @@ def test_a_written_configuration_that_was_changed_is_refused(tmp_path: pathlib.P
         read_config(TrainConfig, path)
 
 
-def test_a_configuration_that_a_user_wrote_is_read(tmp_path: pathlib.Path):
+def test_a_configuration_that_a_user_wrote_is_read(tmp_path):
     path = tmp_path / "config.json"
     path.write_text('{"seed": 7}')
     assert read_config(TrainConfig, path) == TrainConfig(seed=7)
@@ -161,7 +160,7 @@ def test_a_configuration_that_a_user_wrote_is_read(tmp_path: pathlib.Path):
         ),
     ],
 )
-def test_an_unknown_part_is_named_and_may_be_a_plug_ins(value: Any, words: str, place: str):
+def test_an_unknown_part_is_named_and_may_be_a_plug_ins(value, words, place):
     with pytest.raises(InputError) as caught:
         from_plain(TrainConfig, value, source="some/config.json")
     message = str(caught.value)
@@ -183,7 +182,7 @@ def test_differences_name_the_fields_in_full():
     ]
 
 
-def test_a_number_of_numpy_is_a_number_and_other_objects_are_refused() -> None:
+def test_a_number_of_numpy_is_a_number_and_other_objects_are_refused():
     @dataclasses.dataclass(frozen=True)
     class Some:
         value: Any

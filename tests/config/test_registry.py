@@ -92,7 +92,7 @@ def birds(monkeypatch: pytest.MonkeyPatch) -> Registry[Bird]:
     return registry
 
 
-def test_a_part_is_found_and_made_by_its_name(birds: Registry[Bird]):
+def test_a_part_is_found_and_made_by_its_name(birds):
     assert birds.register("goose")(Goose) is Goose
     assert birds.names() == list(birds) == ["duck", "goose"]
     assert "goose" in birds
@@ -105,7 +105,7 @@ def test_a_part_is_found_and_made_by_its_name(birds: Registry[Bird]):
     assert birds.make("duck", "loud", volume=2) == Duck(volume=2)
 
 
-def test_a_name_that_is_taken_is_refused(birds: Registry[Bird]):
+def test_a_name_that_is_taken_is_refused(birds):
     words = (
         f"^register_bird 'duck': found the name taken by {__name__}.Duck, expected another name "
         "for Goose$"
@@ -116,7 +116,7 @@ def test_a_name_that_is_taken_is_refused(birds: Registry[Bird]):
     assert birds.make("duck", "loud") == Duck(volume=3)
 
 
-def test_a_class_has_one_name(birds: Registry[Bird]):
+def test_a_class_has_one_name(birds):
     """Files would name the other one."""
     with pytest.raises(
         InputError, match=r"^register_bird 'drake': found Duck registered as 'duck'"
@@ -126,7 +126,7 @@ def test_a_class_has_one_name(birds: Registry[Bird]):
     assert birds.make("duck").part_name == "duck"
 
 
-def test_a_cell_that_runs_again_brings_the_same_part(birds: Registry[Bird]):
+def test_a_cell_that_runs_again_brings_the_same_part(birds):
     again = dataclasses.make_dataclass(
         "Duck",
         [("volume", int, 5)],
@@ -155,7 +155,7 @@ def test_a_cell_that_runs_again_brings_the_same_part(birds: Registry[Bird]):
         (Mute, ".* abstract class Mute with abstract method call; expected all methods"),
     ],
 )
-def test_what_is_no_part_is_refused_in_one_line(birds: Registry[Bird], part: Any, words: str):
+def test_what_is_no_part_is_refused_in_one_line(birds, part, words):
     with pytest.raises(InputError, match=f"^register_bird 'new': {words}") as caught:
         birds.register("new")(part)
     assert "\n" not in str(caught.value)
@@ -163,7 +163,7 @@ def test_what_is_no_part_is_refused_in_one_line(birds: Registry[Bird], part: Any
     assert not hasattr(part, "part_name") or part.part_name == "duck"
 
 
-def test_a_function_is_a_part_where_the_kind_says_so(monkeypatch: pytest.MonkeyPatch):
+def test_a_function_is_a_part_where_the_kind_says_so(monkeypatch):
     monkeypatch.setitem(REGISTRIES, "bird", None)
     birds = Registry("bird", Bird, of_function=lambda f: {"call": lambda self: f()})
     assert birds.register("chirp")(chirp) is chirp
@@ -174,7 +174,7 @@ def test_a_function_is_a_part_where_the_kind_says_so(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("name", ["swan", "", None, ["duck"], {}])
-def test_an_unknown_name_lists_the_known_and_tells_of_plug_ins(birds: Registry[Bird], name: Any):
+def test_an_unknown_name_lists_the_known_and_tells_of_plug_ins(birds, name):
     with pytest.raises(InputError) as caught:
         birds.find(name)
     assert str(caught.value) == (
@@ -185,7 +185,7 @@ def test_an_unknown_name_lists_the_known_and_tells_of_plug_ins(birds: Registry[B
         birds.make(name)
 
 
-def test_a_field_takes_a_part_or_its_name(birds: Registry[Bird]):
+def test_a_field_takes_a_part_or_its_name(birds):
     @dataclasses.dataclass(frozen=True)
     class Pond:
         bird: Any = part_field(birds, "duck")
@@ -202,7 +202,7 @@ def test_a_field_takes_a_part_or_its_name(birds: Registry[Bird]):
             Pond(bird=other)
 
 
-def test_an_unregistered_subclass_is_refused_where_a_part_is_expected(birds: Registry[Bird]):
+def test_an_unregistered_subclass_is_refused_where_a_part_is_expected(birds):
     """A file would keep it under its parent's name, and load the parent."""
     birds.register("duck")(Duck)
 
@@ -237,20 +237,20 @@ def test_an_unregistered_subclass_is_refused_where_a_part_is_expected(birds: Reg
         (functools.partial(lambda a, b, c, scale: 0, scale=2), 3),
     ],
 )
-def test_a_function_is_given_what_it_requires_and_keeps_its_defaults(function: Any, count: int):
+def test_a_function_is_given_what_it_requires_and_keeps_its_defaults(function, count):
     assert count_arguments(function, "descriptors", "labels", "valid") == count
 
 
 @pytest.mark.parametrize(
     "function", [lambda a, b, c, scale: 0, lambda a, *, scale: 0], ids=["fourth", "by name"]
 )
-def test_a_function_that_requires_more_is_refused(function: Any):
+def test_a_function_that_requires_more_is_refused(function):
     words = r"found the arguments scale, expected at most descriptors, labels, valid$"
     with pytest.raises(InputError, match=words):
         count_arguments(function, "descriptors", "labels", "valid")
 
 
-def test_fields_of_a_plug_ins_part_are_checked_before_its_own_check(birds: Registry[Bird]):
+def test_fields_of_a_plug_ins_part_are_checked_before_its_own_check(birds):
     @birds.register("goose")
     @dataclasses.dataclass(frozen=True)
     class Goose(Bird):
