@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 from jaxtyping import Array, Bool, Int
 
-from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.config.checks import require_field, require_positive
 from crisalad_jax.config.part import OrName, Part
 from crisalad_jax.config.registry import Registry, part_field, resolve_names
 from crisalad_jax.config.short_repr import short_repr
@@ -30,11 +30,14 @@ Solve = Callable[[Problem], Solution]
 class Gradient(Part):
     """A gradient of the potentials, through which JAX differentiates the plan."""
 
+    at_convergence: ClassVar[bool | None] = None
+    """Whether it is the gradient of the converged plan, which needs a tolerance, or of a fixed
+    number of iterations, which has none; None goes with both."""
+    needs_entropic: ClassVar[bool] = False
+    """Whether the step must solve the entropic problem (`Step.entropic`)."""
     takes_solver: ClassVar[bool] = False
-    """Whether `solve` takes the solver that is given to `sinkhorn.solve`."""
-
-    def check(self, config: "SinkhornConfig") -> None:
-        """Raise InputError where this gradient does not go with a configuration."""
+    """Whether `solve` takes the solver that is given to `sinkhorn.solve`, which accelerates in the
+    place of Anderson's method."""
 
     def solve(
         self, problem: Problem, config: "SinkhornConfig", params: Any, init: Potentials
@@ -80,15 +83,17 @@ class SinkhornConfig:
         """Check the ranges, and that the parts go together."""
         resolve_names(self)
         require_positive(self, "iterations")
-        if self.tolerance is not None:
+        gradient, converges = self.gradient, self.tolerance is not None
+        if converges:
             require_positive(self, "tolerance")
-        memory = self.anderson_memory
-        require(
-            isinstance(memory, int) and (memory == 0 or memory > 1),
-            f"SinkhornConfig.anderson_memory: found {memory}, expected 0 or a whole number from 2",
-        )
-        require(
-            not self.throw or self.tolerance is not None,
-            "SinkhornConfig.throw: found no tolerance to converge to",
-        )
-        self.gradient.check(self)
+        allowed = "0" if gradient.takes_solver else "0 or a whole number from 2"
+        fits = self.anderson_memory == 0 or (self.anderson_memory > 1 and allowed != "0")
+        words = f"{allowed} with gradient {gradient.part_name!r}"
+        require_field(self, "anderson_memory", fits, words)
+        require_field(self, "throw", converges or not self.throw, "a tolerance to converge to")
+        fits = gradient.at_convergence in (None, converges)
+        words = "a fixed number of iterations, without a tolerance" if converges else "a tolerance"
+        require_field(self, "gradient", fits, f"{words} beside it")
+        fits = self.step.entropic or not gradient.needs_entropic
+        words = f"a step that says it solves the entropic problem, not {self.step.part_name!r}"
+        require_field(self, "gradient", fits, words)

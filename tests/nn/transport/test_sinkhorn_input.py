@@ -69,21 +69,30 @@ class _Alone(Step):
 
 MU, NU = jnp.zeros(6), jnp.log(jnp.array([1.0, 2.0, 3.0]))
 BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
-    "one axis": (lambda: solve(jnp.zeros(3), MU, NU), r"scores of shape \(3,\) and log_mu"),
-    "rows": (lambda: solve(jnp.zeros((5, 3)), MU, NU), r"\(5, 3\) and log_mu of \(6,\)"),
-    "columns": (lambda: solve(jnp.zeros((6, 4)), MU, NU), r"\(6, 4\) and log_nu of \(3,\)"),
-    "no axis": (lambda: solve(jnp.zeros((6, 3)), MU, MU[0]), r"log_nu of \(\)"),
+    "one axis": (
+        lambda: solve(jnp.zeros(3), MU, NU),
+        r"float32 and shape \(3,\), expected",
+    ),
+    "rows": (
+        lambda: solve(jnp.zeros((5, 3)), MU, NU),
+        r"log_mu found of shape \(6,\), expected \(5,\)",
+    ),
+    "columns": (
+        lambda: solve(jnp.zeros((6, 4)), MU, NU),
+        r"log_nu .* \(3,\), expected \(4,\)",
+    ),
+    "no axis": (lambda: solve(jnp.zeros((6, 3)), MU, MU[0]), r"log_nu found of shape \(\)"),
     "batches": (
         lambda: solve(jnp.zeros((2, 6, 3)), jnp.zeros((3, 6)), NU),
-        r"\(2, 6, 3\) and log_mu of \(3, 6\)",
+        r"log_mu found of shape \(3, 6\), expected \(2, 6\) for scores of \(2, 6, 3\)",
     ),
     "more axes": (
         lambda: solve(jnp.zeros((6, 3)), MU, jnp.zeros((2, 3))),
-        r"\(6, 3\) and log_nu of \(2, 3\)",
+        r"log_nu found of shape \(2, 3\), expected \(3,\)",
     ),
     "epsilons": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, epsilon=jnp.ones(3)),
-        r"epsilon found of shape \(3,\), expected a single number",
+        r"epsilon found of shape \(3,\), expected \(\)",
     ),
     "newton, relaxed rows": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, row_tau=0.5, config=SinkhornConfig("newton")),
@@ -113,11 +122,11 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "no columns": (
         lambda: solve(jnp.zeros((6, 0)), MU, MU[:0]),
-        r"of shape \(6, 0\) and log_mu",
+        r"and shape \(6, 0\), expected real numbers",
     ),
     "complex": (
         lambda: solve(jnp.zeros((6, 3), complex), MU, NU),
-        "scores found of complex64, expected real numbers",
+        "found scores of complex64 and shape .*, expected real numbers",
     ),
     "a step's tuple": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-tuple")),
@@ -157,19 +166,15 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "token, one": (
         lambda: assign_with_dustbin(jnp.zeros((6, 3)), jnp.float32(1), "token"),
-        r"dustbin: found shape \(\), expected \(6,\) for 'token'",
+        r"dustbin: found parameters of shape \(\), expected \(6,\)",
     ),
     "column, many": (
         lambda: assign_with_dustbin(jnp.zeros((6, 3)), jnp.ones(6)),
-        r"dustbin: found shape \(6,\), expected \(\) for 'column'",
+        r"dustbin: found parameters of shape \(6,\), expected \(\)",
     ),
     "mass, none": (
         lambda: assign_with_dustbin(jnp.zeros((6, 3)), None, "mass"),
-        r"dustbin: found shape None, expected \(\) for 'mass'",
-    ),
-    "none, one": (
-        lambda: assign_with_dustbin(jnp.zeros((6, 3)), jnp.float32(1), "none"),
-        r"dustbin: found shape \(\), expected None for 'none'",
+        r"dustbin: found parameters of shape None, expected \(\)",
     ),
 }
 
@@ -190,9 +195,9 @@ def test_bad_shapes_and_pairs_raise(name: str, traced: bool) -> None:
     [
         (jnp.nan, MU, NU, 1.0, "scores found with NaN or infinity"),
         (jnp.inf, MU, NU, 1.0, "scores found with NaN or infinity"),
-        (0.0, MU.at[1].set(jnp.inf), NU, 1.0, "log_mu found with NaN or infinity"),
+        (0.0, MU.at[1].set(jnp.inf), NU, 1.0, "log_mu found with NaN, infinity or no mass"),
         (0.0, MU.at[1].set(-jnp.inf), NU, 1.0, "found to sum to 5 and 6, expected the same"),
-        (0.0, MU, NU.at[1].set(jnp.nan), 1.0, "log_nu found with NaN or infinity"),
+        (0.0, MU, NU.at[1].set(jnp.nan), 1.0, "log_nu found with NaN, infinity or no mass"),
         (0.0, MU, NU, 0.0, "epsilon found 0.0, expected at least 1.2e-38"),
         (0.0, MU, NU, -1.0, "epsilon found -1.0, expected at least"),
         (0.0, MU, NU, jnp.float32(jnp.nan), "epsilon found nan, expected at least"),
@@ -334,29 +339,24 @@ def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
         (
             SinkhornConfig,
             {"gradient": "implicit"},
-            "found 'implicit' with a fixed number of iterations",
+            "found Implicit.*expected a tolerance",
         ),
-        (
-            SinkhornConfig,
-            {"gradient": "optimistix"},
-            "found 'optimistix' with a fixed number of iterations",
-        ),
-        (SinkhornConfig, {"tolerance": 1e-3}, "found 'unrolled' with a tolerance"),
-        (SinkhornConfig, {"throw": True}, "throw: found no tolerance"),
+        (SinkhornConfig, {"tolerance": 1e-3}, "expected a fixed number of iterations"),
+        (SinkhornConfig, {"throw": True}, "throw: found True, expected a tolerance"),
         (
             SinkhornConfig,
             {"gradient": "optimistix", "tolerance": 1e-3, "anderson_memory": 3},
-            "anderson_memory: found with gradient 'optimistix'",
+            "anderson_memory: found 3, expected 0 with gradient 'optimistix'",
         ),
         (
             SinkhornConfig,
             {"step": "softmax", "gradient": "implicit", "tolerance": 1e-3},
-            "gradient: found 'implicit' with step 'softmax', which does not say that it solves",
+            "expected a step that says it solves the entropic problem, not 'softmax'",
         ),
         (
             SinkhornConfig,
             {"step": "test-input-tuple", "gradient": "implicit", "tolerance": 1e-3},
-            "found 'implicit' with step 'test-input-tuple', which does not say that it solves",
+            "expected a step that says it solves the entropic problem, not 'test-input-tuple'",
         ),
         (SinkhornStep, {"relaxation": 2.0}, "SinkhornStep.relaxation: found 2.0"),
         (SinkhornStep, {"relaxation": 0.9}, "SinkhornStep.relaxation: found 0.9"),
@@ -445,9 +445,11 @@ def test_an_epsilon_that_float32_has_no_number_for_is_refused(epsilon):
 @pytest.mark.parametrize(
     ("init", "words"),
     [
-        (Potentials(jnp.zeros(5), jnp.zeros(3)), r"init found of \(\(5,\), \(3,\)\), expected Pot"),
-        (jnp.zeros(6), r"init found of \w+, expected Potentials of shapes \(6,\) and \(3,\)"),
-        (Potentials(jnp.zeros(6), jnp.full(3, jnp.nan)), "init found with NaN or infinity, expect"),
+        (
+            Potentials(jnp.zeros(5), jnp.zeros(3)),
+            r"init.row .* \(5,\), expected \(6,\)",
+        ),
+        (jnp.zeros(6), r"init.column found of shape \(6,\), expected \(3,\)"),
     ],
 )
 def test_potentials_to_start_from_that_do_not_fit_are_refused(init, words):
