@@ -7,8 +7,7 @@ from typing import Literal
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import find_given, give_json, prepare_json, say
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Model
 from crisalad_jax.training.vocabulary import (
     IMAGES,
     build_vocabulary,
@@ -101,10 +100,10 @@ def run(arguments: Vocabulary) -> None:
     """Build the vocabulary, write the model, and print its size."""
     prepare_json(arguments.json)
     check_target(arguments.out, ".safetensors")
-    params, config = _model(arguments)
+    model = _model(arguments)
+    config = model.config
     built = build_vocabulary(
-        params,
-        config,
+        model,
         arguments.images,
         arguments.out,
         fps=arguments.fps,
@@ -131,7 +130,7 @@ def run(arguments: Vocabulary) -> None:
     )
 
 
-def _model(arguments: Vocabulary) -> tuple[Crisalad, ModelConfig]:
+def _model(arguments: Vocabulary) -> Model:
     fields = {
         name: value
         for name in ("clusters", "layer", "facet", "assignment")
@@ -151,4 +150,4 @@ def _model(arguments: Vocabulary) -> tuple[Crisalad, ModelConfig]:
         if getattr(arguments, name) is not None:
             raise InputError(f"--{name}: found beside --weights, expected only one of the two")
     params, config = load_weights(find_weights(arguments.weights, quiet=arguments.quiet))
-    return params, config.resized(arguments.image_size, arguments.resize)
+    return Model(params, config.resized(arguments.image_size, arguments.resize))

@@ -273,10 +273,10 @@ PICTURES: dict[str, tuple[Any, str]] = {
         "found list, expected an array of shape (image, height, width, 3) (np",
     ),
     "a name": ("a.jpg", "found str, expected an array of shape (image, height, width, 3)"),
-    "one image": (IMAGES[0], "found shape (42, 56, 3), expected (image, height, width, 3)"),
-    "channels": (IMAGES[..., :1], "found shape (2, 42, 56, 1), expected (image, height, width, 3)"),
-    "none": (IMAGES[:0], "found none, expected at least one"),
-    "int32": (IMAGES.astype(np.int32), "found int32, expected uint8 pixels, or floats"),
+    "one image": (IMAGES[0], "found uint8 of shape (42, 56, 3), expected uint8 pixels, or floats"),
+    "channels": (IMAGES[..., :1], "found uint8 of shape (2, 42, 56, 1), expected"),
+    "none": (IMAGES[:0], "found uint8 of shape (0, 42, 56, 3), expected"),
+    "int32": (IMAGES.astype(np.int32), "found int32 of shape (2, 42, 56, 3), expected"),
     "0 to 255": (
         IMAGES.astype(np.float32),
         "found float32 from 0 to 255, which are pixels, expected floats that are normalised, or "

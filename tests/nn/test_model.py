@@ -315,7 +315,7 @@ def test_a_mask_of_another_shape_is_refused(params, shape):
 @pytest.mark.usefixtures("_unchecked")
 @pytest.mark.parametrize("dtype", ["int32", "int8", "uint16", "bool"])
 def test_whole_numbers_other_than_bytes_are_refused(params, dtype):
-    words = f"^images: found {dtype}, expected uint8 pixels, or floats that are normalised"
+    words = rf"^images: found {dtype} of shape \(2, .*\), expected uint8 pixels, or floats"
     with pytest.raises(InputError, match=words):
         describe(params, pictures(2).astype(dtype), CONFIG)
 

@@ -699,7 +699,7 @@ def test_another_configuration_or_loss_is_named(params) -> None:
     config = TrainConfig(model=MODEL)
     with pytest.raises(InputError, match=r"^config: found TrainConfig, expected StepConfig$"):
         init_train_state(params, "head", config)
-    with pytest.raises(InputError, match=r"^loss: found 'triplet', expected a function of"):
+    with pytest.raises(InputError, match=r"^GivenLoss.function: found 'triplet', expected"):
         step_config(config, steps=5, loss="triplet")
 
 

@@ -320,8 +320,7 @@ def _start(prepared: Prepared, run: Run, quiet: bool) -> Crisalad:
         places = run.variant.places
         assert places is not None
         params = with_vocabulary(
-            params,
-            model,
+            Model(params, model),
             [places.path(image) for image in range(len(places.files))],
             images=model.aggregator.centroid_images,
             seed=run.seed,

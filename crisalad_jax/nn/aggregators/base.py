@@ -167,12 +167,13 @@ class Aggregator(Part, abc.ABC):
         """Return parameters with the metadata that a file stores with their arrays."""
         return params
 
-    def plan(self, params: Any, features: Features) -> Float[Array, "*batch patch column"] | None:
-        """Return the mass that a transport sends from each patch to each cluster; by default None.
+    def plan(self, params: Any, features: Features) -> Float[Array, "*batch patch column"]:
+        """Return the mass that a transport sends from each patch to each cluster.
 
-        A patch sends a mass of 1. If there is a dustbin, it is the last column.
+        A patch sends a mass of 1. If there is a dustbin, it is the last column. `transports` tells
+        whether an aggregator has this.
         """
-        return None
+        raise NotImplementedError
 
 
 def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int, ...]) -> None:

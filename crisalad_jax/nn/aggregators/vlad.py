@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.config.checks import require, require_field, require_positive, require_range
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import (
     AGGREGATORS,
@@ -44,11 +44,7 @@ class VladConfig(Aggregator):
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_positive(self, "clusters")
-        require(
-            self.count_centroids(0) > 1,
-            f"{type(self).__name__}.clusters: found {self.clusters}, expected at least 2 to choose "
-            "from",
-        )
+        require_field(self, "clusters", self.count_centroids(0) > 1, "at least 2 to choose from")
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of one sum for each cluster."""
@@ -119,9 +115,7 @@ class SuperVladConfig(VladConfig):
     def __post_init__(self) -> None:
         """Check the ranges."""
         super().__post_init__()
-        require(
-            self.ghosts >= 0, f"SuperVladConfig.ghosts: found {self.ghosts}, expected at least 0"
-        )
+        require_range(self, 0, math.inf, "ghosts")
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> SuperVlad:
         """Draw the scores' layer as torch's convolution."""
@@ -180,9 +174,7 @@ class VladBuffConfig(VladConfig):
     def __post_init__(self) -> None:
         """Check the ranges."""
         super().__post_init__()
-        require(
-            self.reduced >= 0, f"VladBuffConfig.reduced: found {self.reduced}, expected at least 0"
-        )
+        require_range(self, 0, math.inf, "reduced")
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of one sum of residuals for each cluster."""
@@ -254,22 +246,14 @@ class AnyLocConfig(VladConfig):
     """What the nearest word of a patch is nearest by. The public code takes the angle; so does the
     k-means that builds a vocabulary."""
 
-    def block(self, depth: int) -> int:
-        """Return the number of the facet's block among `depth` blocks, from 0.
+    def features(self, depth: int) -> FeatureSpec:
+        """Request the facet, without the last layer norm.
 
         Raises:
             InputError: there is no such block.
         """
-        require(
-            -depth <= self.layer < depth,
-            f"AnyLocConfig.layer: found {self.layer}, expected {-depth} to {depth - 1} for a "
-            f"backbone of {depth} blocks",
-        )
-        return self.layer % depth
-
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the facet, without the last layer norm."""
-        return FeatureSpec((self.block(depth) + 1,), self.facet, norm=False)
+        require_range(self, -depth, depth - 1, "layer")
+        return FeatureSpec((self.layer % depth + 1,), self.facet, norm=False)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> AnyLoc:
         """Draw random unit vectors as words, until a vocabulary is built."""

@@ -51,7 +51,7 @@ def test_the_tokens_run_through_the_last_blocks_by_hand() -> None:
 
 @pytest.mark.parametrize("insertion", [-4, 3])
 def test_there_is_such_a_block(insertion: int) -> None:
-    with pytest.raises(InputError, match=f"insertion: found {insertion}, expected -3 to 2 for"):
+    with pytest.raises(InputError, match=f"insertion: found {insertion}, expected -3 to 2"):
         dataclasses.replace(CONFIG, aggregator=AggregationTokensConfig(insertion=insertion))
 
 

@@ -201,11 +201,11 @@ def test_side_adapters_take_the_sum_of_both_paths() -> None:
             FeatureSpec((2,), class_attention=True),
             "levels or a facet and the class token's",
         ),
-        (CONFIG, FeatureSpec((1, 2), "key"), r"found \(1, 2\), expected one for the facet key"),
+        (CONFIG, FeatureSpec((1, 2), "key"), r"found \(1, 2\) of facet key, expected numbers"),
         (
             CONFIG,
             FeatureSpec((2, 1)),
-            r"found \(2, 1\), expected numbers of blocks in order, 1 to 3",
+            r"found \(2, 1\) of facet token, expected numbers of blocks in order, 1 to 3",
         ),
     ],
 )

@@ -24,8 +24,15 @@ from pytorch_metric_learning.losses import (
 )
 from pytorch_metric_learning.miners import MultiSimilarityMiner
 
-from crisalad_jax.training.losses import LossConfig, all_pairs, metric_loss, mine
-from crisalad_jax.training.losses.large_margin_cosine import large_margin_cosine_loss
+from crisalad_jax.training.losses import (
+    LossBatch,
+    LossConfig,
+    LossValue,
+    all_pairs,
+    metric_loss,
+    mine,
+)
+from crisalad_jax.training.losses.large_margin_cosine import LargeMarginCosineConfig
 from crisalad_jax.training.losses.pairwise import (
     CircleConfig,
     ContrastiveConfig,
@@ -339,6 +346,14 @@ def test_the_easy_anchor_fraction_counts_anchors_without_a_hard_positive() -> No
     assert metric_loss(jnp.asarray(x), labels, PAPER).easy_anchor_fraction == 0
     x[3] = [0, 1]
     assert metric_loss(jnp.asarray(x), labels, PAPER).easy_anchor_fraction == 1
+
+
+def large_margin_cosine_loss(
+    x: jax.Array, labels: jax.Array, weights: jax.Array, *, valid=None, classes=None, **constants
+) -> LossValue:
+    valid = jnp.ones(len(labels), bool) if valid is None else valid
+    batch = LossBatch(x, labels, valid, all_pairs(labels), classes)
+    return LargeMarginCosineConfig(**constants).apply(weights, batch)
 
 
 def cosine_batch(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
