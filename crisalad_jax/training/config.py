@@ -1,9 +1,8 @@
 """Configuration of a training run."""
 
 import dataclasses
-import itertools
 import math
-import operator
+from itertools import pairwise
 from typing import Literal
 
 from crisalad_jax.config.checks import (
@@ -79,13 +78,14 @@ class OptimiserConfig:
         names = "end_lr_fraction", "warmup_steps", "warmup_epochs", "weight_decay"
         require_range(self, 0, math.inf, *names)
         require_fraction(self, "b1", "b2", "momentum")
-        one = not (self.warmup_steps and self.warmup_epochs)
-        require_field(self, "warmup_epochs", one, f"0 with warmup_steps {self.warmup_steps}")
-        rises = all(itertools.starmap(operator.lt, itertools.pairwise((0, *self.milestones))))
-        fits = self.schedule != "milestones" or (bool(self.milestones) and rises)
-        require_field(self, "milestones", fits, "numbers of epochs that rise")
-        one = self.clip_norm is None or self.clip_value is None
-        require_field(self, "clip_value", one, f"None with clip_norm {self.clip_norm}")
+        rises = bool(self.milestones) and all(a < b for a, b in pairwise((0, *self.milestones)))
+        steps, norm = self.warmup_steps, self.clip_norm
+        for name, fits, expected in (
+            ("warmup_epochs", not (steps and self.warmup_epochs), f"0 with warmup_steps {steps}"),
+            ("milestones", rises or self.schedule != "milestones", "numbers of epochs that rise"),
+            ("clip_value", None in (norm, self.clip_value), f"None with clip_norm {norm}"),
+        ):
+            require_field(self, name, fits, expected)
 
 
 @short_repr(switch=("kind", "none"))
@@ -130,8 +130,7 @@ class MiningConfig:
         for name in ("queries_per_epoch", "margin"):
             if getattr(self, name) is not None:
                 require_positive(self, name)
-        enough = self.negatives <= self.candidates
-        require_field(self, "candidates", enough, f"at least negatives ({self.negatives})")
+        require_range(self, self.negatives, math.inf, "candidates")
         fits = 0 < self.positive_radius <= self.negative_radius < math.inf
         most = f"negative_radius ({self.negative_radius})"
         require_field(self, "positive_radius", fits, f"metres above 0, and at most {most}")

@@ -112,15 +112,6 @@ def test_descriptors_of_every_method(aggregator: str) -> None:
     assert np.abs(half - described).max() > 1e-5  # it did compute in bfloat16
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("aggregator", PARTS)
-def test_a_batch_is_its_images_one_by_one(aggregator: str) -> None:
-    params, config = model(aggregator)
-    together = describe(params, pictures(0, 1), config)
-    one_by_one = [describe(params, pictures(seed), config)[0] for seed in (0, 1)]
-    np.testing.assert_allclose(together, np.stack(one_by_one), atol=TOLERANCE)
-
-
 @pytest.mark.parametrize(
     "aggregator",
     [

@@ -86,14 +86,15 @@ class SinkhornConfig:
         gradient, converges = self.gradient, self.tolerance is not None
         if converges:
             require_positive(self, "tolerance")
-        allowed = "0" if gradient.takes_solver else "0 or a whole number from 2"
-        fits = self.anderson_memory == 0 or (self.anderson_memory > 1 and allowed != "0")
-        words = f"{allowed} with gradient {gradient.part_name!r}"
-        require_field(self, "anderson_memory", fits, words)
-        require_field(self, "throw", converges or not self.throw, "a tolerance to converge to")
-        fits = gradient.at_convergence in (None, converges)
-        words = "a fixed number of iterations, without a tolerance" if converges else "a tolerance"
-        require_field(self, "gradient", fits, f"{words} beside it")
-        fits = self.step.entropic or not gradient.needs_entropic
-        words = f"a step that says it solves the entropic problem, not {self.step.part_name!r}"
-        require_field(self, "gradient", fits, words)
+        solves = gradient.part_name if gradient.takes_solver else None
+        memory = "0 or a whole number from 2" if solves is None else f"0 with gradient {solves!r}"
+        remembers = self.anderson_memory > 1 and solves is None
+        mode = "a fixed number of iterations, without a tolerance" if converges else "a tolerance"
+        step = f"a step that says it solves the entropic problem, not {self.step.part_name!r}"
+        for name, fits, expected in (
+            ("anderson_memory", self.anderson_memory == 0 or remembers, memory),
+            ("throw", converges or not self.throw, "a tolerance to converge to"),
+            ("gradient", gradient.at_convergence in (None, converges), f"{mode} beside it"),
+            ("gradient", self.step.entropic or not gradient.needs_entropic, step),
+        ):
+            require_field(self, name, fits, expected)

@@ -106,17 +106,6 @@ def test_a_cut_stack_of_blocks_gives_the_same_features() -> None:
         np.testing.assert_allclose(a, b, atol=1e-6)  # the same sums, compiled twice
 
 
-def test_an_untrained_adapter_leaves_the_backbone_unchanged() -> None:
-    params = CONFIG.init(jax.random.key(0))
-    bare_blocks = dataclasses.replace(params.blocks, adapter=None)
-    bare = dataclasses.replace(params, blocks=bare_blocks)
-    config = dataclasses.replace(CONFIG, adapter=AdapterConfig(kind="none"))
-    ours, _ = vit(params, images(1, 28, 42), CONFIG)
-    theirs, _ = vit(bare, images(1, 28, 42), config)
-    for a, b in zip(*map(jax.tree.leaves, (ours, theirs)), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-6)
-
-
 def test_alpha_and_layer_scale_weigh_the_adapter() -> None:
     """x + ls2 * (MLP + alpha * adapter): tripling alpha triples the adapter's share."""
     params = dataclasses.replace(CONFIG, depth=1, layer_scale_init=0.5).init(jax.random.key(0))

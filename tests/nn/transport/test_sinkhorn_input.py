@@ -38,16 +38,6 @@ def _plain_tuple(problem: Problem, at: Potentials) -> Any:
     return tuple(at)
 
 
-@register_step("test-input-short")
-def _short(problem: Problem, at: Potentials) -> Potentials:
-    return at._replace(row=at.row[:2])
-
-
-@register_step("test-input-half")
-def _half(problem: Problem, at: Potentials) -> Potentials:
-    return at._replace(row=at.row.astype(jnp.float16))
-
-
 @register_step("test-input-state")
 @dataclasses.dataclass(frozen=True)
 class _Unsteady(Step):
@@ -77,18 +67,9 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: solve(jnp.zeros((5, 3)), MU, NU),
         r"log_mu found of shape \(6,\), expected \(5,\)",
     ),
-    "columns": (
-        lambda: solve(jnp.zeros((6, 4)), MU, NU),
-        r"log_nu .* \(3,\), expected \(4,\)",
-    ),
-    "no axis": (lambda: solve(jnp.zeros((6, 3)), MU, MU[0]), r"log_nu found of shape \(\)"),
     "batches": (
         lambda: solve(jnp.zeros((2, 6, 3)), jnp.zeros((3, 6)), NU),
         r"log_mu found of shape \(3, 6\), expected \(2, 6\) for scores of \(2, 6, 3\)",
-    ),
-    "more axes": (
-        lambda: solve(jnp.zeros((6, 3)), MU, jnp.zeros((2, 3))),
-        r"log_nu found of shape \(2, 3\), expected \(3,\)",
     ),
     "epsilons": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, epsilon=jnp.ones(3)),
@@ -116,10 +97,6 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         ),
         "a solver with gradient 'unrolled', expected one that takes it",
     ),
-    "no clusters": (
-        lambda: assign_with_dustbin(jnp.zeros((6, 0)), 1.0),
-        r"assign_with_dustbin: found scores of shape \(6, 0",
-    ),
     "no columns": (
         lambda: solve(jnp.zeros((6, 0)), MU, MU[:0]),
         r"and shape \(6, 0\), expected real numbers",
@@ -131,14 +108,6 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "a step's tuple": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-tuple")),
         r"^step test-input-tuple: found to return \(\(float32.*, expected \(Potentials\(row",
-    ),
-    "a step's shapes": (
-        lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-short")),
-        r"^step test-input-short: found to return \(Potentials\(row=float32\[2\]",
-    ),
-    "a step's type": (
-        lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-half")),
-        "^step test-input-half: found to return .*float16.*, expected .*float32",
     ),
     "a step's state": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-state")),
@@ -160,21 +129,9 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: assign_with_dustbin(jnp.zeros((6, 6)), jnp.float32(1)),
         "6 patches for 6 clusters",
     ),
-    "less mass": (
-        lambda: assign_with_dustbin(jnp.zeros((4, 6)), jnp.float32(1)),
-        "4 patches for 6 clusters",
-    ),
     "token, one": (
         lambda: assign_with_dustbin(jnp.zeros((6, 3)), jnp.float32(1), "token"),
         r"dustbin: found parameters of shape \(\), expected \(6,\)",
-    ),
-    "column, many": (
-        lambda: assign_with_dustbin(jnp.zeros((6, 3)), jnp.ones(6)),
-        r"dustbin: found parameters of shape \(6,\), expected \(\)",
-    ),
-    "mass, none": (
-        lambda: assign_with_dustbin(jnp.zeros((6, 3)), None, "mass"),
-        r"dustbin: found parameters of shape None, expected \(\)",
     ),
 }
 
@@ -199,7 +156,7 @@ def test_bad_shapes_and_pairs_raise(name: str, traced: bool) -> None:
         (0.0, MU.at[1].set(-jnp.inf), NU, 1.0, "found to sum to 5 and 6, expected the same"),
         (0.0, MU, NU.at[1].set(jnp.nan), 1.0, "log_nu found with NaN, infinity or no mass"),
         (0.0, MU, NU, 0.0, "epsilon found 0.0, expected at least 1.2e-38"),
-        (0.0, MU, NU, -1.0, "epsilon found -1.0, expected at least"),
+        (0.0, MU, NU, 1e-300, "epsilon found 1e-300, expected at least"),
         (0.0, MU, NU, jnp.float32(jnp.nan), "epsilon found nan, expected at least"),
         (1e10, MU, NU, 1e-35, "scores overflow, expected numbers that float32 can hold"),
         (0.0, MU, NU + 1e-3, 1.0, "found to sum to 6 and 6.006, expected the same"),
@@ -322,7 +279,6 @@ def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
             {"gradient": "exact"},
             "SinkhornConfig.gradient: found 'exact', expected one of implicit, optim",
         ),
-        (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),
         (
             SinkhornConfig,
             {"iterations": 2.5},
@@ -366,8 +322,6 @@ def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
             {"dustbin": "row"},
             "SaladConfig.dustbin: found 'row', expected one of column, mass, none",
         ),
-        (SaladConfig, {"epsilon": 0.0}, "SaladConfig.epsilon: found 0.0"),
-        (SaladConfig, {"epsilon": float("nan")}, "SaladConfig.epsilon: found nan"),
         (SaladConfig, {"epsilon": float("inf")}, "SaladConfig.epsilon: found inf"),
         (SaladConfig, {"row_tau": 0.0}, "SaladConfig.row_tau: found 0.0"),
         (SaladConfig, {"column_tau": 1.1}, "SaladConfig.column_tau: found 1.1"),
@@ -433,12 +387,6 @@ def test_a_dustbin_of_ones_own() -> None:
     named = assign_with_dustbin(scores, params, "test-input-last-patch", patches=patches)
     expected = assign_with_dustbin(scores, 2 * patches[..., -1] + 0.5, "token")
     assert (named.log_plan == expected.log_plan).all()
-
-
-@pytest.mark.parametrize("epsilon", [1e-38, 1e-300, 0.0, -1.0])
-def test_an_epsilon_that_float32_has_no_number_for_is_refused(epsilon):
-    with pytest.raises(InputError, match=f"^sinkhorn: epsilon found {epsilon}, expected "):
-        solve(jnp.zeros((6, 3)), MU, NU, epsilon=epsilon)
 
 
 @pytest.mark.usefixtures("_unchecked")
