@@ -150,9 +150,9 @@ def fit(
         silent = quiet or not distributed.is_primary()
         bar = progress_bar("training", steps, "steps", quiet=silent, done=done)
         with defer_signals() as signals, bar as bar:
-            run = _Run(config, data, trainer, validator, files, signals, bar)
-            run.train(steps)
-        run.save()
+            loop = _Loop(config, data, trainer, validator, files, signals, bar)
+            loop.train(steps)
+        loop.save()
     record = files.record
     best = record.best[0][0] if record.best else None
     return FitResult(
@@ -210,7 +210,7 @@ def _warn_of_extension(config: TrainConfig, record: RunRecord, out: pathlib.Path
 
 
 @dataclasses.dataclass(frozen=True)
-class _Run:
+class _Loop:
     """The parts of a run, and the phases in which they act."""
 
     config: TrainConfig

@@ -91,7 +91,7 @@ class Trainer:
     def resume(self, state: TrainState) -> None:
         """Go on from a state, which has to be the same in all processes."""
         # Copied, because a step donates the buffers of its state.
-        self.state = _copied(self._place(state))
+        self.state, self._params = _copied(self._place(state)), None
 
     def on_devices(self, batches: Iterator[ImageBatch]) -> Generator[Batch, None, None]:
         """Yield batches on the devices, each copied while they compute the one before."""
