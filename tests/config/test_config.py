@@ -458,6 +458,7 @@ def test_one_patch_more_than_clusters_is_enough():
         ),
         (ModelConfig, {"aggregator": "class-token", "image_size": (28, 57)}, "found 28 x 57"),
         (NetVladConfig, {"clusters": 1}, "NetVladConfig.clusters: found 1, expected at least 2"),
+        (VladBuffConfig, {"reduced": -1}, "VladBuffConfig.reduced: found -1, expected at least 0"),
         (AnyLocConfig, {"facet": "values"}, "AnyLocConfig.facet: found 'values', expected one of"),
         (
             ModelConfig,
