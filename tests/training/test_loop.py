@@ -447,44 +447,26 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(
     assert fit(config, places, tmp_path, initial=params, quiet=True).steps == STEPS
 
 
-def test_a_step_is_started_before_the_one_before_is_read(tmp_path, places, params, monkeypatch):
-    """Or the devices would wait while its numbers are fetched and logged."""
-    events = []
-
-    def step(*args):
-        events.append("step")
-        return train_step(*args)
-
-    def log(self, values, *, of=""):
-        events.append(f"line {values['step']}")
-
-    monkeypatch.setattr(trainer, "train_step", step)
-    monkeypatch.setattr(RunFiles, "log", log)
-    fit(RECIPE, places, tmp_path, initial=params, quiet=True)
-    assert events[:4] == ["step", "step", "line 1", "line 2"]  # an epoch has two
-
-
-def test_a_step_costs_one_fetch_from_the_devices(tmp_path, places, params, monkeypatch):
-    """All metrics in one call, which starts every copy before it waits for the first."""
+def test_a_step_is_started_before_the_one_before_is_read_in_one_fetch(
+    tmp_path, places, params, monkeypatch
+):
+    """Or the devices would wait while its numbers are fetched, one by one, and logged."""
     config, events = dataclasses.replace(RECIPE, epochs=1), []
-    real = jax.device_get
 
-    def step(*args):
-        events.append("step")
-        return train_step(*args)
+    def recorded(name, function=lambda *args, **options: None):
+        def call(*args, **options):
+            events.append(name)
+            return function(*args, **options)
 
-    def device_get(tree):
-        events.append("fetch")
-        return real(tree)
+        return call
 
-    def save(self, *args):
-        events.append("save")
-
-    monkeypatch.setattr(trainer, "train_step", step)
-    monkeypatch.setattr(trainer.jax, "device_get", device_get)
-    monkeypatch.setattr(RunFiles, "save", save)
+    monkeypatch.setattr(trainer, "train_step", recorded("step", train_step))
+    monkeypatch.setattr(trainer.jax, "device_get", recorded("fetch", jax.device_get))
+    monkeypatch.setattr(RunFiles, "log", recorded("line"))
+    monkeypatch.setattr(RunFiles, "save", recorded("save"))
     fit(config, places, tmp_path, initial=params, quiet=True)
-    assert events[events.index("step") :] == ["step", "step", "fetch", "fetch", "save"]
+    found = events[events.index("step") :]
+    assert found == ["step", "step", "fetch", "line", "fetch", "line", "save"]
 
 
 def test_an_error_of_the_system_that_is_none_of_writing_is_not_told_as_one(
