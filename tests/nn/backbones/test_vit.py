@@ -184,7 +184,12 @@ def test_side_adapters_take_the_sum_of_both_paths() -> None:
     ("config", "request_", "words"),
     [
         (SIDE, FeatureSpec((1,)), "levels or a facet and adapters on a side path, expected one"),
-        (SIDE, FeatureSpec((2, 3)), "levels or a facet and adapters on a side path, expected one"),
+        (SIDE, FeatureSpec(class_attention=True), "token's attention and adapters on a side path"),
+        (
+            SIDE,
+            FeatureSpec(insertion=1, inserted=jnp.ones((2, 16))),
+            "inserted tokens and adapters on a side path",
+        ),
         (
             CONFIG,
             FeatureSpec((2,), class_attention=True),
