@@ -19,7 +19,7 @@ from crisalad_jax.data.resize import Pixels
 from crisalad_jax.experiments.report.gallery import thumbnail
 from crisalad_jax.experiments.report.style import GREY, INK, Picture, new_figure
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, check_params, transport_masses
+from crisalad_jax.nn.model import Crisalad, Model, check_params, transport_masses
 from crisalad_jax.retrieval.describe import prepare_image
 
 CLUSTER_COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
@@ -29,10 +29,8 @@ _OPACITY = 0.65
 _PIXELS = 480
 
 
-@takes(params=Crisalad, config=ModelConfig)
-def show_transport(
-    image: str | os.PathLike[str] | Pixels, params: Crisalad, config: ModelConfig
-) -> Picture:
+@takes(model=Model)
+def show_transport(image: str | os.PathLike[str] | Pixels, model: Model) -> Picture:
     """Draw a picture, each patch's share in the dustbin, and the cluster that took most of it.
 
     The strongest seven clusters have colours; patches that others took stay grey. A colour's
@@ -41,8 +39,7 @@ def show_transport(
 
     Args:
         image: a file, or 8-bit RGB or grey, as `prepare_image` takes it.
-        params: the model's parameters.
-        config: the model.
+        model: the model, as `load` returns it.
 
     Returns:
         A figure that a notebook shows; `figure.savefig(path)` writes it.
@@ -55,11 +52,12 @@ def show_transport(
         >>> import jax
         >>> from crisalad_jax import PRESETS, init_crisalad
         >>> config = PRESETS["tiny"]
-        >>> params = init_crisalad(jax.random.key(0), config)
-        >>> figure = show_transport(pictures / "0.png", params, config)
+        >>> model = Model(init_crisalad(jax.random.key(0), config), config)
+        >>> figure = show_transport(pictures / "0.png", model)
         >>> [axes.get_title(loc="left").split(",")[0] for axes in figure.axes[:3]]
         ['80 x 60 pixels', 'dustbin: 67 %', 'top clusters']
     """
+    params, config = model
     check_params(params, config)
     pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
     picture = transport_of(as_rgb(pixels, config.preprocessing.bit_depth), params, config)

@@ -277,11 +277,10 @@ def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeyp
     """Of a method that learns nothing: what the vocabulary gave is what is evaluated."""
     built = []
 
-    def with_vocabulary(params, config, paths, *, images, seed, on_bad_image, quiet):
+    def with_vocabulary(model, paths, *, images, seed, on_bad_image, quiet):
         built.append((len(paths), images, seed))
-        return dataclasses.replace(
-            params, aggregator=jax.tree.map(lambda x: x + 1, params.aggregator)
-        )
+        moved = jax.tree.map(lambda x: x + 1, model.params.aggregator)
+        return dataclasses.replace(model.params, aggregator=moved)
 
     monkeypatch.setattr(start, "with_vocabulary", with_vocabulary)
     monkeypatch.delattr(runner, "fit")

@@ -111,7 +111,7 @@ def _pixels(figure):
 
 def test_transport_shows_picture_dustbin_and_clusters(params, benchmark, tmp_path):
     image = cj.read_image(benchmark.queries[0])
-    figure = cj.show_transport(image, params, MODEL)
+    figure = cj.show_transport(image, cj.Model(params, MODEL))
     first, dustbin, clusters, _ = figure.axes
     assert (
         first.get_title(loc="left") == f"{image.shape[1]} x {image.shape[0]} pixels, 3 x 4 patches"
@@ -130,7 +130,7 @@ def test_transport_shows_picture_dustbin_and_clusters(params, benchmark, tmp_pat
     np.testing.assert_allclose(colours, list(map(rgb, CLUSTER_COLOURS[: len(colours)])))
     pixels = _pixels(figure)
     assert pixels.std() > 10  # not blank
-    same = cj.show_transport(benchmark.queries[0], params, MODEL)
+    same = cj.show_transport(benchmark.queries[0], cj.Model(params, MODEL))
     np.testing.assert_array_equal(_pixels(same), pixels)
 
 
@@ -139,12 +139,12 @@ def test_a_model_without_a_transport_is_refused(benchmark):
     model = dataclasses.replace(MODEL, aggregator="gem", cross_image=alone)
     other = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), parameter_shapes(model))
     with pytest.raises(cj.InputError, match="found gem, expected one that transports"):
-        cj.show_transport(benchmark.queries[0], other, model)
+        cj.show_transport(benchmark.queries[0], cj.Model(other, model))
 
 
 def test_the_order_of_the_arguments_is_one_line(params, benchmark):
     picture = PIL.Image.open(benchmark.queries[0])
     with pytest.raises(cj.InputError, match="image: found JpegImageFile, expected uint8 or uint16"):
-        cj.show_transport(picture, params, MODEL)
-    with pytest.raises(cj.InputError, match="params: found JpegImageFile, expected Crisalad"):
-        cj.show_transport(params, picture, MODEL)
+        cj.show_transport(picture, cj.Model(params, MODEL))
+    with pytest.raises(cj.InputError, match="model: found JpegImageFile, expected Model"):
+        cj.show_transport(cj.Model(params, MODEL), picture)
