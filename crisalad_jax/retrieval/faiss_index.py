@@ -16,8 +16,8 @@ from typing import Any, Literal, NamedTuple
 import faiss as _faiss
 import numpy as np
 
-from crisalad_jax.config.checks import choose
-from crisalad_jax.retrieval.chunks import WIDE, as_rows, check_rows, sample
+from crisalad_jax.config.checks import check_count, choose
+from crisalad_jax.retrieval.chunks import WIDE, as_rows, as_unit_rows, sample
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.checksums import ChangedFileError, sha256_of, tell_unchecked
 from crisalad_jax.utils.errors import InputError
@@ -81,17 +81,9 @@ class Index(NamedTuple):
             InputError: queries of another length, not finite or not of unit length; k or effort
                 below 1.
         """
-        for name, value in (("k", k), ("effort", effort)):
-            if value is not None and value < 1:
-                raise InputError(f"{name}: found {value}, expected at least 1")
-        queries = as_rows(queries, "queries")
-        if queries.shape[1] != self.faiss_index.d:
-            raise InputError(
-                f"queries: found descriptors of length {queries.shape[1]}, expected "
-                f"{self.faiss_index.d} as in the index"
-            )
-        check_rows(queries, "queries", range(len(queries)), unit=True)
-        queries = np.ascontiguousarray(queries, WIDE)
+        check_count("k", k)
+        check_count("effort", 1 if effort is None else effort)
+        queries = as_unit_rows(queries, "queries", self.faiss_index.d)
         k = min(k, self.size)
         if self.kind == "hnsw":
             chosen = faiss.SearchParametersHNSW(efSearch=effort or max(_LEAST_EFFORT, 2 * k))
@@ -135,15 +127,10 @@ def build(
     shapes = [part.shape for part in parts()]
     count, length = sum(rows for rows, _ in shapes), shapes[0][1]
     index = _graph(length, seed) if kind == "hnsw" else _trained_lists(count, length, parts, seed)
-    start = 0
     with progress_bar(kind, count, "rows", quiet=quiet) as bar:
         for part in parts():
-            with np.errstate(over="ignore"):  # what overflows is reported
-                wide = np.ascontiguousarray(part, WIDE)
-            check_rows(wide, "database", range(start, start + len(wide)), unit=True)
-            index.add(wide)
-            start += len(wide)
-            bar.advance(len(wide))
+            index.add(as_unit_rows(part, "database"))
+            bar.advance(len(part))
     return Index(kind, index)
 
 
@@ -230,7 +217,7 @@ def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
 
 
 def _first_line(error: BaseException) -> str:
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 def recall_against_exact(found: Int[np.ndarray, "q k"], exact: Int[np.ndarray, "q k"]) -> float:

@@ -29,7 +29,6 @@ from crisalad_jax.nn.model import Model, check_params, describe, init_crisalad
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.losses import LOSSES, LossConfig, metric_loss
-from crisalad_jax.training.losses.large_margin_cosine import large_margin_cosine_loss
 from crisalad_jax.training.optimiser import make_optimiser
 from crisalad_jax.training.step import init_train_state, make_train_step, step_config
 from crisalad_jax.training.vocabulary import with_vocabulary
@@ -153,7 +152,8 @@ def test_losses_of_float32_are_float32(name: str) -> None:
 def test_so_is_the_accuracy_of_a_classification() -> None:
     with jax.enable_x64(True):
         rows = jnp.eye(4, dtype=jnp.float32)
-        found = large_margin_cosine_loss(rows, jnp.asarray(LABELS), rows, scale=1.0, margin=0.0)
+        config = LossConfig(kind="large-margin-cosine", miner="none")
+        found = metric_loss(rows, jnp.asarray(LABELS), config, params=rows)
     assert found.accuracy is not None
     # Images 0 to 3 are nearest to the classes 0 to 3, and are of 0, 0, 1 and 1.
     assert (found.accuracy.dtype, float(found.accuracy)) == (jnp.float32, 0.25)
@@ -190,7 +190,7 @@ def test_a_vocabulary_is_the_same(shared: pathlib.Path) -> None:
     )
     params = init_crisalad(jax.random.key(0), config)
     paths = sorted((shared / "city" / "Images").rglob("*.jpg"))
-    in_both_modes(lambda: with_vocabulary(params, config, paths))
+    in_both_modes(lambda: with_vocabulary(Model(params, config), paths))
 
 
 def test_a_run_that_is_extended_in_the_other_mode_is_the_run_itself(
