@@ -169,17 +169,6 @@ def test_hugging_face_there_and_back(tmp_path: pathlib.Path, registers: int, ffn
     assert all(theirs[name].tobytes() == found[name].tobytes() for name in found)
 
 
-def test_the_reference_carries_its_configuration(tmp_path: pathlib.Path) -> None:
-    """Two heads of width 16, which no shape tells."""
-    params = random_params(MODEL)
-    write_checkpoint(tmp_path / "reference.pth", params, MODEL, "reference", {})
-    found = read_checkpoint(tmp_path / "reference.pth")
-    assert (found.format, found.config) == ("reference", MODEL)
-    wanted = named_leaves(params)
-    for name, leaf in named_leaves(found.params).items():
-        np.testing.assert_array_equal(leaf, wanted[name])
-
-
 @pytest.mark.parametrize(
     ("layout", "changed", "words"),
     [

@@ -265,23 +265,18 @@ def test_no_file_or_another_one_is_refused(tmp_path):
         load_weights(tmp_path / "w.safetensors")
 
 
-def test_the_hash_is_of_what_descriptors_are_a_function_of(shared):
+def test_the_hash_is_of_every_number(shared):
+    """Of the configuration: see below."""
     params, config = load_weights(shared / "weights.safetensors")
     found = model_hash(params, config)
     assert len(found) == 64
     assert model_hash(random_params(MODEL), MODEL) == found
-    free = dataclasses.replace(config, image_size=(56, 56), compute_dtype="bfloat16", remat="full")
-    free = dataclasses.replace(free, aggregator=dataclasses.replace(free.aggregator, dropout=0.0))
-    assert model_hash(params, free) == found
     leaves, structure = jax.tree.flatten(params)
     for number in (0, len(leaves) // 2, len(leaves) - 1):
         changed = np.array(leaves[number])
         changed.flat[-1] = np.nextafter(changed.flat[-1], 2)
         others = jax.tree.unflatten(structure, [*leaves[:number], changed, *leaves[number + 1 :]])
         assert model_hash(others, config) != found
-    sinkhorn = dataclasses.replace(config.aggregator.sinkhorn, iterations=4)
-    salad = dataclasses.replace(config.aggregator, sinkhorn=sinkhorn)
-    assert model_hash(params, dataclasses.replace(config, aggregator=salad)) != found
 
 
 def fields_of(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:
