@@ -226,8 +226,9 @@ def write_export(
 
     Raises:
         InputError: as `check_exportable`; `out` is a file, or a folder that holds something; or, in
-            another format than StableHLO, an extra is missing, the model has an operation that the
-            format lacks, or the program's descriptors differ from those of `describe`.
+            another format than StableHLO, the model has an operation that the format lacks, or the
+            program's descriptors differ from those of `describe`.
+        ModuleNotFoundError: the extra of another format than StableHLO is not installed.
 
     Example:
         >>> import jax
