@@ -192,18 +192,6 @@ def test_weights_that_changed_are_refused_unless_they_are_not_verified(tmp_path,
     assert config.compute_dtype == ("float32" if inside else "bfloat16")
 
 
-def changed(config: Any, fields: dict[str, Any]) -> Any:
-    """A configuration with other values in the fields of these names, wherever they are inside."""
-    changes = {}
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        if field.name in fields:
-            changes[field.name] = fields[field.name]
-        elif dataclasses.is_dataclass(value):
-            changes[field.name] = changed(value, fields)
-    return dataclasses.replace(config, **changes)
-
-
 SCORE, DUST = "aggregator.score.fc1.weight", "aggregator.dust_bin"
 
 
@@ -311,7 +299,10 @@ def other_values(config: Any, field: dataclasses.Field[Any]) -> Iterator[Any]:
         yield 0.5  # of what is None
 
 
-CONVERGING = changed(MODEL, {"tolerance": 1e-3, "gradient": "stop"})
+SINKHORN = dataclasses.replace(MODEL.aggregator.sinkhorn, tolerance=1e-3, gradient="stop")
+CONVERGING = dataclasses.replace(
+    MODEL, aggregator=dataclasses.replace(MODEL.aggregator, sinkhorn=SINKHORN)
+)
 
 
 def put(config: Any, name: str, value: Any) -> Any:
