@@ -29,10 +29,7 @@ from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.public import read_checkpoint
 from crisalad_jax.checkpoints.published import PUBLISHED, Licence, Published
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.utils.download import RetryPolicy
 from crisalad_jax.utils.errors import InputError
@@ -40,14 +37,9 @@ from crisalad_jax.utils.files import CACHE, user_cache
 from crisalad_jax.utils.output import Note
 from tests.conftest import assert_equal
 from tests.file_server import FileServer, file_server
+from tests.random_checkpoints import bare_vit
 
-CONFIG = ModelConfig(
-    aggregator="class-token",
-    backbone=ViTConfig(
-        dim=64, depth=1, heads=1, position_grid=3, adapter=AdapterConfig(kind="none")
-    ),
-    cross_image=CrossImageConfig(layers=0),
-)
+CONFIG = bare_vit(depth=1, position_grid=3)
 ROOT = pathlib.Path(__file__).parents[2]
 FILE = "tiny_model.safetensors"
 MIT, GPL = (

@@ -30,7 +30,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import MODEL, random_params
 from tests.random_checkpoints import LAYOUTS as FOLDER
-from tests.random_checkpoints import UNDER, as_arrays, public_layout, random_state
+from tests.random_checkpoints import UNDER, as_arrays, bare_vit, public_layout, random_state
 
 PUBLIC = sorted(path.stem for path in FOLDER.glob("*.json"))
 BARE = CrossImageConfig(layers=0)
@@ -177,12 +177,8 @@ def test_every_number_has_its_own_place() -> None:
 
 
 def small(name: str) -> tuple[dict[str, np.ndarray], ModelConfig]:
-    """DINOv2 of 2 blocks of width 64, by our names for it."""
-    config = ModelConfig(
-        aggregator="class-token",
-        backbone=ViTConfig(dim=64, depth=2, heads=1, position_grid=2, adapter=NO_ADAPTER),
-        cross_image=BARE,
-    )
+    """A small DINOv2, by the names of a format."""
+    config = bare_vit()
     return as_arrays(random_state(public_shapes(config, name))), config
 
 

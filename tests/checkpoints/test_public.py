@@ -29,16 +29,17 @@ from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
-from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, describe, init_crisalad, self_mask
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 from parity import zoo
+from tests.checkpoints.test_weights import put
 from tests.conftest import MODEL, assert_equal, random_params
 from tests.random_checkpoints import (
     UNDER,
+    bare_vit,
     fewer_blocks,
     narrow,
     nested,
@@ -59,13 +60,7 @@ SMALL = {
 }
 SUFFIX = {"dino-salad": ".ckpt"}
 WIDTHS = {"dinov2": 64, "registers": 64, "dino-salad": 256 + 64 * 128, "cricavpr": 14 * 192}
-HUGGING_FACE = ModelConfig(
-    aggregator="class-token",
-    backbone=ViTConfig(
-        dim=64, depth=2, heads=1, position_grid=2, adapter=AdapterConfig(kind="none")
-    ),
-    cross_image=CrossImageConfig(layers=0),
-)
+HUGGING_FACE = bare_vit()
 
 
 def written(folder: pathlib.Path, name: str) -> pathlib.Path:
@@ -189,8 +184,8 @@ def test_what_a_layout_cannot_tell_goes_to_the_reference(
     """Else the way back would give another model, with other descriptors."""
     public = read_checkpoint(written(tmp_path, layout))
     config = public.config
-    for path, value in changed.items():
-        config = replaced(config, path.split("."), value)
+    for name, value in changed.items():
+        config = put(config, name, value)
     ours, back = tmp_path / "ours.safetensors", tmp_path / "back.pth"
     save_weights(ours, Model(public.params, config), extras=public.extras)
     with pytest.raises(InputError, match=f"^format {layout}: cannot tell .*{words}"):
@@ -198,13 +193,6 @@ def test_what_a_layout_cannot_tell_goes_to_the_reference(
     assert not back.exists()
     assert convert(ours, back).target == "reference"
     assert read_checkpoint(back).config == config
-
-
-def replaced(config, path: list[str], value):
-    """A configuration with one field, deep inside, changed."""
-    head, *rest = path
-    inner = replaced(getattr(config, head), rest, value) if rest else value
-    return dataclasses.replace(config, **{head: inner})
 
 
 @pytest.mark.parametrize("layout", ["dino-salad", "cricavpr", "huggingface", "reference"])
@@ -219,15 +207,19 @@ def test_what_no_description_depends_on_comes_back(tmp_path: pathlib.Path, layou
     else:
         source = written(tmp_path, layout)
     public = read_checkpoint(source)
-    config = replaced(public.config, ["image_size"], (126, 140))
-    config = replaced(config, ["compute_dtype"], "bfloat16")
-    config = replaced(config, ["precision"], "high")
-    config = replaced(config, ["remat"], "none")
-    config = replaced(config, ["backbone", "layer_scale_init"], 1e-5)
-    config = replaced(config, ["preprocessing", "filter"], "bicubic")
-    config = replaced(config, ["cross_image", "dropout"], 0.2)
-    if layout == "dino-salad":
-        config = replaced(config, ["aggregator", "dropout"], 0.1)
+    changes = {
+        "image_size": (126, 140),
+        "compute_dtype": "bfloat16",
+        "precision": "high",
+        "remat": "none",
+        "backbone.layer_scale_init": 1e-5,
+        "preprocessing.filter": "bicubic",
+        "cross_image.dropout": 0.2,
+        **({"aggregator.dropout": 0.1} if layout == "dino-salad" else {}),
+    }
+    config = public.config
+    for name, value in changes.items():
+        config = put(config, name, value)
     ours, back = tmp_path / "ours.safetensors", tmp_path / f"back{suffix}"
     save_weights(ours, Model(public.params, config), extras=public.extras)
     assert convert(ours, back, layout).target == layout
