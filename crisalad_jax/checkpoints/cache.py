@@ -13,12 +13,12 @@ from typing import Any
 
 import jax
 
+from crisalad_jax.checkpoints.download import MissingFileError, download
 from crisalad_jax.checkpoints.matlab_io import MATLAB_SUFFIX
 from crisalad_jax.checkpoints.public import Checkpoint, read_checkpoint, read_vocabulary
 from crisalad_jax.checkpoints.published import PUBLISHED, Published
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.utils.checksums import sha256_of
-from crisalad_jax.utils.download import MissingFileError, download
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, user_cache, write_json
 from crisalad_jax.utils.locks import lock
