@@ -298,3 +298,16 @@ def test_other_dustbins_go_to_the_reference_alone(dustbin) -> None:
     wanted = named_leaves(params)
     for name, leaf in named_leaves(again).items():
         np.testing.assert_array_equal(leaf, wanted[name])
+
+
+@pytest.mark.parametrize("name", ["reference", "dino-salad"])
+def test_no_array_is_left_out_of_a_file_in_silence(name) -> None:
+    aggregator = dataclasses.replace(MODEL.aggregator, learn_epsilon=True)
+    config = dataclasses.replace(
+        MODEL,
+        backbone=dataclasses.replace(MODEL.backbone, adapter=NO_ADAPTER),
+        aggregator=aggregator,
+        cross_image=BARE,
+    )
+    with pytest.raises(InputError, match=f"format {name}: found aggregator.log_epsilon, expected"):
+        table(config, name)
