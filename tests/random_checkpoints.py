@@ -9,9 +9,28 @@ import numpy as np
 import safetensors.torch
 import torch
 
+from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
+
 LAYOUTS = pathlib.Path(__file__).parents[1] / "parity" / "layouts"
 UNDER = "model_state_dict/"
 """What the stored layout of CricaVPR writes before the names inside that dictionary."""
+
+
+def bare_vit(depth: int = 2, position_grid: int = 2) -> ModelConfig:
+    """A small DINOv2 by itself, of width 64."""
+    backbone = ViTConfig(
+        dim=64,
+        depth=depth,
+        heads=1,
+        position_grid=position_grid,
+        adapter=AdapterConfig(kind="none"),
+    )
+    return ModelConfig(
+        aggregator="class-token", backbone=backbone, cross_image=CrossImageConfig(layers=0)
+    )
 
 
 def public_layout(name: str) -> dict[str, tuple[int, ...]]:

@@ -47,7 +47,7 @@ CALLS = {
         "params: found ModelConfig, expected Crisalad",
     ),
     "load": (lambda: cj.load(PRESET), f"path: {NO_PATH}"),
-    "save_weights": (lambda: cj.save_weights("w", PARAMS), NO_MODEL),
+    "save_weights": (lambda: cj.save_weights("w", PARAMS), "model: found Crisalad, expected Model"),
     "init_crisalad": (
         lambda: cj.init_crisalad(PRESET, KEY),
         "config: found PRNGKeyArray, expected ModelConfig",

@@ -158,11 +158,8 @@ def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> ex
     where the model resizes floats. The result is their unit descriptors (batch, descriptor).
     `weights` is a dictionary of the arrays by their dotted
     names. Nothing in the program depends on the platform that exports it, nor on who calls this.
-
-    Raises:
-        InputError: as `check_exportable`.
+    `check_exportable` says what can be exported.
     """
-    check_exportable(params, config, how)
     run, weights, images = _program(params, config, how)
     with number_types([config]), lowering_for(PORTABLE), _without_sources():
         if how.weights_inside:
@@ -229,8 +226,9 @@ def write_export(
 
     Raises:
         InputError: as `check_exportable`; `out` is a file, or a folder that holds something; or, in
-            another format than StableHLO, an extra is missing, the model has an operation that the
-            format lacks, or the program's descriptors differ from those of `describe`.
+            another format than StableHLO, the model has an operation that the format lacks, or the
+            program's descriptors differ from those of `describe`.
+        ModuleNotFoundError: the extra of another format than StableHLO is not installed.
 
     Example:
         >>> import jax

@@ -74,8 +74,8 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
 
     Raises:
         InputError: the file is missing, cut short, none of the formats, asks to run code, or does
-            not fit its format (the first names that are missing, unknown or misshaped are listed);
-            or torch is needed and not installed.
+            not fit its format (the first names that are missing, unknown or misshaped are listed).
+        ModuleNotFoundError: torch is needed and not installed.
     """
     path = pathlib.Path(path)
     check_source(path, "a checkpoint")
@@ -201,8 +201,8 @@ def write_checkpoint(
     one, is in the metadata of the state, where no other program looks.
 
     Raises:
-        InputError: the format cannot hold this model, or is not written; the file cannot be made;
-            or torch is needed and not installed.
+        InputError: the format cannot hold this model, or the file cannot be made.
+        ModuleNotFoundError: torch is needed and not installed.
     """
     path = pathlib.Path(path)
     form = choose("format", format, FORMATS)

@@ -202,8 +202,9 @@ def open_runtime(
         The model.
 
     Raises:
-        InputError: the engine is not installed; there is no such folder or file, or it is damaged,
-            of another format or for other images; or what `write_export` raises.
+        InputError: there is no such folder or file, or it is damaged, of another format or for
+            other images; or what `write_export` raises.
+        ModuleNotFoundError: the engine is not installed.
 
     Example:
         >>> import jax, numpy as np

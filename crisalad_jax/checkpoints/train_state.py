@@ -125,17 +125,18 @@ class StateStore:
         try:
             # Check before orbax reads any array: it reads all at once, and raises for a misfit in
             # another thread.
-            self._check_seal(step)
-            problems = diff_trees(self._manager.item_metadata(step)["state"].tree, arrays)
-            if problems:
-                raise ValueError(few(problems))
+            problems = self._changed_files(step) or diff_trees(
+                self._manager.item_metadata(step)["state"].tree, arrays
+            )
         except (OSError, ValueError) as error:
+            problems = [str(error)]
+        if problems:
             older = [other for other in self._manager.all_steps() if other != step]
             advice = f"; delete it to resume from step {max(older)}" if older else ""
             raise InputError(
                 f"{self._folder / str(step)}: this state is damaged or not of this run{advice} "
-                f"({error})"
-            ) from error
+                f"({few(problems)})"
+            )
         saved = self._manager.restore(
             step,
             args=ocp.args.Composite(
@@ -156,13 +157,15 @@ class StateStore:
         folder = pathlib.Path(temporary.get())
         write_json(folder / _SEAL, _hashes(folder))
 
-    def _check_seal(self, step: int) -> None:
+    def _changed_files(self, step: int) -> list[str]:
+        """List the files of a state that are not as they were saved."""
         folder = self._folder / str(step)
         found, saved = _hashes(folder), read_json(folder / _SEAL, "the digests of a state's files")
-        for name in found.keys() | saved.keys():
-            if found.get(name) != saved.get(name):
-                what = "other bytes than were saved" if name in found else "no file"
-                raise ValueError(f"{name}: found {what}")
+        return [
+            f"{name}: found {'other bytes than were saved' if name in found else 'no file'}"
+            for name in sorted(found.keys() | saved.keys())
+            if found.get(name) != saved.get(name)
+        ]
 
     def wait(self) -> None:
         """Wait until all saved states are on the disk; raise as `save`."""

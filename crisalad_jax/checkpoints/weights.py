@@ -188,9 +188,9 @@ def unpack_weights(
     try:
         value, arrays = unseal(path, metadata, arrays, FORMAT, EXPECTED, verify=verify)
     except ChangedFileError as error:
-        if user_cache() in pathlib.Path(path).parents:
-            raise InputError(f"{error}; remove it, and the same command makes it again") from error
-        raise
+        is_cached = user_cache() in pathlib.Path(path).parents
+        advice = "; remove it, and the same command makes it again" if is_cached else ""
+        raise InputError(f"{error}{advice}") from error
     extras = {
         name.removeprefix(EXTRA): arrays.pop(name)
         for name in list(arrays)

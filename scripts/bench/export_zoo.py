@@ -45,7 +45,7 @@ def config_of(name: str) -> ModelConfig:
     sys.path.insert(0, str(ROOT))
     from tests.checkpoints.test_published import inferred
 
-    return inferred(name)
+    return inferred(name)[1]
 
 
 def difference(

@@ -318,7 +318,7 @@ def test_a_transport_that_must_converge(params: Crisalad):
         MODEL, aggregator=dataclasses.replace(MODEL.aggregator, sinkhorn=sinkhorn)
     )
     with pytest.raises(InputError, match=r"^SinkhornConfig.throw: found True"):
-        export_model(params, config, ExportConfig())
+        check_exportable(params, config, ExportConfig())
 
 
 def test_a_folder_in_use_is_left_as_it_is(params: Crisalad, tmp_path: pathlib.Path):

@@ -30,7 +30,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import MODEL, random_params
 from tests.random_checkpoints import LAYOUTS as FOLDER
-from tests.random_checkpoints import UNDER, as_arrays, public_layout, random_state
+from tests.random_checkpoints import UNDER, as_arrays, bare_vit, public_layout, random_state
 
 PUBLIC = sorted(path.stem for path in FOLDER.glob("*.json"))
 BARE = CrossImageConfig(layers=0)
@@ -177,12 +177,8 @@ def test_every_number_has_its_own_place() -> None:
 
 
 def small(name: str) -> tuple[dict[str, np.ndarray], ModelConfig]:
-    """DINOv2 of 2 blocks of width 64, by our names for it."""
-    config = ModelConfig(
-        aggregator="class-token",
-        backbone=ViTConfig(dim=64, depth=2, heads=1, position_grid=2, adapter=NO_ADAPTER),
-        cross_image=BARE,
-    )
+    """A small DINOv2, by the names of a format."""
+    config = bare_vit()
     return as_arrays(random_state(public_shapes(config, name))), config
 
 
@@ -302,3 +298,16 @@ def test_other_dustbins_go_to_the_reference_alone(dustbin) -> None:
     wanted = named_leaves(params)
     for name, leaf in named_leaves(again).items():
         np.testing.assert_array_equal(leaf, wanted[name])
+
+
+@pytest.mark.parametrize("name", ["reference", "dino-salad"])
+def test_no_array_is_left_out_of_a_file_in_silence(name) -> None:
+    aggregator = dataclasses.replace(MODEL.aggregator, learn_epsilon=True)
+    config = dataclasses.replace(
+        MODEL,
+        backbone=dataclasses.replace(MODEL.backbone, adapter=NO_ADAPTER),
+        aggregator=aggregator,
+        cross_image=BARE,
+    )
+    with pytest.raises(InputError, match=f"format {name}: found aggregator.log_epsilon, expected"):
+        table(config, name)

@@ -29,16 +29,17 @@ from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
-from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, describe, init_crisalad, self_mask
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 from parity import zoo
+from tests.checkpoints.test_weights import put
 from tests.conftest import MODEL, assert_equal, random_params
 from tests.random_checkpoints import (
     UNDER,
+    bare_vit,
     fewer_blocks,
     narrow,
     nested,
@@ -59,13 +60,7 @@ SMALL = {
 }
 SUFFIX = {"dino-salad": ".ckpt"}
 WIDTHS = {"dinov2": 64, "registers": 64, "dino-salad": 256 + 64 * 128, "cricavpr": 14 * 192}
-HUGGING_FACE = ModelConfig(
-    aggregator="class-token",
-    backbone=ViTConfig(
-        dim=64, depth=2, heads=1, position_grid=2, adapter=AdapterConfig(kind="none")
-    ),
-    cross_image=CrossImageConfig(layers=0),
-)
+HUGGING_FACE = bare_vit()
 
 
 def written(folder: pathlib.Path, name: str) -> pathlib.Path:
@@ -169,17 +164,6 @@ def test_hugging_face_there_and_back(tmp_path: pathlib.Path, registers: int, ffn
     assert all(theirs[name].tobytes() == found[name].tobytes() for name in found)
 
 
-def test_the_reference_carries_its_configuration(tmp_path: pathlib.Path) -> None:
-    """Two heads of width 16, which no shape tells."""
-    params = random_params(MODEL)
-    write_checkpoint(tmp_path / "reference.pth", params, MODEL, "reference", {})
-    found = read_checkpoint(tmp_path / "reference.pth")
-    assert (found.format, found.config) == ("reference", MODEL)
-    wanted = named_leaves(params)
-    for name, leaf in named_leaves(found.params).items():
-        np.testing.assert_array_equal(leaf, wanted[name])
-
-
 @pytest.mark.parametrize(
     ("layout", "changed", "words"),
     [
@@ -200,8 +184,8 @@ def test_what_a_layout_cannot_tell_goes_to_the_reference(
     """Else the way back would give another model, with other descriptors."""
     public = read_checkpoint(written(tmp_path, layout))
     config = public.config
-    for path, value in changed.items():
-        config = replaced(config, path.split("."), value)
+    for name, value in changed.items():
+        config = put(config, name, value)
     ours, back = tmp_path / "ours.safetensors", tmp_path / "back.pth"
     save_weights(ours, Model(public.params, config), extras=public.extras)
     with pytest.raises(InputError, match=f"^format {layout}: cannot tell .*{words}"):
@@ -209,13 +193,6 @@ def test_what_a_layout_cannot_tell_goes_to_the_reference(
     assert not back.exists()
     assert convert(ours, back).target == "reference"
     assert read_checkpoint(back).config == config
-
-
-def replaced(config, path: list[str], value):
-    """A configuration with one field, deep inside, changed."""
-    head, *rest = path
-    inner = replaced(getattr(config, head), rest, value) if rest else value
-    return dataclasses.replace(config, **{head: inner})
 
 
 @pytest.mark.parametrize("layout", ["dino-salad", "cricavpr", "huggingface", "reference"])
@@ -230,15 +207,19 @@ def test_what_no_description_depends_on_comes_back(tmp_path: pathlib.Path, layou
     else:
         source = written(tmp_path, layout)
     public = read_checkpoint(source)
-    config = replaced(public.config, ["image_size"], (126, 140))
-    config = replaced(config, ["compute_dtype"], "bfloat16")
-    config = replaced(config, ["precision"], "high")
-    config = replaced(config, ["remat"], "none")
-    config = replaced(config, ["backbone", "layer_scale_init"], 1e-5)
-    config = replaced(config, ["preprocessing", "filter"], "bicubic")
-    config = replaced(config, ["cross_image", "dropout"], 0.2)
-    if layout == "dino-salad":
-        config = replaced(config, ["aggregator", "dropout"], 0.1)
+    changes = {
+        "image_size": (126, 140),
+        "compute_dtype": "bfloat16",
+        "precision": "high",
+        "remat": "none",
+        "backbone.layer_scale_init": 1e-5,
+        "preprocessing.filter": "bicubic",
+        "cross_image.dropout": 0.2,
+        **({"aggregator.dropout": 0.1} if layout == "dino-salad" else {}),
+    }
+    config = public.config
+    for name, value in changes.items():
+        config = put(config, name, value)
     ours, back = tmp_path / "ours.safetensors", tmp_path / f"back{suffix}"
     save_weights(ours, Model(public.params, config), extras=public.extras)
     assert convert(ours, back, layout).target == layout
@@ -435,78 +416,62 @@ BIAS = random_state(SMALL["dinov2"])["norm.bias"]
 DEEP = {"backbone": {"name": "vit", "depth": 10**9}}
 DECLARED = json.dumps({"format": "reference", "config": DEEP, "aggregator": {}})
 COUNT = next(name for name in SMALL["cricavpr"] if name.endswith("num_batches_tracked"))
-BAD: dict[str, tuple[str, Callable[[], Any], str]] = {
-    "empty": (".pth", lambda: b"", "not a whole torch checkpoint"),
-    "cut": (".pth", lambda: whole()[:9999], "found the beginning of one, .* unfinished downl"),
-    "old, cut": (".pth", lambda: whole(new=False)[:338], "not a whole torch checkpoint"),
-    "text": (".pth", lambda: b"no checkpoint", "not a whole torch checkpoint|refused"),
-    "a list": (".pth", lambda: [1, 2], "found list, expected nothing but tensors by name"),
-    "no tensor": (".pth", lambda: small(epoch=3), "found epoch, expected nothing but tensors"),
-    "a number for a name": (".pth", lambda: {**small(), 3: BIAS}, "found 3, expected nothing but"),
+BAD: dict[str, tuple[Callable[[], Any], str]] = {
+    "empty": (lambda: b"", "not a whole torch checkpoint"),
+    "cut": (lambda: whole()[:9999], "found the beginning of one, .* unfinished downl"),
+    "old, cut": (lambda: whole(new=False)[:338], "not a whole torch checkpoint"),
+    "text": (lambda: b"no checkpoint", "not a whole torch checkpoint|refused"),
+    "a list": (lambda: [1, 2], "found list, expected nothing but tensors by name"),
+    "no tensor": (lambda: small(epoch=3), "found epoch, expected nothing but tensors"),
+    "a number for a name": (lambda: {**small(), 3: BIAS}, "found 3, expected nothing but"),
     "double": (
-        ".pth",
         lambda: small(norm_bias=BIAS.double()),
         "norm.bias found float64, expected float32 or float16 or bfloat16",
     ),
-    "nan": (".pth", lambda: small(norm_bias=BIAS * float("nan")), "norm.bias holds NaN or inf"),
-    "sparse": (
-        ".pth",
-        lambda: small(norm_bias=BIAS.to_sparse()),
-        "norm.bias is no plain tensor: .*Sparse",
-    ),
+    "nan": (lambda: small(norm_bias=BIAS * float("nan")), "norm.bias holds NaN or inf"),
+    "sparse": (lambda: small(norm_bias=BIAS.to_sparse()), "norm.bias is no plain tensor: .*Sparse"),
     "eight bits": (
-        ".pth",
         lambda: small(norm_bias=BIAS.to(torch.float8_e4m3fn)),
         "norm.bias is no plain tensor: .*Float8",
     ),
     "a float count": (
-        ".pth",
         lambda: nested(random_state(SMALL["cricavpr"]) | {COUNT: torch.zeros(())}),
         "num_batches_tracked found float32, expected int64",
     ),
     "no width": (
-        ".pth",
         lambda: small(cls_token=torch.zeros(1, 1, 0)),
         "found cls_token of shape .1, 1, 0., expected an array of more than 2 axes, none of",
     ),
     "extra and missing": (
-        ".pth",
         lambda: {k.replace("norm.bias", "norm.shift"): v for k, v in small().items()},
         "2 blocks: .*norm.bias missing; .*norm.shift unknown",
     ),
     "a depth for an age": (
-        ".pth",
         lambda: {"state_dict": declaring(small(), DECLARED)},
         "found 35 arrays, far from the sizes .* up to 1000000000$",
     ),
     "a deep configuration": (
-        ".pth",
         lambda: {"state_dict": declaring(small(), "[" * 10**5)},
         "found no JSON .nested too deep",
     ),
     "half a configuration": (
-        ".pth",
         lambda: declaring(small(), '{"config": {}}'),
         "found no aggregator, format",
     ),
     "code": (
-        ".pth",
         lambda: small(norm_weight=Opens(pathlib.Path("made"))),
         "refused: it asks for [a-z]+.mkdir, expected nothing but tenso",
     ),
     "old, code": (
-        ".pth",
         lambda: whole(Opens(pathlib.Path("made")), new=False),
         "refused: it asks for [a-z]+.mkdir, expected nothing but tenso",
     ),
-    "no safetensors": (".safetensors", lambda: b"no checkpoint", "not a whole safetensors file"),
-    "eight bits of safetensors": (
-        ".safetensors",
+    "safetensors: text": (lambda: b"no checkpoint", "not a whole safetensors file"),
+    "safetensors: eight bits": (
         lambda: safetensors.torch.save({"layernorm.bias": BIAS.to(torch.float8_e4m3fn)}),
         "found a type that numpy does not know: .*float8",
     ),
-    "another model": (
-        ".safetensors",
+    "safetensors: another model": (
         lambda: safetensors.numpy.save({"stem.weight": np.zeros(3)}),
         "found no checkpoint that we know .*stem.weight",
     ),
@@ -526,7 +491,8 @@ def refused(source: pathlib.Path, words: str) -> None:
 @pytest.mark.parametrize("kind", BAD)
 def test_a_file_that_is_no_model(tmp_path: pathlib.Path, monkeypatch, kind: str) -> None:
     monkeypatch.chdir(tmp_path)  # where an attack would make its folder
-    suffix, make, words = BAD[kind]
+    make, words = BAD[kind]
+    suffix = ".safetensors" if kind.startswith("safetensors") else ".pth"
     content, path = make(), tmp_path / f"file{suffix}"
     path.write_bytes(content) if isinstance(content, bytes) else torch.save(content, path)
     refused(path, words)

@@ -19,14 +19,13 @@ import torch
 from torch import nn
 
 from crisalad_jax.checkpoints.public import Checkpoint, convert, read_backbone, read_checkpoint
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.base import FeatureSpec
-from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from parity.reference.vit import ViT
 from tests.conftest import assert_equal
 from tests.random_checkpoints import (
+    bare_vit,
     fewer_blocks,
     narrow,
     nested,
@@ -35,7 +34,7 @@ from tests.random_checkpoints import (
     save,
 )
 
-VIT = ViTConfig(dim=64, depth=4, heads=1, position_grid=2, adapter=AdapterConfig(kind="none"))
+VIT = bare_vit(depth=4).backbone
 PUBLIC = {"dino-salad": "dino_salad", "cricavpr": "CricaVPR"}
 
 

@@ -192,18 +192,6 @@ def test_weights_that_changed_are_refused_unless_they_are_not_verified(tmp_path,
     assert config.compute_dtype == ("float32" if inside else "bfloat16")
 
 
-def changed(config: Any, fields: dict[str, Any]) -> Any:
-    """A configuration with other values in the fields of these names, wherever they are inside."""
-    changes = {}
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        if field.name in fields:
-            changes[field.name] = fields[field.name]
-        elif dataclasses.is_dataclass(value):
-            changes[field.name] = changed(value, fields)
-    return dataclasses.replace(config, **changes)
-
-
 SCORE, DUST = "aggregator.score.fc1.weight", "aggregator.dust_bin"
 
 
@@ -265,23 +253,18 @@ def test_no_file_or_another_one_is_refused(tmp_path):
         load_weights(tmp_path / "w.safetensors")
 
 
-def test_the_hash_is_of_what_descriptors_are_a_function_of(shared):
+def test_the_hash_is_of_every_number(shared):
+    """Of the configuration: see below."""
     params, config = load_weights(shared / "weights.safetensors")
     found = model_hash(params, config)
     assert len(found) == 64
     assert model_hash(random_params(MODEL), MODEL) == found
-    free = dataclasses.replace(config, image_size=(56, 56), compute_dtype="bfloat16", remat="full")
-    free = dataclasses.replace(free, aggregator=dataclasses.replace(free.aggregator, dropout=0.0))
-    assert model_hash(params, free) == found
     leaves, structure = jax.tree.flatten(params)
     for number in (0, len(leaves) // 2, len(leaves) - 1):
         changed = np.array(leaves[number])
         changed.flat[-1] = np.nextafter(changed.flat[-1], 2)
         others = jax.tree.unflatten(structure, [*leaves[:number], changed, *leaves[number + 1 :]])
         assert model_hash(others, config) != found
-    sinkhorn = dataclasses.replace(config.aggregator.sinkhorn, iterations=4)
-    salad = dataclasses.replace(config.aggregator, sinkhorn=sinkhorn)
-    assert model_hash(params, dataclasses.replace(config, aggregator=salad)) != found
 
 
 def fields_of(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:
@@ -316,7 +299,10 @@ def other_values(config: Any, field: dataclasses.Field[Any]) -> Iterator[Any]:
         yield 0.5  # of what is None
 
 
-CONVERGING = changed(MODEL, {"tolerance": 1e-3, "gradient": "stop"})
+SINKHORN = dataclasses.replace(MODEL.aggregator.sinkhorn, tolerance=1e-3, gradient="stop")
+CONVERGING = dataclasses.replace(
+    MODEL, aggregator=dataclasses.replace(MODEL.aggregator, sinkhorn=SINKHORN)
+)
 
 
 def put(config: Any, name: str, value: Any) -> Any:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.checkpoints.export import ExportConfig, export_model, write_export
+from crisalad_jax.checkpoints.export import ExportConfig, write_export
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
@@ -115,9 +115,6 @@ DOORS: dict[str, Callable[..., Any]] = {
     ),
     "evaluate": lambda params, config, out, shared: evaluate(
         Model(params, config), open_benchmark(shared / "town"), reading=Reading(quiet=True)
-    ),
-    "export_model": lambda params, config, out, shared: export_model(
-        params, config, ExportConfig(platforms=("cpu",))
     ),
     "write_export": lambda params, config, out, shared: write_export(
         out / "export", Model(params, config), ExportConfig(platforms=("cpu",))

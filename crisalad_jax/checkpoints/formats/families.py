@@ -106,7 +106,7 @@ class _Reference(Format):
     def head_of(self, config: ModelConfig) -> Head:
         """Return the names of any head: our own where no public checkpoint has others."""
         head = HEADS.get(config.aggregator.part_name)
-        if head is not None:
+        if head is not None and head.kind is type(config.aggregator):
             return head
         leaves = named_leaves(parameter_shapes(config))
         own = (

@@ -30,7 +30,15 @@ def table(config: ModelConfig, name: str) -> list[Row]:
     """
     form = choose("format", name, FORMATS)
     form.check_parts(config)
-    return list(form.lines(config, _numbered(_blank(config))))
+    names = _numbered(_blank(config))
+    rows = list(form.lines(config, names))
+    left_out = names.keys() - {ours for row in rows for ours in row.ours}
+    if left_out and not form.bare:
+        raise InputError(
+            f"format {name}: found {few(sorted(left_out))}, expected a model without: it has no "
+            "name for that"
+        )
+    return rows
 
 
 def _blank(config: ModelConfig) -> dict[str, np.ndarray]:
