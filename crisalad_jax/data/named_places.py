@@ -41,14 +41,13 @@ View = Sequence[float]
 class FoundPlace(NamedTuple):
     """A place as its reader finds it."""
 
+    id: int
     name: str
     images: Mapping[str, View | None]
     """Path relative to the root -> the view; None where positions are unknown."""
     near: Sequence[int] = ()
     """Numbers of the places that are too near to be in a batch with it."""
     city: int = 0
-    id: int | None = None
-    """None is its number."""
 
 
 def read_named_places(
@@ -81,7 +80,7 @@ def _read_folders(root: pathlib.Path) -> list[FoundPlace]:
     for path in list_images(root):
         name = path.relative_to(root)
         images[name.parent.as_posix()][name.as_posix()] = None
-    return [FoundPlace(name, files) for name, files in images.items()]
+    return _numbered(images)
 
 
 def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace]:
@@ -111,7 +110,13 @@ def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace
         places[place][file] = view if given else None
     if missing:
         warn(f"{path}: left out {missing} of {len(rows)} images, which are missing")
-    return [FoundPlace(name, images) for name, images in places.items()]
+    return _numbered(places)
+
+
+def _numbered(places: Mapping[str, Mapping[str, View | None]]) -> list[FoundPlace]:
+    return [
+        FoundPlace(number, name, images) for number, (name, images) in enumerate(places.items())
+    ]
 
 
 def places_by_position(
@@ -152,7 +157,7 @@ def places_by_position(
     for name, number in zip(names, place.tolist(), strict=True):
         images[number][name] = None
     return [
-        FoundPlace(names[centre], files, [other for other in others if other != number])
+        FoundPlace(number, names[centre], files, [other for other in others if other != number])
         for number, (centre, files, others) in enumerate(zip(centres, images, near, strict=True))
     ]
 
@@ -172,7 +177,7 @@ def places_by_order(source: ImageSource, frames: int) -> list[FoundPlace]:
             start = (number - first) * frames
             part = sequence[start : start + frames]
             near = [each for each in (number - 1, number + 1) if first <= each <= last]
-            places.append(FoundPlace(part[0], dict.fromkeys(part), near))
+            places.append(FoundPlace(number, part[0], dict.fromkeys(part), near))
     return places
 
 

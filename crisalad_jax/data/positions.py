@@ -265,13 +265,12 @@ def read_image_table(path: str | os.PathLike[str], *, all_positions: bool = Fals
 
 def _axes(path: pathlib.Path, columns: Sequence[str], must: bool) -> tuple[str, str] | None:
     """Return the columns of the positions; None where no column is of any."""
-    *pairs, frame = AXES
-    found = [axes for axes in pairs if set(axes) & set(columns)]
-    if not found and set(frame) <= set(columns):
-        found = [frame]  # x and y may be of anything, such as pixels
-    if len(found) == 1 and set(found[0]) <= set(columns):
-        return found[0]
-    if found or must:
+    # x and y may be of anything, such as pixels, and count only where nothing else is there.
+    begun = [axes for axes in AXES[:2] if set(axes) & set(columns)]
+    axes = (begun or [AXES[2]])[0]
+    if len(begun) < 2 and set(axes) <= set(columns):
+        return axes
+    if begun or must:
         raise InputError(
             f"{path}: found columns {', '.join(columns)}, expected only one of name,east,north or "
             "name,lat,lon or name,x,y"

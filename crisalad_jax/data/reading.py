@@ -43,7 +43,7 @@ class Reading:
     def __post_init__(self) -> None:
         """Check the fields."""
         check_types(self)
-        check_count("batch_size", self.batch_size)
+        check_count("batch size", self.batch_size)
         require(self.threads >= 0, f"threads: found {self.threads}, expected at least 0")
 
     def fitted(self, images: int) -> Self:

@@ -156,7 +156,7 @@ def test_a_table_of_positions_has_the_same_forms(tmp_path):
         ("a.csv", "name,lat,lon\n{run}/left/0.png,1,5,2,5\n", "line 2: found 5 fields, expected 3"),
         ("a.csv", "name;lat;lon\n{run}/left/0.png;1.000,5;2\n", "lat: found '1.000,5', expected"),
         ("a.csv", "name,lat,lon\n{run}/left/0.png,1,\n", "line 2: lon: found '', expected"),
-        ("a.csv", "name,x,x,y\n", "found the column x twice, expected it once"),
+        ("a.csv", "name,x,x,y\n", "found columns name, x, x, y, expected each once"),
         (
             "a.csv",
             "name,x,y\n{run}/walk.avi,1,2\n",
