@@ -174,13 +174,10 @@ class Camera:
         """What messages call it: no user or password of a URL."""
         self._begins = pathlib.Path(given).name if self._is_file else self.name
         is_number = given.isdecimal() and not self._is_file
-        if not (self._is_file or is_number or "://" in given):
-            raise InputError(
-                f"camera: found {given!r}, expected a number from 0, a URL or a video file"
-            )
+        known = self._is_file or is_number or "://" in given
         with QUIET:
             self._capture = cv2.VideoCapture(int(given) if is_number else given)
-            whole = self._capture.isOpened() and self._capture.grab()
+            whole = known and self._capture.isOpened() and self._capture.grab()
         if not whole:
             self._capture.release()
             raise InputError(

@@ -246,7 +246,7 @@ def test_a_watch_ends_by_a_signal_with_its_summary(shared, folder, tmp_path, num
         (("--watch", "{map}", "--fps", "2"), "--watch: found beside --fps, expected only one"),
         (("--camera", "0", "--gallery", "a.png"), "--camera: found beside --gallery, expected onl"),
         (("--camera", "0", "--json", "a"), "--json: found a with --camera, expected -: answers go"),
-        (("--camera", "x.avi"), "camera: found 'x.avi', expected a number from 0, a URL or a vid"),
+        (("--camera", "x.avi"), "camera: found no frame from x.avi, expected a number from 0"),
         (("--watch", "{map}/none"), "none: found nothing, expected a folder to watch"),
         (("{map}/map.json", "--window", "0"), "window: found 0, expected at least 1"),
         ((), "images: found none, expected images or folders of them"),

@@ -162,7 +162,7 @@ def test_a_table_of_positions_has_the_same_forms(tmp_path):
             "name,x,y\n{run}/walk.avi,1,2\n",
             "found the video .*walk.avi, expected images",
         ),
-        ("a.mp4", "text", "a.mp4: found a file that does not decode, expected a video"),
+        ("a.mp4", "text", "a.mp4: found no frame, expected a video"),
         ("a.mp4#t=1.000", None, "a.mp4: found no such file"),
     ],
 )

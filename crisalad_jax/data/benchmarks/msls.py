@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from crisalad_jax.config.checks import choose
 from crisalad_jax.data.benchmarks.benchmark import DEFAULT_RADIUS, Benchmark, within
 from crisalad_jax.data.benchmarks.on_disk import find_images, listing, shown
 from crisalad_jax.data.images import OnBadImage
@@ -75,7 +76,14 @@ def read_msls(
     root, limit = pathlib.Path(root), max_heading_difference
     if limit is not None and not 0 <= limit <= 180:
         raise InputError(f"max heading difference: found {limit}, expected degrees from 0 to 180")
-    folders = _city_folders(root, split or "val")
+    cities = choose("split", split or "val", MSLS_CITIES)
+    parent = root / "train_val" if (root / "train_val").is_dir() else root
+    folders = [parent / city for city in cities if (parent / city).is_dir()]
+    if not folders:
+        raise InputError(
+            f"{parent}: found {listing(parent)}, expected some of "
+            f"{shown(f'{city}/' for city in cities)} for {split or 'val'}"
+        )
     database: list[_Side] = []
     queries: list[_Side] = []
     positives: list[Int64[np.ndarray, " _"]] = []
@@ -151,22 +159,6 @@ def heading_difference(
 def is_msls(root: pathlib.Path) -> bool:
     """Return whether a folder is raw MSLS: it holds train_val/ or is itself train_val/."""
     return (root / "train_val").is_dir() or real_path(root).name == "train_val"
-
-
-def _city_folders(root: pathlib.Path, split: str) -> list[pathlib.Path]:
-    """List the folders of a split's cities that are on disk."""
-    if split not in MSLS_CITIES:
-        raise InputError(
-            f"split: found {split!r}, expected val or train: no other part of MSLS has positions"
-        )
-    parent = root / "train_val" if (root / "train_val").is_dir() else root
-    folders = [parent / city for city in MSLS_CITIES[split] if (parent / city).is_dir()]
-    if not folders:
-        raise InputError(
-            f"{parent}: found {listing(parent)}, expected some of "
-            f"{shown(f'{city}/' for city in MSLS_CITIES[split])} for {split}"
-        )
-    return folders
 
 
 def _read_side(

@@ -148,7 +148,7 @@ def find_lists(root: pathlib.Path) -> dict[str, _Lists]:
     """Find the lists of each set in a folder, or of the set that one of its files is of.
 
     Returns:
-        Prefix of the files' names -> the files. Sets that list no database are left out.
+        Prefix of the files' names -> the files. Sets without a database or queries are left out.
     """
     one = _FILE.fullmatch(root.name) if root.is_file() else None
     sets: dict[str, _Lists] = collections.defaultdict(dict)
@@ -156,7 +156,7 @@ def find_lists(root: pathlib.Path) -> dict[str, _Lists]:
         parts = _FILE.fullmatch(path.name)
         if parts is not None and (one is None or one["prefix"] == parts["prefix"]):
             sets[parts["prefix"]][parts["kind"]] = path
-    return {prefix: files for prefix, files in sets.items() if "dbImages" in files}
+    return {prefix: files for prefix, files in sets.items() if files.keys() >= _FOLDERS.keys()}
 
 
 def _choose(root: pathlib.Path, split: str | None) -> tuple[str, _Lists]:
@@ -169,13 +169,7 @@ def _choose(root: pathlib.Path, split: str | None) -> tuple[str, _Lists]:
             f"{root}: found lists of {names}, expected those of one: name a ..._dbImages.npy, or a "
             f"split that one of them has in its name{'' if split is None else f', unlike {split}'}"
         )
-    files = there[chosen[0]]
-    if "qImages" not in files or {"gt", "pIdx"} <= files.keys():
-        raise InputError(
-            f"{root}: found {', '.join(path.name for path in files.values())}, expected "
-            f"{chosen[0]}qImages.npy, and one of {chosen[0]}gt.npy and {chosen[0]}pIdx.npy"
-        )
-    return chosen[0], files
+    return chosen[0], there[chosen[0]]
 
 
 def _names(path: pathlib.Path) -> list[str]:

@@ -207,7 +207,7 @@ def test_other_splits(tmp_path):
     assert lists_of(read_msls(root / "train_val", "train").positives) == [[0], [1]]
     with pytest.raises(InputError, match="found goa/, tokyo/, expected some of cph/, sf/ for val"):
         read_msls(root)
-    with pytest.raises(InputError, match="split: found 'test', expected val or train"):
+    with pytest.raises(InputError, match="split: found 'test', expected one of train, val"):
         read_msls(root, "test")
 
 

@@ -165,7 +165,6 @@ def test_a_folder_of_several_sets(tmp_path):
         ({"qIdx": np.array([0, 0, 1])}, "a_qIdx.npy: found queries .*0, 0, 1"),
         ({"qIdx": np.array([], int)}, "a_qIdx.npy: found queries"),
         ({"qIdx": np.array([0.0])}, "a_qIdx.npy: row 0: found values of type float"),
-        ({"pIdx": TRUTH}, "a_gt.npy, a_pIdx.npy, .*expected a_qImages.npy, and one of"),
         ({"dbImages": np.arange(5)}, "a_dbImages.npy: found an array of .*, expected names"),
         ({"dbImages": np.empty(0, "<U3")}, "a_dbImages.npy: (found|cannot)"),
         ({"qImages": [*QUERIES[:2], "000/none.jpg"]}, "found 1 of 3 images missing.*none.jpg"),
