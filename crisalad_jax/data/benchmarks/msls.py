@@ -17,7 +17,7 @@ from crisalad_jax.data.benchmarks.benchmark import DEFAULT_RADIUS, Benchmark, wi
 from crisalad_jax.data.benchmarks.on_disk import find_images, listing, shown
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.metres import on_ellipsoid
-from crisalad_jax.data.tables import Row, read_table
+from crisalad_jax.data.tables import read_table
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.shapes import Float, Float64, Int64
@@ -177,25 +177,16 @@ def _read_side(
                 f"{folder / name}: found {len(rows)} rows, expected the same {len(raw)} images as "
                 "in raw.csv, in the same order"
             )
-    chosen = [
-        number
-        for number, row in enumerate(raw)
-        if (not subtask or _truth(marked[number], "all")) and not _truth(row, "pano")
+    kept = [
+        (row, place)
+        for row, place, mark in zip(raw, placed, marked, strict=True)
+        if row.fields["pano"] == "False" and (not subtask or mark.fields["all"] == "True")
     ]
-    if not chosen:
+    if not kept:
         raise InputError(f"{folder}: found {len(raw)} images, expected some that are no panoramas")
-    names = [f"{keys[number]}.jpg" for number in chosen]
+    names = [f"{row.fields['key']}.jpg" for row, _ in kept]
     images = find_images(folder / "raw.csv", names, [folder / "images"], on_bad_image)
-    metres, numbers = (
-        np.array([[rows[number].number(column) for column in wanted] for number in chosen])
-        for rows, wanted in ((placed, ("easting", "northing")), (raw, columns))
-    )
-    angles = numbers[:, 2] if headings else np.zeros(len(chosen))
+    metres = np.array([[place.number("easting"), place.number("northing")] for _, place in kept])
+    numbers = np.array([[row.number(column) for column in columns] for row, _ in kept])
+    angles = numbers[:, 2] if headings else np.zeros(len(kept))
     return _Side(np.array(images, object), metres, numbers[:, :2], angles)
-
-
-def _truth(row: Row, column: str) -> bool:
-    text = row.fields[column]
-    if text not in ("True", "False"):
-        raise InputError(f"{row.where}: {column}: found {text!r}, expected True or False")
-    return text == "True"
