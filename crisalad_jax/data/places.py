@@ -143,7 +143,7 @@ def read_places(
         raise InputError(f"--place-radius: found {place_radius:g}, expected metres above 0")
     if place_frames is not None and place_frames < 2:
         raise InputError(f"--place-frames: found {place_frames}, expected at least 2")
-    names: tuple[str, ...] = (real_path(root).name,)
+    names: tuple[str, ...] = ()
     if is_gsv:
         names, found = read_gsv_cities(root, cities, on_bad_image)
     elif is_grouped:
@@ -156,7 +156,7 @@ def read_places(
             found = places_by_order(source, place_frames or 0)
     else:
         root, found = read_named_places(root, on_bad_image)
-    return _places(root, names, found, min_images)
+    return _places(root, names or (real_path(root).name,), found, min_images)
 
 
 def _places(

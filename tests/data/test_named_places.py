@@ -329,6 +329,7 @@ def test_a_table_names_places(folders, by_file):
     )
     places = read_places(table if by_file else folders, min_images=1)
     assert places.names == ("7", "old town")
+    assert places.cities == ("mine",)
     assert places.files == ("bridge/1.JPG", "bridge/2.jpg", "lone/1.jpg")
     assert places.root == folders
     assert not views_of(places).known.any()
