@@ -71,12 +71,11 @@ def find_split(root: pathlib.Path, split: str | None) -> tuple[pathlib.Path, str
             return root, f"{resolved.parent.parent.name}/{resolved.name}"
         return root, resolved.name
     splits = [name for name in SPLITS if (root / "images" / name).is_dir()]
-    if split is None:
-        split = next((name for name in splits if name != "train"), None)
-    if split is None or not (root / "images" / split).is_dir():
+    split = split or next((name for name in splits if name != "train"), "test")
+    if split not in splits:
         raise InputError(
             f"{root}: found {listing(root)} and splits {', '.join(splits) or 'none'}, expected "
-            f"images/{split or 'test'} with database/ and queries/"
+            f"images/{split} with database/ and queries/"
         )
     return root / "images" / split, f"{resolved.name}/{split}"
 
