@@ -393,9 +393,17 @@ def test_bad_arguments_raise_at_the_call(places, changes, message):
         start(places, **changes)
 
 
-def test_bad_batch_size_raises_at_the_call(places):
-    with pytest.raises(InputError, match="batch size: found 0"):
-        image_batches([places.path(0)], image_size=SIZE, batch_size=0)
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"batch_size": 0}, "batch size: found 0"),
+        ({"threads": -1}, "threads: found -1"),
+        ({"on_bad_image": "black"}, "on_bad_image: found 'black', expected one of skip, stop"),
+    ],
+)
+def test_bad_arguments_of_images_raise_at_the_call(places, changes, message):
+    with pytest.raises(InputError, match=message):
+        image_batches([places.path(0)], **({"image_size": SIZE, "batch_size": 1} | changes))
 
 
 @dataclasses.dataclass(frozen=True)
