@@ -93,7 +93,7 @@ def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace
             f"{path}: found columns {', '.join(table.columns)}, expected {_COLUMNS}; {_GROUPED}"
         )
     rows, root = list(table.named_rows()), path.parent
-    paths = find_images(path, [name for name, _ in rows], [root], on_bad_image)
+    paths = find_images(path, [name for name, _ in rows], root, on_bad_image)
     places: dict[str, dict[str, View | None]] = collections.defaultdict(dict)
     missing = 0
     for image, (name, row) in zip(paths, rows, strict=True):

@@ -185,7 +185,7 @@ def _read_side(
     if not kept:
         raise InputError(f"{folder}: found {len(raw)} images, expected some that are no panoramas")
     names = [f"{row.fields['key']}.jpg" for row, _ in kept]
-    images = find_images(folder / "raw.csv", names, [folder / "images"], on_bad_image)
+    images = find_images(folder / "raw.csv", names, folder / "images", on_bad_image)
     metres = np.array([[place.number("easting"), place.number("northing")] for _, place in kept])
     numbers = np.array([[row.number(column) for column in columns] for row, _ in kept])
     angles = numbers[:, 2] if headings else np.zeros(len(kept))

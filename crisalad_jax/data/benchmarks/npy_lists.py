@@ -18,7 +18,7 @@ import numpy as np
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.msls import msls_title
-from crisalad_jax.data.benchmarks.on_disk import find_images, image_roots, list_part
+from crisalad_jax.data.benchmarks.on_disk import find_images, list_part
 from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
@@ -127,11 +127,10 @@ def read_salad_lists(
             )
         positives = _read_matches(truth, rows, count)
         rule = f"the database images that {truth.name} lists"
-    sides = []
-    for kind, folders in _FOLDERS.items():
-        roots = image_roots(files[kind], images, folders)
-        sides.append(find_images(files[kind], names[kind], roots, on_bad_image))
-    database, queries = sides
+    database, queries = (
+        find_images(files[kind], names[kind], images, on_bad_image, folders)
+        for kind, folders in _FOLDERS.items()
+    )
     cities = [_MSLS_IMAGE.fullmatch(name) for kind in names for name in names[kind]]
     if positives is not None and _is_nordland_star(positives, count):
         name = "Nordland*, winter database, summer queries (SALAD's lists)"
