@@ -70,7 +70,8 @@ def read_named_places(
 
 def _read_folders(root: pathlib.Path) -> list[FoundPlace]:
     """Read a folder in which each folder that holds images is a place."""
-    flat = root.is_dir() and any(is_image(path) and path.is_file() for path in root.iterdir())
+    inside = root.iterdir() if root.is_dir() else ()
+    flat = any(is_image(path) and path.is_file() and path.name[0] != "." for path in inside)
     if flat or not root.is_dir() or has_sides(root) or has_split(root):
         raise InputError(
             f"{root}: found {listing(root)}, expected {_LAYOUTS}, without an image next to the "

@@ -104,7 +104,8 @@ def find_images(
     tops = near if images is None else (pathlib.Path(images),)
     roots = [top / folder for top in tops for folder in folders]
     disk = Disk()
-    found = (root for root in roots if any(disk.find(root, name) is not None for name in names))
+    there = [root for root in roots if root.is_dir()]
+    found = (root for root in there if any(disk.find(root, name) is not None for name in names))
     root = next(found, roots[0])
     paths = [disk.find(root, name) for name in names]
     missing = [name for name, path in zip(names, paths, strict=True) if path is None]
