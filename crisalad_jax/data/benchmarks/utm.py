@@ -79,7 +79,7 @@ def read_utm(
     if nordland is not None:
         metres, there, here = nordland
         # Count in whole frames: the names' truncated decimals would make the radius inexact.
-        frames = np.floor(radius / metres + 1e-9)
+        frames = float(np.floor(radius / metres + 1e-9))
         positives = within(there, here, frames)
         words = f"{frames:g} frame{'s' * (frames != 1)}"
         name = f"{_NORDLANDS[metres]}{which}, +-{words}"
