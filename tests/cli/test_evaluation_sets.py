@@ -59,7 +59,7 @@ def test_flags_reach_the_reader(capfd, tmp_path, shared, streets):
     fails(capfd, *town, "--layout", "netflad", words=("layout: found 'netflad', expected one of",))
 
 
-def test_validation_by_lists(capfd, tmp_path, shared, benchmark: Benchmark, monkeypatch):
+def test_validation_by_lists(capfd, tmp_path, shared, benchmark, monkeypatch):
     """The lists lie elsewhere than the images, as in a checkout of GSV-Cities."""
     root = benchmark.root
     for kind, paths in (("dbImages", benchmark.database), ("qImages", benchmark.queries)):
