@@ -4,6 +4,7 @@ Two classes of one group are never neighbours, so images of one spot are never o
 classes. A group is a training set of its own (`Places`) whose places are the classes.
 """
 
+import collections
 import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -89,25 +90,19 @@ def class_groups(
         InputError: positions are asked for and missing, no class has enough images, or a group has
             fewer classes than a batch asks for.
     """
-    sets = _classes(places, config, min_images)
-    if not all(sets):
-        raise InputError(
-            f"{places.root}: found no class of at least {min_images} images, which "
-            f"loss.kind.classes.kind {config.kind!r} asks for{_ADVICE}"
-        )
     chosen: list[list[list[Class]]] = []
-    for classes in sets:
-        groups: dict[int, list[Class]] = {}
+    for classes in _classes(places, config, min_images):
+        groups: dict[int, list[Class]] = collections.defaultdict(list)
         for each in sorted(classes, key=lambda each: each.group):
-            groups.setdefault(each.group, []).append(each)
+            groups[each.group].append(each)
         # The largest first; ties go to the lower number.
         chosen.append(sorted(groups.values(), key=len, reverse=True)[: config.groups])
-        fewest = len(chosen[-1][-1])
+        fewest = len(chosen[-1][-1]) if groups else 0
         if fewest < places_per_batch:
             raise InputError(
-                f"{places.root}: found {fewest} classes in the smallest of {len(chosen[-1])} "
-                f"groups, expected at least places_per_batch {places_per_batch}; fewer groups "
-                "(--loss.kind.classes.groups) have more"
+                f"{places.root}: found {fewest} classes of at least {min_images} images in the "
+                f"smallest of {len(chosen[-1])} groups, expected places_per_batch "
+                f"{places_per_batch}; fewer groups (--loss.kind.classes.groups) have more{_ADVICE}"
             )
     turns = zip(*chosen)  # noqa: B905, for as many of each set
     return tuple(_regrouped(places, group) for turn in turns for group in turn)

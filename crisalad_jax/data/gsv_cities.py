@@ -49,7 +49,7 @@ def read_gsv_cities(
         return ("", {}) if path is None else (path.name, disk.names(path))
 
     return chosen, [
-        FoundPlace(f"{place} of {city}", images, city=number, id=number * IDS_PER_CITY + place)
+        FoundPlace(number * IDS_PER_CITY + place, f"{place} of {city}", images, city=number)
         for number, city in enumerate(chosen)
         for place, images in sorted(_read_city(tables[city], listing, on_bad_image).items())
     ]

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import pathlib
+import queue
 import threading
 import time
 import urllib.parse
@@ -174,13 +175,10 @@ class Camera:
         """What messages call it: no user or password of a URL."""
         self._begins = pathlib.Path(given).name if self._is_file else self.name
         is_number = given.isdecimal() and not self._is_file
-        if not (self._is_file or is_number or "://" in given):
-            raise InputError(
-                f"camera: found {given!r}, expected a number from 0, a URL or a video file"
-            )
+        known = self._is_file or is_number or "://" in given
         with QUIET:
             self._capture = cv2.VideoCapture(int(given) if is_number else given)
-            whole = self._capture.isOpened() and self._capture.grab()
+            whole = known and self._capture.isOpened() and self._capture.grab()
         if not whole:
             self._capture.release()
             raise InputError(
@@ -193,10 +191,8 @@ class Camera:
         """Height and width of the frames; None where the camera does not tell."""
         self.dropped = 0
         """Number of frames passed over for newer ones."""
-        self._lock = threading.Lock()
-        self._newest: Frame | None = None
-        self._came, self._closing = threading.Event(), threading.Event()
-        self._ended = False
+        self._newest: queue.Queue[Frame] = queue.Queue(1)
+        self._closing = threading.Event()
         self._thread: threading.Thread | None = None
 
     def __enter__(self) -> Self:
@@ -216,26 +212,23 @@ class Camera:
         Raises:
             InputError: a camera, which is no video file, gives no more frames.
         """
-        self._thread = threading.Thread(target=self._take, daemon=True)
-        self._thread.start()
+        self._thread = thread = threading.Thread(target=self._take, daemon=True)
+        thread.start()
         due = 0.0
         while True:
             check()
-            now = time.monotonic()
-            if now < due:
-                time.sleep(min(_TURN, due - now))
+            if (early := due - time.monotonic()) > 0:
+                time.sleep(min(_TURN, early))
                 continue
-            if not self._came.wait(_TURN):
-                continue
-            with self._lock:
-                frame, self._newest = self._newest, None
-                if frame is None and self._ended:
-                    break
-                if not self._ended:
-                    self._came.clear()
-            if frame is not None:
-                due = 0 if self._fps is None else time.monotonic() + 1 / self._fps
-                yield frame
+            goes_on = thread.is_alive()
+            try:
+                frame = self._newest.get(timeout=_TURN)
+            except queue.Empty:
+                if goes_on:
+                    continue
+                break
+            due = 0 if self._fps is None else time.monotonic() + 1 / self._fps
+            yield frame
         if not self._is_file and not self._closing.is_set():
             raise InputError(f"camera: found no more frames from {self.name}, expected it to go on")
 
@@ -252,17 +245,14 @@ class Camera:
             when = at if self._is_file else round(1000 * time.time())
             if found:
                 image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-                frame = Frame(frame_name(self._begins, when), when / 1000, image, taken)
-                with self._lock:
-                    self.dropped += self._newest is not None
-                    self._newest = frame
-                    self._came.set()
+                with contextlib.suppress(queue.Empty):
+                    self._newest.get_nowait()
+                    self.dropped += 1
+                name = frame_name(self._begins, when)
+                self._newest.put(Frame(name, when / 1000, image, taken))
             with QUIET:
                 grabbed = self._capture.grab()
         self._capture.release()
-        with self._lock:
-            self._ended = True
-            self._came.set()
 
     def close(self) -> None:
         """Let go of the camera."""

@@ -4,11 +4,10 @@ import collections
 import contextlib
 import itertools
 import os
-import pathlib
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from crisalad_jax.utils.shapes import Bool, Float32, Int, Int32, Int64, UInt8
 
 if TYPE_CHECKING:  # who only reads images starts sooner without them
     from crisalad_jax.data.augmentations.base import Augmentation
+    from crisalad_jax.data.query_set import QuerySet
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -187,21 +187,8 @@ def training_batches(
     )
 
 
-class ImageFiles(Protocol):
-    """Numbered images: `Places`, or a `QuerySet`."""
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Paths of the images, as text."""
-        ...
-
-    def path(self, image: int | np.integer) -> pathlib.Path:
-        """Return the path of one image."""
-        ...
-
-
 def batches_of_groups(
-    files: ImageFiles,
+    files: "Places | QuerySet",
     chosen: Int[np.ndarray, "steps groups images"],
     labels: Int[np.ndarray, "steps groups images"],
     *,

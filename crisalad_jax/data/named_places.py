@@ -41,14 +41,13 @@ View = Sequence[float]
 class FoundPlace(NamedTuple):
     """A place as its reader finds it."""
 
+    id: int
     name: str
     images: Mapping[str, View | None]
     """Path relative to the root -> the view; None where positions are unknown."""
     near: Sequence[int] = ()
     """Numbers of the places that are too near to be in a batch with it."""
     city: int = 0
-    id: int | None = None
-    """None is its number."""
 
 
 def read_named_places(
@@ -71,7 +70,8 @@ def read_named_places(
 
 def _read_folders(root: pathlib.Path) -> list[FoundPlace]:
     """Read a folder in which each folder that holds images is a place."""
-    flat = root.is_dir() and any(is_image(path) and path.is_file() for path in root.iterdir())
+    inside = root.iterdir() if root.is_dir() else ()
+    flat = any(is_image(path) and path.is_file() and path.name[0] != "." for path in inside)
     if flat or not root.is_dir() or has_sides(root) or has_split(root):
         raise InputError(
             f"{root}: found {listing(root)}, expected {_LAYOUTS}, without an image next to the "
@@ -81,7 +81,7 @@ def _read_folders(root: pathlib.Path) -> list[FoundPlace]:
     for path in list_images(root):
         name = path.relative_to(root)
         images[name.parent.as_posix()][name.as_posix()] = None
-    return [FoundPlace(name, files) for name, files in images.items()]
+    return _numbered(images)
 
 
 def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace]:
@@ -94,7 +94,7 @@ def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace
             f"{path}: found columns {', '.join(table.columns)}, expected {_COLUMNS}; {_GROUPED}"
         )
     rows, root = list(table.named_rows()), path.parent
-    paths = find_images(path, [name for name, _ in rows], [root], on_bad_image)
+    paths = find_images(path, [name for name, _ in rows], root, on_bad_image)
     places: dict[str, dict[str, View | None]] = collections.defaultdict(dict)
     missing = 0
     for image, (name, row) in zip(paths, rows, strict=True):
@@ -111,7 +111,13 @@ def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace
         places[place][file] = view if given else None
     if missing:
         warn(f"{path}: left out {missing} of {len(rows)} images, which are missing")
-    return [FoundPlace(name, images) for name, images in places.items()]
+    return _numbered(places)
+
+
+def _numbered(places: Mapping[str, Mapping[str, View | None]]) -> list[FoundPlace]:
+    return [
+        FoundPlace(number, name, images) for number, (name, images) in enumerate(places.items())
+    ]
 
 
 def places_by_position(
@@ -152,7 +158,7 @@ def places_by_position(
     for name, number in zip(names, place.tolist(), strict=True):
         images[number][name] = None
     return [
-        FoundPlace(names[centre], files, [other for other in others if other != number])
+        FoundPlace(number, names[centre], files, [other for other in others if other != number])
         for number, (centre, files, others) in enumerate(zip(centres, images, near, strict=True))
     ]
 
@@ -172,7 +178,7 @@ def places_by_order(source: ImageSource, frames: int) -> list[FoundPlace]:
             start = (number - first) * frames
             part = sequence[start : start + frames]
             near = [each for each in (number - 1, number + 1) if first <= each <= last]
-            places.append(FoundPlace(part[0], dict.fromkeys(part), near))
+            places.append(FoundPlace(number, part[0], dict.fromkeys(part), near))
     return places
 
 

@@ -48,7 +48,7 @@ class Places:
     """Place -> position in `cities`, ascending."""
     place_id: Int64[np.ndarray, " places"]
     """In the layout of GSV-Cities the id in the CSV modulo 10**5, plus 10**5 times the position of
-    the city; else the place's number."""
+    the city; else the place's number among all, also those that are too small."""
     names: tuple[str, ...]
     """Place -> its name."""
     views: Float64[np.ndarray, "images 3"] | None = None
@@ -143,7 +143,7 @@ def read_places(
         raise InputError(f"--place-radius: found {place_radius:g}, expected metres above 0")
     if place_frames is not None and place_frames < 2:
         raise InputError(f"--place-frames: found {place_frames}, expected at least 2")
-    names: tuple[str, ...] = (real_path(root).name,)
+    names: tuple[str, ...] = ()
     if is_gsv:
         names, found = read_gsv_cities(root, cities, on_bad_image)
     elif is_grouped:
@@ -156,7 +156,7 @@ def read_places(
             found = places_by_order(source, place_frames or 0)
     else:
         root, found = read_named_places(root, on_bad_image)
-    return _places(root, names, found, min_images)
+    return _places(root, names or (real_path(root).name,), found, min_images)
 
 
 def _places(
@@ -176,28 +176,23 @@ def _places(
             f"{min_images} images"
         )
     images = [each for place in large.values() for each in place.images.items()]
-    number = {old: new for new, old in enumerate(large)}
-    near = None
-    if any(place.near for place in found):
-        near = tuple(
-            np.array([number[other] for other in place.near if other in number], np.int64)
-            for place in large.values()
-        )
     views = [view for _, view in images if view is not None]
     counts = [len(place.images) for place in large.values()]
+    number = {old: new for new, old in enumerate(large)}
+    near = tuple(
+        np.array([number[other] for other in place.near if other in number], np.int64)
+        for place in large.values()
+    )
     return Places(
         root=root,
         cities=cities,
         files=tuple(file for file, _ in images),
         place_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         place_city=np.array([place.city for place in large.values()], np.int32),
-        place_id=np.array(
-            [new if large[old].id is None else large[old].id for old, new in number.items()],
-            np.int64,
-        ),
+        place_id=np.array([place.id for place in large.values()], np.int64),
         names=tuple(place.name for place in large.values()),
         views=np.array(views) if views else None,
-        near=near,
+        near=near if any(place.near for place in found) else None,
     )
 
 

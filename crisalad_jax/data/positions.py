@@ -176,8 +176,8 @@ def utm_positions(names: Sequence[str]) -> Positions:
     Raises:
         InputError: several zones, and a name without its zone or with metres that no place has.
     """
-    found = {name: utm_position(name.rpartition("/")[2]) for name in names}
-    of = {name: position for name, position in found.items() if position is not None}
+    found = ((name, utm_position(name.rpartition("/")[2])) for name in names)
+    of = {name: position for name, position in found if position is not None}
     there = list(of)
     zones = utm_zones(there)
     if len(set(zones)) <= 1:
@@ -186,23 +186,13 @@ def utm_positions(names: Sequence[str]) -> Positions:
     return Positions(AXES[1], _by_name(there, np.round(degrees, 9)))
 
 
-@brief
-class ImageTable(NamedTuple):
-    """A table of images, with their positions as far as it has them."""
-
-    names: list[str]
-    """In the table's order."""
-    positions: Positions | None
-    """Positions by name; None where the table has no such columns."""
-
-
 def read_positions(path: str | os.PathLike[str]) -> Positions:
     """Read a table of `name,east,north`, `name,lat,lon` or `name,x,y`; see `read_image_table`.
 
     Raises:
         InputError: as `read_image_table`; no columns of positions, or a row without one.
     """
-    positions = read_image_table(path, all_positions=True).positions
+    _, positions = read_image_table(path, all_positions=True)
     assert positions is not None
     return positions
 
@@ -234,7 +224,9 @@ def positions_of(
     return positions._replace(of=of)
 
 
-def read_image_table(path: str | os.PathLike[str], *, all_positions: bool = False) -> ImageTable:
+def read_image_table(
+    path: str | os.PathLike[str], *, all_positions: bool = False
+) -> tuple[list[str], Positions | None]:
     """Read a table with a column `name`, and perhaps a position: east,north or lat,lon or x,y.
 
     Decimals may have commas where semicolons separate the fields. x and y count only where there
@@ -244,6 +236,9 @@ def read_image_table(path: str | os.PathLike[str], *, all_positions: bool = Fals
     Args:
         path: the file.
         all_positions: whether every row must have a position.
+
+    Returns:
+        The images' names in the table's order, and their positions; None without such columns.
 
     Raises:
         InputError: as `read_table` and `Table.named_rows`; both other pairs of columns or half a
@@ -260,18 +255,17 @@ def read_image_table(path: str | os.PathLike[str], *, all_positions: bool = Fals
             if all_positions or any(row.fields[axis] for axis in axes)
         }
         positions = Positions(axes, of)
-    return ImageTable([name for name, _ in rows], positions)
+    return [name for name, _ in rows], positions
 
 
 def _axes(path: pathlib.Path, columns: Sequence[str], must: bool) -> tuple[str, str] | None:
     """Return the columns of the positions; None where no column is of any."""
-    *pairs, frame = AXES
-    found = [axes for axes in pairs if set(axes) & set(columns)]
-    if not found and set(frame) <= set(columns):
-        found = [frame]  # x and y may be of anything, such as pixels
-    if len(found) == 1 and set(found[0]) <= set(columns):
-        return found[0]
-    if found or must:
+    # x and y may be of anything, such as pixels, and count only where nothing else is there.
+    begun = [axes for axes in AXES[:2] if set(axes) & set(columns)]
+    axes = (begun or [AXES[2]])[0]
+    if len(begun) < 2 and set(axes) <= set(columns):
+        return axes
+    if begun or must:
         raise InputError(
             f"{path}: found columns {', '.join(columns)}, expected only one of name,east,north or "
             "name,lat,lon or name,x,y"

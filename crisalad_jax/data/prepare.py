@@ -45,12 +45,9 @@ def as_rgb(
         "uint8 or uint16 of shape (height, width, 3), or grey (height, width), with sides of at "
         "least 1"
     )
-    if not isinstance(image, np.ndarray):
-        raise InputError(
-            f"{name}: found {type(image).__name__}, expected {expected}, as of `read_image`"
-        )
-    grey = image.ndim == 2 or image.shape[2:] == (1,)
-    right = bool(image.size) and (grey or image.shape[2:] == (3,))
+    shape = image.shape if isinstance(image, np.ndarray) else ()
+    grey = len(shape) == 2 or shape[2:] == (1,)
+    right = 0 not in shape and (grey or shape[2:] == (3,))
     if right and image.dtype != np.uint8 and image.dtype.kind in "iuf":
         if bit_depth == "contrast-stretch":
             image = _stretched(image, name)
@@ -58,12 +55,12 @@ def as_rgb(
             _note_narrow(image, name)
             image = (image >> 8).astype(np.uint8)
     if not right or image.dtype != np.uint8:
-        found = f"{name}: found {image.dtype} of shape {image.shape}"
+        found = f"{image.dtype} of shape {shape}" if shape else type(image).__name__
         if right and image.dtype.kind in "iuf":
             low, high = _range(image, (0, 100), name)
             found += f", values from {low:,.6g} to {high:,.6g}"
             expected = "uint8 or uint16; --resize contrast-stretch spreads such values over 8 bits"
-        raise InputError(f"{found}, expected {expected}")
+        raise InputError(f"{name}: found {found}, expected {expected}")
     return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2) if grey else image
 
 

@@ -1,6 +1,7 @@
 """A training set of queries and a database, of which tuples are mined (NetVLAD, SelaVPR)."""
 
 import dataclasses
+import functools
 import os
 import pathlib
 
@@ -76,19 +77,19 @@ def read_query_set(
     root = pathlib.Path(root)
     raw_msls = root.is_dir() and is_msls(root)
     split = "train" if raw_msls or (root.is_dir() and has_split(root)) else None
-    benchmark = open_benchmark(root, split, images=images, on_bad_image=on_bad_image)
-    there, asked = benchmark.database_positions, benchmark.query_positions
+    read = functools.partial(open_benchmark, root, split, images=images, on_bad_image=on_bad_image)
     radii = (positive_radius, negative_radius)
     if raw_msls:
         # Images of different cities match in no radius, whatever their positions.
-        positives, near = (
-            open_benchmark(root, split, radius, on_bad_image=on_bad_image).ground_truth()
-            for radius in radii
-        )
-    elif there is not None and asked is not None:
-        positives, near = (within(there, asked, radius) for radius in radii)
+        benchmark, wider = map(read, radii)
+        positives, near = benchmark.ground_truth(), wider.ground_truth()
     else:
-        positives = near = benchmark.ground_truth()
+        benchmark = read()
+        there, asked = benchmark.database_positions, benchmark.query_positions
+        if there is None or asked is None:
+            positives = near = benchmark.ground_truth()
+        else:
+            positives, near = (within(there, asked, radius) for radius in radii)
     kept = [query for query, matches in enumerate(positives) if matches.size]
     count = len(benchmark.database)
     if not any(len(near[query]) < count for query in kept):

@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from crisalad_jax.config.checks import check_count, check_types, require
+from crisalad_jax.config.checks import check_count, check_types
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.config.short_repr import with_field_docs
 from crisalad_jax.data.images import OnBadImage
@@ -43,8 +43,7 @@ class Reading:
     def __post_init__(self) -> None:
         """Check the fields."""
         check_types(self)
-        check_count("batch_size", self.batch_size)
-        require(self.threads >= 0, f"threads: found {self.threads}, expected at least 0")
+        check_count("batch size", self.batch_size)
 
     def fitted(self, images: int) -> Self:
         """Return a smaller batch size where the batches of so few images would be mostly padding.

@@ -60,7 +60,7 @@ def resize_image(
     choose("pixels", pixels, {"bytes": None, "floats": None})
     choose("filter", filter, {**_KERNELS, "area": None})
     kinds = (np.uint8,) if pixels == "bytes" else (np.uint8, np.float32)
-    shape = np.shape(image)
+    shape = image.shape if isinstance(image, np.ndarray) else ()
     if len(shape) != 3 or shape[2] != 3 or 0 in shape or image.dtype not in kinds:
         found = f"{image.dtype} of shape {shape}" if shape else type(image).__name__
         raise InputError(
@@ -73,7 +73,10 @@ def resize_image(
             f"image_size: found {image_size!r}, expected two whole numbers of pixels from 1"
         )
     if filter == "area":
-        return _resize_by_area(image, image_size, pixels)
+        grows = any(new > old for new, old in zip(image_size, shape, strict=False))
+        how = cv2.INTER_LINEAR if grows else cv2.INTER_AREA
+        given: Any = image if pixels == "bytes" else image.astype(np.float32)
+        return cv2.resize(given, image_size[::-1], interpolation=how)
     height, width = image.shape[:2]
     taps = (
         _taps(height, image_size[0], filter, antialias),
@@ -89,13 +92,6 @@ def resize_image(
         resample(flat.astype(np.float32), *taps, resized, pixels == "bytes")
     resized = resized.reshape(*image_size, 3)
     return resized.astype(np.uint8) if pixels == "bytes" else resized
-
-
-def _resize_by_area(image: Pixels, image_size: tuple[int, int], pixels: str) -> Pixels:
-    grows = any(new > old for new, old in zip(image_size, image.shape, strict=False))
-    how = cv2.INTER_LINEAR if grows else cv2.INTER_AREA
-    given: Any = image if pixels == "bytes" else image.astype(np.float32)
-    return cv2.resize(given, image_size[::-1], interpolation=how)
 
 
 _Taps = tuple[Int64[np.ndarray, " new"], Int64[np.ndarray, " new"], Float32[np.ndarray, "new most"]]

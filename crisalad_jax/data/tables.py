@@ -108,12 +108,11 @@ def read_table(path: pathlib.Path, *needed: str) -> Table:
     lines = _lines(path)
     separator, columns = next(lines)
     missing = [name for name in needed if name not in columns]
-    if missing:
+    named = [name for name in columns if name]
+    if missing or (needed and len(set(named)) < len(named)):
         found = ", ".join(columns) or "none"
-        raise InputError(f"{path}: found columns {found}; missing {', '.join(missing)}")
-    twice = [name for name in columns if name and columns.count(name) > 1]
-    if twice and needed:
-        raise InputError(f"{path}: found the column {twice[0]} twice, expected it once")
+        lacking = f"; missing {', '.join(missing)}" if missing else ", expected each once"
+        raise InputError(f"{path}: found columns {found}{lacking}")
     return Table(path, columns, lines, separator == ";")
 
 

@@ -7,8 +7,6 @@ the frame.
 """
 
 import bisect
-import collections
-import contextlib
 import functools
 import os
 import pathlib
@@ -170,14 +168,14 @@ def _times_as_of(video: str, size: int, changed: int) -> tuple[int, ...]:
     """Read the times of the frames of a file of this size and time of change."""
     times = _grabbed_times(video, decoded=False)
     # A video that was trimmed without encoding it again keeps frames that are not shown.
-    if not times or not _can_read(pathlib.Path(video), times[-1]):
+    if not times or _Reader(video).read(times[-1]) is None:
         times = _grabbed_times(video, decoded=True)
     if not times:
         raise InputError(f"{video}: found no frame, expected {_VIDEO}")
     return tuple(times)
 
 
-def _grabbed_times(video: str | os.PathLike[str], *, decoded: bool) -> list[int]:
+def _grabbed_times(video: str, *, decoded: bool) -> list[int]:
     capture = _opened(video)
     with QUIET:
         if not decoded:  # packets as they are, in the order of decoding
@@ -185,22 +183,18 @@ def _grabbed_times(video: str | os.PathLike[str], *, decoded: bool) -> list[int]
         times = set()
         while capture.grab():
             times.add(milliseconds_of(capture))
-        capture.release()
     return sorted(time for time in times if time >= 0)
 
 
-def _opened(video: str | os.PathLike[str]) -> cv2.VideoCapture:
+def _opened(video: str) -> cv2.VideoCapture:
     with QUIET:
-        capture = cv2.VideoCapture(os.fspath(video), cv2.CAP_FFMPEG)
-    if not capture.isOpened():
-        raise InputError(f"{video}: found a file that does not decode, expected {_VIDEO}")
-    return capture
+        return cv2.VideoCapture(video, cv2.CAP_FFMPEG)
 
 
 class _Reader:
     """An open video, which is read forwards as far as possible."""
 
-    def __init__(self, video: pathlib.Path) -> None:
+    def __init__(self, video: str) -> None:
         self._video = video
         self._capture = _opened(video)
         self._at = -1
@@ -226,21 +220,17 @@ class _Reader:
     def _seek(self, wanted: int) -> None:
         self._capture.set(cv2.CAP_PROP_POS_MSEC, max(0, wanted - _BEFORE_KEY))
         if not self._grab() or self._at > wanted:
-            self.close()
             self._capture, self._at = _opened(self._video), -1
-
-    def close(self) -> None:
-        self._capture.release()
-
-
-def _can_read(video: pathlib.Path, time: int) -> bool:
-    with contextlib.closing(_Reader(video)) as reader:
-        return reader.read(time) is not None
 
 
 _lock = threading.Lock()
-_readers: "collections.OrderedDict[tuple[str, int, int], _Reader]" = collections.OrderedDict()
-"""Open videos by name, size and time of change, the last used one last."""
+"""Lock of all readers: OpenCV's may not be used by two threads at once."""
+
+
+@functools.lru_cache(maxsize=_OPEN)
+def _reader_of(video: str, size: int, changed: int) -> _Reader:
+    """Open a file of this size and time of change; the last ones stay open."""
+    return _Reader(video)
 
 
 def read_frame(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
@@ -253,16 +243,9 @@ def read_frame(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
     """
     time = frame_time(path)
     assert time is not None
-    video = file_of(path)
-    key = _identity(video)
+    identity = _identity(file_of(path))
     with _lock:
-        reader = _readers.get(key)
-        if reader is None:
-            reader = _readers[key] = _Reader(video)
-        _readers.move_to_end(key)
-        while len(_readers) > _OPEN:
-            _readers.popitem(last=False)[1].close()
-        image = reader.read(round(time * 1000))
+        image = _reader_of(*identity).read(round(time * 1000))
     if image is None:
         raise InputError(f"{path}: found no frame there, expected a time in the video")
     return image

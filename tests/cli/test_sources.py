@@ -246,7 +246,7 @@ def test_a_watch_ends_by_a_signal_with_its_summary(shared, folder, tmp_path, num
         (("--watch", "{map}", "--fps", "2"), "--fps: found with --watch, expected only one of"),
         (("--camera", "0", "--gallery", "a.png"), "--gallery: found with --camera, expected only"),
         (("--camera", "0", "--json", "a"), "--json: found a with --camera, expected -: answers go"),
-        (("--camera", "x.avi"), "camera: found 'x.avi', expected a number from 0, a URL or a vid"),
+        (("--camera", "x.avi"), "camera: found no frame from x.avi, expected a number from 0"),
         (("--watch", "{map}/none"), "none: found nothing, expected a folder to watch"),
         (("{map}/map.json", "--window", "0"), "window: found 0, expected at least 1"),
         ((), "images: found none, expected at least one image"),

@@ -2,7 +2,6 @@
 
 import colorsys
 
-import cv2
 import numpy as np
 import pytest
 
@@ -109,10 +108,3 @@ def test_an_image_too_long_for_any_crop_is_cut_in_the_middle() -> None:
 def test_strengths_out_of_range_are_refused(field: str, value: float) -> None:
     with pytest.raises(InputError, match=rf"^ColourCropConfig\.{field}: found {value}, expected"):
         ColourCropConfig(**{field: value})
-
-
-def test_opencv_turns_hues_as_floats() -> None:
-    """On bytes it would round them to 2 degrees."""
-    pixel = np.float32([[[0.5, 0.25, 0.125]]])
-    hue = cv2.cvtColor(pixel, cv2.COLOR_RGB2HSV)[0, 0, 0]
-    assert hue == pytest.approx(360 * colorsys.rgb_to_hsv(0.5, 0.25, 0.125)[0], abs=1e-3)

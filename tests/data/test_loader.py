@@ -6,7 +6,7 @@ import gc
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -57,7 +57,7 @@ def places(tmp_path: Path) -> Places:
     return read_places(tmp_path, min_images=3)
 
 
-def train(places: Places, **changes) -> list[ImageBatch]:
+def start(places: Places, **changes) -> Iterator[ImageBatch]:
     arguments = {
         "image_size": SIZE,
         "places_per_batch": 2,
@@ -67,7 +67,11 @@ def train(places: Places, **changes) -> list[ImageBatch]:
         "seed": 1,
         "epoch": 4,
     }
-    return list(training_batches(places, **(arguments | changes)))
+    return training_batches(places, **(arguments | changes))
+
+
+def train(places: Places, **changes) -> list[ImageBatch]:
+    return list(start(places, **changes))
 
 
 def plain(path: Path) -> np.ndarray:
@@ -146,16 +150,7 @@ def test_an_augmentation_goes_by_its_name(places, name):
 )
 def test_what_is_no_augmentation_is_told_at_once(places, wrong, words):
     with pytest.raises(InputError, match=words):
-        training_batches(
-            places,
-            image_size=SIZE,
-            places_per_batch=2,
-            images_per_place=3,
-            order="shuffled",
-            augmentation=wrong,
-            seed=0,
-            epoch=0,
-        )
+        start(places, augmentation=wrong)
 
 
 def test_opencv_has_one_thread_while_batches_are_read(places):
@@ -181,13 +176,8 @@ def test_parts_of_a_batch_are_the_whole(places):
     options = {"augmentation": RandAugmentConfig(), "start_step": 1}
     whole = train(places, **options)
     parts = [train(places, part=(number, 3), **options) for number in range(3)]
-    assert_same(
-        [
-            ImageBatch(*map(np.concatenate, zip(*step, strict=True)))
-            for step in zip(*parts, strict=True)
-        ],
-        whole,
-    )
+    steps = [zip(*step, strict=True) for step in zip(*parts, strict=True)]
+    assert_same([ImageBatch(*map(np.concatenate, step)) for step in steps], whole)
     with pytest.raises(InputError, match=r"found 0 and \(0, 4\), expected .* parts of 6"):
         train(places, part=(0, 4))
     with pytest.raises(InputError, match=r"found 0 and \(3, 3\)"):
@@ -265,16 +255,7 @@ def test_a_bad_training_image(places, content):
 def test_batches_before_a_bad_image_arrive(places):
     whole = train(places)
     places.path(int(whole[1].indices[2])).write_bytes(b"no image")
-    batches = training_batches(
-        places,
-        image_size=SIZE,
-        places_per_batch=2,
-        images_per_place=3,
-        order="within-city",
-        augmentation=NoAugmentation(),
-        seed=1,
-        epoch=4,
-    )
+    batches = start(places)
     assert_same([next(batches)], whole[:1])
     with pytest.raises(InputError):
         next(batches)
@@ -408,22 +389,21 @@ def test_an_abandoned_iterator_does_not_hold_up_the_exit(places):
     ],
 )
 def test_bad_arguments_raise_at_the_call(places, changes, message):
-    arguments = {
-        "image_size": SIZE,
-        "places_per_batch": 2,
-        "images_per_place": 3,
-        "order": "within-city",
-        "augmentation": NoAugmentation(),
-        "seed": 1,
-        "epoch": 4,
-    }
     with pytest.raises(InputError, match=message):
-        training_batches(places, **(arguments | changes))
+        start(places, **changes)
 
 
-def test_bad_batch_size_raises_at_the_call(places):
-    with pytest.raises(InputError, match="batch_size: found 0"):
-        image_batches([places.path(0)], image_size=SIZE, batch_size=0)
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"batch_size": 0}, "batch size: found 0"),
+        ({"threads": -1}, "threads: found -1"),
+        ({"on_bad_image": "black"}, "on_bad_image: found 'black', expected one of skip, stop"),
+    ],
+)
+def test_bad_arguments_of_images_raise_at_the_call(places, changes, message):
+    with pytest.raises(InputError, match=message):
+        image_batches([places.path(0)], **({"image_size": SIZE, "batch_size": 1} | changes))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -58,10 +58,6 @@ def rand_augment(image: Image, config: RandAugmentConfig, generator: np.random.G
     return image
 
 
-def _identity(image: Image, _: float) -> Image:
-    return image
-
-
 def _affine(image: Image, a: float, b: float, c: float, d: float, e: float, f: float) -> Image:
     """Transform as Pillow's AFFINE, BILINEAR: output (x, y) shows input (ax+by+c, dx+ey+f).
 
@@ -210,7 +206,7 @@ def _scaled(most: float) -> Callable[[float, int, int], float]:
 
 
 OPERATIONS: dict[str, Operation] = {
-    "Identity": Operation(_identity, _scaled(0), signed=False),
+    "Identity": Operation(lambda image, _: image, _scaled(0), signed=False),
     "ShearX": Operation(_shear_x, _scaled(0.3), signed=True),
     "ShearY": Operation(_shear_y, _scaled(0.3), signed=True),
     "TranslateX": Operation(_translate_x, lambda level, _, w: 150 / 331 * w * level, signed=True),

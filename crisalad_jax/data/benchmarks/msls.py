@@ -12,11 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from crisalad_jax.config.checks import choose
 from crisalad_jax.data.benchmarks.benchmark import DEFAULT_RADIUS, Benchmark, within
 from crisalad_jax.data.benchmarks.on_disk import find_images, listing, shown
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.metres import on_ellipsoid
-from crisalad_jax.data.tables import Row, read_table
+from crisalad_jax.data.tables import read_table
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.shapes import Float, Float64, Int64
@@ -75,7 +76,14 @@ def read_msls(
     root, limit = pathlib.Path(root), max_heading_difference
     if limit is not None and not 0 <= limit <= 180:
         raise InputError(f"max heading difference: found {limit}, expected degrees from 0 to 180")
-    folders = _city_folders(root, split or "val")
+    cities = choose("split", split or "val", MSLS_CITIES)
+    parent = root / "train_val" if (root / "train_val").is_dir() else root
+    folders = [parent / city for city in cities if (parent / city).is_dir()]
+    if not folders:
+        raise InputError(
+            f"{parent}: found {listing(parent)}, expected some of "
+            f"{shown(f'{city}/' for city in cities)} for {split or 'val'}"
+        )
     database: list[_Side] = []
     queries: list[_Side] = []
     positives: list[Int64[np.ndarray, " _"]] = []
@@ -153,22 +161,6 @@ def is_msls(root: pathlib.Path) -> bool:
     return (root / "train_val").is_dir() or real_path(root).name == "train_val"
 
 
-def _city_folders(root: pathlib.Path, split: str) -> list[pathlib.Path]:
-    """List the folders of a split's cities that are on disk."""
-    if split not in MSLS_CITIES:
-        raise InputError(
-            f"split: found {split!r}, expected val or train: no other part of MSLS has positions"
-        )
-    parent = root / "train_val" if (root / "train_val").is_dir() else root
-    folders = [parent / city for city in MSLS_CITIES[split] if (parent / city).is_dir()]
-    if not folders:
-        raise InputError(
-            f"{parent}: found {listing(parent)}, expected some of "
-            f"{shown(f'{city}/' for city in MSLS_CITIES[split])} for {split}"
-        )
-    return folders
-
-
 def _read_side(
     folder: pathlib.Path, on_bad_image: OnBadImage, *, headings: bool, subtask: bool
 ) -> _Side:
@@ -185,25 +177,16 @@ def _read_side(
                 f"{folder / name}: found {len(rows)} rows, expected the same {len(raw)} images as "
                 "in raw.csv, in the same order"
             )
-    chosen = [
-        number
-        for number, row in enumerate(raw)
-        if (not subtask or _truth(marked[number], "all")) and not _truth(row, "pano")
+    kept = [
+        (row, place)
+        for row, place, mark in zip(raw, placed, marked, strict=True)
+        if row.fields["pano"] == "False" and (not subtask or mark.fields["all"] == "True")
     ]
-    if not chosen:
+    if not kept:
         raise InputError(f"{folder}: found {len(raw)} images, expected some that are no panoramas")
-    names = [f"{keys[number]}.jpg" for number in chosen]
-    images = find_images(folder / "raw.csv", names, [folder / "images"], on_bad_image)
-    metres, numbers = (
-        np.array([[rows[number].number(column) for column in wanted] for number in chosen])
-        for rows, wanted in ((placed, ("easting", "northing")), (raw, columns))
-    )
-    angles = numbers[:, 2] if headings else np.zeros(len(chosen))
+    names = [f"{row.fields['key']}.jpg" for row, _ in kept]
+    images = find_images(folder / "raw.csv", names, folder / "images", on_bad_image)
+    metres = np.array([[place.number("easting"), place.number("northing")] for _, place in kept])
+    numbers = np.array([[row.number(column) for column in columns] for row, _ in kept])
+    angles = numbers[:, 2] if headings else np.zeros(len(kept))
     return _Side(np.array(images, object), metres, numbers[:, :2], angles)
-
-
-def _truth(row: Row, column: str) -> bool:
-    text = row.fields[column]
-    if text not in ("True", "False"):
-        raise InputError(f"{row.where}: {column}: found {text!r}, expected True or False")
-    return text == "True"

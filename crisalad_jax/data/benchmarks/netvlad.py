@@ -10,7 +10,7 @@ import pathlib
 import numpy as np
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark, within
-from crisalad_jax.data.benchmarks.on_disk import find_images, image_roots
+from crisalad_jax.data.benchmarks.on_disk import find_images
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.mat_files import load_mat
@@ -66,7 +66,7 @@ def read_netvlad(
                 f"{path}: found {len(names)} names, a count of {count:g} and positions of shape "
                 f"{positions.T.shape}, expected the same number of each, and finite positions"
             )
-        sides.append(find_images(path, names, image_roots(path, images, folders), on_bad_image))
+        sides.append(find_images(path, names, images, on_bad_image, folders))
     (database, queries), (places, asked) = sides, (positions for _, positions, _, _ in found)
     name = f"{path.stem} (NetVLAD .mat, {which} set, {radius:g} m)"
     rule = f"UTM distance of at most {radius:g} m"

@@ -18,7 +18,7 @@ import numpy as np
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.msls import msls_title
-from crisalad_jax.data.benchmarks.on_disk import find_images, image_roots, list_part
+from crisalad_jax.data.benchmarks.on_disk import find_images, list_part
 from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
@@ -127,11 +127,10 @@ def read_salad_lists(
             )
         positives = _read_matches(truth, rows, count)
         rule = f"the database images that {truth.name} lists"
-    sides = []
-    for kind, folders in _FOLDERS.items():
-        roots = image_roots(files[kind], images, folders)
-        sides.append(find_images(files[kind], names[kind], roots, on_bad_image))
-    database, queries = sides
+    database, queries = (
+        find_images(files[kind], names[kind], images, on_bad_image, folders)
+        for kind, folders in _FOLDERS.items()
+    )
     cities = [_MSLS_IMAGE.fullmatch(name) for kind in names for name in names[kind]]
     if positives is not None and _is_nordland_star(positives, count):
         name = "Nordland*, winter database, summer queries (SALAD's lists)"
@@ -148,7 +147,7 @@ def find_lists(root: pathlib.Path) -> dict[str, _Lists]:
     """Find the lists of each set in a folder, or of the set that one of its files is of.
 
     Returns:
-        Prefix of the files' names -> the files. Sets that list no database are left out.
+        Prefix of the files' names -> the files. Sets without a database or queries are left out.
     """
     one = _FILE.fullmatch(root.name) if root.is_file() else None
     sets: dict[str, _Lists] = collections.defaultdict(dict)
@@ -156,7 +155,7 @@ def find_lists(root: pathlib.Path) -> dict[str, _Lists]:
         parts = _FILE.fullmatch(path.name)
         if parts is not None and (one is None or one["prefix"] == parts["prefix"]):
             sets[parts["prefix"]][parts["kind"]] = path
-    return {prefix: files for prefix, files in sets.items() if "dbImages" in files}
+    return {prefix: files for prefix, files in sets.items() if files.keys() >= _FOLDERS.keys()}
 
 
 def _choose(root: pathlib.Path, split: str | None) -> tuple[str, _Lists]:
@@ -169,13 +168,7 @@ def _choose(root: pathlib.Path, split: str | None) -> tuple[str, _Lists]:
             f"{root}: found lists of {names}, expected those of one: name a ..._dbImages.npy, or a "
             f"split that one of them has in its name{'' if split is None else f', unlike {split}'}"
         )
-    files = there[chosen[0]]
-    if "qImages" not in files or {"gt", "pIdx"} <= files.keys():
-        raise InputError(
-            f"{root}: found {', '.join(path.name for path in files.values())}, expected "
-            f"{chosen[0]}qImages.npy, and one of {chosen[0]}gt.npy and {chosen[0]}pIdx.npy"
-        )
-    return chosen[0], files
+    return chosen[0], there[chosen[0]]
 
 
 def _names(path: pathlib.Path) -> list[str]:

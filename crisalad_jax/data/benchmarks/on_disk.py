@@ -71,50 +71,41 @@ def find_split(root: pathlib.Path, split: str | None) -> tuple[pathlib.Path, str
             return root, f"{resolved.parent.parent.name}/{resolved.name}"
         return root, resolved.name
     splits = [name for name in SPLITS if (root / "images" / name).is_dir()]
-    if split is None:
-        split = next((name for name in splits if name != "train"), None)
-    if split is None or not (root / "images" / split).is_dir():
+    split = split or next((name for name in splits if name != "train"), "test")
+    if split not in splits:
         raise InputError(
             f"{root}: found {listing(root)} and splits {', '.join(splits) or 'none'}, expected "
-            f"images/{split or 'test'} with database/ and queries/"
+            f"images/{split} with database/ and queries/"
         )
     return root / "images" / split, f"{resolved.name}/{split}"
-
-
-def image_roots(
-    named_by: pathlib.Path, images: str | os.PathLike[str] | None, folders: Sequence[str] = (".",)
-) -> list[pathlib.Path]:
-    """List where the images that a file names may be.
-
-    Args:
-        named_by: the file.
-        images: the folder that holds them; None is that of the file, and the one above.
-        folders: folders in it that names may be relative to.
-    """
-    near = (named_by.parent, named_by.parent.absolute().parent)
-    roots = near if images is None else (pathlib.Path(images),)
-    return [root / folder for root in roots for folder in folders]
 
 
 def find_images(
     named_by: pathlib.Path,
     names: Sequence[str],
-    roots: Sequence[pathlib.Path],
+    images: str | os.PathLike[str] | None,
     on_bad_image: OnBadImage,
+    folders: Sequence[str] = (".",),
 ) -> tuple[pathlib.Path, ...]:
     """Return the paths of all images that a file names; see `tables.Disk`.
 
     Args:
         named_by: the file.
         names: the images'.
-        roots: folders that names may be relative to, of which the first that has any is taken.
+        images: the folder that holds them; None is that of the file, or the one above.
         on_bad_image: under "skip" some may be missing, and whoever reads them leaves them out.
+        folders: folders in it that names may be relative to, of which the first that has any of
+            the images is taken.
 
     Raises:
         InputError: some are missing; how many, and which is the first.
     """
+    near = (named_by.parent, named_by.parent.absolute().parent)
+    tops = near if images is None else (pathlib.Path(images),)
+    roots = [top / folder for top in tops for folder in folders]
     disk = Disk()
-    found = (root for root in roots if any(disk.find(root, name) is not None for name in names))
+    there = [root for root in roots if root.is_dir()]
+    found = (root for root in there if any(disk.find(root, name) is not None for name in names))
     root = next(found, roots[0])
     paths = [disk.find(root, name) for name in names]
     missing = [name for name, path in zip(names, paths, strict=True) if path is None]

@@ -79,14 +79,15 @@ def read_utm(
     if nordland is not None:
         metres, there, here = nordland
         # Count in whole frames: the names' truncated decimals would make the radius inexact.
-        frames = int(radius / metres + 1e-9)
-        words = f"{frames} frame{'s' * (frames != 1)}"
+        frames = float(np.floor(radius / metres + 1e-9))
+        positives = within(there, here, frames)
+        words = f"{frames:g} frame{'s' * (frames != 1)}"
         name = f"{_NORDLANDS[metres]}{which}, +-{words}"
         rule = (
             f"at most {words} apart ({radius:g} m); it is Nordland by eastings of 0 and "
             f"northings of {metres:.4g} m a frame"
         )
-        return Benchmark(name, root, database, asking, within(there, here, frames), rule)
+        return Benchmark(name, root, database, asking, positives, rule)
 
     if radius < _PLACE_METRES and _are_placeholders(places, asked):
         known = _PAIRED.get(len(database)) if len(database) == len(asking) else None

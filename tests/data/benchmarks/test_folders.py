@@ -64,12 +64,6 @@ def test_bad_tables(tmp_path, table, message):
     assert "\n" not in str(caught.value)
 
 
-def test_a_table_that_is_no_text(tmp_path):
-    (write(tmp_path) / "ground_truth.csv").write_bytes(b"q1.jpg,\xff\xfe\n")
-    with pytest.raises(InputError, match=r"ground_truth.csv: cannot be read as UTF-8 CSV"):
-        read_folders(tmp_path)
-
-
 def test_nothing_tells(tmp_path):
     benchmark = read_folders(write(tmp_path / "hall"))
     assert benchmark.name == "hall (two folders, no ground truth)"

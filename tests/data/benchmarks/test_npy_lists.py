@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crisalad_jax.data.benchmarks import open_benchmark, read_salad_lists, read_vpr_bench
+from crisalad_jax.data.benchmarks import read_salad_lists, read_vpr_bench
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.data.benchmarks.trees import (
@@ -165,7 +165,6 @@ def test_a_folder_of_several_sets(tmp_path):
         ({"qIdx": np.array([0, 0, 1])}, "a_qIdx.npy: found queries .*0, 0, 1"),
         ({"qIdx": np.array([], int)}, "a_qIdx.npy: found queries"),
         ({"qIdx": np.array([0.0])}, "a_qIdx.npy: row 0: found values of type float"),
-        ({"pIdx": TRUTH}, "a_gt.npy, a_pIdx.npy, .*expected a_qImages.npy, and one of"),
         ({"dbImages": np.arange(5)}, "a_dbImages.npy: found an array of .*, expected names"),
         ({"dbImages": np.empty(0, "<U3")}, "a_dbImages.npy: (found|cannot)"),
         ({"qImages": [*QUERIES[:2], "000/none.jpg"]}, "found 1 of 3 images missing.*none.jpg"),
@@ -178,16 +177,6 @@ def test_bad_lists(tmp_path, changes, message):
     with pytest.raises(InputError, match=message) as caught:
         read_salad_lists(tmp_path)
     assert "\n" not in str(caught.value)
-
-
-def test_missing_images_stay_in_the_set_to_be_skipped(tmp_path):
-    write_images(tmp_path, DATABASE + QUERIES[1:])
-    write_lists(tmp_path, "a_", dbImages=DATABASE, qImages=QUERIES, gt=TRUTH)
-    with pytest.raises(InputError, match=f"found 1 of 3 images missing, .* first is {QUERIES[0]}"):
-        open_benchmark(tmp_path)
-    found = open_benchmark(tmp_path, on_bad_image="skip")
-    assert found.queries == tuple(tmp_path / name for name in QUERIES)
-    assert found.database == tuple(tmp_path / name for name in DATABASE)
 
 
 @pytest.mark.parametrize("as_array", [False, True])

@@ -123,18 +123,6 @@ def test_positives_across_zones_equal_brute_force(tmp_path):
         assert abs(metres - 25) < 0.05 or found == (metres < 25)
 
 
-def test_one_zone_is_compared_as_before(tmp_path):
-    names = [f"@{500_000 + i}.25@{4_000_000 + 7 * i}.50@32@S@@@@@@@@@@@.jpg" for i in range(9)]
-    write(tmp_path, names, names[::2])
-    benchmark = read_utm(tmp_path)
-    expected = [[float(text) for text in name.split("@")[1:3]] for name in names]
-    assert benchmark.database_positions.tolist() == expected
-    assert benchmark.rule == "UTM distance of at most 25 m"
-    for row, positives in zip(expected[::2], lists_of(benchmark.positives), strict=True):
-        apart = np.hypot(*(np.array(expected) - row).T)
-        assert positives == np.flatnonzero(apart <= 25).tolist()
-
-
 def test_images_of_one_zone_match_by_its_metres_beside_others(tmp_path):
     """Published sets such as MSLS have a city a zone: their positives are those of other tools.
 
