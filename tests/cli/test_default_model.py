@@ -132,11 +132,10 @@ def test_a_map_of_it_is_calibrated_without_weights(shared, own_map, capfd):
     assert notes == []
 
 
-def test_damaged_weights_are_found_unless_told_not_to_look(shared, tmp_path, capfd):
+def test_damaged_weights_are_found_unless_told_not_to_look(shared, tmp_path, capfd, database):
     data = bytearray((shared / "weights.safetensors").read_bytes())
     data[-1] ^= 1  # the last bit of a number
     (tmp_path / "damaged.safetensors").write_bytes(data)
-    database = shared / "town" / "images" / "test" / "database"
     given = ("index", "--images", database, "--weights", tmp_path / "damaged.safetensors")
     fails(capfd, *given, "--out", tmp_path / "a", "--quiet", words=("damaged.safetensors",))
     words, _ = said(capfd, *given, "--out", tmp_path / "b", "--quiet", "--no-verify")

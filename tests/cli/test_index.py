@@ -23,7 +23,7 @@ from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import new_metadata
 from tests.cli.test_cli import fails, files_in, succeeds
 from tests.conftest import BATCH, MODEL, describe_single, random_params
-from tests.retrieval.maps.test_stores import ROUNDING, brute_force
+from tests.retrieval.maps.test_stores import brute_force
 from tests.retrieval.test_hloc_pairs import brute_force as nearest
 from tests.retrieval.test_hloc_pairs import by_name, pairs_as_hloc_reads_them
 
@@ -39,23 +39,6 @@ def index(shared: pathlib.Path, images: pathlib.Path, out: pathlib.Path, *more: 
 
 def query(folder: pathlib.Path, *more: object) -> tuple:
     return ("query", *more, "--map", folder, "--batch-size", BATCH, "--quiet")
-
-
-@pytest.fixture(scope="module")
-def database(shared) -> pathlib.Path:
-    return shared / "town" / "images" / "test" / "database"
-
-
-@pytest.fixture(scope="module")
-def queries(shared) -> pathlib.Path:
-    return shared / "town" / "images" / "test" / "queries"
-
-
-@pytest.fixture
-def folder(shared, database, tmp_path, capfd) -> pathlib.Path:
-    """A map of the town's database."""
-    succeeds(capfd, *index(shared, database, tmp_path / "map"))
-    return tmp_path / "map"
 
 
 def expected_answers(shared, database, queries, k: int) -> list[list[bytes]]:
@@ -139,23 +122,6 @@ def test_a_gallery_shows_so_much_and_says_of_how_much(
     # A query and three answers of 1.7 inches at 120 dots; the next would be beyond 1,000.
     assert 4 * 204 < cv2.imread(str(picture)).shape[1] < 1000
     assert len(json.loads(answers.read_text().splitlines()[0])["neighbours"]) == 7
-
-
-def test_queries_are_searched_for_in_portions_all_the_same(
-    folder, queries, tmp_path, capfd, monkeypatch
-):
-    found = []
-    for number, at_once in enumerate((1024, 1)):
-        monkeypatch.setattr("crisalad_jax.retrieval.maps.query.AT_ONCE", at_once)
-        path = tmp_path / f"{number}.jsonl"
-        succeeds(capfd, *query(folder, queries, "--json", path))
-        found.append([json.loads(line) for line in path.read_text().splitlines()])
-    for whole, part in zip(*found, strict=True):
-        for one, other in zip(whole["neighbours"], part["neighbours"], strict=True):
-            assert one["name"] == other["name"]
-            # To six decimals, of which rounding may change the last.
-            assert abs(one["similarity"] - other["similarity"]) <= ROUNDING
-    assert len(found[1]) == 5
 
 
 def test_a_map_moved_without_its_weights_and_images_is_told_where_they_are(

@@ -45,12 +45,11 @@ def module_of(command):
 
 
 @pytest.mark.parametrize("platforms", ["gpuu", "rocm", "cpu,gpuu"])
-def test_platforms_that_jax_lacks_are_one_line(tmp_path, shared, platforms):
+def test_platforms_that_jax_lacks_are_one_line(tmp_path, shared, platforms, database):
     """JAX raises a RuntimeError of the first, and an AssertionError without words of the second."""
-    images = shared / "town" / "images" / "test" / "database"
     verbs = (
         ("info", "--weights", shared / "weights.safetensors"),
-        ("index", "--images", images, "--weights", shared / "weights.safetensors", "--out", "m"),
+        ("index", "--images", database, "--weights", shared / "weights.safetensors", "--out", "m"),
     )
     for verb in verbs:
         done = subprocess.run(
@@ -267,10 +266,9 @@ def printed(capfd, *arguments):
     return json.loads(out), err
 
 
-def test_json_on_stdout_is_what_the_last_line_says(capfd, tmp_path, shared):
+def test_json_on_stdout_is_what_the_last_line_says(capfd, tmp_path, shared, database):
     weights = shared / "weights.safetensors"
-    images = shared / "town" / "images" / "test" / "database"
-    common = ("--images", images, "--weights", weights, "--batch-size", BATCH, "--quiet")
+    common = ("--images", database, "--weights", weights, "--batch-size", BATCH, "--quiet")
     found, words = printed(capfd, "extract", *common, "--out", tmp_path / "d.npy", "--json", "-")
     assert (found["descriptors"], found["length"], found["skipped"]) == (7, 48, [])
     assert f"{tmp_path / 'd.npy'}: 7 descriptors of 48 numbers" in words
@@ -394,12 +392,11 @@ def test_leaving_out_counts_positives_anew(spoilt):
         leave_out_unreadable(open_benchmark(town), quiet=True)
 
 
-def test_a_query_that_skips_answers_the_rest(capfd, tmp_path, shared, spoilt):
+def test_a_query_that_skips_answers_the_rest(capfd, tmp_path, shared, spoilt, database):
     town, _ = spoilt
     weights = shared / "weights.safetensors"
-    images = shared / "town" / "images" / "test" / "database"
     common = ("--weights", weights, "--batch-size", BATCH, "--quiet")
-    succeeds(capfd, "index", "--images", images, "--out", tmp_path / "map", *common)
+    succeeds(capfd, "index", "--images", database, "--out", tmp_path / "map", *common)
     asked = sorted((town / "images" / "test" / "queries").iterdir())
     given = ("query", *asked, "--map", tmp_path / "map", *common, "--json", "-", "--k", 1)
     assert main([*map(str, given), "--on-bad-image", "skip"]) == 0

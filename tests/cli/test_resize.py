@@ -11,12 +11,11 @@ from crisalad_jax.retrieval.extract import extract
 from tests.cli.test_cli import fails, succeeds
 
 
-def test_words_change_what_is_extracted_and_are_told(shared, tmp_path, capfd):
+def test_words_change_what_is_extracted_and_are_told(shared, tmp_path, capfd, database):
     weights, out = shared / "weights.safetensors", tmp_path / "out.npy"
-    images = shared / "town" / "images" / "test" / "database"
     said = succeeds(
         capfd,
-        *("extract", "--weights", weights, "--images", images, "--out", out, "--batch-size", 4),
+        *("extract", "--weights", weights, "--images", database, "--out", out, "--batch-size", 4),
         *("--resize", "bicubic", "floats", "--quiet"),
     )
     assert "images at 42 x 56, bicubic, antialiased, on floats" in said
@@ -25,7 +24,7 @@ def test_words_change_what_is_extracted_and_are_told(shared, tmp_path, capfd):
     params, config = load_weights(weights)
     config = config.resized(None, ["bicubic", "floats"])
     expected = extract(
-        Model(params, config), images, reading=Reading(batch_size=4, quiet=True)
+        Model(params, config), database, reading=Reading(batch_size=4, quiet=True)
     ).descriptors
     # The same program on the same numbers.
     np.testing.assert_allclose(np.load(out), expected, atol=1e-6)
