@@ -20,10 +20,15 @@ def queries(shared) -> pathlib.Path:
 
 
 @pytest.fixture(scope="session")
-def town_map(shared, database, tmp_path_factory) -> pathlib.Path:
+def weights(shared) -> pathlib.Path:
+    return shared / "weights.safetensors"
+
+
+@pytest.fixture(scope="session")
+def town_map(weights, database, tmp_path_factory) -> pathlib.Path:
     """A map of the town's database that no test changes."""
     out = tmp_path_factory.mktemp("town") / "map"
-    given = ("index", "--weights", shared / "weights.safetensors", "--images", database)
+    given = ("index", "--weights", weights, "--images", database)
     assert main([*map(str, given), "--out", str(out), "--batch-size", str(BATCH), "--quiet"]) == 0
     return out
 

@@ -152,7 +152,7 @@ def test_a_map_moved_without_its_weights_and_images_is_told_where_they_are(
     }
 
 
-def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd):
+def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd, weights):
     said = succeeds(capfd, "info", "--map", folder, "--verify", "--json", tmp_path / "info.json")
     # The town's database: one folder, whose names say where they are.
     places = [image.position for image in Map.open(folder).images]
@@ -172,7 +172,7 @@ def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd):
         assert words in said
     assert "none" not in said
     summary = json.loads((tmp_path / "info.json").read_text())
-    assert summary["weights"] == str(shared / "weights.safetensors")
+    assert summary["weights"] == str(weights)
     assert summary["verified"] is True
     assert summary["additions"] == [{"day": day, "root": root.as_posix(), "images": 7}]
     assert summary["extent"] == {"east": east, "north": north}
@@ -291,14 +291,14 @@ def test_a_folder_without_a_readable_image_makes_no_images(shared, tmp_path, cap
 
 
 def test_a_command_that_failed_binds_the_corrected_one_to_nothing(
-    shared, database, tmp_path, capfd
+    shared, database, tmp_path, capfd, weights
 ):
     """No server answers; then a kill has left a map of other settings without an image."""
     out = tmp_path / "map"
     nowhere = ("--store", "milvus:http://127.0.0.1:9")
     fails(capfd, *index(shared, database, out, *nowhere), words=("Fail connecting",))
     assert not out.exists()
-    describer = describer_of(load_weights(shared / "weights.safetensors"))
+    describer = describer_of(load_weights(weights))
     other = new_metadata(describer, tmp_path / "w", out, dtype="float16")
     other = dataclasses.replace(other, model="0" * 64)
     with open_for_appending(out, other):
@@ -371,13 +371,13 @@ def test_the_command_killed_while_it_appends_goes_on(shared, database, tmp_path)
 # Pairs
 
 
-def test_extract_writes_pairs_that_hloc_reads(shared, database, queries, tmp_path, capfd):
+def test_extract_writes_pairs_that_hloc_reads(shared, database, queries, tmp_path, capfd, weights):
     """Names relative to the folder of all images, as hloc has them; against brute force."""
     root = shared / "town" / "images" / "test"
 
     def extract(images: pathlib.Path, out: str, *more: object) -> tuple:
         return (
-            *("extract", "--weights", shared / "weights.safetensors", "--images", images),
+            *("extract", "--weights", weights, "--images", images),
             *("--root", root, "--out", tmp_path / out, "--batch-size", BATCH, "--quiet", *more),
         )
 

@@ -42,7 +42,7 @@ def test_info_tells_how_images_are_resized(shared, tmp_path, capfd):
     assert told["preprocessing"]["size_rule"] == "longer-side"
 
 
-def test_wrong_words_are_one_line(shared, capfd):
-    info = ("info", "--weights", shared / "weights.safetensors", "--resize")
+def test_wrong_words_are_one_line(capfd, weights):
+    info = ("info", "--weights", weights, "--resize")
     fails(capfd, *info, "cubic", words=("--resize: found 'cubic', expected some of fixed",))
     fails(capfd, *info, "bytes", "floats", words=("expected one of bytes, floats",))

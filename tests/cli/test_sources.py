@@ -72,10 +72,10 @@ def test_positions_are_of_the_flag_the_table_names_or_exif(shared, images, tmp_p
     assert positions(tmp_path / "table")["new.jpg"] is None
 
 
-def test_a_rate_without_a_video_is_refused(shared, images, town_map, tmp_path, capfd):
+def test_a_rate_without_a_video_is_refused(shared, images, town_map, tmp_path, capfd, weights):
     words = ("--fps: found 2 without a video among the images, expected both",)
     out = ("--out", tmp_path / "out.npy")
-    common = ("--weights", shared / "weights.safetensors", "--images", images, "--quiet")
+    common = ("--weights", weights, "--images", images, "--quiet")
     before = sorted(tmp_path.iterdir())
     fails(capfd, "extract", *common, *out, "--fps", 2, words=words)
     fails(capfd, *index(shared, images, tmp_path / "map", "--fps", 2), words=words)
@@ -103,9 +103,9 @@ def test_a_folder_that_is_no_map_is_not_asked(images, capfd):
     assert fails(capfd, *query(images, images), words=()).endswith(words)
 
 
-def test_a_video_is_extracted_and_described_as_its_frames(shared, tmp_path, capfd):
+def test_a_video_is_extracted_and_described_as_its_frames(tmp_path, capfd, weights):
     video = write_video(tmp_path / "walk.avi", 21)
-    common = ("--weights", shared / "weights.safetensors", "--batch-size", BATCH, "--quiet")
+    common = ("--weights", weights, "--batch-size", BATCH, "--quiet")
     out = tmp_path / "d.npy"
     succeeds(capfd, "extract", "--images", video, "--fps", 2, "--out", out, *common)
     names, descriptors = read_descriptors(out)
