@@ -529,7 +529,7 @@ def test_one_patch_more_than_clusters_is_enough():
             "^LossConfig.kind: found 'softmax', expected one of circle",
         ),
         (LossConfig, {"miner": "hard"}, "LossConfig.miner: found 'hard'"),
-        (LossConfig, {"kind": "fast-ap"}, "expected 'none': it ranks all images"),
+        (LossConfig, {"kind": "fast-ap"}, "expected 'none' for loss fast-ap, which ranks all"),
         (
             ContrastiveConfig,
             {"negative_margin": 2.1},
