@@ -162,7 +162,10 @@ def test_no_command_prints_the_usage(capfd):
         ("train --data d --out o --recipe dbow", "recipe: found 'dbow', expected one of anyloc"),
         ("train --data d --out o --recipe salad --config c", "--recipe: found beside --config"),
         ("train --data d --out o --micro-batch 5", "micro_batch: found 5, expected a divisor of"),
-        ("train --data d --out o --loss.kind fast-ap", "expected 'none' for loss fast-ap, which ranks all"),
+        (
+            "train --data d --out o --loss.kind fast-ap",
+            "expected 'none' for loss fast-ap, which ranks all",
+        ),
         ("evaluate --data d --preset b16", "preset: found 'b16'"),
         ("train --data d --out o --recipe tiny", "recipe: found 'tiny', expected one of anyloc"),
         ("info --preset boq", "preset: found 'boq', expected one of b14, g14"),
