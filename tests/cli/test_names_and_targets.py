@@ -50,7 +50,7 @@ def test_pairs_of_descriptors_that_are_no_unit_vectors_are_refused_before_the_wo
     save_pca(components, fit_pca(rows, 5, PcaConfig(renormalise=False)))
     more = "--pca", components, "--pairs", tmp_path / "pairs.txt"
     start = extract(shared, shared / "town", tmp_path / "d.npy", *more)
-    fails(capfd, *start, words=(f"--pairs: found {components}, which leaves lengths",))
+    fails(capfd, *start, words=("--pairs: found components that leave lengths",))
     assert files_in(tmp_path) == {"pca.safetensors"}
 
 
@@ -58,8 +58,8 @@ def test_verify_needs_a_map(capfd):
     fails(capfd, "info", "--verify", words=("--verify: found without --map",))
 
 
-def test_an_export_does_not_take_the_place_of_the_folder_that_one_stands_in(
-    capfd, tmp_path, shared, monkeypatch: pytest.MonkeyPatch
+def test_an_export_does_not_take_the_place_of_the_working_folder(
+    capfd, tmp_path, shared, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     start = ("export", "--weights", shared / "weights.safetensors", "--out", ".")
