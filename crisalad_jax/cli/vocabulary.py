@@ -69,7 +69,7 @@ def run(arguments: Vocabulary) -> dict[str, Any]:
     check_target(arguments.out, ".safetensors")
     model = _model(arguments)
     built = build_vocabulary(
-        *model,
+        model,
         arguments.images,
         arguments.out,
         **pick(arguments, "fps", "max_images", "seed", "batch_size", "on_bad_image", "quiet"),
@@ -94,11 +94,10 @@ def _model(arguments: Vocabulary) -> Model:
     if arguments.weights is not None:
         refuse_with("--weights", **pick(arguments, "backbone", "preset", "aggregator"), **given)
         return load_model(arguments.weights, arguments, quiet=arguments.quiet)
-    started = start_vocabulary(
+    return start_vocabulary(
         arguments.aggregator or "anyloc",
         arguments.preset or "b14",
         backbone=find_given(arguments.backbone, quiet=arguments.quiet),
         fields={name: value for name, value in given.items() if value is not None},
         **pick(arguments, "image_size", "resize", "seed"),
     )
-    return Model(*started)

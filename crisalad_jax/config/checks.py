@@ -191,6 +191,12 @@ def in_words(hint: Any) -> str:
     return hint.__name__.rpartition(".")[2] if hasattr(hint, "__name__") else str(hint)
 
 
+def require_field(config: object, name: str, holds: bool, expected: str) -> None:
+    """Check a field of a configuration; the message says what was expected of it."""
+    found = getattr(config, name)
+    require(holds, f"{type(config).__name__}.{name}: found {found!r}, expected {expected}")
+
+
 def require_range(config: object, least: float, most: float, *names: str) -> None:
     """Check that fields are from `least` to `most`, both included."""
     limits = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"

@@ -22,22 +22,36 @@ _SCATTERED = 4
 """Number of scattered rows that are read before their pages are released."""
 
 
-def as_rows(array: np.ndarray, name: str) -> Float[np.ndarray, "n d"]:
-    """Check that an array is a matrix of descriptors, and view it as one.
+def as_rows(array: np.ndarray, name: str, length: int | None = None) -> Float[np.ndarray, "n d"]:
+    """Check that an array is a matrix of descriptors, of a length if that is given, and view it so.
 
     Numpy has no name for bfloat16: a .npy file holds it as two bytes without a type ("V2").
 
     Raises:
-        InputError: the array is not a matrix, or is empty.
+        InputError: the array is not a matrix, is empty, or is of another length.
     """
     array = np.asanyarray(array)
     if array.dtype == np.dtype("V2"):
         array = array.view(ml_dtypes.bfloat16)
-    if array.ndim != 2 or 0 in array.shape:
+    if array.ndim != 2 or 0 in array.shape or length not in (None, array.shape[1]):
         raise InputError(
-            f"{name}: found shape {array.shape}, expected (images, descriptor), neither zero"
+            f"{name}: found shape {array.shape}, expected (images, {length or 'descriptor'}), "
+            "neither zero"
         )
     return array
+
+
+def as_unit_rows(
+    array: np.ndarray, name: str, length: int | None = None
+) -> Float32[np.ndarray, "n d"]:
+    """Check that an array is a matrix of unit descriptors, and return them in float32.
+
+    Raises:
+        InputError: what `as_rows` and `check_rows` raise.
+    """
+    wide = np.ascontiguousarray(_widened(as_rows(array, name, length)))
+    check_rows(wide, name, range(len(wide)), unit=True)
+    return wide
 
 
 def as_sides(
@@ -46,15 +60,10 @@ def as_sides(
     """Check that database and queries are matrices of descriptors of one length.
 
     Raises:
-        InputError: one is not a matrix, or is empty; or their lengths differ.
+        InputError: what `as_rows` raises.
     """
-    database, queries = as_rows(database, "database"), as_rows(queries, "queries")
-    if database.shape[1] != queries.shape[1]:
-        raise InputError(
-            f"queries: found descriptors of length {queries.shape[1]}, "
-            f"expected {database.shape[1]} as in the database"
-        )
-    return database, queries
+    database = as_rows(database, "database")
+    return database, as_rows(queries, "queries", database.shape[1])
 
 
 class Block(NamedTuple):
@@ -127,11 +136,11 @@ def joined(stream: Iterable[Block], size: int) -> Generator[Block, None, None]:
 def gathered(
     array: Float[np.ndarray, "n d"], places: Int[np.ndarray, " m"]
 ) -> Float[np.ndarray, "m d"]:
-    """Read the rows at some places in ascending order as float32, and release their pages."""
+    """Read the rows at some places in ascending order, and release their pages."""
     parts = []
     for start in range(0, len(places), _SCATTERED):
         some = places[start : start + _SCATTERED]
-        parts.append(_widened(array[some]))
+        parts.append(array[some])
         _let_go(array[some[0] : some[-1] + 1])
     return np.concatenate(parts)
 

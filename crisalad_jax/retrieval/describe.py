@@ -8,7 +8,7 @@ import itertools
 import os
 import pathlib
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from crisalad_jax.utils.shapes import Float, Float32, Int64
 if TYPE_CHECKING:  # an engine describes images without JAX
     from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.model import Model
+    from crisalad_jax.retrieval.segments import Segments
 
 
 @brief
@@ -40,13 +41,10 @@ class Described(NamedTuple):
     unreadable: Int64[np.ndarray, " _"]
     """Indices of the images that could not be read."""
 
-
-class RowSource(Protocol):
-    """Rows that are read by number: an array in memory, or a folder of files."""
-
-    def __getitem__(self, numbers: Int64[np.ndarray, " n"], /) -> Rows:
-        """Return rows by number."""
-        ...
+    @property
+    def tried(self) -> int:
+        """Number of images, readable or not."""
+        return len(self.indices) + len(self.unreadable)
 
 
 def prepare_image(image: np.ndarray, config: "ModelConfig", name: str | None = None) -> Pixels:
@@ -74,6 +72,24 @@ def prepare_image(image: np.ndarray, config: "ModelConfig", name: str | None = N
         raise InputError(f"config: found {type(config).__name__}, expected ModelConfig")
     how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
     return how.prepare(image, config.check_image_size, name)
+
+
+def as_list(name: str, given: Any) -> list[Any]:
+    """Return what was given, a file or a list, as a list.
+
+    Raises:
+        InputError: the list is empty.
+    """
+    found = [given] if isinstance(given, str | os.PathLike) else list(given)
+    if not found:
+        raise InputError(f"{name}: found none, expected at least one image")
+    return found
+
+
+def check_readable(source: object, tried: int, readable: int) -> None:
+    """Raise InputError where none of a source's images could be read."""
+    if not readable:
+        raise InputError(f"{source}: found {tried} images, none of them readable")
 
 
 def describe_files(
@@ -107,16 +123,10 @@ def describe_files(
         (1, 576)
     """
     describer = describer_of(model)
-    given = [files] if isinstance(files, str | os.PathLike) else files
-    paths = [pathlib.Path(file) for file in given]
-    if not paths:
-        raise InputError("files: found none, expected at least one image file")
-    parts = []
-    with progress_bar("images", len(paths), "images", quiet=reading.quiet) as bar:
-        for part in described(describer, paths, reading.fitted(len(paths))):
-            parts.append(part.descriptors)
-            bar.advance(len(part.indices) + len(part.unreadable))
-    return np.concatenate(parts)
+    paths = [pathlib.Path(file) for file in as_list("files", files)]
+    stream = described(describer, paths, reading.fitted(len(paths)))
+    (found,) = joined(shown(stream, "images", len(paths), quiet=reading.quiet), len(paths))
+    return found.descriptors
 
 
 def describe_images(
@@ -149,14 +159,8 @@ def describe_images(
         (1, 576)
     """
     describer, reading = describer_of(model), Reading(batch_size=batch_size)
-    if isinstance(images, np.ndarray) and images.ndim in (2, 3):
-        raise InputError(
-            f"images: found one array of shape {images.shape}, expected a list of images"
-        )
-    if not len(images):
-        raise InputError("images: found none, expected at least one image")
-    how = describer.preparation
-    prepared = [how.prepare(image, describer.check_size) for image in images]
+    how, given = describer.preparation, as_list("images", images)
+    prepared = [how.prepare(image, describer.check_size) for image in given]
     return describe_prepared(describer, prepared, reading.batch_size)
 
 
@@ -207,33 +211,40 @@ def described(
     Raises:
         InputError: an image cannot be read and `reading` says "stop".
     """
+    shorten = (lambda rows: rows) if components is None else components.apply
     before: Rows | None = None
-    for rows, batch in describer.tokens(_batches(describer, paths, reading)):
+    for rows, batch, unreadable in _tokens(describer, paths, reading):
         if window == 1:
-            descriptors = _shortened(_alone(describer, rows), components)[batch.valid]
+            descriptors = shorten(_alone(describer, rows))[batch.valid]
         else:
             new = rows[batch.valid]
             held = new if before is None else np.concatenate([before, new])
             every = group(describer, held, len(held), "window", batch_size=window)
-            descriptors = _shortened(every[len(held) - len(new) :], components)
+            descriptors = every[len(held) - len(new) :]
+            descriptors = shorten(descriptors) if len(new) else descriptors
             before = held[1 - window :]
-        yield Described(batch.indices[batch.valid], descriptors, _unreadable(batch))
+        yield Described(batch.indices[batch.valid], descriptors, unreadable)
 
 
-def _batches(
+def token_rows(
     describer: Describer, paths: Sequence[pathlib.Path], reading: Reading
-) -> Iterator[ImageBatch]:
-    return reading.batches(paths, describer.preparation, describer.check_size)
+) -> Iterator[Described]:
+    """Yield the tokens of images in order, batch by batch, in the place of descriptors.
+
+    Raises:
+        InputError: an image cannot be read and `reading` says "stop".
+    """
+    for rows, batch, unreadable in _tokens(describer, paths, reading):
+        yield Described(batch.indices[batch.valid], rows[batch.valid], unreadable)
 
 
-def _unreadable(batch: ImageBatch) -> Int64[np.ndarray, " _"]:
-    return batch.indices[(batch.indices >= 0) & ~batch.valid]
-
-
-def _shortened(descriptors: np.ndarray, components: Pca | None) -> np.ndarray:
-    return (
-        descriptors if components is None or not len(descriptors) else components.apply(descriptors)
-    )
+def _tokens(
+    describer: Describer, paths: Sequence[pathlib.Path], reading: Reading
+) -> Iterator[tuple[Rows, ImageBatch, Int64[np.ndarray, " _"]]]:
+    """Yield the tokens of each batch, padding included, and which images could not be read."""
+    batches = reading.batches(paths, describer.preparation, describer.check_size)
+    for rows, batch in describer.tokens(batches):
+        yield rows, batch, batch.indices[(batch.indices >= 0) & ~batch.valid]
 
 
 def described_sources(
@@ -260,52 +271,54 @@ def described_sources(
         first += len(source)
 
 
-def token_rows(
-    describer: Describer, paths: Sequence[pathlib.Path], reading: Reading
+def shown(
+    stream: Iterator[Described], label: str, total: int, *, quiet: bool, done: int = 0
 ) -> Iterator[Described]:
-    """Yield the tokens of images in order, batch by batch, in the place of descriptors.
+    """Pass descriptors on, and show in a progress bar how many of the images are done."""
+    with progress_bar(label, total, "images", quiet=quiet, done=done) as bar:
+        for part in stream:
+            yield part
+            bar.advance(part.tried)
 
-    Raises:
-        InputError: an image cannot be read and `reading` says "stop".
-    """
-    for rows, batch in describer.tokens(_batches(describer, paths, reading)):
-        yield Described(batch.indices[batch.valid], rows[batch.valid], _unreadable(batch))
+
+def joined(stream: Iterator[Described], size: int) -> Iterator[Described]:
+    """Join parts until they have `size` descriptors; the last one may have fewer, or none."""
+    waiting: list[Described] = []
+    for part in stream:
+        waiting.append(part)
+        if sum(len(each.indices) for each in waiting) >= size:
+            yield _concatenated(waiting)
+            waiting.clear()
+    if waiting:
+        yield _concatenated(waiting)
+
+
+def _concatenated(parts: Sequence[Described]) -> Described:
+    return Described(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def read_tokens(
     describer: Describer, paths: Sequence[pathlib.Path], reading: Reading, label: str = "images"
 ) -> Described:
     """Read the tokens of all images into memory, as `token_rows` yields them."""
-    parts: list[Described] = []
-    with progress_bar(label, len(paths), "images", quiet=reading.quiet) as bar:
-        for part in token_rows(describer, paths, reading):
-            parts.append(part)
-            bar.advance(len(part.indices) + len(part.unreadable))
-    return Described(*map(np.concatenate, zip(*parts, strict=True)))
+    stream = token_rows(describer, paths, reading)
+    (found,) = joined(shown(stream, label, len(paths), quiet=reading.quiet), len(paths))
+    return found
 
 
 def group(
-    describer: Describer,
-    rows: RowSource,
-    count: int,
-    grouping: str,
-    *,
-    batch_size: int,
-    seed: int = 0,
-    label: str = "images",
-    quiet: bool = True,
+    describer: Describer, rows: "Rows | Segments", count: int, grouping: str, **options: Any
 ) -> Float[np.ndarray, "image descriptor"]:
-    """Describe images, in their order, under one of `GROUPINGS`; see `grouped`."""
+    """Describe images, in their order, under one of `GROUPINGS`; options are those of `grouped`."""
     descriptors = np.empty((count, describer.config.descriptor_dim), np.float32)
-    options: dict[str, Any] = {"batch_size": batch_size, "seed": seed, "quiet": quiet}
-    for images, found in grouped(describer, rows, count, grouping, label=label, **options):
+    for images, found in grouped(describer, rows, count, grouping, **options):
         descriptors[images] = found
     return descriptors
 
 
 def grouped(
     describer: Describer,
-    rows: RowSource,
+    rows: "Rows | Segments",
     count: int,
     grouping: str,
     *,
@@ -349,13 +362,11 @@ def check_window(config: "ModelConfig", window: int) -> None:
     Raises:
         InputError: it is below 1, or above with a model whose images do not attend to each other.
     """
-    if window < 1:
-        raise InputError(f"window: found {window}, expected at least 1")
-    if window > 1 and not config.cross_image.layers:
-        raise InputError(
-            f"window: found {window} with a model without a cross-image encoder, expected 1: it "
-            "describes every image independently"
-        )
+    if window < 1 or (window > 1 and not config.cross_image.layers):
+        expected = "at least 1"
+        if not config.cross_image.layers:
+            expected = "1 of a model without a cross-image encoder"
+        raise InputError(f"window: found {window}, expected {expected}")
 
 
 class FrameDescriber:

@@ -26,34 +26,19 @@ Rows = Float[np.ndarray, "image token_numbers"]
 class Describer(Protocol):
     """A model that describes images in two steps: every image's tokens, then their descriptors."""
 
-    @property
-    def config(self) -> "ModelConfig":
-        """The model's configuration."""
-        ...
-
-    @property
-    def preparation(self) -> Preparation:
-        """How images are prepared."""
-        ...
-
-    @property
-    def digest(self) -> str:
-        """The `model_hash` of the model."""
-        ...
-
-    @property
-    def row_length(self) -> int:
-        """Number of values in the row of an image's tokens."""
-        ...
-
-    @property
-    def row_dtype(self) -> str:
-        """Type of the values in rows of tokens."""
-        ...
+    config: "ModelConfig"
+    """The model's configuration."""
+    preparation: Preparation
+    """How images are prepared."""
+    digest: str
+    """The `model_hash` of the model."""
+    row_length: int
+    """Number of values in the row of an image's tokens."""
+    row_dtype: str
+    """Type of the values in rows of tokens."""
 
     def check_size(self, size: Size) -> None:
         """Raise InputError for a height and width that the model cannot describe."""
-        ...
 
     def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[Rows, ImageBatch]]:
         """Yield each batch with the tokens of its images, padding included, in order."""

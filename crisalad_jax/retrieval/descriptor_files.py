@@ -6,11 +6,12 @@ d.npy.json     how they were made, and the digests of the files that belong toge
 d.h5           a group for each image; d.h5.json beside it
 """
 
+import contextlib
 import io
 import os
 import pathlib
-from collections.abc import Mapping, Sequence
-from typing import IO, Any, Self
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ from crisalad_jax.utils.files import (
     write_json,
     write_npy,
 )
-from crisalad_jax.utils.shapes import Float, Float32, Int
+from crisalad_jax.utils.shapes import Float, Int
 
 Descriptors = Float[np.ndarray, "image descriptor"]
 _DIGESTS = "files"
@@ -57,12 +58,13 @@ def record_of(path: pathlib.Path) -> pathlib.Path:
 
 def targets(path: pathlib.Path) -> list[pathlib.Path]:
     """List all files that a set of descriptors in `path` consists of."""
-    names = [_names_of(path)] if path.suffix == ".npy" else []
-    return [path, *names, record_of(path)]
+    return [*_files_of(path).values(), record_of(path)]
 
 
-def _names_of(path: pathlib.Path) -> pathlib.Path:
-    return path.with_suffix(".names.txt")
+def _files_of(path: pathlib.Path) -> dict[str, pathlib.Path]:
+    """Return the files whose digests the record holds, by their roles."""
+    names = {"names": path.with_suffix(".names.txt")} if path.suffix == ".npy" else {}
+    return {"descriptors": path, **names}
 
 
 def write_descriptors(
@@ -93,134 +95,86 @@ def write_descriptors(
     """
     check_suffix(path)
     path = pathlib.Path(path)
-    if path.suffix == ".npy":
-        _write_npy(path, descriptors, names, dict(record or {}), within, written)
-    else:
-        _write_h5(path, descriptors, names, dict(record or {}), within)
+    with contextlib.ExitStack() as stack:
+        # The files that are entered last are renamed first.
+        files = {
+            role: stack.enter_context(atomic_path(file, within))
+            for role, file in _files_of(path).items()
+        }
+        recorded = stack.enter_context(atomic_path(record_of(path), within))
+        if path.suffix == ".h5":
+            _write_h5(files["descriptors"], descriptors, names, path)
+        else:
+            with wrap_os_errors(path):
+                if written is None:
+                    write_npy(files["descriptors"], descriptors)
+                else:
+                    os.replace(written, files["descriptors"])
+            files["names"].write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
+        digests = {role: sha256_of(file) for role, file in files.items()}
+        write_json(recorded, {_DIGESTS: digests, **(record or {})})
 
 
-def _write_npy(
+def write_rows(
     path: pathlib.Path,
-    descriptors: Descriptors,
-    names: Sequence[str],
-    record: dict[str, Any],
-    within: pathlib.Path | None,
-    written: pathlib.Path | None,
+    shape: tuple[int, int],
+    parts: Iterable[tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n descriptor"]]],
 ) -> None:
-    # The files that are entered last are renamed first.
-    with (
-        atomic_path(path, within) as array,
-        atomic_path(_names_of(path), within) as listed,
-        atomic_path(record_of(path), within) as recorded,
-    ):
-        with wrap_os_errors(path):
-            if written is None:
-                write_npy(array, descriptors)
-            else:
-                os.replace(written, array)
-        listed.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
-        digests = {"descriptors": sha256_of(array), "names": sha256_of(listed)}
-        write_json(recorded, {_DIGESTS: digests} | record)
-
-
-class RowFile:
-    """A .npy file of float32 rows, which are written in any order, some at a time.
+    """Write a .npy file of float32 rows, which come in any order, some at a time.
 
     A memory map would end the process where the disk gets full; this raises OSError.
+
+    Args:
+        path: the file.
+        shape: number of rows, and their length.
+        parts: the places of some rows, and the rows.
     """
-
-    def __init__(self, path: pathlib.Path, count: int, length: int) -> None:
-        """Make the file for so many rows of so many numbers."""
-        header = npy_header(np.dtype(np.float32), (count, length))
-        self._origin, self._row = len(header), 4 * length
-        self._file = path.open("wb")
-        self._file.write(header)
-
-    def write(
-        self, places: Int[np.ndarray, " n"], rows: Float32[np.ndarray, "n descriptor"]
-    ) -> None:
-        """Write rows at these places."""
-        runs = np.split(np.arange(len(places)), np.flatnonzero(np.diff(places) != 1) + 1)
-        for run in runs if len(places) else ():
-            self._file.seek(self._origin + self._row * int(places[run[0]]))
-            self._file.write(np.ascontiguousarray(rows[run]).data)
-
-    def __enter__(self) -> Self:
-        """Return the file itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the file."""
-        self._file.close()
+    header = npy_header(np.dtype(np.float32), shape)
+    with path.open("wb") as file:
+        file.write(header)
+        for places, rows in parts:
+            for place, row in zip(places, np.ascontiguousarray(rows, np.float32), strict=True):
+                file.seek(len(header) + row.nbytes * int(place))
+                file.write(row.data)
 
 
 def _write_h5(
-    path: pathlib.Path,
-    descriptors: Descriptors,
-    names: Sequence[str],
-    record: dict[str, Any],
-    within: pathlib.Path | None,
+    target: pathlib.Path, descriptors: Descriptors, names: Sequence[str], path: pathlib.Path
 ) -> None:
     """Write a group for each image, with a dataset `global_descriptor`, as hloc does."""
     import h5py
 
-    with atomic_path(path, within) as array, atomic_path(record_of(path), within) as written:
-        with array.open("w+b", buffering=0) as raw:
-            target = _NeverFull(raw)
-            with h5py.File(target, "w") as file:
-                for name, descriptor in zip(names, descriptors, strict=True):
-                    if f"{name}/global_descriptor" in file:
-                        raise InputError(
-                            f"{path}: found the image name {name!r} twice, expected it once"
-                        )
-                    file.create_dataset(f"{name}/global_descriptor", data=descriptor)
-            if target.error is not None:
-                raise target.error
-        write_json(written, {_DIGESTS: {"descriptors": sha256_of(array)}} | record)
+    with _NeverFull(target, "w+") as raw:
+        with h5py.File(raw, "w") as file:
+            for name, descriptor in zip(names, descriptors, strict=True):
+                if f"{name}/global_descriptor" in file:
+                    raise InputError(
+                        f"{path}: found the image name {name!r} twice, expected it once"
+                    )
+                file.create_dataset(f"{name}/global_descriptor", data=descriptor)
+        if raw.error is not None:
+            raise raw.error
 
 
-class _NeverFull(io.RawIOBase):
+class _NeverFull(io.FileIO):
     """A file that keeps the first error of the disk to itself: HDF5 would crash the process."""
 
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
-        self.error: OSError | None = None
+    error: OSError | None = None
 
-    def write(self, data: Any) -> int:
-        count = memoryview(data).nbytes
-        self._try(lambda: self._file.write(data))
-        return count
+    def write(self, data: Any, /) -> int:
+        self._try(super().write, data)
+        return memoryview(data).nbytes
 
-    def truncate(self, size: int | None = None) -> int:
-        self._try(lambda: self._file.truncate(size))
+    def truncate(self, size: int | None = None, /) -> int:
+        self._try(super().truncate, size)
         return self.tell() if size is None else size
 
-    def _try(self, change: Any) -> None:
+    def _try(self, change: Callable[..., object], value: Any) -> None:
         if self.error is None:
             try:
-                change()
+                change(value)
             except OSError as error:
                 self.error = error
-
-    def readinto(self, buffer: Any) -> int:
-        data = self._file.read(memoryview(buffer).nbytes)
-        memoryview(buffer).cast("B")[: len(data)] = data
-        return len(data)
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-    def readable(self) -> bool:
-        return True
-
-    def writable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
 
 
 def open_npy(path: str | os.PathLike[str], *, verify: bool = True) -> Descriptors:
@@ -238,7 +192,7 @@ def open_npy(path: str | os.PathLike[str], *, verify: bool = True) -> Descriptor
     check_source(path, "a .npy file of descriptors")
     check_one_array(path)
     if verify:
-        _check_files(path, {"descriptors": path})
+        _check_files(path, ["descriptors"])
     try:
         array = np.lib.format.open_memmap(path, mode="r")
     except Exception as error:  # numpy's parser of headers raises errors of many kinds
@@ -277,39 +231,32 @@ def read_descriptors(
     readers = {".npy": _read_npy, ".h5": _read_h5}
     read = choose(f"{path}: suffix of the descriptors' file", path.suffix, readers)
     check_source(path, "a file of descriptors")
-    names, descriptors = read(path, verify)
+    if verify:
+        _check_files(path, list(_files_of(path)))
+    names, descriptors = read(path)
     check_lines(names, path)
     return names, descriptors
 
 
-def _check_files(path: pathlib.Path, files: Mapping[str, pathlib.Path]) -> None:
+def _check_files(path: pathlib.Path, roles: Sequence[str]) -> None:
     """Compare files with the digests in the record of the set in `path`, if it has one."""
-    record = record_of(path)
+    record, files = record_of(path), _files_of(path)
     if not record.is_file():
         tell_unchecked(path, f"no {record.name} with its checksum")
         return
-    value = read_json(record, "a record of descriptors")
-    digests = value.get(_DIGESTS)
-    if not isinstance(digests, dict) or not digests.keys() >= files.keys():
-        raise InputError(
-            f"{record}: found no digests of {', '.join(files)}, expected them: {path.name} and "
-            "this file do not belong together"
-        )
-    for role, file in files.items():
-        if sha256_of(file) != digests[role]:
+    digests = read_json(record, "a record of descriptors").get(_DIGESTS)
+    for role in roles:
+        if not isinstance(digests, dict) or digests.get(role) != sha256_of(files[role]):
             raise InputError(
-                f"{file}: found other bytes than {record.name} says, expected those that were "
-                "written together: they were changed, or an extraction ended between the two; the "
-                "same command finishes it"
+                f"{files[role]}: found other bytes than {record.name} says, expected those that "
+                "were written together: they were changed, or an extraction ended between the two; "
+                "the same command finishes it"
             )
 
 
-def _read_npy(path: pathlib.Path, verify: bool) -> tuple[list[str], Descriptors]:
-    listed = _names_of(path)
-    text = read_text(listed, f"the names of the images in {path.name}")
-    if verify:
-        _check_files(path, {"descriptors": path, "names": listed})
-    names = text.splitlines()
+def _read_npy(path: pathlib.Path) -> tuple[list[str], Descriptors]:
+    listed = _files_of(path)["names"]
+    names = read_text(listed, f"the names of the images in {path.name}").splitlines()
     descriptors = open_npy(path, verify=False)
     if len(descriptors) != len(names):
         raise InputError(
@@ -319,11 +266,9 @@ def _read_npy(path: pathlib.Path, verify: bool) -> tuple[list[str], Descriptors]
     return names, descriptors
 
 
-def _read_h5(path: pathlib.Path, verify: bool) -> tuple[list[str], Descriptors]:
+def _read_h5(path: pathlib.Path) -> tuple[list[str], Descriptors]:
     import h5py
 
-    if verify:
-        _check_files(path, {"descriptors": path})
     names: list[str] = []
     rows: list[np.ndarray] = []
 
@@ -333,17 +278,14 @@ def _read_h5(path: pathlib.Path, verify: bool) -> tuple[list[str], Descriptors]:
         item = file[name] if last == "global_descriptor" else None
         if not isinstance(item, h5py.Dataset):
             return
-        if item.ndim != 1 or item.dtype.kind != "f" or (rows and item.shape != rows[0].shape):
-            raise InputError(
-                f"{path}: found {item.dtype} {item.shape} as {name}, expected floats "
-                f"{rows[0].shape if rows else '(descriptor,)'}"
-            )
         # The header may claim any size, or numbers of other files.
         stored = item.id.get_storage_size() * (1 if item.compression is None else _INFLATION)
-        if item.external or item.is_virtual or item.nbytes > stored:
+        is_whole = item.nbytes <= stored and not item.external and not item.is_virtual
+        is_vector = item.ndim == 1 and item.dtype.kind == "f"
+        if not is_vector or not is_whole or (rows and item.shape != rows[0].shape):
             raise InputError(
-                f"{path}: found {item.nbytes} bytes of numbers as {name}, of which the file holds "
-                f"{item.id.get_storage_size()}, expected all of them in this file"
+                f"{path}: found {item.dtype} {item.shape} as {name}, expected floats "
+                f"{rows[0].shape if rows else '(descriptor,)'}, all of them in this file"
             )
         names.append(group)
         rows.append(item[()])

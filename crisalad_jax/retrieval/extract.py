@@ -1,9 +1,10 @@
 """Descriptors of a folder or a list of images, in files or in memory."""
 
+import collections
 import contextlib
 import dataclasses
 import hashlib
-import json
+import itertools
 import os
 import pathlib
 import tempfile
@@ -21,23 +22,31 @@ from crisalad_jax.data.images import check_lines, read_pixels
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import file_of, frame_time, name_frame
-from crisalad_jax.retrieval.chunks import check_all_rows, check_rows
-from crisalad_jax.retrieval.describe import Described, described, grouped, token_rows
+from crisalad_jax.retrieval.chunks import as_rows, check_all_rows, check_rows
+from crisalad_jax.retrieval.describe import (
+    as_list,
+    check_readable,
+    described,
+    grouped,
+    joined,
+    shown,
+    token_rows,
+)
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.descriptor_files import (
     Descriptors,
-    RowFile,
     check_suffix,
     open_npy,
     read_descriptors,
     record_of,
     targets,
     write_descriptors,
+    write_rows,
 )
 from crisalad_jax.retrieval.grouping import GROUPINGS
 from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_pairs
 from crisalad_jax.retrieval.maps.file_store import FileStore
-from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
+from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened_length
 from crisalad_jax.retrieval.segments import SEGMENT, Segments, Share, Shares, digest_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import (
@@ -47,18 +56,15 @@ from crisalad_jax.utils.files import (
     read_json,
     real_path,
     wrap_os_errors,
-    write_json,
 )
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.output import warn
-from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.temporaries import in_use, remove_temporaries, temporary_beside
 
 if TYPE_CHECKING:
     from crisalad_jax.nn.model import Model
 
 StrPath = str | os.PathLike[str]
-_PLAN = "plan.json"
 _SHARES = "shares"
 """Key of the shares' digest in a set's record."""
 
@@ -144,18 +150,13 @@ def extract(
     """
     describer = describer_of(model, [grouping])
     check_extraction(
-        out,
-        grouping=grouping,
-        seed=seed,
-        pairs=pairs,
-        database=database,
-        k=k,
-        share=share,
+        out, grouping=grouping, seed=seed, pairs=pairs, database=database, k=k, share=share
     )
-    components = _components(pca, describer, weights, unit=pairs is not None, verify=verify)
+    components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca, verify=verify)
+    made_by = "--pairs" if pairs is not None else "model" if weights is None else str(weights)
+    length = shortened_length(components, describer.config, made_by, unit=pairs is not None)
     paths, names = _listed(images, root, fps, reading)
     check_rate_used(fps, paths)
-    length = describer.config.descriptor_dim if components is None else len(components.components)
     others = None if pairs is None else _others(pairs, names, database, length, verify=verify)
     reading = reading.fitted(len(paths))
     source = str(images) if isinstance(images, str | os.PathLike) else "images"
@@ -165,27 +166,27 @@ def extract(
         "grouping": grouping,
         "batch_size": reading.batch_size,
         "seed": seed,
-        "pca": _words(pca),
+        "pca": f"{length} components" if isinstance(pca, Pca) else pca and str(pca),
         "model": to_plain(describer.config),
     }
     if any(frame_time(path) is not None for path in paths):
         record["fps"] = 1.0 if fps is None else fps
-    work = _Work(describer, components, grouping, seed, reading, source)
+    work = _Work(describer, components, length, grouping, seed, reading, source)
 
     def finish(parts: Sequence[Segments], folder: pathlib.Path, **more: Any) -> Extracted:
         with work.written(parts, names, folder) as (found, file), contextlib.ExitStack() as staged:
-            nearest = None
             if pairs is not None:  # staged, so that pairs and descriptors appear, or none
                 between = others or (found.names, found.descriptors)
                 nearest = nearest_pairs(found.names, found.descriptors, *between, k=k)
                 write_pairs(staged.enter_context(atomic_path(pairs)), nearest)
+                found = found._replace(pairs=nearest)
             if out is None:
-                return found._replace(descriptors=np.array(found.descriptors), pairs=nearest)
+                return found._replace(descriptors=np.array(found.descriptors))
             whole = record | {"skipped": found.skipped, **more}
             write_descriptors(
                 out, found.descriptors, found.names, whole, within=folder, written=file
             )
-            return found._replace(pairs=nearest)
+            return found
 
     if share is None or out is None:
         with _work_folder(out) as folder:
@@ -194,9 +195,8 @@ def extract(
             return finish([work.resume(folder, paths, names, resumes=resumes)], folder)
     out = pathlib.Path(out)
     common = {name: value for name, value in record.items() if name not in ("weights", "images")}
-    common |= {"pca": components and pca_hash(components), "digest": describer.digest}
     folder = out.with_name(f"{out.name}.shares")
-    shares = Shares(folder, Share.parse(share), digest_of(names, common))
+    shares = Shares(folder, Share.parse(share), digest_of(names, common | work.plan()))
     if _is_joined(out, shares.digest):
         listed, descriptors = read_descriptors(out)
         skipped = read_json(record_of(out), "a record of descriptors")["skipped"]
@@ -245,10 +245,9 @@ def check_extraction(
     Example:
         >>> check_extraction("descriptors.npy", grouping="single")
     """
-    files: list[pathlib.Path] = []
+    files = [] if out is None else targets(pathlib.Path(out))
     if out is not None:
         check_suffix(out)
-        files = targets(pathlib.Path(out))
     for target in (*files, *([] if pairs is None else [pairs])):
         check_target(target)
     choose("grouping", grouping, GROUPINGS)
@@ -278,22 +277,27 @@ class _Work:
 
     describer: Describer
     components: Pca | None
+    length: int
+    """Number of dimensions of the descriptors that are written."""
     grouping: str
     seed: int
     reading: Reading
     source: str
 
-    @property
-    def _length(self) -> int:
-        """Number of dimensions of the descriptors that are written."""
-        if self.components is not None:
-            return len(self.components.components)
-        return self.describer.config.descriptor_dim
+    def plan(self) -> dict[str, Any]:
+        """Return what all rows depend on."""
+        return {
+            "digest": self.describer.digest,
+            "config": to_plain(self.describer.config),
+            "batch_size": self.reading.batch_size,
+            "rows": "descriptors" if self.grouping == "single" else "tokens",
+            "pca": self.components and pca_hash(self.components),
+        }
 
     def opened(self, folder: pathlib.Path) -> Segments:
         """Open the rows in a folder."""
         if self.grouping == "single":
-            length, dtype = self._length, "float32"
+            length, dtype = self.length, "float32"
         else:
             length, dtype = self.describer.row_length, self.describer.row_dtype
         return Segments(folder, FileStore(folder, length, dtype), dtype)
@@ -307,7 +311,9 @@ class _Work:
         resumes: bool = True,
     ) -> Segments:
         """Describe the images whose rows are not in the folder yet, and store them there."""
-        plan = {} if not resumes else self._plan()
+        plan = digest_of((), self.plan()) if resumes else ""
+        if not resumes:
+            _remove_work(folder)
         done = _reusable(folder, plan, paths, complete=self.reading.on_bad_image == "stop")
         try:
             segments = self.opened(folder)
@@ -316,62 +322,29 @@ class _Work:
             warn(f"{error}; the work in this folder starts again")
             _remove_work(folder)
             done, segments = 0, self.opened(folder)
-        write_json(folder / _PLAN, plan)
+        first, quiet = done, self.reading.quiet
         if self.grouping == "single":
-            stream = described(
-                self.describer, paths[done:], self.reading, components=self.components
-            )
+            new = described(self.describer, paths[done:], self.reading, components=self.components)
         else:
-            stream = token_rows(self.describer, paths[done:], self.reading)
-        waiting: list[Described] = []
-        count, first = 0, done
-
-        def append() -> None:
-            rows = np.concatenate([part.descriptors for part in waiting])
-            numbers = np.concatenate([part.indices for part in waiting])
+            new = token_rows(self.describer, paths[done:], self.reading)
+        for part in joined(shown(new, "images", len(paths), quiet=quiet, done=done), SEGMENT):
+            if not len(part.indices):
+                continue
             if self.grouping == "single":
-                self._check(rows, numbers)
+                self._check(part.descriptors, part.indices)
+            images = paths[done : done + part.tried]
             record = {
-                "names": [names[done + int(number)] for number in numbers],
-                "count": count - first,
-                "images": _digest(paths[first:count]),
+                "names": [names[first + int(number)] for number in part.indices],
+                "count": len(images),
+                "work": _digest(plan, images),
             }
-            segments.append(record, rows)
-            waiting.clear()
-
-        count = done
-        with progress_bar(
-            "images", len(paths), "images", quiet=self.reading.quiet, done=done
-        ) as bar:
-            for part in stream:
-                waiting.append(part)
-                tried = len(part.indices) + len(part.unreadable)
-                count += tried
-                bar.advance(tried)
-                if sum(len(each.indices) for each in waiting) >= SEGMENT:
-                    append()
-                    first = count
-            if any(len(each.indices) for each in waiting):
-                append()
+            segments.append(record, part.descriptors)
+            done += part.tried
         return segments
 
-    def _plan(self) -> dict[str, Any]:
-        """Return what all rows depend on."""
-        plan = {
-            "model": self.describer.digest,
-            "config": to_plain(self.describer.config),
-            "batch_size": self.reading.batch_size,
-            "rows": "descriptors" if self.grouping == "single" else "tokens",
-            "pca": self.components and pca_hash(self.components),
-        }
-        return json.loads(json.dumps(plan))
-
     def _check(self, rows: np.ndarray, numbers: np.ndarray) -> None:
-        unit = (
-            self.describer.config.unit_length
-            if self.components is None
-            else self.components.config.renormalise
-        )
+        model, components = self.describer.config, self.components
+        unit = model.unit_length if components is None else components.config.renormalise
         check_rows(rows, f"{self.source}: descriptors", numbers, unit=unit)
 
     @contextlib.contextmanager
@@ -384,13 +357,11 @@ class _Work:
             InputError: there are no rows, or the disk is full.
         """
         stored, skipped = _names_of(parts, names)
-        if not stored:
-            raise InputError(f"{self.source}: found {len(names)} images, none of them readable")
+        check_readable(self.source, len(names), len(stored))
         file = temporary_beside(folder / "rows.npy")
         with in_use(file):
-            with wrap_os_errors(folder), RowFile(file, len(stored), self._length) as target:
-                for numbers, rows in self._descriptors(parts, len(stored)):
-                    target.write(numbers, rows)
+            with wrap_os_errors(folder):
+                write_rows(file, (len(stored), self.length), self._descriptors(parts, len(stored)))
             yield Extracted(stored, open_npy(file, verify=False), skipped), file
 
     def _descriptors(
@@ -399,21 +370,14 @@ class _Work:
         """Yield descriptors, some at a time, with their numbers."""
         if self.grouping == "single":
             start = 0
-            for part in parts:
-                for block in part.blocks():
-                    yield np.arange(start, start + len(block)), block
-                    start += len(block)
+            for block in itertools.chain.from_iterable(part.blocks() for part in parts):
+                yield np.arange(start, start + len(block)), block
+                start += len(block)
             return
         (tokens,) = parts
-        for numbers, rows in grouped(
-            self.describer,
-            tokens,
-            count,
-            self.grouping,
-            batch_size=self.reading.batch_size,
-            seed=self.seed,
-            quiet=self.reading.quiet,
-        ):
+        options: dict[str, Any] = {"seed": self.seed, "quiet": self.reading.quiet}
+        options["batch_size"] = self.reading.batch_size
+        for numbers, rows in grouped(self.describer, tokens, count, self.grouping, **options):
             short = rows if self.components is None else self.components.apply(rows)
             self._check(short, numbers)
             yield numbers, short
@@ -422,11 +386,10 @@ class _Work:
 def _names_of(parts: Sequence[Segments], names: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the names whose rows are stored, and the others, which could not be read."""
     stored = [name for part in parts for record in part.records for name in record["names"]]
-    skipped, waiting = [], iter([*stored, None])
-    expected = next(waiting)
+    skipped, waiting = [], collections.deque(stored)  # in order: a list may have a name twice
     for name in names:
-        if name == expected:
-            expected = next(waiting)
+        if waiting and name == waiting[0]:
+            waiting.popleft()
         else:
             skipped.append(name)
     return stored, skipped
@@ -452,7 +415,7 @@ def _work_folder(out: StrPath | None) -> Iterator[pathlib.Path]:
         try:
             yield folder
         except BaseException as error:
-            if not any(folder.glob("[0-9]*.json")):
+            if not _records(folder):
                 _remove_work(folder)
             elif isinstance(error, InputError):
                 raise InputError(
@@ -464,59 +427,57 @@ def _work_folder(out: StrPath | None) -> Iterator[pathlib.Path]:
         folder.rmdir()
 
 
+def _records(folder: pathlib.Path) -> list[pathlib.Path]:
+    return sorted(folder.glob("[0-9]*.json"))
+
+
 def _remove_work(folder: pathlib.Path) -> None:
     """Remove the rows in a folder, their records first."""
-    for path in (*sorted(folder.glob("[0-9]*.json")), *folder.glob("[0-9]*.npy"), folder / _PLAN):
+    for path in (*_records(folder), *folder.glob("[0-9]*.npy")):
         path.unlink(missing_ok=True)
 
 
 def _reusable(
-    folder: pathlib.Path, plan: dict[str, Any], paths: Sequence[pathlib.Path], *, complete: bool
+    folder: pathlib.Path, plan: str, paths: Sequence[pathlib.Path], *, complete: bool
 ) -> int:
     """Count the images whose stored rows can be used again; remove the rows of all others.
 
     Args:
         folder: the folder of work.
-        plan: what all rows depend on; empty where no work is resumed.
+        plan: digest of what all rows depend on.
         paths: the images.
         complete: whether an image that was skipped is an error now.
 
     Raises:
         InputError: an image was skipped and is an error now.
     """
-    try:
-        if not plan or read_json(folder / _PLAN, "the plan of an extraction") != plan:
-            raise InputError("another plan")
-    except InputError:
-        if any(folder.glob("[0-9]*.json")):
-            warn(f"{folder}: found work of another model or batch size; it starts again")
-        _remove_work(folder)
-    done, broken = 0, False
-    for record in sorted(folder.glob("[0-9]*.json")):
+    done, records = 0, _records(folder)
+    for number, path in enumerate(records):
         try:
-            value = read_json(record, "a record of images")
-            images = paths[done : done + value["count"]]
-            unusable = value["images"] != _digest(images)
-            skipped = value["count"] > len(value["names"])
+            record = read_json(path, "a record of images")
+            images = paths[done : done + record["count"]]
+            is_usable = record["work"] == _digest(plan, images)
         except (InputError, LookupError, TypeError):
-            unusable, skipped = True, False
-        if unusable and not broken:
-            warn(f"{record}: found work on other images, or damaged; from there on it starts again")
-        broken = broken or unusable
-        if broken:
-            record.unlink()
-            record.with_suffix(".npy").unlink(missing_ok=True)
-            continue
-        if skipped and complete:
-            for path in images:
-                read_pixels(path)  # raises for the image that was skipped
+            is_usable = False
+        if not is_usable:
+            warn(
+                f"{path}: found work of another model, batch size or images, or damaged; from "
+                "there on it starts again"
+            )
+            for old in records[number:]:
+                old.unlink()
+                old.with_suffix(".npy").unlink(missing_ok=True)
+            break
+        if complete and len(record["names"]) < record["count"]:
+            for image in images:
+                read_pixels(image)  # raises for the image that was skipped
         done += len(images)
     return done
 
 
-def _digest(paths: Sequence[pathlib.Path]) -> str:
-    """Compute a digest of the names, sizes and times of image files."""
-    files = hashlib.sha256()
+def _digest(plan: str, paths: Sequence[pathlib.Path]) -> str:
+    """Compute a digest of a plan, and of the names, sizes and times of image files."""
+    files = hashlib.sha256(plan.encode())
     for path in paths:
         with contextlib.suppress(OSError):  # reported when it is read
             there = file_of(path).stat()
@@ -532,37 +493,6 @@ def _is_joined(out: pathlib.Path, digest: str) -> bool:
     return read_json(record_of(out), "a record of descriptors").get(_SHARES) == digest
 
 
-def _components(
-    pca: StrPath | Pca | None,
-    describer: Describer,
-    weights: StrPath | None,
-    *,
-    unit: bool,
-    verify: bool,
-) -> Pca | None:
-    """Load components, and check that they fit the model and, for pairs, give unit vectors."""
-    if pca is None:
-        if unit:
-            from crisalad_jax.nn.config import check_unit_length
-
-            check_unit_length(describer.config, "--pairs")
-        return None
-    components = pca if isinstance(pca, Pca) else load_pca(pca, verify=verify)
-    components.check(describer.config.descriptor_dim, "model" if weights is None else str(weights))
-    if unit and not components.config.renormalise:
-        raise InputError(
-            f"--pairs: found {'components' if isinstance(pca, Pca) else pca}, which leaves lengths "
-            "as they are, expected components that make unit vectors, which are paired by cosine"
-        )
-    return components
-
-
-def _words(pca: StrPath | Pca | None) -> str | None:
-    if pca is None:
-        return None
-    return f"{len(pca.components)} components" if isinstance(pca, Pca) else str(pca)
-
-
 def _listed(
     images: StrPath | Sequence[StrPath],
     root: StrPath | None,
@@ -574,9 +504,7 @@ def _listed(
         source = open_source(images, fps=fps, on_bad_image=reading.on_bad_image)
         inside = _inside(source.root, root) if root is not None else pathlib.PurePath()
         return source.paths, [(inside / name).as_posix() for name in source.names]
-    paths = [name_frame(pathlib.Path(path)) for path in images]
-    if not paths:
-        raise InputError("images: found none, expected at least one")
+    paths = [name_frame(pathlib.Path(path)) for path in as_list("images", images)]
     names = [(path if root is None else _inside(path, root)).as_posix() for path in paths]
     check_lines(names, "images")
     return paths, names
@@ -598,10 +526,6 @@ def _others(
         return None
     listed, descriptors = read_descriptors(database, verify=verify)
     check_names(pairs, listed)
-    if descriptors.shape[1] != length:
-        raise InputError(
-            f"{database}: found descriptors of {descriptors.shape[1]} numbers, expected {length} "
-            "as of these images"
-        )
+    as_rows(descriptors, str(database), length)
     check_all_rows(descriptors, str(database), unit=True)
     return listed, descriptors

@@ -6,6 +6,7 @@ part of them. What either misses is measured against the exact search: `recall_a
 Descriptors of thousands of numbers are reduced first (`pca`).
 """
 
+import hashlib
 import math
 import os
 import pathlib
@@ -15,10 +16,10 @@ from typing import Any, Literal, NamedTuple
 import faiss as _faiss
 import numpy as np
 
-from crisalad_jax.config.checks import choose
-from crisalad_jax.retrieval.chunks import WIDE, as_rows, check_rows, sample
+from crisalad_jax.config.checks import check_count, choose
+from crisalad_jax.retrieval.chunks import WIDE, as_rows, as_unit_rows, sample
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.utils.checksums import append_checksum, check_appended
+from crisalad_jax.utils.checksums import ChangedFileError, sha256_of, tell_unchecked
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source
 from crisalad_jax.utils.progress import progress_bar
@@ -80,17 +81,9 @@ class Index(NamedTuple):
             InputError: queries of another length, not finite or not of unit length; k or effort
                 below 1.
         """
-        for name, value in (("k", k), ("effort", effort)):
-            if value is not None and value < 1:
-                raise InputError(f"{name}: found {value}, expected at least 1")
-        queries = as_rows(queries, "queries")
-        if queries.shape[1] != self.faiss_index.d:
-            raise InputError(
-                f"queries: found descriptors of length {queries.shape[1]}, expected "
-                f"{self.faiss_index.d} as in the index"
-            )
-        check_rows(queries, "queries", range(len(queries)), unit=True)
-        queries = np.ascontiguousarray(queries, WIDE)
+        check_count("k", k)
+        check_count("effort", 1 if effort is None else effort)
+        queries = as_unit_rows(queries, "queries", self.faiss_index.d)
         k = min(k, self.size)
         if self.kind == "hnsw":
             chosen = faiss.SearchParametersHNSW(efSearch=effort or max(_LEAST_EFFORT, 2 * k))
@@ -134,15 +127,10 @@ def build(
     shapes = [part.shape for part in parts()]
     count, length = sum(rows for rows, _ in shapes), shapes[0][1]
     index = _graph(length, seed) if kind == "hnsw" else _trained_lists(count, length, parts, seed)
-    start = 0
     with progress_bar(kind, count, "rows", quiet=quiet) as bar:
         for part in parts():
-            with np.errstate(over="ignore"):  # what overflows is reported
-                wide = np.ascontiguousarray(part, WIDE)
-            check_rows(wide, "database", range(start, start + len(wide)), unit=True)
-            index.add(wide)
-            start += len(wide)
-            bar.advance(len(wide))
+            index.add(as_unit_rows(part, "database"))
+            bar.advance(len(part))
     return Index(kind, index)
 
 
@@ -198,7 +186,7 @@ def save_index(path: str | os.PathLike[str], index: Index) -> None:
             faiss.write_index(index.faiss_index, str(temporary))
         except RuntimeError as error:
             raise InputError(f"{path}: cannot be written: {_first_line(error)}") from error
-        append_checksum(temporary)
+        _append_checksum(temporary)
 
 
 def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
@@ -214,7 +202,7 @@ def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
     path = pathlib.Path(path)
     check_source(path, "a faiss index")
     if verify:
-        check_appended(path)
+        _check_appended(path)
     try:
         index = faiss.read_index(str(path))
     except (RuntimeError, MemoryError) as error:
@@ -229,7 +217,7 @@ def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
 
 
 def _first_line(error: BaseException) -> str:
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 def recall_against_exact(found: Int[np.ndarray, "q k"], exact: Int[np.ndarray, "q k"]) -> float:
@@ -249,3 +237,36 @@ def recall_against_exact(found: Int[np.ndarray, "q k"], exact: Int[np.ndarray, "
         )
     pairs = zip(found, exact, strict=True)
     return sum(np.intersect1d(a, b).size for a, b in pairs) / exact.size
+
+
+_APPENDED = b"\nsha256 "
+_APPENDED_SIZE = len(_APPENDED) + 64 + 1
+
+
+def _append_checksum(path: pathlib.Path) -> None:
+    """Append a line with the digest of the bytes before it, where readers of the format stop."""
+    line = _APPENDED + sha256_of(path).encode() + b"\n"
+    with path.open("ab") as file:
+        file.write(line)
+
+
+def _check_appended(path: pathlib.Path) -> None:
+    """Check the line that `_append_checksum` wrote; a note tells of a file without one.
+
+    Raises:
+        InputError: the file has other bytes than the line says.
+    """
+    with path.open("rb") as file:
+        size = max(0, os.fstat(file.fileno()).st_size - _APPENDED_SIZE)
+        file.seek(size)
+        line = file.read()
+        if not line.startswith(_APPENDED):
+            tell_unchecked(path)
+            return
+        file.seek(0)
+        digester = hashlib.sha256()
+        while size and (data := file.read(min(size, 2**20))):
+            digester.update(data)
+            size -= len(data)
+    if line != _APPENDED + digester.hexdigest().encode() + b"\n":
+        raise ChangedFileError(path)

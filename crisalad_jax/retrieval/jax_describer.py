@@ -36,6 +36,11 @@ class JaxDescriber:
         """Check that the parameters are of the configuration, and cast them once."""
         check_params(params, config)
         self.config = config
+        self.preparation = Preparation(
+            config.image_size, config.preprocessing, config.side_multiple
+        )
+        self.row_length = config.unprojected_dim
+        self.row_dtype = "float64" if config.compute_dtype == "float64" else "float32"
         self._given, self._params = params, cast_params(params, config)
         self._placed: tuple[int, Devices, Crisalad] | None = None
         """A batch size, the devices that share such a batch, and the parameters on them."""
@@ -44,22 +49,6 @@ class JaxDescriber:
     def digest(self) -> str:
         """The `model_hash` of the model."""
         return model_hash(self._given, self.config)
-
-    @property
-    def preparation(self) -> Preparation:
-        """How images are prepared."""
-        config = self.config
-        return Preparation(config.image_size, config.preprocessing, config.side_multiple)
-
-    @property
-    def row_length(self) -> int:
-        """Number of values in the row of an image's tokens."""
-        return self.config.unprojected_dim
-
-    @property
-    def row_dtype(self) -> str:
-        """Type of the values in rows of tokens."""
-        return "float64" if self.config.compute_dtype == "float64" else "float32"
 
     def check_size(self, size: Size) -> None:
         """Raise InputError for a height and width that the model cannot describe."""

@@ -34,6 +34,11 @@ class Neighbours(NamedTuple):
     indices: Int64[np.ndarray, "q k"]
     similarities: Float32[np.ndarray, "q k"]
 
+    def in_order(self) -> "Neighbours":
+        """Sort each query's neighbours by falling similarity, and then by index."""
+        order = np.lexsort((self.indices, -self.similarities))
+        return Neighbours(*(np.take_along_axis(part, order, axis=1) for part in self))
+
 
 class Products(NamedTuple):
     """Products in float32 of database rows and some queries."""

@@ -20,6 +20,7 @@ from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Float, Float32, Float64
 
 if TYPE_CHECKING:
+    from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.layers import Linear
     from crisalad_jax.nn.projection import ProjectionConfig
 
@@ -71,38 +72,18 @@ class Pca(NamedTuple):
 
         Raises:
             InputError: descriptors of another length than those that were fitted, no matrix, or
-                rows that are not finite; where they are to be unit vectors, one that lies at the
-                mean.
+                rows that are not finite.
         """
+        descriptors = as_rows(descriptors, "descriptors", len(self.mean))
         reduced = np.empty((len(descriptors), len(self.components)), np.float32)
-        start = 0
-        for part in self.parts(descriptors):
-            reduced[start : start + len(part)] = part
-            start += len(part)
-        return reduced
-
-    def parts(
-        self, descriptors: Float[np.ndarray, "n d"]
-    ) -> Iterator[Float32[np.ndarray, "rows dim"]]:
-        """Yield the reduced descriptors of `apply` in order, a few thousand rows at a time.
-
-        Raises:
-            InputError: what `apply` raises.
-        """
-        descriptors = as_rows(descriptors, "descriptors")
-        self.check(descriptors.shape[1], "descriptors")
         size = _rows_at_a_time(len(self.mean))
         for start, rows in blocks(descriptors, "descriptors", size, unit=False):
             part = (rows - self.mean) @ self.components.T / self._scale
             if self.config.renormalise:
-                lengths = np.linalg.norm(part, axis=1, keepdims=True)
-                if not lengths.all():
-                    raise InputError(
-                        f"descriptors: row {start + np.argmin(lengths)} lies at the mean, expected "
-                        "one with a direction from there"
-                    )
-                part /= lengths
-            yield part
+                with np.errstate(invalid="ignore"):  # one at the mean has no direction: NaN
+                    part /= np.linalg.norm(part, axis=1, keepdims=True)
+            reduced[start : start + len(part)] = part
+        return reduced
 
     @property
     def _scale(self) -> Float32[np.ndarray, "*dim"]:
@@ -136,6 +117,35 @@ class Pca(NamedTuple):
                 f"{name}: found descriptors of length {length}, expected {len(self.mean)} as the "
                 "components were fitted to"
             )
+
+
+def shortened_length(
+    pca: Pca | None, config: "ModelConfig", name: str, *, unit: bool = False
+) -> int:
+    """Check that components fit a model; return the length of the descriptors that they leave.
+
+    Args:
+        pca: the components; None leaves descriptors as they are.
+        config: the model's configuration.
+        name: what messages call the model, or what asks for the descriptors.
+        unit: whether these have to be unit vectors.
+
+    Raises:
+        InputError: the components were fitted to other descriptors, or no unit vectors are left.
+    """
+    if pca is None:
+        if unit:
+            from crisalad_jax.nn.config import check_unit_length
+
+            check_unit_length(config, name)
+        return config.descriptor_dim
+    pca.check(config.descriptor_dim, name)
+    if unit and not pca.config.renormalise:
+        raise InputError(
+            f"{name}: found components that leave lengths as they are, expected some that make "
+            "unit vectors, which are compared by cosine"
+        )
+    return len(pca.components)
 
 
 def fit_pca(
@@ -181,8 +191,6 @@ def fit_pca(
     descriptors = as_rows(descriptors, name)
     total, length = descriptors.shape
     count = total if samples is None else min(samples, total)
-    if count < 2:
-        raise InputError(f"{name}: found {count} to fit to, expected at least 2")
     if not 1 <= dim <= min(count - 1, length):
         raise InputError(
             f"dim: found {dim}, expected 1 to {min(count - 1, length)}, the highest rank that "
@@ -288,23 +296,11 @@ def load_pca(path: str | os.PathLike[str], *, verify: bool = True) -> Pca:
     path = pathlib.Path(path)
     expected = f"a file of principal components ({FORMAT!r}), as `crisalad pca` writes it"
     value, arrays = read_sealed(path, FORMAT, expected, verify=verify)
-    if not _fits(arrays):
-        shapes = {name: array.shape for name, array in arrays.items()}
-        raise InputError(
-            f"{path}: found arrays {shapes}, expected mean (d,), components (dim, d), variances "
-            "(dim,) and total () of finite float32, the last two above zero"
-        )
-    return Pca(**arrays, config=from_plain(PcaConfig, value.get("config"), source=str(path)))
-
-
-def _fits(arrays: dict[str, np.ndarray]) -> bool:
-    """Return whether arrays are those of principal components."""
-    if arrays.keys() != set(_ARRAYS):
-        return False
-    dim, length = (*arrays["components"].shape, 0, 0)[:2]
+    dim, length = (*arrays.get("components", np.empty(0)).shape, 0, 0)[:2]
     shapes = {"mean": (length,), "components": (dim, length), "variances": (dim,), "total": ()}
-    return (
-        {name: array.shape for name, array in arrays.items()} == shapes
-        and all(array.dtype == WIDE and np.isfinite(array).all() for array in arrays.values())
-        and min(arrays["variances"].min(initial=1), arrays["total"].min()) > 0
-    )
+    found = {name: array.shape for name, array in arrays.items()}
+    if found != shapes or not all(
+        array.dtype == WIDE and np.isfinite(array).all() for array in arrays.values()
+    ):
+        raise InputError(f"{path}: found arrays {found}, expected {shapes} of finite float32")
+    return Pca(**arrays, config=from_plain(PcaConfig, value.get("config"), source=str(path)))

@@ -16,12 +16,11 @@ from jaxtyping import Array, Float, Float32, Int32
 from crisalad_jax.config.checks import check_count
 from crisalad_jax.data.loader import one_ahead
 from crisalad_jax.retrieval.chunks import (
-    WIDE,
     Block,
     as_sides,
+    as_unit_rows,
     blocks,
     check_all_rows,
-    check_rows,
     gathered,
 )
 from crisalad_jax.retrieval.neighbours import QUERY_CHUNK, Neighbours, Products, multiply, nearest
@@ -77,9 +76,7 @@ def search(
     for name, value in (("k", k), ("chunk", chunk)):
         check_count(name, value)
     database, queries = as_sides(database, queries)
-    with np.errstate(over="ignore"):  # what overflows is reported
-        queries = np.ascontiguousarray(queries, WIDE)
-    check_rows(queries, "queries", range(len(queries)), unit=True)
+    queries = as_unit_rows(queries, "queries")
     on_host = target().platform == "cpu"
     return _search(database, queries, k, chunk, on_host=on_host, label=label, quiet=quiet)
 

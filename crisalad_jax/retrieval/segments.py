@@ -99,7 +99,7 @@ class Segments:
         """
         rows = np.ascontiguousarray(rows, self._dtype)
         path = self.path(len(self))
-        whole = {**record, "sha256": hashlib.sha256(rows.data).hexdigest()}
+        whole = {**record, "sha256": _sha256(rows, self._dtype)}
         self.store.add(len(self), rows)
         write_record(path, whole)
         self._take(whole, path)
@@ -120,14 +120,15 @@ class Segments:
             InputError: one has changed; the message says in which segment.
         """
         for span, rows in zip(self.spans, self.blocks(), strict=True):
-            if (
-                hashlib.sha256(np.ascontiguousarray(rows, self._dtype).data).hexdigest()
-                != span.sha256
-            ):
+            if _sha256(rows, self._dtype) != span.sha256:
                 raise InputError(
                     f"{self.path(span.first).with_suffix('')}: descriptors {span.first} to "
                     f"{span.first + span.count - 1} have changed since they were written"
                 )
+
+
+def _sha256(rows: np.ndarray, dtype: np.dtype) -> str:
+    return hashlib.sha256(np.ascontiguousarray(rows, dtype).data).hexdigest()
 
 
 class Share(NamedTuple):
@@ -233,29 +234,10 @@ class Shares(NamedTuple):
                 warn(f"{self.folder}: another process joins the shares")
                 yield None
                 return
-            found = [self.result(index) for index in range(self.share.count)]
-            results = [each for each in found if each is not None]
-            if len(results) < len(found):
+            if self.left():  # another process has joined them meanwhile
                 yield None
                 return
-            yield results
+            yield [self.result(index) or {} for index in range(self.share.count)]
             for index in range(self.share.count):
                 self._marker(index).unlink()
         shutil.rmtree(self.folder, ignore_errors=True)
-
-    def check_same_count(self) -> None:
-        """Check that the work in the folder is of as many shares.
-
-        Raises:
-            InputError: it is of another count.
-        """
-        others = [
-            path.name
-            for path in self.folder.glob("[0-9]*-of-[0-9]*")
-            if not path.stem.endswith(f"-of-{self.share.count}")
-        ]
-        if others:
-            raise InputError(
-                f"{self.folder}: found {min(others)}, expected shares of {self.share.count}: "
-                "finish those first, or remove the folder"
-            )

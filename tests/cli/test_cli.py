@@ -357,7 +357,7 @@ def no_number(city: pathlib.Path) -> pathlib.Path:
         (without_column, "missing northdeg"),
         (without_file, "Brill_0000001_2020_05_001_1.5_2.5_pano.jpg"),
         (few_images, "found no place with at least 2 images; the largest has 1"),
-        (few_places, "found 2 places, expected at least places_per_batch 3"),
+        (few_places, "found 2 places, expected places_per_batch 3"),
         (no_tables, "found no CSV file"),
         (no_number, "MMXX"),
     ],

@@ -66,7 +66,7 @@ def test_what_does_not_belong_together(files, capfd, tmp_path):
         read_vocabulary(wide, backbone)
     with pytest.raises(InputError, match=r"AnyLocConfig.layer: found 5, expected -2 to 1"):
         read_vocabulary(words, backbone, {"layer": 5})
-    with pytest.raises(InputError, match=r"dinov2.pth: found dict, expected one tensor"):
+    with pytest.raises(InputError, match=r"dinov2.pth: the content is no plain tensor"):
         read_vocabulary(backbone, backbone)
     with pytest.raises(InputError, match=r"one tensor by itself, of shape .3, 64. .*--backbone"):
         read_checkpoint(words)

@@ -69,7 +69,7 @@ def test_bad_input_is_named_before_any_work(capfd, shared, weights, monkeypatch)
         ((*nowhere, "--rerank-weights", weights), ("--rerank-weights: found without --rerank",)),
         (
             (*start, "--rerank", "patch-netvlad:3", "--rerank-weights", weights),
-            ("found a model with aggregator transvpr, expected netvlad",),
+            ("found a model with aggregator transvpr and size rule fixed, expected netvlad",),
         ),
         (
             (*nowhere, "--rerank", "transvpr:3", "--rerank-weights", shared / "no"),

@@ -406,7 +406,7 @@ def test_a_query_that_skips_answers_the_rest(capfd, tmp_path, spoilt, database, 
     fails(
         capfd,
         *("query", asked[1], "--map", tmp_path / "map", *common, "--on-bad-image", "skip"),
-        words=("images: found 1, none of them readable",),
+        words=("images: found 1 images, none of them readable",),
     )
 
 

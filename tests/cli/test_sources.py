@@ -240,7 +240,7 @@ def test_a_watch_ends_by_a_signal_with_its_summary(shared, town_map, tmp_path, n
         (("--camera", "x.avi"), "camera: found 'x.avi', expected a number from 0, a URL or a vid"),
         (("--watch", "{map}/none"), "none: found nothing, expected a folder to watch"),
         (("{map}/map.json", "--window", "0"), "window: found 0, expected at least 1"),
-        ((), "images: found none, expected images or folders of them"),
+        ((), "images: found none, expected at least one image"),
     ],
 )
 def test_bad_live_queries_are_one_line(town_map, capfd, flags, words):

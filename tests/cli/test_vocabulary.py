@@ -34,7 +34,7 @@ def test_it_leaves_a_whole_model(capfd, shared, tmp_path):
     found, config = load_weights(out)
     assert config == ANYLOC
     paths = list_images(shared / "town")
-    assert_equal(found, with_vocabulary(fresh, ANYLOC, paths, seed=3, batch_size=BATCH))
+    assert_equal(found, with_vocabulary(Model(fresh, ANYLOC), paths, seed=3, batch_size=BATCH))
     succeeds(
         capfd,
         *("extract", "--weights", out, "--images", shared / "town", "--quiet"),
@@ -146,6 +146,6 @@ def test_a_plug_ins_aggregator(capfd, shared, tmp_path, monkeypatch):
     params, config = load_weights(out)
     assert (config.aggregator.clusters, config.aggregator.layer) == (5, 2)
     paths = list_images(shared / "town")
-    assert_equal(with_vocabulary(params, config, paths, batch_size=BATCH), params)
+    assert_equal(with_vocabulary(Model(params, config), paths, batch_size=BATCH), params)
     succeeds(capfd, "extract", "--weights", out, "--out", tmp_path / "d.npy", *images)
     assert np.load(tmp_path / "d.npy").shape == (12, 5)

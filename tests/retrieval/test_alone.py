@@ -67,7 +67,7 @@ def test_grey_is_described_as_its_three_channels(params: Crisalad, shape: tuple[
 def test_nothing_and_other_types_are_refused(params: Crisalad) -> None:
     with pytest.raises(InputError, match="images: found none, expected at least one image"):
         describe_images(Model(params, MODEL), [])
-    with pytest.raises(InputError, match="files: found none, expected at least one image file"):
+    with pytest.raises(InputError, match="files: found none, expected at least one image"):
         describe_files(Model(params, MODEL), [])
     with pytest.raises(InputError, match="image: found float64 of shape"):
         describe_images(Model(params, MODEL), [np.zeros((9, 9, 3))])

@@ -58,17 +58,6 @@ def test_h5_with_a_name_twice_is_not_written(tmp_path):
     assert names_in(tmp_path) == set()
 
 
-@pytest.mark.parametrize("suffix", ["npy", "h5"])
-def test_an_older_file_is_replaced(tmp_path, suffix):
-    path = tmp_path / f"map.{suffix}"
-    write_descriptors(path, DESCRIPTORS, NAMES)
-    first = path.read_bytes()
-    write_descriptors(path, DESCRIPTORS[:1], NAMES[:1])
-    assert path.read_bytes() != first
-    write_descriptors(path, DESCRIPTORS, NAMES)
-    assert len(path.read_bytes()) == len(first)
-
-
 @pytest.mark.parametrize("name", ["map.csv", "map", "map.npy.gz", "map.NPY"])
 def test_another_suffix_is_refused_before_any_work(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -77,17 +66,6 @@ def test_another_suffix_is_refused_before_any_work(name, tmp_path, monkeypatch):
         with pytest.raises(InputError, match=words):
             refuse(name)
     assert names_in(tmp_path) == set()
-
-
-@pytest.mark.parametrize("suffix", ["npy", "h5"])
-def test_what_was_written_is_read(tmp_path, suffix):
-    path = tmp_path / f"map.{suffix}"
-    write_descriptors(path, DESCRIPTORS, NAMES)
-    names, descriptors = read_descriptors(path)
-    found = dict(zip(names, descriptors, strict=True))
-    assert set(found) == set(NAMES)
-    for name, expected in zip(NAMES, DESCRIPTORS, strict=True):
-        np.testing.assert_array_equal(found[name], expected)
 
 
 def write_h5(path: pathlib.Path, **arrays: np.ndarray) -> None:

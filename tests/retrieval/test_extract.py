@@ -64,21 +64,13 @@ def test_into_a_file(params, town, expected, tmp_path):
     assert (record["seed"], record["grouping"], record["pca"]) == (3, "single", None)
 
 
-def test_pairs_without_a_file_of_descriptors(params, town, tmp_path):
-    found = run(params, town, pairs=tmp_path / "pairs.txt", k=1)
-    lines = (tmp_path / "pairs.txt").read_text().splitlines()
-    assert lines == [f"{a} {b}" for a, b in found.pairs]
-    assert [a for a, _ in found.pairs] == found.names
-    assert [path.name for path in tmp_path.iterdir()] == ["pairs.txt"]
-
-
 def test_components_in_memory(params, town, expected, tmp_path):
     fitted = fit_pca(expected, 3)
     found = run(params, town, tmp_path / "d.npy", pca=fitted)
     np.testing.assert_array_equal(found.descriptors, fitted.apply(expected))
     assert json.loads((tmp_path / "d.npy.json").read_text())["pca"] == "3 components"
     loose = fit_pca(expected, 3, PcaConfig(renormalise=False))
-    with pytest.raises(InputError, match="--pairs: found components, which leaves lengths"):
+    with pytest.raises(InputError, match="--pairs: found components that leave lengths"):
         run(params, town, pca=loose, pairs=tmp_path / "pairs.txt")
 
 
@@ -173,14 +165,6 @@ def test_a_share_that_another_process_joins_says_so(params, town, tmp_path, monk
     assert not first.joined_elsewhere
     whole = run(params, town).names
     assert [*first.names, *found.names] == whole
-
-
-def test_a_share_of_other_images_is_not_joined(params, town, tmp_path):
-    out, paths = tmp_path / "d.npy", list_images(town)
-    run(params, paths, out, share="0/2")
-    with pytest.warns(Note, match=r"0-of-2\.json: found a share of other images or settings"):
-        assert run(params, paths[:-1], out, share="1/2").shares_left == 1
-    assert not out.exists()
 
 
 def test_memory_does_not_grow_with_the_images(params, town, expected, tmp_path, monkeypatch):

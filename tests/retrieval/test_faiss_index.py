@@ -81,11 +81,6 @@ def test_the_parameters_are_those_that_are_documented(places, indexes):
     assert graph.hnsw.efConstruction == 128
 
 
-def test_another_seed_makes_other_lists(places, indexes):
-    other = build("ivf-pq", places[0], seed=4).search(places[1], 10)
-    assert not np.array_equal(other.similarities, indexes["ivf-pq"].search(places[1], 10)[1])
-
-
 def test_the_same_seed_makes_the_same_lists_of_a_memory_map(places, indexes, tmp_path, monkeypatch):
     np.save(tmp_path / "database.npy", places[0].astype(np.float16))
     mapped = np.load(tmp_path / "database.npy", mmap_mode="r")
@@ -116,13 +111,6 @@ def test_what_is_saved_comes_back(kind, places, indexes, tmp_path):
     assert [one.name for one in path.parent.iterdir()] == ["some.index"]
 
 
-def test_a_database_smaller_than_k_gives_what_it_has():
-    rows = np.eye(4, dtype=np.float32)
-    found = build("hnsw", rows).search(rows[:2], 20)
-    assert found.indices.shape == (2, 4)
-    np.testing.assert_array_equal(found.indices[:, 0], [0, 1])
-
-
 def test_neighbours_that_are_not_found_are_minus_one(places, indexes):
     """Of one list of some 39 vectors, 100 are wanted."""
     found = indexes["ivf-pq"].search(places[1], 1000, effort=1)
@@ -144,7 +132,7 @@ def test_bad_input_is_named(places, indexes, tmp_path):
         ),
         (
             lambda: indexes["hnsw"].search(queries[:, :5], 3),
-            "^queries: found descriptors of length 5, expected 16",
+            r"^queries: found shape \(50, 5\), expected \(images, 16\)",
         ),
         (lambda: indexes["hnsw"].search(queries, 0), "^k: found 0, expected at least 1"),
         (lambda: indexes["ivf-pq"].search(queries, 1, 0), "^effort: found 0, expected at least 1"),

@@ -111,14 +111,6 @@ def test_a_change_of_size_ends_a_batch(folder: pathlib.Path) -> None:
         list(batches_of(NATIVE, paths, batch_size=2))
 
 
-def test_images_that_nobody_could_read_have_the_models_size(folder: pathlib.Path) -> None:
-    for path in paths_in(folder)[:2]:
-        path.write_bytes(b"no image")
-    first, *_ = batches_of(NATIVE, paths_in(folder), batch_size=2, on_bad_image="skip")
-    assert first.images.shape == (2, *MODEL.image_size, 3)
-    assert not first.valid.any()
-
-
 def test_an_image_that_the_model_cannot_describe_is_named(folder: pathlib.Path) -> None:
     assert cv2.imwrite(str(folder / "8.png"), np.zeros((14, 14, 3), np.uint8))
     assert cv2.imwrite(str(folder / "9.png"), np.zeros((1, 4200, 3), np.uint8))
@@ -155,11 +147,7 @@ def test_descriptors_of_all_sizes_in_order(folder: pathlib.Path, tmp_path: pathl
         reading=Reading(batch_size=2, quiet=True),
     )
     again = index(
-        Model(params, config),
-        folder,
-        place,
-        weights=weights,
-        reading=Reading(quiet=True),
+        Model(params, config), folder, place, weights=weights, reading=Reading(quiet=True)
     )
     assert (again.added, again.there) == (0, len(SHAPES))
     with pytest.raises(InputError, match=r"found images at 42 x 56, .* expected native size, "):
@@ -183,32 +171,11 @@ def test_descriptors_of_all_sizes_in_order(folder: pathlib.Path, tmp_path: pathl
     assert answers.neighbours.indices.ravel().tolist() == [2, 3]
 
 
-def test_a_map_of_another_way_than_its_weights(
-    folder: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
-    """The same parameters: the map keeps its way, and is asked by it."""
-    params, weights, place = random_params(ALONE), tmp_path / "w.safetensors", tmp_path / "map"
-    save_weights(weights, Model(params, ALONE))
-    words = ["bicubic", "floats"]
-    index(
-        Model(params, ALONE.resized(None, words)),
-        folder,
-        place,
-        weights=weights,
-        reading=Reading(quiet=True),
-    )
-    with Map.open(place) as places:
-        assert places.config == ALONE.resized(None, words)
-        answers = query(places, folder, k=1, reading=Reading(quiet=True))
-    # In float32 a unit vector with itself.
-    np.testing.assert_allclose(answers.neighbours.similarities, 1, atol=1e-5)
-
-
 def test_local_features_need_a_fixed_size() -> None:
     config = dataclasses.replace(
         ALONE, image_size=(56, 56), aggregator=NetVladConfig(clusters=4)
     ).resized(None, ["native"])
-    words = "rerank: found a model with size rule native, expected fixed"
+    words = "rerank: found a model with aggregator netvlad and size rule native, expected"
     with pytest.raises(InputError, match=words):
         Reranking("patch-netvlad", 2).check(config)
 

@@ -105,24 +105,11 @@ def test_frames_before_tell_twins_apart():
     assert followed.probabilities[2] > 0.9
 
 
-def test_a_camera_that_was_carried_elsewhere_is_found_again():
-    database = np.eye(40)
-    way = [3, 4, 5, 30, 31, 32]
-    followed = BayesFilter().follow(database[way], database @ database.mean(axis=0))
-    assert followed.places[[0, 2, 4, 5]].tolist() == [3, 5, 31, 32]
-
-
 def test_a_frame_that_tells_nothing_leaves_the_prediction():
     settings = BayesFilter(adapt=False)
     state = settings.step(settings.start(np.zeros(6)), np.eye(6)[2])
     after = settings.step(state, np.full(6, 0.25))
     np.testing.assert_allclose(after.belief, settings.predict(state), rtol=1e-14)
-
-
-def test_a_map_of_one_image_is_where_the_camera_is():
-    followed = BayesFilter().follow(np.full((3, 1), 0.5), np.ones(1))
-    assert followed.places.tolist() == [0, 0, 0]
-    assert followed.probabilities.tolist() == [1, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -186,25 +173,6 @@ def walk(rate: float, seed: int, noise: float) -> tuple[np.ndarray, np.ndarray]:
     second = times.astype(int)
     exact = corners[second] * (1 - part) + corners[second + 1] * part
     return times, unit(exact + np.random.default_rng(seed).normal(0, noise, exact.shape))
-
-
-@pytest.mark.parametrize("noise", [0.6, 0.9, 1.2])
-@pytest.mark.parametrize(("of_map", "of_frames"), [(5, 1), (1, 5), (5, 5), (30, 1)])
-def test_frames_of_another_rate_than_the_map_find_more_than_single_ones(of_map, of_frames, noise):
-    """Within a second is right. Counting images, 1 a second in 5 a second halves the recall."""
-    there, database = walk(of_map, 2, 0.1)
-    when, queries = walk(of_frames, 3, noise)
-    similarities, common = queries @ database.T, database @ database.mean(axis=0)
-
-    def recall(places: np.ndarray) -> float:
-        return float(np.mean(np.abs(there[places] - when) <= 1))
-
-    single = recall(similarities.argmax(axis=1))
-    moved = np.full(len(queries), 1 / of_frames)
-    filtered = recall(BayesFilter().follow(similarities, common, there, moved).places)
-    assert filtered > single
-    if of_map > of_frames:  # the test can fail
-        assert recall(BayesFilter().follow(similarities, common).places) < single
 
 
 @pytest.mark.parametrize("along", [[0.0, 2.0, 1.0], [0.0, 1.0]])

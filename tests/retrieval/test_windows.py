@@ -76,7 +76,7 @@ def test_windows_that_mean_nothing_are_refused():
     with pytest.raises(InputError, match="window: found 0, expected at least 1"):
         check_window(MODEL, 0)
     alone = dataclasses.replace(MODEL, cross_image=CrossImageConfig(layers=0))
-    with pytest.raises(InputError, match="window: found 2 with a model without a cross-image enc"):
+    with pytest.raises(InputError, match="window: found 2, expected 1 of a model without a cross"):
         check_window(alone, 2)
     check_window(alone, 1)
 

@@ -7,8 +7,8 @@ not used, so that a map that grew never answers from an old index.
 import hashlib
 import pathlib
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import sample
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.neighbours import Neighbours
+from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
-from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float32
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
@@ -64,9 +64,9 @@ class Approximate(NamedTuple):
         numbers = self.index.search(queries, min(count, max(least, each * k))).indices
         similarities = store.similarities(queries, np.maximum(numbers, 0))
         similarities[numbers < 0] = -np.inf
-        order = np.lexsort((numbers, -similarities))[:, :k]
-        numbers = np.take_along_axis(numbers, order, axis=1)
-        similarities = np.take_along_axis(similarities, order, axis=1)
+        numbers, similarities = (
+            part[:, :k] for part in Neighbours(numbers, similarities).in_order()
+        )
         few = np.flatnonzero(numbers[:, -1] < 0)
         if few.size:
             numbers[few], similarities[few] = store.search(queries[few], k, count)
@@ -87,9 +87,6 @@ def open_approximate(
     from crisalad_jax.retrieval.faiss_index import load_index
 
     index = load_index(path, verify=verify)
-    count = sum(count for _, count, _ in additions)
-    if index.size != count:
-        raise InputError(f"{path}: found {index.size} descriptors, expected {count} as in the map")
     return Approximate(index.kind, index, float(_record(path)["recall"]))
 
 
@@ -110,57 +107,45 @@ def stale_kind(folder: pathlib.Path, additions: Additions) -> str | None:
     return found[0].stem.rpartition("-")[0]
 
 
-def tell_stale(folder: pathlib.Path, additions: Additions) -> None:
-    """Tell of an approximate search that is not used, since it is of fewer or other images."""
-    kind = stale_kind(folder, additions)
-    if kind is not None:
-        warn(
-            f"{folder}: found an approximate search of fewer or other images; the map is searched "
-            f"exactly; `crisalad index --search {kind}` builds it anew"
-        )
+def check_search(kind: str, store: str) -> None:
+    """Check that the descriptors in a store can be searched so.
+
+    Raises:
+        InputError: an unknown kind, or an approximate search of descriptors in Milvus.
+    """
+    choose("search", kind, SEARCHES)
+    if kind != "exact" and store != "files":
+        raise InputError(f"search: found {kind}, expected exact, as {store} is searched by Milvus")
 
 
 def build_approximate(
-    folder: pathlib.Path,
-    kind: str,
-    additions: Additions,
-    store: object,
-    rows: Callable[[], Iterator[np.ndarray]],
-    *,
-    quiet: bool = True,
+    folder: pathlib.Path, kind: str, segments: Segments, *, quiet: bool = True
 ) -> Approximate | None:
     """Build the approximate search of a map, unless it is there; "exact" removes any.
 
     Args:
         folder: the map's, whose lock is held.
-        kind: of `SEARCHES`.
-        additions: to the map.
-        store: of its descriptors.
-        rows: yields them from the first on.
+        kind: of `SEARCHES`, and of what `check_search` takes.
+        segments: the map's descriptors.
         quiet: no progress bar.
 
     Raises:
-        InputError: an unknown kind; descriptors in Milvus, or too few of them; a full disk.
+        InputError: too few descriptors; a full disk.
     """
-    choose("search", kind, SEARCHES)
     if kind == "exact":
         shutil.rmtree(folder / FOLDER, ignore_errors=True)
         return None
-    if not isinstance(store, FileStore):
-        raise InputError(
-            f"search: found {kind}, expected exact, as a map in Milvus is searched by Milvus"
-        )
-    path = folder / FOLDER / f"{kind}-{_digest(additions)}.index"
+    path = folder / FOLDER / f"{kind}-{_digest(segments.spans)}.index"
     if path.exists():
-        return open_approximate(folder, additions, verify=True)
+        return open_approximate(folder, segments.spans, verify=True)
     from crisalad_jax.retrieval.faiss_index import build, recall_against_exact, save_index
 
-    count = sum(count for _, count, _ in additions)
-    index = build(kind, rows, seed=_SEED, quiet=quiet)  # pyright: ignore[reportArgumentType]
+    count, store = len(segments), cast(FileStore, segments.store)
+    index = build(cast(Any, kind), segments.blocks, seed=_SEED, quiet=quiet)
     built = Approximate(index.kind, index, 0.0)
     places = sample(count, min(SAMPLE, count), _SEED)
     k = min(NEIGHBOURS + 1, count)
-    queries = store.rows(places)
+    queries = store.rows(places).astype(np.float32)
     sides = built.search(store, queries, k, count), store.search(queries, k, count)
     found, exact = (_others(places, side.indices) for side in sides)
     built = built._replace(recall=recall_against_exact(found, exact) if exact.size else 1.0)

@@ -5,22 +5,18 @@ import dataclasses
 import os
 import pathlib
 import shutil
-from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-import numpy as np
-
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.checks import choose
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import ImageSource, check_rate_used, open_source
 from crisalad_jax.data.video import file_of, frame_time
-from crisalad_jax.retrieval.describe import Described, described
+from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
 from crisalad_jax.retrieval.describer import Describer, describer_of
-from crisalad_jax.retrieval.maps.approximate import SEARCHES
-from crisalad_jax.retrieval.maps.map import Map, MapImage, open_for_appending
+from crisalad_jax.retrieval.maps.approximate import check_search
+from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import (
     SHARES,
     MapMetadata,
@@ -31,8 +27,7 @@ from crisalad_jax.retrieval.maps.metadata import (
     read_components,
     read_metadata,
 )
-from crisalad_jax.retrieval.maps.recovery import check_no_record_lost
-from crisalad_jax.retrieval.maps.store import store_name
+from crisalad_jax.retrieval.maps.store import check_store, store_name
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.segments import SEGMENT, Share, Shares, digest_of
 from crisalad_jax.utils.errors import InputError
@@ -43,9 +38,6 @@ from crisalad_jax.utils.progress import progress_bar
 if TYPE_CHECKING:
     from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.model import Model
-
-_TOGETHER = 4096
-"""Number of images of a share that are joined as one addition: a search opens fewer files."""
 
 
 @brief
@@ -98,44 +90,39 @@ def index_images(
     """
     names, sizes, new = _new_images(target, source)
     target.fitted(names, positions)  # checks them before any work
-    stay = sum(target.image(name) is not None for name in positions.of)
-    waiting: list[Described] = []
-    unreadable: list[str] = []
-    known, there = len(target), len(source.paths) - len(new)
+    result = _so_far(target, target.metadata, source, positions)
+    root, total, quiet = real_path(source.root).as_posix(), len(source.paths), reading.quiet
+    stream = described(describer, new, reading, components=target.components)
+    for part in joined(shown(stream, "images", total, quiet=quiet, done=result.there), SEGMENT):
+        result.unreadable.extend(names[i] for i in part.unreadable)
+        if len(part.indices):
+            some, bytes_ = ([column[i] for i in part.indices] for column in (names, sizes))
+            target.append(some, bytes_, part.descriptors, root=root, positions=positions)
+    return _with_added(result, target, result.images)
 
-    def append() -> None:
-        chosen = [int(i) for part in waiting for i in part.indices]
-        if chosen:
-            target.append(
-                [names[i] for i in chosen],
-                [sizes[i] for i in chosen],
-                np.concatenate([part.descriptors for part in waiting]),
-                root=real_path(source.root).as_posix(),
-                positions=positions,
-            )
-        waiting.clear()
 
-    with progress_bar(
-        "images", len(source.paths), "images", quiet=reading.quiet, done=there
-    ) as bar:
-        for part in described(describer, new, reading, components=target.components):
-            waiting.append(part)
-            unreadable += [names[i] for i in part.unreadable]
-            bar.advance(len(part.indices) + len(part.unreadable))
-            if sum(len(each.indices) for each in waiting) >= SEGMENT:
-                append()
-        append()
-    added = target.images[known:]
+def _so_far(
+    target: Map | None, metadata: MapMetadata, source: ImageSource, positions: Positions
+) -> Indexed:
+    """Count what a map has of a source before any image is added; None has nothing."""
+    there = set[str]() if target is None else {image.name for image in target.images}
+    listed = set(source.names)
     return Indexed(
-        added=len(added),
-        there=there,
-        positions=sum(image.position is not None for image in added),
-        stay=stay,
-        unreadable=unreadable,
-        unmatched=sorted(positions.of.keys() - set(source.names), key=list(positions.of).index),
-        images=len(target),
-        metadata=target.metadata,
+        added=0,
+        there=len(listed & there),
+        positions=0,
+        stay=len(positions.of.keys() & there),
+        unreadable=[],
+        unmatched=[name for name in positions.of if name not in listed],
+        images=len(there),
+        metadata=metadata,
     )
+
+
+def _with_added(result: Indexed, target: Map, known: int) -> Indexed:
+    """Count the images that a map has beyond the first `known`."""
+    located = sum(image.position is not None for image in target.images[known:])
+    return result._replace(added=len(target) - known, positions=located, images=len(target))
 
 
 def _new_images(
@@ -223,26 +210,19 @@ def index(
         4
     """
     describer = describer_of(model)
-    if search is not None:
-        choose("search", search, SEARCHES)
     part = None if share is None else Share.parse(share)
     out = pathlib.Path(out)
     metadata = read_metadata(out)
-    if not has_images(out):
-        check_no_record_lost(out)  # before any work
-        metadata = None  # a map that a kill left without images binds nobody
     source = open_source(images, fps=fps, on_bad_image=reading.on_bad_image)
     check_rate_used(fps, source.paths)
     table = source.positions if positions is None else positions
     if table is None:
         known = utm_positions(source.names)
+        if known.axes == AXES[1] and metadata is None:
+            warn(f"{images}: the names are of several zones of UTM: positions become lat, lon")
     else:
         known = positions_of(table, source.names, images)
-    by_exif = table is None and not known.of
-    if table is None and known.axes == AXES[1] and metadata is None:
-        warn(f"{images}: the names are of several zones of UTM: positions become lat, lon")
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca)
-    reading = reading.fitted(len(source.paths))
     if metadata is None:
         options: dict[str, Any] = {"store": store or "files", "dtype": dtype or "float32"}
         metadata = new_metadata(describer, weights, out, pca=components, **options)
@@ -250,136 +230,115 @@ def index(
         check_model(metadata, out, describer.digest, weights)
         _check_settings(metadata, out, describer.config, dtype, store, components)
         components = read_components(out, metadata)
-    if search not in (None, "exact") and metadata.store != "files":
-        raise InputError(
-            f"search: found {search}, expected exact, as {metadata.store} is searched by Milvus"
-        )
-
-    def describe(target: Map, source: ImageSource, whole: Map | None) -> Indexed:
-        here = _by_exif(whole or target, source) if by_exif else known
-        return index_images(target, describer, source, here, reading)
-
-    def finish(target: Map) -> float | None:
-        if not len(target):
-            raise InputError(f"{images}: found {len(source.paths)} images, none of them readable")
-        return None if search is None else target.build_search(search, quiet=reading.quiet)
-
-    if part is None:
-        with open_for_appending(out, metadata, components) as target:
-            result = describe(target, source, None)
-            result = result._replace(recall=finish(target))
-    else:
-        settings = {
-            "dtype": metadata.dtype,
-            "pca": metadata.pca,
-            "batch_size": reading.batch_size,
-            "config": metadata.config,
-            "digest": describer.digest,
-        }
-        shares = Shares(out / SHARES, part, digest_of(source.names, settings))
-        mine = part.of(len(source.paths), reading.batch_size)
-        own = source._replace(paths=source.paths[mine], names=source.names[mine])
-        result = _index_share(
-            shares, source, own, describe, finish, metadata, components, known, reading.quiet
-        )
+    if search is not None:
+        check_search(search, metadata.store)
+    work = _Indexing(
+        describer=describer,
+        source=source,
+        positions=known,
+        by_exif=table is None and not known.of,
+        metadata=metadata,
+        components=components,
+        search=search,
+        reading=reading.fitted(len(source.paths)),
+    )
+    result = work.alone(out) if part is None else work.share(out, part)
     return result if table is not None else result._replace(stay=0)
 
 
-def _index_share(
-    shares: Shares,
-    source: ImageSource,
-    own: ImageSource,
-    describe: Callable[[Map, ImageSource, Map | None], Indexed],
-    finish: Callable[[Map], float | None],
-    metadata: MapMetadata,
-    components: Pca | None,
-    positions: Positions,
-    quiet: bool,
-) -> Indexed:
-    """Index the images of one share in a map of its own; if it is the last one, join all.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Indexing:
+    """Images to be described, and the map that they are appended to."""
 
-    Raises:
-        InputError: a share of other settings is there; what `describe` and `finish` raise.
-    """
-    out = shares.folder.parent
-    listed = set(source.names)
-    unmatched = [name for name in positions.of if name not in listed]
-    result = Indexed(0, 0, 0, 0, [], unmatched, 0, metadata)
-    with contextlib.ExitStack() as stack:
-        whole = None
-        if has_images(out):
-            whole = stack.enter_context(Map.open(out, verify=False, calibrated=False))
-            whole.fitted(source.names, positions)
-            new = set(_new_images(whole, source)[0])
-            stay = sum(whole.image(name) is not None for name in positions.of)
-            result = result._replace(there=len(listed - new), stay=stay, images=len(whole))
-            if not new and not shares.folder.exists():
+    describer: Describer
+    source: ImageSource
+    positions: Positions
+    by_exif: bool
+    """Whether the images' EXIF data says where they were taken."""
+    metadata: MapMetadata
+    components: Pca | None
+    search: str | None
+    reading: Reading
+
+    def alone(self, out: pathlib.Path) -> Indexed:
+        """Index all images in this process.
+
+        Raises:
+            InputError: what `index_images` and `_finish` raise.
+        """
+        with open_for_appending(out, self.metadata, self.components) as target:
+            result = self._describe(target, self.source, target)
+            return result._replace(recall=self._finish(target))
+
+    def _describe(self, target: Map, source: ImageSource, whole: Map) -> Indexed:
+        """Append images to `target`; those that `whole` has are not read."""
+        positions = _by_exif(whole, source) if self.by_exif else self.positions
+        return index_images(target, self.describer, source, positions, self.reading)
+
+    def _finish(self, target: Map) -> float | None:
+        """Build the search that was asked for, and return its recall."""
+        check_readable(self.source.root, len(self.source.paths), len(target))
+        if self.search is None:
+            return None
+        return target.build_search(self.search, quiet=self.reading.quiet)
+
+    def share(self, out: pathlib.Path, part: Share) -> Indexed:
+        """Index the images of one share in a map of its own; if it is the last one, join all.
+
+        Raises:
+            InputError: a share of other settings is there; what `index_images` and `_finish` raise.
+        """
+        metadata, source = self.metadata, self.source
+        settings = {name: getattr(metadata, name) for name in ("dtype", "pca", "config")}
+        settings |= {"batch_size": self.reading.batch_size, "digest": self.describer.digest}
+        shares = Shares(out / SHARES, part, digest_of(source.names, settings))
+        mine = part.of(len(source.paths), self.reading.batch_size)
+        own = list(zip(source.names, source.paths, strict=True))[mine]
+        with contextlib.ExitStack() as stack:
+            whole = None
+            if has_images(out):
+                whole = stack.enter_context(Map.open(out, verify=False, calibrated=False))
+                whole.fitted(source.names, self.positions)
+                new = set(_new_images(whole, source)[0])
+                own = [each for each in own if each[0] in new]
+            result = _so_far(whole, metadata, source, self.positions)
+            if result.there == len(source.names) and not shares.folder.exists():
                 return result
-            chosen = [i for i, name in enumerate(own.names) if name in new]
-            own = own._replace(
-                paths=[own.paths[i] for i in chosen], names=[own.names[i] for i in chosen]
-            )
-        if shares.result(shares.share.index) is None:
-            shares.check_same_count()
-            with open_for_appending(shares.own, _of_share(shares, metadata), components) as target:
-                unreadable = describe(target, own, whole).unreadable
-                located = sum(image.position is not None for image in target.images)
-                counts = {"added": len(target), "positions": located, "unreadable": unreadable}
-            if not counts["added"]:
-                shutil.rmtree(shares.own)
-            shares.finish(counts)
-            result = result._replace(**counts, images=counts["added"])
-    if left := shares.left():
-        return result._replace(shares_left=left)
-    with shares.joining() as results:
-        if results is None:
-            return result._replace(joined_elsewhere=True)
-        existing = read_metadata(out) if has_images(out) else None
-        with open_for_appending(out, existing or metadata, components) as target:
-            total = sum(each["added"] for each in results)
-            with progress_bar("joining", total, "images", quiet=quiet) as bar:
-                for index in range(shares.share.count):
-                    _append_share(target, shares.path(index), bar.advance)
-            recall, images = finish(target), len(target)
-    return result._replace(
-        added=total,
-        positions=sum(each["positions"] for each in results),
-        unreadable=[name for each in results for name in each["unreadable"]],
-        images=images,
-        recall=recall,
-    )
+            if shares.result(part.index) is None:
+                named = source._replace(names=[n for n, _ in own], paths=[p for _, p in own])
+                own_metadata = dataclasses.replace(metadata, store="files")
+                with open_for_appending(shares.own, own_metadata, self.components) as target:
+                    unreadable = self._describe(target, named, whole or target).unreadable
+                    result = _with_added(result, target, 0)
+                shares.finish({"unreadable": unreadable})
+        if left := shares.left():
+            return result._replace(shares_left=left)
+        with shares.joining() as results:
+            if results is None:
+                return result._replace(joined_elsewhere=True)
+            bar = progress_bar("joining", part.count, "shares", quiet=self.reading.quiet)
+            with open_for_appending(out, metadata, self.components) as target, bar as joining:
+                known = len(target)
+                for index in range(part.count):
+                    _append_share(target, shares.path(index))
+                    joining.advance(1)
+                recall = self._finish(target)
+        unreadable = [name for each in results for name in each["unreadable"]]
+        return _with_added(result, target, known)._replace(unreadable=unreadable, recall=recall)
 
 
-def _of_share(shares: Shares, metadata: MapMetadata) -> MapMetadata:
-    """Return the metadata of a share's own map, which a killed process may have made.
-
-    Raises:
-        InputError: that map is of another model or of other settings.
-    """
-    mine = dataclasses.replace(metadata, store="files")
-    there = read_metadata(shares.own)
-    if there is None or not has_images(shares.own):
-        return mine
-    changes = {name: getattr(mine, name) for name in ("created", "collection", "weights")}
-    if dataclasses.replace(there, **changes) != mine:
-        raise InputError(
-            f"{shares.own}: found a share of another model or other settings, expected those of "
-            "before; remove it to start again"
-        )
-    return there
-
-
-def _append_share(target: Map, folder: pathlib.Path, advance: Callable[[int], None]) -> None:
+def _append_share(target: Map, folder: pathlib.Path) -> None:
     """Append the images of a share's map that the whole map lacks, and remove the share's."""
-    if not folder.exists():
+    if not has_images(folder):
         return  # it is joined, or had no new image
     with Map.open(folder) as part:
-        for images, rows in _additions(part):
-            advance(len(images))
+        start = 0
+        for rows in part.descriptors:
+            images = part.images[start : start + len(rows)]
+            start += len(rows)
             new = [i for i, image in enumerate(images) if target.image(image.name) is None]
-            of = {images[i].name: images[i].position for i in new}
-            of = {name: position for name, position in of.items() if position is not None}
             if new:
+                of = {image.name: image.position for image in images if image.position}
                 target.append(
                     [images[i].name for i in new],
                     [images[i].bytes for i in new],
@@ -388,19 +347,6 @@ def _append_share(target: Map, folder: pathlib.Path, advance: Callable[[int], No
                     positions=None if part.axes is None else Positions(part.axes, of, part.zone),
                 )
     shutil.rmtree(folder)
-
-
-def _additions(part: Map) -> Iterator[tuple[Sequence[MapImage], np.ndarray]]:
-    """Yield a map's images with their descriptors, some thousand at a time."""
-    waiting: list[np.ndarray] = []
-    start = end = 0
-    for rows in part.descriptors:
-        waiting.append(rows)
-        end += len(rows)
-        if end - start >= _TOGETHER or end == len(part):
-            yield part.images[start:end], np.concatenate(waiting)
-            waiting.clear()
-            start = end
 
 
 def _by_exif(target: Map, source: ImageSource) -> Positions:
@@ -429,12 +375,14 @@ def _check_settings(
     pca: Pca | None,
 ) -> None:
     """Check that a model's configuration and the given settings agree with an existing map."""
+    if store is not None:
+        check_store(store, metadata.dtype)
     there = model_config(metadata, folder)
     for name, found, expected in (
         ("images at", config.images_in_words, there.images_in_words),
         ("compute dtype", config.compute_dtype, there.compute_dtype),
         ("dtype", dtype, metadata.dtype),
-        ("store", store and store_name(store, folder, metadata.dtype), metadata.store),
+        ("store", store and store_name(store, folder), metadata.store),
         ("components", pca and pca_hash(pca)[:12], metadata.pca[:12] or "none"),
     ):
         if found is not None and found != expected:

@@ -41,6 +41,10 @@ class Calibration:
     created: str = ""
     format: int = FORMAT
 
+    def __post_init__(self) -> None:
+        """Check the similarity."""
+        check_min_similarity(self.min_similarity)
+
 
 def read_calibration(folder: pathlib.Path, model: str) -> Calibration | None:
     """Read what the map in `folder` remembers; None where it was never calibrated.
@@ -52,26 +56,22 @@ def read_calibration(folder: pathlib.Path, model: str) -> Calibration | None:
     if not path.exists():
         return None
     try:
-        return _read(path, model)
+        value = read_json(path, "a map's calibration", sealed=False)
+        calibration = from_plain(Calibration, value, source=str(path))
+        for name, found, expected in (
+            ("format", calibration.format, FORMAT),
+            ("model", calibration.model[:12], model[:12]),
+        ):
+            if found != expected:
+                raise InputError(
+                    f"{path}: found a calibration of {name} {found}, expected {expected} as of the "
+                    "map; `crisalad calibrate` replaces it"
+                )
     except InputError as error:
         raise InputError(
             f"{error}; the file may be removed: the map then answers every query, as with "
             "--min-similarity -1"
         ) from error
-
-
-def _read(path: pathlib.Path, model: str) -> Calibration:
-    calibration = from_plain(
-        Calibration, read_json(path, "a map's calibration", sealed=False), source=str(path)
-    )
-    if calibration.format != FORMAT:
-        raise InputError(f"{path}: found format {calibration.format}, expected {FORMAT}")
-    check_min_similarity(calibration.min_similarity, str(path))
-    if calibration.model != model:
-        raise InputError(
-            f"{path}: found a calibration of model {calibration.model[:12]}, expected "
-            f"{model[:12]}, which made the map; `crisalad calibrate` replaces it"
-        )
     return calibration
 
 
@@ -84,7 +84,7 @@ def write_calibration(folder: pathlib.Path, calibration: Calibration) -> None:
     write_record(folder / CALIBRATION, to_plain(calibration), indent=2)
 
 
-def check_min_similarity(value: float, source: str = "min_similarity") -> None:
+def check_min_similarity(value: float) -> None:
     """Raise InputError unless a similarity is a cosine."""
     if not -1 <= value <= 1:
-        raise InputError(f"{source}: found similarity {value}, expected one from -1 to 1")
+        raise InputError(f"min_similarity: found similarity {value}, expected one from -1 to 1")

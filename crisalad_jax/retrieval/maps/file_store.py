@@ -1,5 +1,6 @@
 """Descriptors in .npy files, one for each addition, searched exactly."""
 
+import functools
 import math
 import pathlib
 from collections.abc import Iterator, Sequence
@@ -64,38 +65,24 @@ class FileStore:
         check_source(path, "a file of a map's descriptors")
         header = npy_header(self._dtype, shape)
         size = len(header) + math.prod(shape) * self._dtype.itemsize
-        try:
-            with path.open("rb") as file:
-                begins = file.read(len(header))
-            if begins != header or path.stat().st_size != size:
-                raise InputError(
-                    f"{path}: found other bytes than of {self._dtype} {shape}, expected the whole "
-                    ".npy file that was written"
-                )
-            return np.memmap(path, self._dtype, "r", len(header), shape)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        with path.open("rb") as file:
+            begins = file.read(len(header))
+        if begins != header or path.stat().st_size != size:
+            raise InputError(
+                f"{path}: found other bytes than of {self._dtype} {shape}, expected the whole .npy "
+                "file that was written"
+            )
+        return np.memmap(path, self._dtype, "r", len(header), shape)
 
     def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
         """Find the k most similar descriptors of each query; see `Store.search`."""
-        queries = np.ascontiguousarray(queries, np.float32)
-        firsts = np.array([first for first in self._counts if first < count])
         size = max(1, _BLOCK // max(self._length, min(len(queries), QUERY_CHUNK)))
 
         def files() -> Iterator[Block]:
-            for first in firsts:
+            for first in [first for first in self._counts if first < count]:
                 yield from blocks(self._open(first), str(self._path(first)), size)
 
-        def read_rows(numbers: Int64[np.ndarray, " n"]) -> Float[np.ndarray, "n d"]:
-            segments = np.searchsorted(firsts, numbers, side="right") - 1
-            parts = [
-                gathered(
-                    self._open(firsts[segment]), numbers[segments == segment] - firsts[segment]
-                )
-                for segment in _distinct(segments)
-            ]
-            return np.concatenate(parts)
-
+        read_rows = functools.partial(self.rows, release=True)
         return nearest(lambda: joined(files(), size), queries, k, read_rows, 2 * size)
 
     def similarities(
@@ -107,34 +94,34 @@ class FileStore:
             InputError: a file is damaged or gone.
         """
         query = np.repeat(np.arange(len(queries)), numbers.shape[1])
-        wide = np.ascontiguousarray(queries, np.float32)
-        return similarities_of(wide, query, numbers.ravel(), self.rows).reshape(numbers.shape)
+        return similarities_of(queries, query, numbers.ravel(), self.rows).reshape(numbers.shape)
 
-    def rows(self, numbers: Int64[np.ndarray, " n"]) -> Float[np.ndarray, "n d"]:
+    def rows(
+        self, numbers: Int64[np.ndarray, " n"], *, release: bool = False
+    ) -> Float[np.ndarray, "n d"]:
         """Read the descriptors of these numbers; their files stay mapped into memory.
+
+        Args:
+            numbers: of descriptors, in any order.
+            release: whether to release the pages that are read; numbers are then in order.
 
         Raises:
             InputError: a file is damaged or gone.
         """
         firsts = np.array(list(self._counts))
-        wide = np.promote_types(self._dtype, np.float32)
-        rows = np.empty((len(numbers), self._length), wide)
-        segments = np.searchsorted(firsts, numbers, side="right") - 1
-        for segment in _distinct(segments):
-            places, first = np.flatnonzero(segments == segment), int(firsts[segment])
+        rows = np.empty((len(numbers), self._length), self._dtype)
+        files = firsts[np.searchsorted(firsts, numbers, side="right") - 1]
+        for first in sorted(set(files.tolist())):  # `np.unique` would import masked arrays
+            places = np.flatnonzero(files == first)
             mapped = self._mapped.get(first)
             if mapped is None:
                 if len(self._mapped) >= _MAPPED:
                     self._mapped.clear()
                 mapped = self._mapped[first] = self._open(first).view(np.ndarray)
-            rows[places] = mapped[numbers[places] - first]
+            here = numbers[places] - first
+            rows[places] = gathered(mapped, here) if release else mapped[here]
         return rows
 
     def close(self) -> None:
         """Let go of files."""
         self._mapped.clear()
-
-
-def _distinct(numbers: Int64[np.ndarray, "*shape"]) -> list[int]:
-    """List each number once, in order; `np.unique` would import masked arrays into every query."""
-    return sorted(set(numbers.ravel().tolist()))

@@ -14,9 +14,14 @@ from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.live import Frame
 from crisalad_jax.retrieval.describe import FrameDescriber
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.retrieval.maps.query import Answers, asked_similarity, json_rows, json_text
-from crisalad_jax.retrieval.maps.tracking import SequenceTracker
-from crisalad_jax.retrieval.neighbours import Neighbours
+from crisalad_jax.retrieval.maps.query import (
+    Answers,
+    answers_of,
+    asked_similarity,
+    asking,
+    json_rows,
+    json_text,
+)
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.output import counted
 
@@ -110,8 +115,8 @@ def query_live(
     check_count("k", k)
     least = asked_similarity(places, min_similarity)
     model_describer = places.describer(model, groupings=["single" if window == 1 else "window"])
-    tracker = None if sequence is None else SequenceTracker(places, sequence)
     describer = FrameDescriber(model_describer, window)
+    ask = asking(places, k, sequence)
 
     def answers() -> Iterator[LiveAnswer]:
         blank = np.zeros((*(source.size or places.config.image_size), 3), np.uint8)
@@ -119,26 +124,11 @@ def query_live(
         describer.forget()
         ready()
         for frame in source.frames(check):
-            described = places.shorten(describer(frame.image))
-            if tracker is None:
-                neighbours, filtered = places.search(described, k), ()
-            else:
-                name = pathlib.Path(frame.name)
-                numbers, similarities, *filtered = tracker.answer(described, k, [name])
-                neighbours = Neighbours(numbers, similarities)
-            found = Answers(
-                [pathlib.Path(frame.name)],
-                neighbours,
-                places.images,
-                places.axes,
-                (),
-                least,
-                *filtered,
-                zone=places.zone,
-                root=None,
-            )
+            asked = [pathlib.Path(frame.name)]
+            found = ask(places.shorten(describer(frame.image)), asked)
+            answer = answers_of(places, asked, [found], least)
             latency = time.perf_counter() - frame.taken
-            yield LiveAnswer(found, frame.time, 1000 * latency)
+            yield LiveAnswer(answer, frame.time, 1000 * latency)
 
     return answers()
 

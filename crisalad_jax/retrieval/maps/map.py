@@ -6,13 +6,14 @@ is as it was before the addition or after it. docs/maps.md has the format.
 """
 
 import contextlib
+import dataclasses
 import datetime
 import functools
 import os
 import pathlib
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, cast
 
 import numpy as np
 
@@ -25,20 +26,21 @@ from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import Positions
-from crisalad_jax.retrieval.chunks import check_rows
+from crisalad_jax.retrieval.chunks import as_unit_rows
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import (
     Approximate,
     build_approximate,
+    check_search,
     open_approximate,
     stale_kind,
-    tell_stale,
 )
 from crisalad_jax.retrieval.maps.calibration import Calibration, read_calibration
 from crisalad_jax.retrieval.maps.contents import MapAddition, contents, with_addition
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.metadata import (
     COMPONENTS,
+    METADATA,
     SEGMENTS,
     MapMetadata,
     check_model,
@@ -46,18 +48,17 @@ from crisalad_jax.retrieval.maps.metadata import (
     model_config,
     read_components,
     read_metadata,
-    undone_without_images,
     weights_of,
-    write_metadata,
 )
-from crisalad_jax.retrieval.maps.recovery import check_no_record_lost, remove_unrecorded
+from crisalad_jax.retrieval.maps.recovery import remove_unrecorded
 from crisalad_jax.retrieval.maps.store import open_store
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, save_pca
-from crisalad_jax.retrieval.segments import Segments
+from crisalad_jax.retrieval.segments import Segments, write_record
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import lock
-from crisalad_jax.utils.shapes import Float, Float32
+from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.shapes import Float, Float32, Int64
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 if TYPE_CHECKING:  # a map is searched without JAX
@@ -91,6 +92,16 @@ class Answer(NamedTuple):
     """Probability that the camera is there; None without a filter."""
 
 
+def ranked(
+    images: Sequence[MapImage],
+    numbers: Int64[np.ndarray, " k"],
+    similarities: Float32[np.ndarray, " k"],
+) -> list[Answer]:
+    """Return the answers to one query, of images by number."""
+    pairs = zip(numbers, similarities, strict=True)
+    return [Answer(rank, float(value), images[i]) for rank, (i, value) in enumerate(pairs, 1)]
+
+
 class Map:
     """An open map: made by `Map.open` to search it, or by `open_for_appending`.
 
@@ -118,17 +129,16 @@ class Map:
         """The images by number."""
         self.additions: list[MapAddition] = []
         """What was appended, in order: from which folder, on which day, and how many images."""
-        self._numbers: dict[str, int] = {}
         self.axes: tuple[str, str] | None = None
         """Axes of the positions, see `positions.AXES`; None where no image has a position."""
         self.zone: Zone | None = None
         """Zone of UTM of all positions in metres east and north; None where it is unknown."""
-        self._segments = segments
-        self._close = weakref.finalize(self, segments.store.close)
         self.calibration: Calibration | None = None
         """What `calibrate` measured; None where it did not, or the map is open for appending."""
         self.components = read_components(folder, metadata)
         """The components that shorten descriptors, and those of queries; None is none."""
+        self._segments, self._numbers = segments, dict[str, int]()
+        self._close = weakref.finalize(self, segments.store.close)
         self._approximate: Approximate | None = None
         self._tells_stale = True
         """Whether the next search that is not asked to be exact tells why it is."""
@@ -170,20 +180,14 @@ class Map:
         metadata = read_metadata(folder)
         if metadata is None:
             raise InputError(
-                f"{folder}: found no map, expected a folder that `crisalad index` wrote"
+                f"{folder}: found no map, expected a folder that `crisalad index` put images into"
             )
-        if not has_images(folder):
-            raise InputError(f"{folder}: found a map without images, expected at least one")
         opened = cls._opened(folder, metadata)
-        try:
-            if calibrated:
-                opened.calibration = read_calibration(folder, metadata.model)
-            if verify and metadata.store == "files":
-                opened.verify()
-            opened._approximate = open_approximate(folder, opened._segments.spans, verify=verify)
-        except BaseException:
-            opened.close()
-            raise
+        if calibrated:
+            opened.calibration = read_calibration(folder, metadata.model)
+        if verify and metadata.store == "files":
+            opened.verify()
+        opened._approximate = open_approximate(folder, opened._segments.spans, verify=verify)
         return opened
 
     @classmethod
@@ -272,20 +276,22 @@ class Map:
             exact: whether to search exactly although the map has an approximate search.
 
         Raises:
-            InputError: no queries, none in the map, descriptors that are no unit vectors of the
-                map's length, k below 1; or the store is damaged or gone.
+            InputError: no queries, descriptors that are no unit vectors of the map's length, k
+                below 1; or the store is damaged or gone.
         """
         check_count("k", k)
-        if not len(self):
-            raise InputError(f"{self.folder}: found a map without images, expected at least one")
-        self._check_descriptors("queries", queries)
+        queries = self._unit_rows("queries", queries)
         k = min(k, len(self))
         store = self._segments.store
         if self._approximate is not None and isinstance(store, FileStore) and not exact:
             return self._approximate.search(store, queries, k, len(self))
         if self._tells_stale and not exact:
-            tell_stale(self.folder, self._segments.spans)
             self._tells_stale = False
+            if (kind := self.stale_search) is not None:
+                warn(
+                    f"{self.folder}: found an approximate search of fewer or other images; the map "
+                    f"is searched exactly; `crisalad index --search {kind}` builds it anew"
+                )
         return store.search(queries, k, len(self))
 
     @property
@@ -316,14 +322,8 @@ class Map:
         Raises:
             InputError: an unknown kind, too few images, or a map in Milvus.
         """
-        self._approximate = build_approximate(
-            self.folder,
-            kind,
-            self._segments.spans,
-            self._segments.store,
-            self._segments.blocks,
-            quiet=quiet,
-        )
+        check_search(kind, self.metadata.store)
+        self._approximate = build_approximate(self.folder, kind, self._segments, quiet=quiet)
         return None if self._approximate is None else self._approximate.recall
 
     def locate(
@@ -368,15 +368,10 @@ class Map:
         """
         from crisalad_jax.retrieval.describe import describe_images
 
-        check_count("k", k)
         pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
         descriptor = describe_images(self.describer(model), [pixels])
         found = self.search(self.shorten(descriptor), k)
-        pairs = zip(found.indices[0], found.similarities[0], strict=True)
-        return [
-            Answer(rank, float(similarity), self.images[number])
-            for rank, (number, similarity) in enumerate(pairs, 1)
-        ]
+        return ranked(self.images, found.indices[0], found.similarities[0])
 
     def similarities(self, queries: Float32[np.ndarray, "q d"]) -> Float32[np.ndarray, "q n"]:
         """Compute the similarities of queries to all images, in the order of the images.
@@ -387,17 +382,12 @@ class Map:
         Raises:
             InputError: as `search`.
         """
-        self._check_descriptors("queries", queries)
+        queries = self._unit_rows("queries", queries)
         parts = [queries @ part.astype(np.float32, copy=False).T for part in self.descriptors]
         return np.concatenate(parts, axis=1)
 
-    def _check_descriptors(self, name: str, descriptors: Float[np.ndarray, "n d"]) -> None:
-        length = self.metadata.descriptor_length
-        if descriptors.ndim != 2 or not len(descriptors) or descriptors.shape[1] != length:
-            raise InputError(
-                f"{name}: found shape {descriptors.shape}, expected (images, {length})"
-            )
-        check_rows(descriptors, name, range(len(descriptors)), unit=True)
+    def _unit_rows(self, name: str, rows: Float[np.ndarray, "n d"]) -> Float32[np.ndarray, "n d"]:
+        return as_unit_rows(rows, name, self.metadata.descriptor_length)
 
     def fitted(self, names: Iterable[str], positions: Positions | None) -> Positions | None:
         """Return the positions of new images in the map's axes; None where none of them has one.
@@ -433,7 +423,7 @@ class Map:
             InputError: a name that is there already or twice, descriptors that are no unit vectors,
                 positions that have no place among the map's, or a store that cannot be written to.
         """
-        self._check_descriptors("descriptors", descriptors)
+        descriptors = self._unit_rows("descriptors", descriptors)
         if twice := len(names) - len(set(names) - self._numbers.keys()):
             raise InputError(
                 f"{self.folder}: found {twice} of {len(names)} names twice, or in the map already, "
@@ -545,7 +535,7 @@ class Map:
                 any_grouping=set(groupings) != {"single"},
                 verify=verify,
             )
-            self._check_runtime(model, file)
+            self._check_describer(cast(Describer, model), file)
         self._describer = model, describer_of(model, groupings)
         return model
 
@@ -565,27 +555,20 @@ class Map:
         if model is None and self._describer is None:
             self.load_model(groupings=groupings)
         known = self._describer
-        if known is None or not (model is None or model is known[0]):
-            if isinstance(model, Runtime):
-                self._check_runtime(model, "the given model")
-                found = describer_of(model, groupings)
-            else:
-                if not isinstance(model, tuple):
-                    raise InputError(
-                        f"model: found {type(model).__name__}, expected a Model(params, config) or "
-                        "a Runtime"
-                    )
+        if known is None or (model is not None and model is not known[0]):
+            given: Any = model
+            if isinstance(model, tuple):
                 config = with_non_semantic_fields_of(self.config, model.config)
-                found = describer_of(model._replace(config=config), groupings)
-                check_model(self.metadata, self.folder, found.digest, "the given model")
-            known = self._describer = model, found
-        if isinstance(known[1], Runtime):
-            known[1].check_groupings(groupings)
-        return known[1]
+                given = model._replace(config=config)
+            known = model, describer_of(given, groupings)
+            self._check_describer(known[1], "the given model")
+            self._describer = known
+        return describer_of(known[1], groupings)
 
-    def _check_runtime(self, runtime: Runtime, given: object) -> None:
+    def _check_describer(self, describer: Describer, given: object) -> None:
+        quantised_from = getattr(describer, "quantised_from", None)
         check_model(
-            self.metadata, self.folder, runtime.digest, given, quantised_from=runtime.quantised_from
+            self.metadata, self.folder, describer.digest, given, quantised_from=quantised_from
         )
 
     def close(self) -> None:
@@ -615,19 +598,28 @@ def open_for_appending(
         stack.enter_context(made_folder(folder / SEGMENTS))
         stack.enter_context(lock(folder))
         existing = read_metadata(folder)
+        if existing is not None and existing != metadata:
+            raise InputError(f"{folder}: found another map than was expected here")
         for each in (folder, folder / SEGMENTS):
             remove_temporaries(each)
-        check_no_record_lost(folder)  # first: what follows removes a map without images
-        stack.enter_context(undone_without_images(folder))
-        if existing != metadata:
-            if has_images(folder):
-                raise InputError(f"{folder}: found another map than was expected here")
-            if components is not None:
-                save_pca(folder / COMPONENTS, components)
-            write_metadata(folder, metadata)
-        opened = stack.enter_context(Map._opened(folder, metadata))
-        remove_unrecorded(folder, len(opened))
-        yield opened
+        if existing is None:
+            remove_unrecorded(folder, 0)
+        try:
+            if existing is None:
+                if components is not None:
+                    save_pca(folder / COMPONENTS, components)
+                write_record(folder / METADATA, dataclasses.asdict(metadata), indent=2)
+            opened = stack.enter_context(Map._opened(folder, existing or metadata))
+            if existing is not None:
+                remove_unrecorded(folder, len(opened))
+            yield opened
+        except BaseException:
+            if not has_images(folder):
+                for name in (METADATA, COMPONENTS):
+                    (folder / name).unlink(missing_ok=True)
+                for path in (folder / SEGMENTS).glob("[0-9]*.npy"):
+                    path.unlink()
+            raise
 
 
 def _inside(name: object) -> str:

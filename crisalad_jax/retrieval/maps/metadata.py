@@ -3,25 +3,22 @@
 Nothing here imports JAX until `model_config` is called.
 """
 
-import contextlib
 import dataclasses
 import datetime
 import os
 import pathlib
 import uuid
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from crisalad_jax.checkpoints.runtime import read_header
 from crisalad_jax.checkpoints.starter import FILES, recorded, resolved
 from crisalad_jax.config.io import from_plain, to_plain
-from crisalad_jax.retrieval.maps.store import store_name
-from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
-from crisalad_jax.retrieval.segments import write_record
+from crisalad_jax.retrieval.maps.store import check_store, store_name
+from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened_length
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.output import warn
-from crisalad_jax.utils.temporaries import LOCK, is_temporary, remove_temporaries
+from crisalad_jax.utils.temporaries import LOCK, is_temporary
 
 if TYPE_CHECKING:  # a map is searched without JAX
     from crisalad_jax.nn.config import ModelConfig
@@ -37,11 +34,11 @@ COMPONENTS, SHARES = "pca.safetensors", "shares"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MapMetadata:
-    """The contents of map.json."""
+    """The contents of map.json; two are equal that describe images alike."""
 
     model: str
     """The `model_hash` of the weights that describe its images, and its queries."""
-    weights: str
+    weights: str = dataclasses.field(compare=False)
     """Where those weights were: a path, or a name in `starter.FILES`."""
     config: dict
     """The model's configuration as JSON values, at the image size and in the type in which images
@@ -53,13 +50,17 @@ class MapMetadata:
     """Type of the stored descriptors."""
     grouping: str = "single"
     """Every image is described independently, so that no descriptor depends on neighbours."""
-    collection: str = ""
+    collection: str = dataclasses.field(default="", compare=False)
     """Name of Milvus' collection of the descriptors."""
-    created: str = ""
+    created: str = dataclasses.field(default="", compare=False)
     pca: str = ""
     """The `pca_hash` of the components that shorten its descriptors, and those of queries; "" is
     none."""
     format: int = FORMAT
+
+    def __post_init__(self) -> None:
+        """Check the store."""
+        check_store(self.store, self.dtype)
 
 
 def model_config(metadata: MapMetadata, folder: str | os.PathLike[str]) -> "ModelConfig":
@@ -86,25 +87,17 @@ def new_metadata(
 
     Raises:
         InputError: the model's descriptors are not unit vectors, or its components make none or are
-            of another length; what `store_name` raises.
+            of another length; what `check_store` raises.
     """
-    from crisalad_jax.nn.config import check_unit_length
-
+    check_store(store, dtype)
     config = describer.config
-    check_unit_length(config, str(weights))
-    if pca is not None:
-        pca.check(config.descriptor_dim, str(weights))
-        if not pca.config.renormalise:
-            raise InputError(
-                "pca: found components that leave lengths as they are, expected some that make "
-                "unit vectors, which maps compare by cosine"
-            )
+    length = shortened_length(pca, config, str(weights), unit=True)
     return MapMetadata(
         model=describer.digest,
         weights=recorded(weights),
         config=to_plain(config),
-        descriptor_length=config.descriptor_dim if pca is None else len(pca.components),
-        store=store_name(store, folder, dtype),
+        descriptor_length=length,
+        store=store_name(store, folder),
         dtype=dtype,
         collection=f"crisalad_{uuid.uuid4().hex}",
         created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -112,27 +105,18 @@ def new_metadata(
     )
 
 
-def write_metadata(folder: pathlib.Path, metadata: MapMetadata) -> None:
-    """Write map.json, whole or not at all.
-
-    Raises:
-        InputError: the disk is full, or the folder cannot be written to.
-    """
-    write_record(folder / METADATA, dataclasses.asdict(metadata), indent=2)
-
-
 def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
     """Read the metadata of the map in `folder`; None where a new map can be made.
 
+    A map without images, which a killed process left, counts as none.
+
     Raises:
-        InputError: the folder is a file or holds other things than a map, or the map is damaged or
-            of another format.
+        InputError: the folder holds other things than a map, or the map is damaged or of another
+            format.
     """
     folder = pathlib.Path(folder)
     path = folder / METADATA
     if not path.exists():
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"{folder}: found a file, expected a map's folder")
         # A process killed before it has made the map leaves its lock and temporary files behind.
         others = sorted(_other_files(folder, LOCK, SEGMENTS, COMPONENTS, SHARES))
         if _other_files(folder / SEGMENTS):
@@ -151,11 +135,7 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
             "new folder makes one"
         )
     metadata = from_plain(MapMetadata, value, source=str(path))
-    try:
-        store_name(metadata.store, folder, metadata.dtype)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    return metadata
+    return metadata if has_images(folder) else None
 
 
 def read_components(folder: pathlib.Path, metadata: MapMetadata) -> Pca | None:
@@ -228,28 +208,3 @@ def weights_of(metadata: MapMetadata, folder: str | os.PathLike[str]) -> pathlib
             f"{folder}: found no {file}, which made this map, expected it there or as --weights"
         )
     return file
-
-
-@contextlib.contextmanager
-def undone_without_images(folder: pathlib.Path) -> Iterator[None]:
-    """Remove the map if the block raises before it has images: nothing is lost."""
-    try:
-        yield
-    except BaseException:
-        if not has_images(folder):
-            with contextlib.suppress(OSError):
-                _remove(folder)
-        raise
-
-
-def _remove(folder: pathlib.Path) -> None:
-    """Remove a map without images; its metadata stays where other files are left."""
-    segments = folder / SEGMENTS
-    remove_temporaries(segments)
-    for path in segments.glob("[0-9]*.npy"):
-        path.unlink()
-    segments.rmdir()
-    if {path.name for path in folder.iterdir()} <= {METADATA, COMPONENTS, LOCK}:
-        for name in (METADATA, COMPONENTS, LOCK):
-            (folder / name).unlink(missing_ok=True)
-        folder.rmdir()

@@ -46,6 +46,28 @@ def check_address(address: str) -> bool:
     return False
 
 
+@contextlib.contextmanager
+def _one_line(address: str) -> Iterator[None]:
+    """Turn Milvus' errors into one line, and silence its own logs of them."""
+    import grpc
+    import pymilvus
+
+    loggers = [logging.getLogger(name) for name in _LOGS]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL + 1)
+        yield
+    except (pymilvus.MilvusException, grpc.RpcError) as error:
+        words = getattr(error, "message", None) or str(error)
+        if "Open local milvus failed" in words:
+            words += " (damaged, or another process has it open)"
+        raise InputError(f"{address}: Milvus says: {' '.join(words.split())}") from error
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
 class MilvusStore:
     """A `Store` in a collection of Milvus with the index FLAT, which is exact."""
 
@@ -61,13 +83,13 @@ class MilvusStore:
             raise InputError(missing_extra(error, "store milvus")) from error
         self._address, self._collection = address, collection
         self._rows = max(1, min(_MOST, _MESSAGE_BYTES // (4 * length)))
+        path = pathlib.Path(address)
         if self._is_file and new:
-            pathlib.Path(address).parent.mkdir(parents=True, exist_ok=True)
-        if self._is_file and not new and not pathlib.Path(address).exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+        if self._is_file and not new and not path.exists():
             raise InputError(f"{address}: found nothing, expected the descriptors of this map")
-        with self._one_line():
-            token = os.environ.get(TOKEN, "")
-            self._client = pymilvus.MilvusClient(address, token=token)
+        with _one_line(address):
+            self._client = pymilvus.MilvusClient(address, token=os.environ.get(TOKEN, ""))
             if new:
                 self._client.drop_collection(collection)
                 self._create(length)
@@ -77,27 +99,6 @@ class MilvusStore:
                     "descriptors of this map"
                 )
             self._load()
-
-    @contextlib.contextmanager
-    def _one_line(self) -> Iterator[None]:
-        """Turn Milvus' errors into one line, and silence its own logs of them."""
-        import grpc
-        import pymilvus
-
-        loggers = [logging.getLogger(name) for name in _LOGS]
-        levels = [logger.level for logger in loggers]
-        try:
-            for logger in loggers:
-                logger.setLevel(logging.CRITICAL + 1)
-            yield
-        except (pymilvus.MilvusException, grpc.RpcError) as error:
-            words = getattr(error, "message", None) or str(error)
-            if "Open local milvus failed" in words:
-                words += " (damaged, or another process has it open)"
-            raise InputError(f"{self._address}: Milvus says: {' '.join(words.split())}") from error
-        finally:
-            for logger, level in zip(loggers, levels, strict=True):
-                logger.setLevel(level)
 
     def _create(self, length: int) -> None:
         from pymilvus import DataType
@@ -132,46 +133,38 @@ class MilvusStore:
     def add(self, first: int, descriptors: Float[np.ndarray, "n d"]) -> None:
         """Upsert descriptors by number; see `Store.add`."""
         rows = np.ascontiguousarray(descriptors, np.float32)
-        with self._one_line():
+        with _one_line(self._address):
             for start in range(0, len(rows), self._rows):
-                part = rows[start : start + self._rows]
-                self._client.upsert(
-                    self._collection,
-                    [{"id": first + start + i, "descriptor": row} for i, row in enumerate(part)],
-                )
+                part = enumerate(rows[start : start + self._rows], first + start)
+                data = [{"id": number, "descriptor": row} for number, row in part]
+                self._client.upsert(self._collection, data)
             self._client.flush(self._collection)
 
     def check(self, segments: Sequence[tuple[int, int]]) -> None:
         """Count the stored descriptors; see `Store.check`."""
         expected = sum(count for _, count in segments)
-        with self._one_line():
-            answer = self._client.query(
-                self._collection, filter=f"id < {expected}", output_fields=["count(*)"]
-            )
-        if (stored := answer[0]["count(*)"]) != expected:
+        (answer,) = self._fetch(f"id < {expected}", "count(*)")
+        if (stored := answer["count(*)"]) != expected:
             raise InputError(
                 f"{self._address}: found {stored} descriptors in {self._collection}, expected "
                 f"{expected}, as many as the map has images"
             )
 
+    def _fetch(self, condition: str, *fields: str) -> list[dict[str, Any]]:
+        with _one_line(self._address):
+            found = self._client.query(
+                self._collection, filter=condition, output_fields=list(fields)
+            )
+        return list(found)
+
     def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
         """Fetch the descriptors of one addition; see `Store.read`."""
-        parts: list[Any] = []
+        found: dict[int, Any] = {}
         for start in range(first, first + count, self._rows):
             stop = min(start + self._rows, first + count)
-            with self._one_line():
-                parts += self._client.query(
-                    self._collection,
-                    filter=f"{start} <= id and id < {stop}",
-                    output_fields=["id", "descriptor"],
-                )
-        parts.sort(key=lambda part: part["id"])
-        if [part["id"] for part in parts] != list(range(first, first + count)):
-            raise InputError(
-                f"{self._address}: found {len(parts)} descriptors in {self._collection} from "
-                f"{first}, expected {count}"
-            )
-        return np.array([part["descriptor"] for part in parts], np.float32)
+            part = self._fetch(f"{start} <= id and id < {stop}", "id", "descriptor")
+            found |= {row["id"]: row["descriptor"] for row in part}
+        return np.array([found[number] for number in range(first, first + count)], np.float32)
 
     def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
         """Find the k most similar descriptors of each query; see `Store.search`."""
@@ -187,10 +180,10 @@ class MilvusStore:
             ]
             return Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
 
-        return break_ties(ask, np.ascontiguousarray(queries, np.float32), k, min(count, _MOST))
+        return break_ties(ask, queries, k, min(count, _MOST))
 
     def _ask(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
-        with self._one_line():
+        with _one_line(self._address):
             answers = self._client.search(
                 self._collection,
                 data=list(queries),
@@ -207,7 +200,7 @@ class MilvusStore:
 
     def close(self) -> None:
         """Disconnect; other processes may then open the file."""
-        with self._one_line():
+        with _one_line(self._address):
             self._client.close()
         if self._is_file:
             from milvus_lite.server_manager import server_manager_instance
@@ -224,7 +217,7 @@ def break_ties(
     """Search so that equal similarities are ordered by number, also at the k-th place.
 
     One more than k is asked for. Where the last is as similar as the k-th, there may be more equal
-    ones. Such queries ask again for twice as many, until the last is less similar.
+    ones: twice as many are asked for, until the last is less similar.
 
     Args:
         ask: takes queries and k; returns the k most similar of each, equal ones in any order.
@@ -232,21 +225,9 @@ def break_ties(
         k: neighbours per query, at most `count`.
         count: how many descriptors there are.
     """
-    asked = min(k + 1, count)
-    found = _in_order(ask(queries, asked))
-    indices, similarities = (part[:, :k].copy() for part in found)
-    rows = np.arange(len(queries))
-    while asked < count:
-        is_open = found.similarities[:, k - 1] == found.similarities[:, -1]
-        rows = rows[is_open]
-        if not len(rows):
-            break
-        asked = min(2 * asked, count)
-        found = _in_order(ask(queries[rows], asked))
-        indices[rows], similarities[rows] = (part[:, :k] for part in found)
-    return Neighbours(indices, similarities)
-
-
-def _in_order(neighbours: Neighbours) -> Neighbours:
-    order = np.lexsort((neighbours.indices, -neighbours.similarities))
-    return Neighbours(*(np.take_along_axis(array, order, axis=1) for array in neighbours))
+    asked = k + 1
+    while True:
+        indices, similarities = ask(queries, min(asked, count)).in_order()
+        if asked >= count or (similarities[:, k - 1] > similarities[:, -1]).all():
+            return Neighbours(indices[:, :k], similarities[:, :k])
+        asked *= 2

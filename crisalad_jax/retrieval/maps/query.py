@@ -4,7 +4,7 @@ import itertools
 import json
 import os
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -17,15 +17,20 @@ from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import frame_time
-from crisalad_jax.retrieval.describe import Described, check_window, described_sources
+from crisalad_jax.retrieval.describe import (
+    as_list,
+    check_readable,
+    check_window,
+    described_sources,
+    joined,
+    shown,
+)
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
-from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage
+from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage, ranked
 from crisalad_jax.retrieval.maps.tracking import SequenceTracker, TrackResult
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path
-from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Bool, Float32, Float64
 
 if TYPE_CHECKING:  # answers are searched without JAX
@@ -78,20 +83,13 @@ class Answers(NamedTuple):
 
     def rows(self) -> Iterator[tuple[pathlib.Path, list[Answer]]]:
         """Yield each query with its answers, best first."""
-        for i, (query, *columns) in enumerate(zip(self.queries, *self.neighbours, strict=True)):
-            chances = None if self.probabilities is None else self.probabilities[i]
-            yield (
-                query,
-                [
-                    Answer(
-                        rank + 1,
-                        float(similarity),
-                        self.images[index],
-                        None if chances is None else float(chances[rank]),
-                    )
-                    for rank, (index, similarity) in enumerate(zip(*columns, strict=True))
-                ],
-            )
+        chances = self.probabilities
+        for number, query in enumerate(self.queries):
+            answers = ranked(self.images, *(part[number] for part in self.neighbours))
+            if chances is not None:
+                pairs = zip(answers, chances[number], strict=True)
+                answers = [answer._replace(probability=float(chance)) for answer, chance in pairs]
+            yield query, answers
 
     def position(self, image: MapImage) -> dict[str, float] | None:
         """Return where an image was taken, by the names of the axes; None where unknown."""
@@ -153,50 +151,55 @@ def query(
         ['2.png']
     """
     check_count("k", k)
-    min_similarity = asked_similarity(places, min_similarity)
+    least = asked_similarity(places, min_similarity)
     root, sources = _listed(images, fps, reading.on_bad_image)
-    paths = [path for source in sources for path in source]
+    paths = list(itertools.chain(*sources))
     check_rate_used(fps, paths)
     describer = places.describer(model, groupings=["single" if window == 1 else "window"])
     if window != 1:
         check_window(places.config, window)
-    stream = described_sources(
-        describer,
-        sources,
-        reading.fitted(len(paths)),
-        window=window,
-        components=places.components,
-    )
-    tracker = None if sequence is None else SequenceTracker(places, sequence)
-    parts: list[Neighbours | TrackResult] = []
-    waiting: list[Described] = []
+    ask = asking(places, k, sequence, exact=exact)
+    reading, components = reading.fitted(len(paths)), places.components
+    stream = described_sources(describer, sources, reading, window=window, components=components)
+    found: list[Sequence[np.ndarray]] = []
+    asked: list[pathlib.Path] = []
     unreadable: list[pathlib.Path] = []
-    seen = 0
-    with progress_bar("queries", len(paths), "images", quiet=reading.quiet) as bar:
-        for part in stream:
-            waiting.append(part)
-            unreadable += (paths[index] for index in part.unreadable)
-            tried = len(part.indices) + len(part.unreadable)
-            seen += tried
-            bar.advance(tried)
-            if len(unreadable) == len(paths):
-                raise InputError(f"images: found {len(paths)}, none of them readable")
-            count = sum(len(each.indices) for each in waiting)
-            if count >= AT_ONCE or (count and seen == len(paths)):
-                found = np.concatenate([each.descriptors for each in waiting])
-                asked = [paths[index] for each in waiting for index in each.indices]
-                parts.append(
-                    places.search(found, k, exact=exact)
-                    if tracker is None
-                    else tracker.answer(found, k, asked)
-                )
-                waiting.clear()
-    indices, similarities, *filtered = map(np.concatenate, zip(*parts, strict=True))
+    for part in joined(shown(stream, "queries", len(paths), quiet=reading.quiet), AT_ONCE):
+        unreadable += (paths[index] for index in part.unreadable)
+        if len(part.indices):
+            frames = [paths[index] for index in part.indices]
+            found.append(ask(part.descriptors, frames))
+            asked += frames
+    check_readable("images", len(paths), len(asked))
+    return answers_of(places, asked, found, least, unreadable=unreadable, root=root)
+
+
+Ask = Callable[[Float32[np.ndarray, "query d"], Sequence[pathlib.Path]], Neighbours | TrackResult]
+"""Finds the answers to described images, given their names too."""
+
+
+def asking(places: Map, k: int, sequence: BayesFilter | None, *, exact: bool = False) -> Ask:
+    """Return what asks a map for k answers: its search, or a filter over consecutive frames."""
+    if sequence is None:
+        return lambda descriptors, _: places.search(descriptors, k, exact=exact)
+    tracker = SequenceTracker(places, sequence)
+    return lambda descriptors, frames: tracker.answer(descriptors, k, frames)
+
+
+def answers_of(
+    places: Map,
+    asked: list[pathlib.Path],
+    found: Sequence[Sequence[np.ndarray]],
+    least: float | None,
+    *,
+    unreadable: Sequence[pathlib.Path] = (),
+    root: pathlib.Path | None = None,
+) -> Answers:
+    """Join what `asking` found, part by part."""
+    indices, similarities, *filtered = map(np.concatenate, zip(*found, strict=True))
     neighbours = Neighbours(indices, similarities)
-    lost = set(unreadable)
-    readable = [path for path in paths if path not in lost]
-    given = (places.images, places.axes, unreadable, min_similarity)
-    return Answers(readable, neighbours, *given, *filtered, zone=places.zone, root=root)
+    given = (places.images, places.axes, unreadable, least)
+    return Answers(asked, neighbours, *given, *filtered, zone=places.zone, root=root)
 
 
 def asked_similarity(places: Map, min_similarity: float | None) -> float | None:
@@ -219,26 +222,24 @@ def _listed(
     images: Any, fps: float | None, on_bad_image: OnBadImage
 ) -> tuple[pathlib.Path, list[list[pathlib.Path]]]:
     """List the images of each source, below a folder that holds all."""
-    given = [images] if isinstance(images, str | os.PathLike) else images
-    if not given:
-        raise InputError("images: found none, expected images or folders of them")
+    given = as_list("images", images)
     sources = [open_source(each, fps=fps, on_bad_image=on_bad_image) for each in given]
     roots = {source.root for source in sources}
     if len(roots) == 1:
-        return roots.pop(), _joined([source.paths for source in sources])
+        return roots.pop(), _runs([source.paths for source in sources])
     # Written out, as relative and absolute ones have no folder in common.
     paths = [[pathlib.Path(os.path.abspath(path)) for path in source.paths] for source in sources]
     root = pathlib.Path(os.path.commonpath([os.path.abspath(root) for root in roots]))
-    return root, _joined(paths)
+    return root, _runs(paths)
 
 
-def _joined(sources: Sequence[Sequence[pathlib.Path]]) -> list[list[pathlib.Path]]:
+def _runs(sources: Sequence[Sequence[pathlib.Path]]) -> list[list[pathlib.Path]]:
     """Join images named one after the other to one source: a shell writes a pattern out so."""
-    joined: list[list[pathlib.Path]] = []
+    runs: list[list[pathlib.Path]] = []
     for is_one, run in itertools.groupby(sources, lambda paths: len(paths) == 1):
         each = [list(paths) for paths in run]
-        joined += [list(itertools.chain(*each))] if is_one else each
-    return joined
+        runs += [list(itertools.chain(*each))] if is_one else each
+    return runs
 
 
 def position_fields(image: MapImage, axes: tuple[str, str] | None) -> dict[str, float] | None:
@@ -275,11 +276,10 @@ def json_lines(answers: Answers) -> Iterator[str]:
 def json_rows(answers: Answers) -> Iterator[dict[str, Any]]:
     """Yield what `json_lines` writes of each query."""
     zone = {} if answers.zone is None else {"zone": str(answers.zone)}
-    for name, known, (path, ranked) in zip(
-        answers.names, answers.known, answers.rows(), strict=True
-    ):
+    columns = answers.names, answers.known, answers.rows()
+    for name, known, (path, found) in zip(*columns, strict=True):
         neighbours = [
-            answer_fields(answer, answers.axes) | _time(answer.image.name) for answer in ranked
+            answer_fields(answer, answers.axes) | _time(answer.image.name) for answer in found
         ]
         row = {"query": name, **_time(path), **zone, "neighbours": neighbours}
         yield row if answers.min_similarity is None else row | {"known": bool(known)}
@@ -306,12 +306,8 @@ def write_answers(path: str | os.PathLike[str], answers: Answers) -> None:
     Raises:
         InputError: the file cannot be made.
     """
-    with (
-        atomic_path(path) as temporary,
-        temporary.open("w", encoding="utf-8") as file,
-    ):
-        if pathlib.Path(path).suffix.lower() == ".json":
-            rows = ",\n".join(json_lines(answers))
-            file.write(f"[\n{rows}\n]\n")
-        else:
-            file.writelines(f"{line}\n" for line in json_lines(answers))
+    lines = list(json_lines(answers))
+    if pathlib.Path(path).suffix.lower() == ".json":
+        lines = ["[", *(f"{line}," for line in lines[:-1]), lines[-1], "]"]
+    with atomic_path(path) as temporary:
+        temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

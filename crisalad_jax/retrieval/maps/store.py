@@ -28,11 +28,9 @@ class Store(Protocol):
 
     def add(self, first: int, descriptors: Float[np.ndarray, "n d"]) -> None:
         """Write descriptors as numbers `first` and on; they are durable once this returns."""
-        ...
 
     def check(self, segments: Sequence[tuple[int, int]]) -> None:
         """Check, without reading them, that all additions, as (first, count), are there."""
-        ...
 
     def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
         """Read the descriptors that were added together as numbers `first` and on."""
@@ -47,31 +45,34 @@ class Store(Protocol):
 
     def close(self) -> None:
         """Close connections, if there are any."""
-        ...
 
 
-def store_name(name: str, folder: pathlib.Path, dtype: str) -> str:
-    """Check a store's name on the command line; return the name that a map in `folder` stores.
-
-    The name holds a file of Milvus by its absolute path, or by one relative to the map's folder if
-    it is inside.
+def check_store(name: str, dtype: str) -> None:
+    """Check the name of a store, and that it holds descriptors of a type.
 
     Raises:
         InputError: neither "files" nor "milvus:URI", or such an URI or type that Milvus has not.
     """
-    if dtype not in DTYPES:
-        raise InputError(f"dtype: found {dtype!r}, expected one of {', '.join(DTYPES)}")
-    if name == "files":
-        return name
-    if not name.startswith(_MILVUS):
-        raise InputError(f"store: found {name!r}, expected files or milvus:URI")
-    if dtype != "float32":
-        raise InputError(f"dtype: found {dtype}, expected float32, which {name} keeps")
+    if name != "files":
+        if not name.startswith(_MILVUS):
+            raise InputError(f"store: found {name!r}, expected files or milvus:URI")
+        check_address(name.removeprefix(_MILVUS))
+    types = DTYPES if name == "files" else DTYPES[:1]
+    if dtype not in types:
+        raise InputError(f"dtype: found {dtype!r}, expected {' or '.join(types)} in {name}")
+
+
+def store_name(name: str, folder: pathlib.Path) -> str:
+    """Return the name that a map in `folder` records of a store on the command line.
+
+    It holds a file of Milvus by its absolute path, or by one relative to the map's folder if it is
+    inside.
+    """
     address = name.removeprefix(_MILVUS)
-    if not check_address(address):
-        path, folder = real_path(address), real_path(folder)
-        address = str(path.relative_to(folder) if path.is_relative_to(folder) else path)
-    return _MILVUS + address
+    if name == "files" or check_address(address):
+        return name
+    path, folder = real_path(address), real_path(folder)
+    return f"{_MILVUS}{path.relative_to(folder) if path.is_relative_to(folder) else path}"
 
 
 def open_store(

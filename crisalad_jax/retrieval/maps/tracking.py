@@ -3,7 +3,7 @@
 import itertools
 import math
 import pathlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -76,12 +76,16 @@ class SequenceTracker:
         """
         if self.state.frames == 0:
             self._choose_unit(frames)
-        rows = [
-            self._ranked(row, k, self._moved(frame))
-            for row, frame in zip(self._similarities(descriptors), frames, strict=True)
-        ]
-        numbers, similarities, probabilities, best = map(np.stack, zip(*rows, strict=True))
-        return TrackResult(numbers, similarities, probabilities, best)
+        found = []
+        step = max(1, _NUMBERS // len(self._map))
+        for start in range(0, len(descriptors), step):
+            part = self._map.similarities(descriptors[start : start + step])
+            for row, frame in zip(part, frames[start : start + step], strict=True):
+                self.state = self._filter.step(self.state, row, self._moved(frame))
+                belief = self.state.belief
+                numbers = np.argsort(-belief, kind="stable")[:k]
+                found.append((numbers, row[numbers], belief[numbers], row.max()))
+        return TrackResult(*map(np.stack, zip(*found, strict=True)))
 
     def _choose_unit(self, frames: Sequence[pathlib.Path]) -> None:
         moments = [_when(image.name) for image in self._map.images]
@@ -105,22 +109,6 @@ class SequenceTracker:
             return 1.0
         before, self._before = self._before, self._read(str(frame))
         return _apart(before, self._before)
-
-    def _ranked(
-        self, row: Float32[np.ndarray, " place"], k: int, moved: float
-    ) -> tuple[np.ndarray, ...]:
-        self.state = self._filter.step(self.state, row, moved)
-        belief = self.state.belief
-        numbers = np.argsort(-belief, kind="stable")[:k]
-        return numbers, row[numbers], belief[numbers], row.max()
-
-    def _similarities(
-        self, descriptors: Float32[np.ndarray, "frame d"]
-    ) -> Iterator[Float32[np.ndarray, " place"]]:
-        """Yield the similarities of each frame to all images of the map."""
-        step = max(1, _NUMBERS // len(self._map))
-        for start in range(0, len(descriptors), step):
-            yield from self._map.similarities(descriptors[start : start + step])
 
 
 def _apart(first: _Spot | None, second: _Spot | None) -> float:

@@ -1,7 +1,9 @@
 """The second stage: local features of the retrieved images, computed once, and the new order."""
 
+import contextlib
 import dataclasses
 import pathlib
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +20,7 @@ from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.reranking import matching, patch_netvlad
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.shapes import Bool, Float, Int
 
 
@@ -85,8 +87,6 @@ class Reranking:
             raise InputError(
                 f"rerank: found {self.label}, expected at least 2 retrievals to put in order"
             )
-        if (self.params is None) != (self.config is None):
-            raise InputError("rerank: found params or config alone, expected both or neither")
 
     @property
     def label(self) -> str:
@@ -106,19 +106,13 @@ class Reranking:
             InputError: the model that makes local features has another aggregator, or its images
                 too few patches; more retrievals than the database has images, if that is given.
         """
-        method = _METHODS[self.name]
-        own = self.config or config
-        if own.aggregator.part_name != method.aggregator:
+        method, own = _METHODS[self.name], self.config or config
+        found = own.aggregator.part_name, own.preprocessing.size_rule
+        if found != (method.aggregator, "fixed"):
             raise InputError(
-                f"rerank: found a model with aggregator {own.aggregator.part_name}, expected "
-                f"{method.aggregator}, whose local features {self.name} compares (--rerank-weights "
-                "takes another model than the first stage's)"
-            )
-        rule = own.preprocessing.size_rule
-        if rule != "fixed":
-            raise InputError(
-                f"rerank: found a model with size rule {rule}, expected fixed: {self.name} "
-                "compares equally many local features of each image"
+                f"rerank: found a model with aggregator {found[0]} and size rule {found[1]}, "
+                f"expected {method.aggregator} and fixed, whose local features {self.name} "
+                "compares (--rerank-weights takes another model than the first stage's)"
             )
         method.shape(own)
         if database is not None and self.top > database:
@@ -134,13 +128,13 @@ def parse_reranking(text: str) -> Reranking:
     Raises:
         InputError: the form, the name or the number is wrong.
     """
-    name, colon, top = text.partition(":")
-    if not colon or not top.isascii() or not top.isdecimal() or len(top) > 9:
+    match = re.fullmatch(r"(.+):([0-9]{1,9})", text)
+    if match is None:
         raise InputError(
             f"rerank: found {text!r}, expected NAME:TOPK, as in patch-netvlad:100, with one of "
             f"{', '.join(sorted(_METHODS))}"
         )
-    return Reranking(name, int(top))
+    return Reranking(match[1], int(match[2]))
 
 
 class _Side(NamedTuple):
@@ -168,17 +162,16 @@ class Reranker:
         queries: Sequence[pathlib.Path],
         reading: Reading = Reading(),
     ) -> None:
-        """Prepare the second stage; enter it as a context before use.
+        """Prepare the second stage, of a re-ranking with a model; enter it before use.
 
         Raises:
-            InputError: no model, or what `Reranking.check` raises.
+            InputError: what `Reranking.check` raises.
         """
-        if reranking.params is None or reranking.config is None:
-            raise InputError("rerank: found no model, expected one, or `over` the first stage's")
+        assert reranking.params is not None  # `over` gives it the first stage's
+        assert reranking.config is not None
         reranking.check(reranking.config, len(database))
         self._top, self._config, self._label = reranking.top, reranking.config, reranking.name
-        self._method = _METHODS[reranking.name]
-        self._reading, self._quiet = reading, reading.quiet
+        self._method, self._reading = _METHODS[reranking.name], reading
         self._devices = devices_for(reading.batch_size)
         self._params = self._devices.replicate(cast_params(reranking.params, reranking.config))
         self._scores: dict[tuple[int, int], float | list[float]] = {}
@@ -207,21 +200,14 @@ class Reranker:
         Scores replace the similarities of the neighbours that are re-ranked.
 
         Raises:
-            InputError: neighbours of fewer columns than `top`, or of other queries; an image
-                cannot be read; the disk has no room for the features.
+            InputError: an image cannot be read; the disk has no room for the features.
         """
         indices, similarities = (np.array(part) for part in neighbours)
         top = self._top
-        if indices.shape[0] != len(self._queries.paths) or indices.shape[1] < top:
-            raise InputError(
-                f"rerank: found {indices.shape[1]} neighbours of {indices.shape[0]} queries, "
-                f"expected at least {top} of {len(self._queries.paths)}"
-            )
         first = indices[:, :top]
         self._describe(self._queries, np.arange(len(indices)), "queries")
         self._describe(self._database, np.unique(first), "candidates")
-        pairs = len(first) * top
-        with progress_bar(f"{self._label}, pairs", pairs, "pairs", quiet=self._quiet) as bar:
+        with self._bar("pairs", len(first) * top, "pairs") as bar:
             for query, candidates in enumerate(first):
                 scores = self._score(query, candidates)
                 order = np.argsort(-scores, kind="stable")
@@ -230,6 +216,9 @@ class Reranker:
                 bar.advance(top)
         return Neighbours(indices, similarities)
 
+    def _bar(self, what: str, count: int, unit: str) -> contextlib.AbstractContextManager[Bar]:
+        return progress_bar(f"{self._label}, {what}", count, unit, quiet=self._reading.quiet)
+
     def _describe(self, side: _Side, images: Int[np.ndarray, " image"], name: str) -> None:
         """Compute the features of those images that have none yet.
 
@@ -237,6 +226,8 @@ class Reranker:
             InputError: an image cannot be read, or the disk has no room.
         """
         missing = images[~side.known[images]]
+        if not len(missing):
+            return
         needed = len(missing) * side.features[:1].nbytes
         free = shutil.disk_usage(self._folder.name).free
         if needed > free:
@@ -244,14 +235,10 @@ class Reranker:
                 f"{self._folder.name}: found {free / 2**30:.1f} GiB free, expected "
                 f"{needed / 2**30:.1f} GiB for the local features of {len(missing)} images"
             )
-        if not len(missing):
-            return
         config, paths = self._config, [side.paths[i] for i in missing]
         how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
-        batches = self._reading.batches(paths, how, config.check_image_size)
-        label = f"{self._label}, {name}"
-        with progress_bar(label, len(missing), "images", quiet=self._quiet) as bar:
-            for batch in batches:
+        with self._bar(name, len(missing), "images") as bar:
+            for batch in self._reading.batches(paths, how, config.check_image_size):
                 sharded = self._devices.shard_batch(batch.images)
                 found = np.asarray(self._method.describe(self._params, sharded, config))
                 rows = missing[batch.indices[batch.valid]]

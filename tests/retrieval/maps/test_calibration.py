@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import pathlib
-import re
 import shutil
 
 import jax
@@ -26,39 +25,25 @@ from crisalad_jax.retrieval.maps.calibration import (
     write_calibration,
 )
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.retrieval.maps.query import Answers, json_lines, query
+from crisalad_jax.retrieval.maps.query import Answers, json_lines
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL, describe_single, random_params
+from tests.retrieval.maps.conftest import ask
 
-
-@pytest.fixture(scope="module")
-def queries(shared) -> pathlib.Path:
-    return shared / "town" / "images" / "test" / "queries"
-
-
-@pytest.fixture(scope="module")
-def made(shared, params, tmp_path_factory) -> pathlib.Path:
-    """A map of the town's database in segments of five and two."""
-    out = tmp_path_factory.mktemp("maps") / "map"
-    images = shared / "town" / "images" / "test" / "database"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(crisalad_jax.retrieval.maps.build, "SEGMENT", 4)
-        index(
-            Model(params, MODEL),
-            images,
-            out,
-            weights=shared / "weights.safetensors",
-            reading=Reading(batch_size=BATCH, quiet=True),
-        )
-    return out
+QUIET = Reading(batch_size=BATCH, quiet=True)
 
 
 @pytest.fixture
-def folder(made, tmp_path) -> pathlib.Path:
+def queries(sides) -> pathlib.Path:
+    return sides[1]
+
+
+@pytest.fixture
+def folder(town_map, tmp_path) -> pathlib.Path:
     """A copy to spoil."""
-    return shutil.copytree(made, tmp_path / "map")
+    return shutil.copytree(town_map, tmp_path / "map")
 
 
 def remembered(folder: pathlib.Path, **changes) -> Calibration:
@@ -85,27 +70,12 @@ def remembered(folder: pathlib.Path, **changes) -> Calibration:
     return calibration
 
 
-def ask(folder, params, images, **options) -> Answers:
-    with Map.open(folder) as places:
-        return query(
-            places,
-            images,
-            model=Model(params, places.config),
-            **options,
-            reading=Reading(batch_size=BATCH, quiet=True),
-        )
-
-
 # What is remembered
 
 
 def test_a_map_remembers_the_point_of_an_evaluation(folder, params, benchmark):
     (result,) = evaluate(
-        Model(params, MODEL),
-        benchmark,
-        groupings=["single"],
-        precision=0.4,
-        reading=Reading(batch_size=BATCH, quiet=True),
+        Model(params, MODEL), benchmark, groupings=["single"], precision=0.4, reading=QUIET
     )
     point = result.operating_point
     assert point is not None
@@ -113,13 +83,7 @@ def test_a_map_remembers_the_point_of_an_evaluation(folder, params, benchmark):
     with Map.open(folder) as places:
         assert places.calibration is None
         assert places.summary()["calibration"] is None
-        found = calibrate(
-            places,
-            benchmark,
-            0.4,
-            model=Model(params, places.config),
-            reading=Reading(batch_size=BATCH, quiet=True),
-        )
+        found = calibrate(places, benchmark, 0.4, model=Model(params, places.config), reading=QUIET)
         assert places.calibration is found
         assert found.model == places.metadata.model
     assert operating_point_of(found) == point
@@ -143,42 +107,10 @@ def test_a_precision_out_of_reach_leaves_what_was_there(folder, params, benchmar
     words = "precision: no similarity reaches a precision of 99 %; the highest is 0.0 %"
     with Map.open(folder) as places:
         with pytest.raises(InputError, match=words):
-            calibrate(
-                places,
-                lost,
-                model=Model(params, places.config),
-                reading=Reading(batch_size=BATCH, quiet=True),
-            )
+            calibrate(places, lost, model=Model(params, places.config), reading=QUIET)
         assert places.calibration == before
     with Map.open(folder) as places:
         assert places.calibration == before
-
-
-@pytest.mark.parametrize("precision", [0.99, 1.0])
-def test_a_similarity_that_rests_on_too_few_answers_is_not_remembered(
-    folder, params, benchmark, precision
-):
-    """One query that is right shows a precision of 5 %."""
-    one = dataclasses.replace(
-        benchmark,
-        queries=benchmark.queries[:1],
-        query_positions=None,
-        database_positions=None,
-        positives=(np.arange(7),),
-    )
-    where = re.escape(benchmark.name)
-    words = f"precision: found 1 answer of similarity .* on {where}, 1 right, .* at least 5.0 %"
-    with Map.open(folder) as places:
-        with pytest.raises(InputError, match=words):
-            calibrate(
-                places,
-                one,
-                precision,
-                model=Model(params, places.config),
-                reading=Reading(batch_size=BATCH, quiet=True),
-            )
-        assert places.calibration is None
-    assert not (folder / CALIBRATION).exists()
 
 
 def test_another_model_calibrates_nothing(folder, benchmark):
@@ -197,7 +129,7 @@ def test_a_calibration_that_is_not_this_maps_is_refused(folder):
         Map.open(folder)
     path.unlink()
     remembered(folder, format=2)
-    with pytest.raises(InputError, match=r"calibration\.json: found format 2, expected 1;"):
+    with pytest.raises(InputError, match="found a calibration of format 2, expected 1 as of"):
         Map.open(folder)
     path.unlink()
     remembered(folder)
@@ -216,38 +148,10 @@ def test_a_calibration_that_is_not_this_maps_is_refused(folder):
         Map.open(folder)
 
 
-def test_a_damaged_calibration_is_named_and_may_be_left_out(folder, params, benchmark, queries):
-    plain = ask(folder, params, queries)
-    (folder / CALIBRATION).write_text('{"min_sim')
-    with pytest.raises(InputError, match=r"calibration\.json: .*; the file may be removed"):
-        Map.open(folder)
-    with Map.open(folder, calibrated=False) as places:
-        answers = query(
-            places,
-            queries,
-            model=Model(params, places.config),
-            reading=Reading(batch_size=BATCH, quiet=True),
-        )
-        assert list(json_lines(answers)) == list(json_lines(plain))
-        calibrate(
-            places,
-            benchmark,
-            0.4,
-            model=Model(params, places.config),
-            reading=Reading(batch_size=BATCH, quiet=True),
-        )
-    with Map.open(folder) as places:
-        assert places.calibration is not None
-
-
 def test_a_map_with_a_calibration_grows(folder, params, shared, queries):
     before = remembered(folder)
     grown = index(
-        Model(params, MODEL),
-        queries,
-        folder,
-        weights=shared / "weights.safetensors",
-        reading=Reading(batch_size=BATCH, quiet=True),
+        Model(params, MODEL), queries, folder, weights=shared / "weights.safetensors", reading=QUIET
     )
     assert grown.images == 12
     with Map.open(folder) as places:
@@ -288,8 +192,8 @@ def hand_made(min_similarity: float | None, images) -> Answers:
     return Answers(paths, neighbours, images, ("east", "north"), min_similarity=min_similarity)
 
 
-def test_unknown_places_in_json_and_in_the_table(made):
-    with Map.open(made) as places:
+def test_unknown_places_in_json_and_in_the_table(town_map):
+    with Map.open(town_map) as places:
         images = places.images
     lines = [json.loads(line) for line in json_lines(hand_made(0.5, images))]
     assert [line["known"] for line in lines] == [True, False]
@@ -314,13 +218,13 @@ def test_a_similarity_equal_to_the_least_is_known():
 
 
 @pytest.mark.parametrize("numbers", [14, 2**25])
-def test_a_followed_camera_is_that_of_the_filter(made, params, queries, monkeypatch, numbers):
+def test_a_followed_camera_is_that_of_the_filter(town_map, params, queries, monkeypatch, numbers):
     """In portions of two frames, and at once; the map has two segments. Names say @UTM positions,
     so that it moves in metres."""
     monkeypatch.setattr(crisalad_jax.retrieval.maps.tracking, "_NUMBERS", numbers)
     settings = BayesFilter(reach=1)
-    found = ask(made, params, queries, k=3, sequence=settings)
-    with Map.open(made) as places:
+    found = ask(town_map, params, queries, k=3, sequence=settings)
+    with Map.open(town_map) as places:
         rows = np.concatenate(list(places.descriptors)).astype(np.float64)
     asked = describe_single(Model(params, MODEL), list_images(queries)).astype(np.float64)
     similarities = asked @ rows.T

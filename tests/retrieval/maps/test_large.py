@@ -17,7 +17,7 @@ from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import Indexed, index
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.query import query
-from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, save_pca
+from crisalad_jax.retrieval.pca import fit_pca, save_pca
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.conftest import BATCH, MODEL, describe_single, read_options
@@ -145,20 +145,6 @@ def test_a_kill_after_all_is_joined_leaves_nothing_undone(
     assert not (out / "shares").exists()
 
 
-@pytest.mark.parametrize(
-    ("share", "words"),
-    [
-        ("2/2", "share: found '2/2', expected INDEX/COUNT"),
-        ("1", "share: found '1', expected INDEX/COUNT"),
-        ("0/3", "found 3 shares of 7 images in batches of 4, expected at most 2"),
-    ],
-)
-def test_what_is_no_share(shared, params, database, tmp_path, share, words):
-    with pytest.raises(InputError, match=words):
-        run(shared, params, database, tmp_path / "map", share=share)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_share_of_other_images_is_not_joined(shared, params, database, tmp_path):
     images, out = tmp_path / "images", tmp_path / "map"
     shutil.copytree(database, images)
@@ -207,14 +193,6 @@ def test_a_map_of_components_shortens_queries_too(shared, params, database, whol
     save_pca(out / "pca.safetensors", other)
     with pytest.raises(InputError, match=r"pca\.safetensors: found other components"):
         Map.open(out)
-
-
-def test_components_that_leave_lengths_are_refused(shared, params, database, whole, tmp_path):
-    with Map.open(whole) as places:
-        full = np.concatenate(list(places.descriptors))
-    loose = fit_pca(full, 3, PcaConfig(renormalise=False))
-    with pytest.raises(InputError, match="pca: found components that leave lengths"):
-        run(shared, params, database, tmp_path / "map", pca=loose)
 
 
 # Approximate search
@@ -314,12 +292,6 @@ def test_what_cannot_be_built(grown, shared, params, database, tmp_path):
     with pytest.raises(InputError, match="is searched by Milvus"):
         run(shared, params, database, tmp_path / "new", search="hnsw", store=store)
     assert not (tmp_path / "new").exists()
-
-
-def test_an_index_is_built_while_images_are_indexed(shared, params, database, tmp_path):
-    done = run(shared, params, database, tmp_path / "map", search="hnsw")
-    assert done.recall == 1.0
-    assert run(shared, params, database, tmp_path / "map", search="hnsw").recall == 1.0
 
 
 @pytest.mark.slow

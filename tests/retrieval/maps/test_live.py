@@ -8,33 +8,17 @@ import pytest
 
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.live import Camera, FolderWatch, Frame
-from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.video import list_frames
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.live import latency_words, query_live
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.retrieval.maps.query import json_lines, query
+from crisalad_jax.retrieval.maps.query import json_lines
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
-from tests.conftest import BATCH, MODEL, read_options, write_video
+from tests.conftest import MODEL, read_options, write_video
+from tests.retrieval.maps.conftest import ask
 from tests.retrieval.maps.test_stores import ROUNDING
-
-
-@pytest.fixture(scope="module")
-def folder(shared, params, tmp_path_factory):
-    """A map of the town's database."""
-    out = tmp_path_factory.mktemp("live") / "map"
-    images = shared / "town" / "images" / "test" / "database"
-    weights = shared / "weights.safetensors"
-    index(
-        Model(params, MODEL),
-        images,
-        out,
-        weights=weights,
-        reading=Reading(batch_size=BATCH, quiet=True),
-    )
-    return out
 
 
 class Given:
@@ -53,18 +37,11 @@ class Given:
 
 
 @pytest.mark.parametrize("window", [1, 3])
-def test_the_answers_are_those_of_query(folder, shared, params, window):
+def test_the_answers_are_those_of_query(town_map, shared, params, window):
     paths = list_images(shared / "town" / "images" / "test" / "queries")
     source = Given(paths)
-    with Map.open(folder) as places:
-        expected = query(
-            places,
-            paths[0].parent,
-            model=Model(params, places.config),
-            k=2,
-            window=window,
-            reading=Reading(batch_size=BATCH, quiet=True),
-        )
+    expected = ask(town_map, params, paths[0].parent, k=2, window=window)
+    with Map.open(town_map) as places:
         stream = query_live(
             places,
             source,
@@ -91,14 +68,14 @@ def test_the_answers_are_those_of_query(folder, shared, params, window):
     assert all(answer.latency_ms > 0 for answer in found)
 
 
-def test_a_watched_folder_and_a_camera(folder, shared, params, tmp_path):
+def test_a_watched_folder_and_a_camera(town_map, shared, params, tmp_path):
     database = shared / "town" / "images" / "test" / "database"
     image = list_images(database)[4]
     (tmp_path / "in").mkdir()
     watch = FolderWatch(tmp_path / "in")
     shutil.copy(image, tmp_path / "in")
     video = write_video(tmp_path / "walk.avi", 4)
-    with Map.open(folder) as places:
+    with Map.open(town_map) as places:
         first = next(query_live(places, watch, model=Model(params, places.config), k=1))
         line = json.loads(first.json_line())
         assert line["neighbours"][0]["name"] == image.name
@@ -118,21 +95,8 @@ def test_a_map_of_a_video_tells_times(shared, params, tmp_path):
     with Map.open(tmp_path / "map") as places:
         assert {image.root for image in places.images} == {tmp_path.resolve().as_posix()}
         assert places.images[1].bytes == video.stat().st_size
-        answers = query(
-            places,
-            list_frames(video, 1)[2],
-            model=Model(params, places.config),
-            k=1,
-            reading=Reading(batch_size=BATCH, quiet=True),
-        )
-        whole = query(
-            places,
-            video,
-            model=Model(params, places.config),
-            fps=2,
-            k=1,
-            reading=Reading(batch_size=BATCH, quiet=True),
-        )
+    answers = ask(tmp_path / "map", params, list_frames(video, 1)[2], k=1)
+    whole = ask(tmp_path / "map", params, video, fps=2, k=1)
     (line,) = map(json.loads, json_lines(answers))
     assert (line["query"], line["time"]) == ("walk.avi#t=2.000", 2.0)
     assert line["neighbours"][0] == {
@@ -152,36 +116,24 @@ def test_latencies_in_words():
     assert latency_words([]) == "no answers"
 
 
-def test_what_is_refused(folder, params):
-    with Map.open(folder) as places:
+def test_what_is_refused(town_map, params):
+    with Map.open(town_map) as places:
         with pytest.raises(InputError, match="k: found 0, expected at least 1"):
             query_live(places, Given([]), model=Model(params, places.config), k=0)
         with pytest.raises(InputError, match="window: found 0, expected at least 1"):
             query_live(places, Given([]), model=Model(params, places.config), window=0)
 
 
-def test_a_filter_and_a_least_similarity_are_those_of_query(folder, shared, params):
+def test_a_filter_and_a_least_similarity_are_those_of_query(town_map, shared, params):
     paths = list_images(shared / "town" / "images" / "test" / "queries")
-    with Map.open(folder) as places:
-        options = {"k": 2, "sequence": BayesFilter(reach=1)}
-        best = query(
-            places,
-            paths,
-            model=Model(params, places.config),
-            k=1,
-            reading=Reading(batch_size=BATCH, quiet=True),
-        ).neighbours
-        # In the widest gap between two of the queries: rounding does not decide.
-        ordered = np.sort(best.similarities[:, 0])
-        below = int(np.argmax(np.diff(ordered))) + 1
-        options["min_similarity"] = float(ordered[below - 1] + ordered[below]) / 2
-        expected = query(
-            places,
-            paths,
-            model=Model(params, places.config),
-            **options,
-            reading=Reading(batch_size=BATCH, quiet=True),
-        )
+    best = ask(town_map, params, paths, k=1).neighbours
+    # In the widest gap between two of the queries: rounding does not decide.
+    ordered = np.sort(best.similarities[:, 0])
+    below = int(np.argmax(np.diff(ordered))) + 1
+    between = float(ordered[below - 1] + ordered[below]) / 2
+    options = {"k": 2, "sequence": BayesFilter(reach=1), "min_similarity": between}
+    expected = ask(town_map, params, paths, **options)
+    with Map.open(town_map) as places:
         found = list(
             query_live(places, Given(paths), model=Model(params, places.config), **options)
         )

@@ -1,6 +1,5 @@
 """Questions to a map in Python: answers that outlive it, in any portions the same."""
 
-import gc
 import json
 import math
 import pathlib
@@ -19,57 +18,21 @@ from crisalad_jax.data.live import FolderWatch, Frame
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import index
-from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.live import query_live
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.retrieval.maps.query import (
-    Answers,
-    json_lines,
-    query,
-    write_answers,
-)
+from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
 from crisalad_jax.utils.errors import InputError
-from tests.conftest import BATCH, MODEL, random_params, read_options
+from tests.conftest import MODEL, random_params, read_options
+from tests.retrieval.maps.conftest import ask
 from tests.retrieval.maps.test_stores import ROUNDING
 
 
 @pytest.fixture(scope="module")
-def sides(shared) -> tuple[pathlib.Path, pathlib.Path]:
-    """The town's database and queries."""
-    images = shared / "town" / "images" / "test"
-    return images / "database", images / "queries"
+def answers(town_map, params, sides) -> Answers:
+    return ask(town_map, params, sides[1], k=3)
 
 
-@pytest.fixture(scope="module")
-def folder(shared, params, sides, tmp_path_factory) -> pathlib.Path:
-    out = tmp_path_factory.mktemp("maps") / "map"
-    weights = shared / "weights.safetensors"
-    index(
-        Model(params, MODEL),
-        sides[0],
-        out,
-        weights=weights,
-        reading=Reading(batch_size=BATCH, quiet=True),
-    )
-    return out
-
-
-def ask(folder, params, images, **options) -> Answers:
-    with Map.open(folder) as places:
-        return query(
-            places,
-            images,
-            model=Model(params, places.config),
-            **read_options(options),
-        )
-
-
-@pytest.fixture(scope="module")
-def answers(folder, params, sides) -> Answers:
-    return ask(folder, params, sides[1], k=3)
-
-
-def test_answers_after_the_map_is_closed(folder, answers, sides):
+def test_answers_after_the_map_is_closed(town_map, answers, sides):
     assert answers.queries == list_images(sides[1])
     assert answers.neighbours.indices.shape == (5, 3)
     rows = list(answers.rows())
@@ -85,17 +48,17 @@ def test_answers_after_the_map_is_closed(folder, answers, sides):
     assert answers.position(image._replace(position=None)) is None
 
 
-def test_a_file_a_folder_or_a_list_of_both(folder, params, sides, answers):
+def test_a_file_a_folder_or_a_list_of_both(town_map, params, sides, answers):
     one = answers.queries[0]
-    assert ask(folder, params, one).queries == [one]
-    assert ask(folder, params, [one, sides[1]]).queries == [one, *answers.queries]
+    assert ask(town_map, params, one).queries == [one]
+    assert ask(town_map, params, [one, sides[1]]).queries == [one, *answers.queries]
     # Fewer in the map than asked for: all of them.
-    assert ask(folder, params, str(one), k=99).neighbours.indices.shape == (1, 7)
+    assert ask(town_map, params, str(one), k=99).neighbours.indices.shape == (1, 7)
 
 
-def test_in_portions_all_the_same(folder, params, sides, answers, monkeypatch):
+def test_in_portions_all_the_same(town_map, params, sides, answers, monkeypatch):
     monkeypatch.setattr(crisalad_jax.retrieval.maps.query, "AT_ONCE", 1)
-    found = ask(folder, params, sides[1], k=3)
+    found = ask(town_map, params, sides[1], k=3)
     np.testing.assert_array_equal(found.neighbours.indices, answers.neighbours.indices)
     np.testing.assert_allclose(
         found.neighbours.similarities, answers.neighbours.similarities, atol=ROUNDING, rtol=0
@@ -124,17 +87,17 @@ def test_a_list_is_written_to_a_file_of_json(answers, tmp_path):
     assert found == list(map(json.loads, json_lines(answers)))
 
 
-def test_names_of_queries_are_relative_to_their_source(folder, params, sides, monkeypatch):
+def test_names_of_queries_are_relative_to_their_source(town_map, params, sides, monkeypatch):
     """Of several sources, to the folder that holds all, so that no two images have one name."""
     database, queries = sides
     one = list_images(queries)[0]
-    assert ask(folder, params, one).names == [one.name]
-    assert ask(folder, params, [one, one]).names == [one.name] * 2
-    found = ask(folder, params, [queries, database])
+    assert ask(town_map, params, one).names == [one.name]
+    assert ask(town_map, params, [one, one]).names == [one.name] * 2
+    found = ask(town_map, params, [queries, database])
     expected = [f"{s.name}/{each.name}" for s in (queries, database) for each in list_images(s)]
     assert found.names == expected
     monkeypatch.chdir(queries)
-    assert ask(folder, params, [pathlib.Path(one.name), database]).names == [
+    assert ask(town_map, params, [pathlib.Path(one.name), database]).names == [
         f"{queries.name}/{one.name}",
         *(f"{database.name}/{each.name}" for each in list_images(database)),
     ]
@@ -161,13 +124,13 @@ def test_lines_for_people(answers):
 @pytest.mark.parametrize(
     ("images", "options", "words"),
     [
-        ([], {}, "images: found none, expected images or folders of them"),
+        ([], {}, "images: found none, expected at least one image"),
         (["none.jpg"], {}, "none.jpg: found no such file"),
         (["none.jpg"], {"k": 0}, "k: found 0, expected at least 1"),
     ],
 )
-def test_what_is_refused(folder, params, images, options, words):
-    with Map.open(folder) as places, pytest.raises(InputError, match=words):
+def test_what_is_refused(town_map, params, images, options, words):
+    with Map.open(town_map) as places, pytest.raises(InputError, match=words):
         query(
             places,
             images,
@@ -177,8 +140,8 @@ def test_what_is_refused(folder, params, images, options, words):
         )
 
 
-def test_the_model_of_a_map(folder, shared, params, tmp_path):
-    with Map.open(folder) as places:
+def test_the_model_of_a_map(town_map, shared, params, tmp_path):
+    with Map.open(town_map) as places:
         found = places.load_model()
         np.testing.assert_array_equal(found.params.backbone.cls_token, params.backbone.cls_token)
         assert found.config == places.config
@@ -190,23 +153,16 @@ def test_the_model_of_a_map(folder, shared, params, tmp_path):
             places.load_model(other)
 
 
-def test_a_summary(folder, shared):
-    with Map.open(folder) as places:
+def test_a_summary(town_map, shared):
+    with Map.open(town_map) as places:
         summary = places.summary(verify=True)
     assert json.loads(json.dumps(summary)) == summary | {"axes": ["east", "north"]}
     assert (summary["images"], summary["positions"], summary["verified"]) == (7, 7, True)
     assert summary["weights"] == str((shared / "weights.safetensors").resolve())
 
 
-def test_parameters_of_another_model_are_refused(folder, params, sides):
-    """Also where they have the same shapes, and answers would come."""
-    other = jax.tree.map(lambda x: x + 1, params)
-    with pytest.raises(InputError, match=r"found a map made by model \w+ .*, but the given model"):
-        ask(folder, other, sides[1])
-
-
-def test_one_picture_is_located_as_by_a_query(folder, params, answers):
-    places = Map.open(folder)
+def test_one_picture_is_located_as_by_a_query(town_map, params, answers):
+    places = Map.open(town_map)
     for path, ranked in answers.rows():
         for image in (path, str(path), read_image(path)):
             found = places.locate(image, k=3)
@@ -224,11 +180,11 @@ def test_one_picture_is_located_as_by_a_query(folder, params, answers):
 
 
 @pytest.mark.parametrize("last", [(), (1,)], ids=["mono8", "one channel"])
-def test_grey_is_located_as_its_three_channels(folder, answers, last):
+def test_grey_is_located_as_its_three_channels(town_map, answers, last):
     """As cv2.IMREAD_GRAYSCALE and ROS's mono8 have it, and what comes live."""
     grey = cv2.imread(str(answers.queries[0]), cv2.IMREAD_GRAYSCALE)
     picture, repeated = grey.reshape(*grey.shape, *last), np.stack([grey] * 3, axis=-1)
-    places = Map.open(folder)
+    places = Map.open(town_map)
     assert places.locate(picture, k=3) == places.locate(repeated, k=3)
 
     class Node:
@@ -286,8 +242,8 @@ def test_a_map_of_thermal_images_reads_queries_as_it_was_made(tmp_path, shared, 
         index(Model(params, other), tmp_path / "thermal", out, **options)
 
 
-def test_what_locate_refuses(folder, params, answers):
-    places = Map.open(folder)
+def test_what_locate_refuses(town_map, params, answers):
+    places = Map.open(town_map)
     with pytest.raises(InputError, match="k: found 0, expected at least 1"):
         places.locate(answers.queries[0], k=0)
     with pytest.raises(InputError, match=r"nowhere\.png"):
@@ -301,30 +257,16 @@ def test_what_locate_refuses(folder, params, answers):
 
 
 @pytest.mark.parametrize("k", [1.5, 2.0, "3", None, True, np.float32(1)])
-def test_a_number_of_answers_is_a_whole_number(folder, params, answers, k):
-    with Map.open(folder) as places:
+def test_a_number_of_answers_is_a_whole_number(town_map, params, answers, k):
+    with Map.open(town_map) as places:
         rows = np.eye(1, places.metadata.descriptor_length, dtype=np.float32)
         for ask_for in (
             lambda: places.locate(answers.queries[0], k=k),
             lambda: places.search(rows, k),
             lambda: query(places, answers.queries, model=Model(params, places.config), k=k),
             lambda: query_live(
-                places, FolderWatch(folder), model=Model(params, places.config), k=k
+                places, FolderWatch(town_map), model=Model(params, places.config), k=k
             ),
         ):
             with pytest.raises(InputError, match=r"k: found .*, expected a whole number"):
                 ask_for()
-
-
-def test_a_map_that_is_forgotten_closes_its_store(folder, monkeypatch):
-    closed = []
-    monkeypatch.setattr(FileStore, "close", lambda store: closed.append(store))
-    places = Map.open(folder)
-    assert not closed
-    del places
-    gc.collect()
-    assert len(closed) == 1
-    places = Map.open(folder)
-    places.close()
-    places.close()
-    assert len(closed) == 2
