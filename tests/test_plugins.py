@@ -756,7 +756,7 @@ def close(batch):
     succeeds(capfd, *given)
     succeeds(capfd, *given)  # the same command finds all done
     plugin.write_text(text.replace("1 -", "2 -"))
-    words = f"{out}: found another source of loss.kind close than the run began with; expected"
+    words = f"{out}: the run started from another source of loss.kind close than are given now"
     fails(capfd, *given, words=(words,))
 
 

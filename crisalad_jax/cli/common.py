@@ -179,7 +179,6 @@ def open_model(
     flags: ModelFlags,
     weights: pathlib.Path | None = None,
     *,
-    quiet: bool = False,
     groupings: Sequence[str] = ("single",),
     like: "ModelConfig | None" = None,
 ) -> OpenedModel:
@@ -188,7 +187,6 @@ def open_model(
     Args:
         flags: which model, and how it describes images.
         weights: a file in place of --weights.
-        quiet: whether to show no progress of a download.
         groupings: the groupings that images will be described in.
         like: configuration of a map, whose image size and types the flags then change.
 
@@ -203,7 +201,7 @@ def open_model(
         )
 
     given = weights or flags.weights
-    file = find_given(given, runtime=flags.runtime, quiet=quiet) or find_weights(None)
+    file = find_given(given, runtime=flags.runtime, quiet=flags.quiet) or find_weights(None)
     short = f"{file.parent.name}/{file.name}" if file.parent.name else file.name
     name = starter.named(file) if file in starter.FILES.values() else short
     if flags.runtime == "jax":

@@ -68,7 +68,7 @@ def run(arguments: Evaluate) -> None:
     if arguments.preset is not None:
         model, name = _untrained(arguments.preset, arguments)
     else:
-        model, name, file = open_model(arguments, quiet=arguments.quiet, groupings=groupings)
+        model, name, file = open_model(arguments, groupings=groupings)
         weights = arguments.weights or file
     config = model.config
     pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)

@@ -55,7 +55,7 @@ def run(arguments: Extract) -> dict[str, Any] | None:
     out, how = arguments.out, pick(arguments, "grouping", "seed", "pairs", "database", "k", "share")
     reading = arguments.reading
     check_extraction(out, **how)
-    opened = open_model(arguments, quiet=arguments.quiet, groupings=[arguments.grouping])
+    opened = open_model(arguments, groupings=[arguments.grouping])
     model = opened.model
     result = extract(
         model,

@@ -95,7 +95,7 @@ class ComputeFlags(SizeFlags):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ModelFlags(ComputeFlags):
+class ModelFlags(ComputeFlags, QuietFlag):
     """Which model describes images, and how."""
 
     weights: pathlib.Path | None = None

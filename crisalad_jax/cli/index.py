@@ -65,7 +65,7 @@ def run(arguments: Index) -> dict[str, Any]:
     if metadata is not None:
         like = model_config(metadata, out)
         weights = None if arguments.weights else weights_of(metadata, out)
-    opened = open_model(arguments, weights, quiet=arguments.quiet, like=like)
+    opened = open_model(arguments, weights, like=like)
     config = opened.model.config
     result = index(
         opened.model,

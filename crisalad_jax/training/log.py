@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, read_text
 
@@ -82,13 +83,11 @@ def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:
     Raises:
         InputError: the file is missing, or a line is no record of a step.
     """
+    lines = read_text(path, "a log of a run").split("\n")[:-1]
     try:
-        lines = read_text(path, "a log of a run").split("\n")
-        records = [json.loads(line) for line in lines[:-1]]
-        if not all(isinstance(r, dict) and type(r.get("step")) is int for r in records):
-            raise ValueError("a line has no step")
-        return records
-    except InputError:
-        raise
+        records = [json.loads(line) for line in lines]
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot read this log of a run: {error}") from error
+    have_steps = all(isinstance(r, dict) and type(r.get("step")) is int for r in records)
+    require(have_steps, f"{path}: cannot read this log of a run: a line has no step")
+    return records

@@ -2,14 +2,13 @@
 
 from typing import Any, NamedTuple
 
-from crisalad_jax.config.checks import takes
+from crisalad_jax.config.checks import check_count, takes
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.costs import PartCost, adapter_macs, paper_adapter_macs, part_costs
 from crisalad_jax.training.config import has_adapters
 from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, HEAD, count_trainable
-from crisalad_jax.utils.errors import InputError
 
 
 class AdapterSummary(NamedTuple):
@@ -67,8 +66,7 @@ def model_summary(
         >>> model_summary(PRESETS["b14"]).descriptor
         8448
     """
-    if images < 1:
-        raise InputError(f"batch size: found {images}, expected at least 1")
+    check_count("batch size", images)
     if trainable is None:
         trainable = ADAPTERS_AND_HEAD if has_adapters(config) else HEAD
     trained = count_trainable(config, trainable)

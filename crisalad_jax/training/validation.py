@@ -59,6 +59,8 @@ class Validator:
         if benchmark is not None:
             benchmark.ground_truth()
         self._config, self._benchmark = config, benchmark
+        self._model = model = config.validation_model
+        self._how = Preparation(model.image_size, model.preprocessing, model.side_multiple)
         self._reading = Reading(on_bad_image=on_bad_image, cache=cache, quiet=True)
 
     @property
@@ -82,7 +84,7 @@ class Validator:
         """Evaluate the model, each image by itself, and watch its transport."""
         assert self._benchmark is not None
         (result,) = evaluate(
-            Model(params, self._config.validation_model),
+            Model(params, self._model),
             self._benchmark,
             groupings=("single",),
             reading=self._reading,
@@ -107,13 +109,10 @@ class Validator:
 
     def _watch_transport(self, params: Crisalad, benchmark: Benchmark) -> dict[str, float]:
         """Compute statistics of the transport on the first queries, without dropout."""
-        model = self._config.validation_model
         paths = benchmark.queries[:WATCHED_QUERIES]
-        how = Preparation(model.image_size, model.preprocessing, model.side_multiple)
         reading = Reading(batch_size=len(paths), cache=self._reading.cache)
-        batches = reading.batches(paths, how, model.check_image_size)
+        batches = reading.batches(paths, self._how, self._model.check_image_size)
         batch = next(iter(batches))  # of the size of the first, where sizes differ
-        transport = extract_tokens(params, batch.images[batch.valid], model).transport
-        if transport is None:
-            return {}
-        return named_scalars(jax.device_get(jax.tree.map(jnp.mean, transport)))
+        transport = extract_tokens(params, batch.images[batch.valid], self._model).transport
+        means = jax.device_get(jax.tree.map(jnp.mean, transport))
+        return {} if means is None else named_scalars(means)

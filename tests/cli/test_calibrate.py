@@ -6,16 +6,8 @@ import pathlib
 import pytest
 
 from tests.cli.test_cli import fails, files_in, succeeds
-from tests.cli.test_index import index, query
+from tests.cli.test_index import query
 from tests.conftest import BATCH
-
-
-@pytest.fixture
-def folder(shared, tmp_path, capfd) -> pathlib.Path:
-    """A map of the town's database."""
-    database = shared / "town" / "images" / "test" / "database"
-    succeeds(capfd, *index(shared, database, tmp_path / "map"))
-    return tmp_path / "map"
 
 
 def calibrate(folder: pathlib.Path, data: pathlib.Path, *more: object) -> tuple:
@@ -25,8 +17,7 @@ def calibrate(folder: pathlib.Path, data: pathlib.Path, *more: object) -> tuple:
     )
 
 
-def test_a_map_is_calibrated_and_says_unknown(folder, shared, tmp_path, capfd):
-    queries = shared / "town" / "images" / "test" / "queries"
+def test_a_map_is_calibrated_and_says_unknown(folder, shared, tmp_path, capfd, queries):
     said = succeeds(capfd, *calibrate(folder, shared / "town", "--precision", 0.4))
     value = json.loads((folder / "calibration.json").read_text())
     least = value["min_similarity"]
@@ -68,8 +59,7 @@ def test_what_cannot_be_is_one_line_and_leaves_nothing(folder, shared, tmp_path,
     assert files_in(folder) == before
 
 
-def test_a_damaged_calibration_is_left_out_where_a_similarity_is_given(folder, shared, capfd):
-    queries = shared / "town" / "images" / "test" / "queries"
+def test_a_damaged_calibration_is_left_out_with_a_similarity(folder, shared, capfd, queries):
     (folder / "calibration.json").write_text("{")
     fails(capfd, *query(folder, queries), words=("calibration.json", "the file may be removed"))
     for least in (-1, 0.5):
@@ -83,8 +73,7 @@ def test_a_damaged_calibration_is_left_out_where_a_similarity_is_given(folder, s
     assert "rests on" in succeeds(capfd, *query(folder, queries))
 
 
-def test_frames_of_a_camera_are_followed(folder, shared, tmp_path, capfd):
-    queries = shared / "town" / "images" / "test" / "queries"
+def test_frames_of_a_camera_are_followed(folder, tmp_path, capfd, queries):
     answers = tmp_path / "answers.jsonl"
     followed = ("--sequence", "bayes", "--sequence-reach", 1)
     succeeds(capfd, *query(folder, queries, *followed, "--k", 7, "--json", answers))

@@ -461,8 +461,7 @@ def test_too_few_patches_for_the_clusters(capfd, tmp_path, shared):
 # Weights
 
 
-def test_weights_of_another_configuration(capfd, tmp_path, shared):
-    weights = shared / "weights.safetensors"
+def test_weights_of_another_configuration(capfd, tmp_path, shared, weights):
     fails(
         capfd,
         *("train", "--data", shared / "city", "--out", tmp_path / "run", "--min-images", "2"),
@@ -593,10 +592,10 @@ def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public):
 # evaluate
 
 
-def test_evaluate_prints_and_writes_the_table(capfd, tmp_path, shared, params, benchmark):
+def test_evaluate_prints_and_writes_the_table(capfd, tmp_path, shared, params, benchmark, weights):
     out = succeeds(
         capfd,
-        *("evaluate", "--weights", shared / "weights.safetensors", "--data", shared / "town"),
+        *("evaluate", "--weights", weights, "--data", shared / "town"),
         *("--batch-size", BATCH, "--seed", "3", "--json", tmp_path / "table.json", "--quiet"),
         *("--seeds", "2", "--out", tmp_path / "pictures"),
     )
@@ -644,20 +643,20 @@ def test_without_an_encoder_there_is_one_row(capfd, tmp_path, shared):
 
 
 @SPOILT
-def test_a_bad_image_stops_an_evaluation(capfd, tmp_path, shared, town, how):
+def test_a_bad_image_stops_an_evaluation(capfd, tmp_path, town, how, weights):
     bad = sorted((town / "images" / "test" / "database").iterdir())[5]
     spoil(bad, how)
     fails(
         capfd,
-        *("evaluate", "--weights", shared / "weights.safetensors", "--data", town, "--quiet"),
+        *("evaluate", "--weights", weights, "--data", town, "--quiet"),
         *("--batch-size", BATCH, "--json", tmp_path / "out" / "t.json", "--out", tmp_path / "out"),
         words=(f"crisalad: {bad}: found ",),
     )
     assert not (tmp_path / "out").exists()
 
 
-def test_bad_evaluation_sets(capfd, tmp_path, shared, town):
-    start = ("evaluate", "--weights", shared / "weights.safetensors", "--data", town)
+def test_bad_evaluation_sets(capfd, tmp_path, town, weights):
+    start = ("evaluate", "--weights", weights, "--data", town)
     fails(capfd, *start, "--split", "val", words=(f"crisalad: {town}: ", "splits test"))
     fails(capfd, *start, "--radius", "-1", words=("radius: found -1",))
     fails(capfd, *start, "--image-size", "28", "28", words=("4 patches for 4 clusters",))
@@ -713,7 +712,9 @@ def test_what_the_disk_refuses_is_one_line(capfd, tmp_path, shared, monkeypatch)
     assert files_in(tmp_path) == {"d.npy", "d.names.txt", "d.npy.json"}
 
 
-def test_extract_writes_descriptors_names_and_configuration(capfd, tmp_path, shared, params):
+def test_extract_writes_descriptors_names_and_configuration(
+    capfd, tmp_path, shared, params, weights
+):
     town = shared / "town"
     out = succeeds(capfd, *extract(shared, town, tmp_path / "new" / "d.npy"))
     assert "12 descriptors of 48 numbers, grouping single (every image alone)" in out
@@ -731,7 +732,7 @@ def test_extract_writes_descriptors_names_and_configuration(capfd, tmp_path, sha
     }
     assert len(config.pop("checksum")) == 64
     assert config == {
-        "weights": str(shared / "weights.safetensors"),
+        "weights": str(weights),
         "images": str(town),
         "grouping": "single",
         "batch_size": BATCH,
@@ -889,10 +890,10 @@ def test_info_gives_the_papers_numbers(capfd, tmp_path):
     )
 
 
-def test_info_of_a_file_and_of_other_choices(capfd, tmp_path, shared, params):
+def test_info_of_a_file_and_of_other_choices(capfd, tmp_path, params, weights):
     succeeds(
         capfd,
-        *("info", "--weights", shared / "weights.safetensors", "--image-size", "56", "70"),
+        *("info", "--weights", weights, "--image-size", "56", "70"),
         *("--trainable", "all", "--json", tmp_path / "info.json"),
     )
     summary = json.loads((tmp_path / "info.json").read_text())

@@ -113,8 +113,8 @@ def test_a_map_of_another_versions_model_says_so(shared, own_map, capfd):
     fails(capfd, "query", list_images(shared / "town")[0], "--map", own_map, words=words)
 
 
-def test_a_map_asked_with_another_model_blames_no_version(shared, starters, capfd):
-    given = ("--map", starters, "--weights", shared / "weights.safetensors")
+def test_a_map_asked_with_another_model_blames_no_version(shared, starters, capfd, weights):
+    given = ("--map", starters, "--weights", weights)
     line = fails(capfd, "query", list_images(shared / "town")[0], *given, words=("(starter), but",))
     assert "version" not in line
 
@@ -132,11 +132,10 @@ def test_a_map_of_it_is_calibrated_without_weights(shared, own_map, capfd):
     assert notes == []
 
 
-def test_damaged_weights_are_found_unless_told_not_to_look(shared, tmp_path, capfd):
-    data = bytearray((shared / "weights.safetensors").read_bytes())
+def test_damaged_weights_are_found_unless_told_not_to_look(tmp_path, capfd, database, weights):
+    data = bytearray(weights.read_bytes())
     data[-1] ^= 1  # the last bit of a number
     (tmp_path / "damaged.safetensors").write_bytes(data)
-    database = shared / "town" / "images" / "test" / "database"
     given = ("index", "--images", database, "--weights", tmp_path / "damaged.safetensors")
     fails(capfd, *given, "--out", tmp_path / "a", "--quiet", words=("damaged.safetensors",))
     words, _ = said(capfd, *given, "--out", tmp_path / "b", "--quiet", "--no-verify")

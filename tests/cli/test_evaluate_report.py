@@ -7,10 +7,10 @@ from tests.conftest import BATCH
 from tests.experiments.report.test_page import Page
 
 
-def test_the_page_holds_the_numbers_of_the_json(shared, tmp_path, capfd):
+def test_the_page_holds_the_numbers_of_the_json(shared, tmp_path, capfd, weights):
     said = succeeds(
         capfd,
-        *("evaluate", "--data", shared / "town", "--weights", shared / "weights.safetensors"),
+        *("evaluate", "--data", shared / "town", "--weights", weights),
         *("--batch-size", BATCH, "--grouping", "single,sequential", "--quiet"),
         *("--report", tmp_path / "page", "--json", tmp_path / "found.json", "--precision", 0.6),
     )
@@ -46,8 +46,8 @@ def test_the_page_holds_the_numbers_of_the_json(shared, tmp_path, capfd):
     assert json.loads(page.all("pre")[0]["text"])["model"]["image_size"] == [42, 56]
 
 
-def test_a_folder_that_cannot_be_is_found_before_the_work(shared, tmp_path, capfd):
+def test_a_folder_that_cannot_be_is_found_before_the_work(shared, tmp_path, capfd, weights):
     (tmp_path / "file").write_text("")
-    given = ("evaluate", "--data", shared / "town", "--weights", shared / "weights.safetensors")
+    given = ("evaluate", "--data", shared / "town", "--weights", weights)
     words = (f"{tmp_path}/file", "cannot be made")
     fails(capfd, *given, "--report", tmp_path / "file", words=words)

@@ -22,23 +22,25 @@ def streets(tmp_path: pathlib.Path) -> pathlib.Path:
 
 
 @pytest.mark.parametrize("command", ["evaluate", "train"])
-def test_without_ground_truth_there_is_nothing_to_score(capfd, tmp_path, shared, streets, command):
+def test_without_ground_truth_there_is_nothing_to_score(
+    capfd, tmp_path, shared, streets, command, weights
+):
     words = (
         f"crisalad: {streets}: streets (two folders, no ground truth): no ground truth, nothing to "
         "score; see `crisalad query`",
     )
     out = tmp_path / "out"
     if command == "evaluate":
-        start = ("evaluate", "--weights", shared / "weights.safetensors", "--data", streets)
+        start = ("evaluate", "--weights", weights, "--data", streets)
         fails(capfd, *start, "--json", out / "t.json", "--out", out, words=words)
     else:
         fails(capfd, *train(shared, shared / "city", out, "--val", streets), words=words)
     assert not out.exists()
 
 
-def test_flags_reach_the_reader(capfd, tmp_path, shared, streets):
+def test_flags_reach_the_reader(capfd, tmp_path, shared, streets, weights):
     """A frame matches itself, so a table is written; the other flags are told by their errors."""
-    start = ("evaluate", "--weights", shared / "weights.safetensors", "--quiet")
+    start = ("evaluate", "--weights", weights, "--quiet")
     out = succeeds(
         capfd,
         *(*start, "--data", streets, "--frames", "0", "--batch-size", BATCH),

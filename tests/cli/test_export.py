@@ -7,11 +7,11 @@ import pytest
 from tests.cli.test_cli import fails, succeeds
 
 
-def test_flags_become_the_manifest(shared, tmp_path, capfd):
+def test_flags_become_the_manifest(tmp_path, capfd, weights):
     out = tmp_path / "export"
     said = succeeds(
         capfd,
-        *("export", "--weights", shared / "weights.safetensors", "--out", out),
+        *("export", "--weights", weights, "--out", out),
         *("--image-size", "56", "42", "--batch-size", "2", "--grouping", "batch"),
         *("--weights-inside", "--platforms", "cpu"),
     )
@@ -51,9 +51,8 @@ def test_bad_input_is_one_line(shared, tmp_path, capfd, flags, words):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_there_is_not_overwritten(shared, tmp_path, capfd):
+def test_what_is_there_is_not_overwritten(tmp_path, capfd, weights):
     (tmp_path / "file").write_text("mine")
-    weights = shared / "weights.safetensors"
     for out in (tmp_path, tmp_path / "file"):
         fails(capfd, "export", "--weights", weights, "--out", out, words=(out,))
     assert (tmp_path / "file").read_text() == "mine"

@@ -64,9 +64,9 @@ def test_a_part_that_the_recipe_puts_in_place_is_told_not_ignored(shared, tmp_pa
     assert "aggregator: found conv-ap, expected gem" in capfd.readouterr().err
 
 
-def test_what_is_saved_has_the_files_images(shared, tmp_path, capfd):
+def test_what_is_saved_has_the_files_images(shared, tmp_path, capfd, weights):
     model = dataclasses.replace(MODEL, image_size=(28, 42))
-    params, _ = load_weights(shared / "weights.safetensors")
+    params, _ = load_weights(weights)
     save_weights(tmp_path / "w.safetensors", Model(params, model))
     flags = ["--preset", "tiny", "--epochs", "1", "--places-per-batch", "3", "--quiet"]
     files = ("--data", shared / "city", "--out", tmp_path / "run")
@@ -79,8 +79,8 @@ def test_what_is_saved_has_the_files_images(shared, tmp_path, capfd):
     assert "weights for images" not in out + err
 
 
-def test_python_tells_of_weights_for_other_images(shared, tmp_path):
-    params, _ = load_weights(shared / "weights.safetensors")
+def test_python_tells_of_weights_for_other_images(shared, tmp_path, weights):
+    params, _ = load_weights(weights)
     file, city = tmp_path / "w.safetensors", shared / "city"
     save_weights(file, Model(params, dataclasses.replace(MODEL, image_size=(28, 42))))
     config = dataclasses.replace(RECIPE, epochs=1)

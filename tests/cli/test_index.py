@@ -23,7 +23,7 @@ from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import new_metadata
 from tests.cli.test_cli import fails, files_in, succeeds
 from tests.conftest import BATCH, MODEL, describe_single, random_params
-from tests.retrieval.maps.test_stores import ROUNDING, brute_force
+from tests.retrieval.maps.test_stores import brute_force
 from tests.retrieval.test_hloc_pairs import brute_force as nearest
 from tests.retrieval.test_hloc_pairs import by_name, pairs_as_hloc_reads_them
 
@@ -39,23 +39,6 @@ def index(shared: pathlib.Path, images: pathlib.Path, out: pathlib.Path, *more: 
 
 def query(folder: pathlib.Path, *more: object) -> tuple:
     return ("query", *more, "--map", folder, "--batch-size", BATCH, "--quiet")
-
-
-@pytest.fixture(scope="module")
-def database(shared) -> pathlib.Path:
-    return shared / "town" / "images" / "test" / "database"
-
-
-@pytest.fixture(scope="module")
-def queries(shared) -> pathlib.Path:
-    return shared / "town" / "images" / "test" / "queries"
-
-
-@pytest.fixture
-def folder(shared, database, tmp_path, capfd) -> pathlib.Path:
-    """A map of the town's database."""
-    succeeds(capfd, *index(shared, database, tmp_path / "map"))
-    return tmp_path / "map"
 
 
 def expected_answers(shared, database, queries, k: int) -> list[list[bytes]]:
@@ -141,23 +124,6 @@ def test_a_gallery_shows_so_much_and_says_of_how_much(
     assert len(json.loads(answers.read_text().splitlines()[0])["neighbours"]) == 7
 
 
-def test_queries_are_searched_for_in_portions_all_the_same(
-    folder, queries, tmp_path, capfd, monkeypatch
-):
-    found = []
-    for number, at_once in enumerate((1024, 1)):
-        monkeypatch.setattr("crisalad_jax.retrieval.maps.query.AT_ONCE", at_once)
-        path = tmp_path / f"{number}.jsonl"
-        succeeds(capfd, *query(folder, queries, "--json", path))
-        found.append([json.loads(line) for line in path.read_text().splitlines()])
-    for whole, part in zip(*found, strict=True):
-        for one, other in zip(whole["neighbours"], part["neighbours"], strict=True):
-            assert one["name"] == other["name"]
-            # To six decimals, of which rounding may change the last.
-            assert abs(one["similarity"] - other["similarity"]) <= ROUNDING
-    assert len(found[1]) == 5
-
-
 def test_a_map_moved_without_its_weights_and_images_is_told_where_they_are(
     shared, database, queries, tmp_path, capfd
 ):
@@ -186,7 +152,7 @@ def test_a_map_moved_without_its_weights_and_images_is_told_where_they_are(
     }
 
 
-def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd):
+def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd, weights):
     said = succeeds(capfd, "info", "--map", folder, "--verify", "--json", tmp_path / "info.json")
     # The town's database: one folder, whose names say where they are.
     places = [image.position for image in Map.open(folder).images]
@@ -206,7 +172,7 @@ def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd):
         assert words in said
     assert "none" not in said
     summary = json.loads((tmp_path / "info.json").read_text())
-    assert summary["weights"] == str(shared / "weights.safetensors")
+    assert summary["weights"] == str(weights)
     assert summary["verified"] is True
     assert summary["additions"] == [{"day": day, "root": root.as_posix(), "images": 7}]
     assert summary["extent"] == {"east": east, "north": north}
@@ -325,14 +291,14 @@ def test_a_folder_without_a_readable_image_makes_no_images(shared, tmp_path, cap
 
 
 def test_a_command_that_failed_binds_the_corrected_one_to_nothing(
-    shared, database, tmp_path, capfd
+    shared, database, tmp_path, capfd, weights
 ):
     """No server answers; then a kill has left a map of other settings without an image."""
     out = tmp_path / "map"
     nowhere = ("--store", "milvus:http://127.0.0.1:9")
     fails(capfd, *index(shared, database, out, *nowhere), words=("Fail connecting",))
     assert not out.exists()
-    describer = describer_of(load_weights(shared / "weights.safetensors"))
+    describer = describer_of(load_weights(weights))
     other = new_metadata(describer, tmp_path / "w", out, dtype="float16")
     other = dataclasses.replace(other, model="0" * 64)
     with open_for_appending(out, other):
@@ -405,13 +371,13 @@ def test_the_command_killed_while_it_appends_goes_on(shared, database, tmp_path)
 # Pairs
 
 
-def test_extract_writes_pairs_that_hloc_reads(shared, database, queries, tmp_path, capfd):
+def test_extract_writes_pairs_that_hloc_reads(shared, database, queries, tmp_path, capfd, weights):
     """Names relative to the folder of all images, as hloc has them; against brute force."""
     root = shared / "town" / "images" / "test"
 
     def extract(images: pathlib.Path, out: str, *more: object) -> tuple:
         return (
-            *("extract", "--weights", shared / "weights.safetensors", "--images", images),
+            *("extract", "--weights", weights, "--images", images),
             *("--root", root, "--out", tmp_path / out, "--batch-size", BATCH, "--quiet", *more),
         )
 

@@ -45,12 +45,11 @@ def module_of(command):
 
 
 @pytest.mark.parametrize("platforms", ["gpuu", "rocm", "cpu,gpuu"])
-def test_platforms_that_jax_lacks_are_one_line(tmp_path, shared, platforms):
+def test_platforms_that_jax_lacks_are_one_line(tmp_path, platforms, database, weights):
     """JAX raises a RuntimeError of the first, and an AssertionError without words of the second."""
-    images = shared / "town" / "images" / "test" / "database"
     verbs = (
-        ("info", "--weights", shared / "weights.safetensors"),
-        ("index", "--images", images, "--weights", shared / "weights.safetensors", "--out", "m"),
+        ("info", "--weights", weights),
+        ("index", "--images", database, "--weights", weights, "--out", "m"),
     )
     for verb in verbs:
         done = subprocess.run(
@@ -70,13 +69,13 @@ def test_platforms_that_jax_lacks_are_one_line(tmp_path, shared, platforms):
 # The cache
 
 
-def test_all_that_is_cached_is_in_one_folder(tmp_path, shared):
+def test_all_that_is_cached_is_in_one_folder(tmp_path, shared, weights):
     """A process of its own, as of a user: the tests' set-up keeps no programs."""
     environment = {k: v for k, v in os.environ.items() if k not in OWN_CACHES}
     home, cache = tmp_path / "home", tmp_path / "cache"
     environment |= {"HOME": str(home), "CRISALAD_CACHE": str(cache), "PYTHONPATH": str(ROOT)}
     images = shared / "town" / "images" / "test"
-    given = ("--images", images, "--weights", shared / "weights.safetensors", "--out", "d.npy")
+    given = ("--images", images, "--weights", weights, "--out", "d.npy")
     resizes = "from crisalad_jax.data import resize; resize._machine_code(True)"  # for many images
     for program in (["-m", "crisalad_jax", "extract", *map(str, given)], ["-c", resizes]):
         command = [sys.executable, *program]
@@ -267,10 +266,8 @@ def printed(capfd, *arguments):
     return json.loads(out), err
 
 
-def test_json_on_stdout_is_what_the_last_line_says(capfd, tmp_path, shared):
-    weights = shared / "weights.safetensors"
-    images = shared / "town" / "images" / "test" / "database"
-    common = ("--images", images, "--weights", weights, "--batch-size", BATCH, "--quiet")
+def test_json_on_stdout_is_what_the_last_line_says(capfd, tmp_path, database, weights):
+    common = ("--images", database, "--weights", weights, "--batch-size", BATCH, "--quiet")
     found, words = printed(capfd, "extract", *common, "--out", tmp_path / "d.npy", "--json", "-")
     assert (found["descriptors"], found["length"], found["skipped"]) == (7, 48, [])
     assert f"{tmp_path / 'd.npy'}: 7 descriptors of 48 numbers" in words
@@ -317,10 +314,10 @@ def spoilt(town):
 
 
 def test_an_evaluation_that_skips_is_that_of_the_readable_set(
-    capfd, tmp_path, shared, params, spoilt
+    capfd, tmp_path, params, spoilt, weights
 ):
     town, whole = spoilt
-    given = ("evaluate", "--data", town, "--weights", shared / "weights.safetensors", "--quiet")
+    given = ("evaluate", "--data", town, "--weights", weights, "--quiet")
     given += ("--batch-size", BATCH, "--grouping", "single,window")
     found, words = printed(
         capfd, *given, "--on-bad-image", "skip", "--json", "-", "--report", tmp_path / "page"
@@ -344,7 +341,7 @@ def test_an_evaluation_that_skips_is_that_of_the_readable_set(
     fails(capfd, *given, words=("found an image cut short",))
 
 
-def test_an_evaluation_that_skips_what_is_missing(capfd, tmp_path, shared, spoilt):
+def test_an_evaluation_that_skips_what_is_missing(capfd, tmp_path, spoilt, weights):
     """SALAD's lists name two images that are not there: as the set without them, of two folders."""
     town, whole = spoilt
     sides = ("database", "queries")
@@ -354,7 +351,7 @@ def test_an_evaluation_that_skips_what_is_missing(capfd, tmp_path, shared, spoil
     truth = np.empty(len(images["queries"]), object)
     truth[:] = [np.array(each) for each in open_benchmark(town).ground_truth()]
     np.save(tmp_path / "town_gt.npy", truth, allow_pickle=True)
-    given = ("evaluate", "--data", tmp_path, "--weights", shared / "weights.safetensors", "--quiet")
+    given = ("evaluate", "--data", tmp_path, "--weights", weights, "--quiet")
     given += ("--batch-size", BATCH, "--images", whole)
     fails(capfd, *given, words=("found 1 of 7 images missing",))
     found, _ = printed(capfd, *given, "--on-bad-image", "skip", "--json", "-")
@@ -394,12 +391,10 @@ def test_leaving_out_counts_positives_anew(spoilt):
         leave_out_unreadable(open_benchmark(town), quiet=True)
 
 
-def test_a_query_that_skips_answers_the_rest(capfd, tmp_path, shared, spoilt):
+def test_a_query_that_skips_answers_the_rest(capfd, tmp_path, spoilt, database, weights):
     town, _ = spoilt
-    weights = shared / "weights.safetensors"
-    images = shared / "town" / "images" / "test" / "database"
     common = ("--weights", weights, "--batch-size", BATCH, "--quiet")
-    succeeds(capfd, "index", "--images", images, "--out", tmp_path / "map", *common)
+    succeeds(capfd, "index", "--images", database, "--out", tmp_path / "map", *common)
     asked = sorted((town / "images" / "test" / "queries").iterdir())
     given = ("query", *asked, "--map", tmp_path / "map", *common, "--json", "-", "--k", 1)
     assert main([*map(str, given), "--on-bad-image", "skip"]) == 0

@@ -59,8 +59,8 @@ def test_verify_needs_a_map(capfd):
 
 
 def test_an_export_does_not_take_the_place_of_the_working_folder(
-    capfd, tmp_path, shared, monkeypatch
+    capfd, tmp_path, monkeypatch, weights
 ):
     monkeypatch.chdir(tmp_path)
-    start = ("export", "--weights", shared / "weights.safetensors", "--out", ".")
+    start = ("export", "--weights", weights, "--out", ".")
     fails(capfd, *start, words=(".: found the folder that this runs in, expected another",))

@@ -16,14 +16,13 @@ CONFIG = dataclasses.replace(
 )
 
 
-def test_every_command_that_describes_refuses_it(shared, tmp_path, capfd):
+def test_every_command_that_describes_refuses_it(shared, tmp_path, capfd, database):
     weights, out = tmp_path / "w.safetensors", tmp_path / "out.npy"
     save_weights(weights, Model(random_params(CONFIG), CONFIG))
-    images = shared / "town" / "images" / "test" / "database"
     for command in (
         ("evaluate", "--data", shared / "town", "--out", out),
-        ("extract", "--images", images, "--out", out),
-        ("index", "--images", images, "--out", out),
+        ("extract", "--images", database, "--out", out),
+        ("index", "--images", database, "--out", out),
         ("export", "--out", out),
         ("info",),
     ):

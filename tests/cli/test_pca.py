@@ -91,11 +91,11 @@ def test_evaluate_ranks_shorter_descriptors(capfd, tmp_path, shared, benchmark):
 
 
 @pytest.mark.parametrize("whiten", [False, True])
-def test_components_become_the_last_layer_of_a_model(capfd, tmp_path, shared, whiten):
+def test_components_become_the_last_layer_of_a_model(capfd, tmp_path, shared, whiten, weights):
     town, model = shared / "town", tmp_path / "model.safetensors"
     succeeds(capfd, *extract(shared, town, tmp_path / "d.npy"))
     whole = np.load(tmp_path / "d.npy")
-    fit = ("pca", "--descriptors", tmp_path / "d.npy", "--weights", shared / "weights.safetensors")
+    fit = ("pca", "--descriptors", tmp_path / "d.npy", "--weights", weights)
     more = ("--whiten",) if whiten else ()
     succeeds(capfd, *fit, *more, "--dim", 4, "--out", model, "--quiet")
     out = ("extract", "--images", town, "--weights", model, "--out", tmp_path / "s.npy")
@@ -113,9 +113,8 @@ def test_components_become_the_last_layer_of_a_model(capfd, tmp_path, shared, wh
     assert not (tmp_path / "map").exists()
 
 
-def test_bad_input_is_named_before_any_work(capfd, tmp_path, shared):
+def test_bad_input_is_named_before_any_work(capfd, tmp_path, shared, weights):
     save_pca(tmp_path / "long.safetensors", fit_pca(np.pad(DESCRIPTORS, ((0, 0), (0, 2))), 5))
-    weights = shared / "weights.safetensors"
     for components, words in (
         (tmp_path / "none", (f"{tmp_path / 'none'}: found no such file",)),
         (weights, (f"{weights}: found metadata", "as `crisalad pca` writes it")),

@@ -11,12 +11,11 @@ from crisalad_jax.retrieval.extract import extract
 from tests.cli.test_cli import fails, succeeds
 
 
-def test_words_change_what_is_extracted_and_are_told(shared, tmp_path, capfd):
+def test_words_change_what_is_extracted_and_are_told(shared, tmp_path, capfd, database):
     weights, out = shared / "weights.safetensors", tmp_path / "out.npy"
-    images = shared / "town" / "images" / "test" / "database"
     said = succeeds(
         capfd,
-        *("extract", "--weights", weights, "--images", images, "--out", out, "--batch-size", 4),
+        *("extract", "--weights", weights, "--images", database, "--out", out, "--batch-size", 4),
         *("--resize", "bicubic", "floats", "--quiet"),
     )
     assert "images at 42 x 56, bicubic, antialiased, on floats" in said
@@ -25,7 +24,7 @@ def test_words_change_what_is_extracted_and_are_told(shared, tmp_path, capfd):
     params, config = load_weights(weights)
     config = config.resized(None, ["bicubic", "floats"])
     expected = extract(
-        Model(params, config), images, reading=Reading(batch_size=4, quiet=True)
+        Model(params, config), database, reading=Reading(batch_size=4, quiet=True)
     ).descriptors
     # The same program on the same numbers.
     np.testing.assert_allclose(np.load(out), expected, atol=1e-6)
@@ -43,7 +42,7 @@ def test_info_tells_how_images_are_resized(shared, tmp_path, capfd):
     assert told["preprocessing"]["size_rule"] == "longer-side"
 
 
-def test_wrong_words_are_one_line(shared, capfd):
-    info = ("info", "--weights", shared / "weights.safetensors", "--resize")
+def test_wrong_words_are_one_line(capfd, weights):
+    info = ("info", "--weights", weights, "--resize")
     fails(capfd, *info, "cubic", words=("--resize: found 'cubic', expected some of fixed",))
     fails(capfd, *info, "bytes", "floats", words=("expected one of bytes, floats",))

@@ -51,9 +51,9 @@ def test_extract_gives_the_descriptors_of_jax(engine, grouping, shared, tmp_path
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_evaluate_recalls_as_jax_does(engine, shared, tmp_path, capfd):
+def test_evaluate_recalls_as_jax_does(engine, shared, tmp_path, capfd, weights):
     command = (
-        *("evaluate", "--data", shared / "town", "--weights", shared / "weights.safetensors"),
+        *("evaluate", "--data", shared / "town", "--weights", weights),
         *("--batch-size", "4", "--seeds", "1", "--quiet"),
     )
     tables = {}
@@ -70,8 +70,7 @@ def test_evaluate_recalls_as_jax_does(engine, shared, tmp_path, capfd):
     assert found == expected
 
 
-def test_a_map_of_one_runtime_answers_another(shared, tmp_path, capfd):
-    weights = shared / "weights.safetensors"
+def test_a_map_of_one_runtime_answers_another(shared, tmp_path, capfd, weights):
     images, queries = town(shared) / "database", town(shared) / "queries"
     index = ("index", "--weights", weights, "--images", images, "--out", tmp_path / "map")
     succeeds(capfd, *index, "--runtime", "openvino", "--quiet")
@@ -96,8 +95,7 @@ def printed_by(program: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
-def test_a_kept_export_describes_without_jax(shared, tmp_path, capfd):
-    weights = shared / "weights.safetensors"
+def test_a_kept_export_describes_without_jax(shared, tmp_path, capfd, weights):
     out = tmp_path / "d.npy"
     extract = ("extract", "--weights", weights, "--images", town(shared) / "queries")
     succeeds(capfd, *extract, "--runtime", "onnxruntime", "--out", out, "--quiet")
@@ -172,7 +170,7 @@ def test_a_program_of_other_weights_is_not_a_maps(exported, shared, tmp_path, ca
     fails(capfd, *query, "--runtime", "onnxruntime", words=(exported, "map"))
 
 
-def test_an_int8_program_is_a_model_of_its_own(params, shared, tmp_path, capfd):
+def test_an_int8_program_is_a_model_of_its_own(params, shared, tmp_path, capfd, weights):
     """It may ask a map of the weights that it was made of; nothing else may ask its maps."""
     photographs = town(shared) / "queries"
     calibration = np.stack(
@@ -182,7 +180,6 @@ def test_an_int8_program_is_a_model_of_its_own(params, shared, tmp_path, capfd):
     manifest = write_export(
         eight, Model(params, MODEL), ExportConfig(format="onnx"), calibration=calibration
     )
-    weights = shared / "weights.safetensors"
     assert manifest["quantised_from"] == model_hash(params, MODEL) != manifest["model_sha256"]
     of_floats, of_bytes = tmp_path / "floats.map", tmp_path / "bytes.map"
     engine = ("--runtime", "onnxruntime")

@@ -72,21 +72,21 @@ def test_positions_are_of_the_flag_the_table_names_or_exif(shared, images, tmp_p
     assert positions(tmp_path / "table")["new.jpg"] is None
 
 
-def test_a_rate_without_a_video_is_refused(shared, images, folder, tmp_path, capfd):
+def test_a_rate_without_a_video_is_refused(shared, images, town_map, tmp_path, capfd, weights):
     words = ("--fps: found 2 without a video among the images, expected both",)
     out = ("--out", tmp_path / "out.npy")
-    common = ("--weights", shared / "weights.safetensors", "--images", images, "--quiet")
+    common = ("--weights", weights, "--images", images, "--quiet")
     before = sorted(tmp_path.iterdir())
     fails(capfd, "extract", *common, *out, "--fps", 2, words=words)
     fails(capfd, *index(shared, images, tmp_path / "map", "--fps", 2), words=words)
-    fails(capfd, *query(folder, images, "--fps", 2), words=words)
+    fails(capfd, *query(town_map, images, "--fps", 2), words=words)
     target = ("--out", tmp_path / "v.safetensors")
     fails(capfd, "vocabulary", "--images", images, *target, "--fps", 2, words=words)
     assert sorted(tmp_path.iterdir()) == before
     # One video among several sources is enough.
     video = write_video(tmp_path / "walk.avi", 21)
     assert "walk.avi#t=0.500" in succeeds(
-        capfd, *query(folder, images, video, "--fps", 2, "--json", "-")
+        capfd, *query(town_map, images, video, "--fps", 2, "--json", "-")
     )
 
 
@@ -103,9 +103,9 @@ def test_a_folder_that_is_no_map_is_not_asked(images, capfd):
     assert fails(capfd, *query(images, images), words=()).endswith(words)
 
 
-def test_a_video_is_extracted_and_described_as_its_frames(shared, tmp_path, capfd):
+def test_a_video_is_extracted_and_described_as_its_frames(tmp_path, capfd, weights):
     video = write_video(tmp_path / "walk.avi", 21)
-    common = ("--weights", shared / "weights.safetensors", "--batch-size", BATCH, "--quiet")
+    common = ("--weights", weights, "--batch-size", BATCH, "--quiet")
     out = tmp_path / "d.npy"
     succeeds(capfd, "extract", "--images", video, "--fps", 2, "--out", out, *common)
     names, descriptors = read_descriptors(out)
@@ -127,20 +127,11 @@ def test_a_video_is_extracted_and_described_as_its_frames(shared, tmp_path, capf
     np.testing.assert_allclose(found[::-1], descriptors, atol=ROUNDING)
 
 
-@pytest.fixture(scope="module")
-def folder(shared, tmp_path_factory) -> pathlib.Path:
-    out = tmp_path_factory.mktemp("live") / "map"
-    database = shared / "town" / "images" / "test" / "database"
-    assert main([str(part) for part in index(shared, database, out)]) == 0
-    return out
-
-
-def test_a_pattern_and_a_window_of_queries(shared, folder, tmp_path, capfd):
-    queries = shared / "town" / "images" / "test" / "queries"
+def test_a_pattern_and_a_window_of_queries(town_map, tmp_path, capfd, queries):
 
     def answers(*flags: object) -> list[dict]:
         out = tmp_path / "answers.jsonl"
-        succeeds(capfd, *query(folder, queries / "*.jpg", "--k", 1, "--json", out, *flags))
+        succeeds(capfd, *query(town_map, queries / "*.jpg", "--k", 1, "--json", out, *flags))
         return [json.loads(line) for line in out.read_text().splitlines()]
 
     lines, together = answers(), answers("--window", 3)
@@ -153,11 +144,11 @@ def test_a_pattern_and_a_window_of_queries(shared, folder, tmp_path, capfd):
     # As a shell writes out a pattern: one file after the other.
     out = tmp_path / "answers.jsonl"
     files = list_images(queries)
-    succeeds(capfd, *query(folder, *files, "--k", 1, "--json", out, "--window", 3))
+    succeeds(capfd, *query(town_map, *files, "--k", 1, "--json", out, "--window", 3))
     assert [json.loads(line) for line in out.read_text().splitlines()] == together
 
 
-def test_the_default_rate_of_a_video_is_said(shared, folder, tmp_path, capfd):
+def test_the_default_rate_of_a_video_is_said(shared, town_map, tmp_path, capfd):
     """Of 21 frames in 2.1 seconds three are taken: at 0, 1 and 2 s."""
     video = write_video(tmp_path / "walk.avi", 21)
     said = f"crisalad: note: {video}: 3 of 21 frames, 1 per second: --fps\n"
@@ -167,7 +158,7 @@ def test_the_default_rate_of_a_video_is_said(shared, folder, tmp_path, capfd):
     verbs = (
         ("extract", *weights, "--images", video, *out, "--quiet"),
         index(shared, video, tmp_path / "map"),
-        query(folder, video),
+        query(town_map, video),
         (
             *("vocabulary", "--images", video, "--weights", tmp_path / "start.safetensors"),
             *("--out", tmp_path / "v.safetensors", "--quiet"),
@@ -179,16 +170,16 @@ def test_the_default_rate_of_a_video_is_said(shared, folder, tmp_path, capfd):
     # Of two videos in a list, together; nothing where a rate is given, or all are taken.
     write_video(tmp_path / "slow.avi", 3, rate=1)
     (tmp_path / "list.txt").write_text("walk.avi\nslow.avi\n")
-    assert main(list(map(str, query(folder, tmp_path / "list.txt")))) == 0
+    assert main(list(map(str, query(town_map, tmp_path / "list.txt")))) == 0
     assert "list.txt: 6 of 24 frames, 1 per second: --fps\n" in capfd.readouterr().err
-    succeeds(capfd, *query(folder, video, "--fps", 1))
-    succeeds(capfd, *query(folder, tmp_path / "slow.avi"))
-    succeeds(capfd, *query(folder, f"{video}#t=0.5"))
+    succeeds(capfd, *query(town_map, video, "--fps", 1))
+    succeeds(capfd, *query(town_map, tmp_path / "slow.avi"))
+    succeeds(capfd, *query(town_map, f"{video}#t=0.5"))
 
 
-def test_a_camera_of_a_video(folder, tmp_path, capfd):
+def test_a_camera_of_a_video(town_map, tmp_path, capfd):
     video = write_video(tmp_path / "walk.avi", 5)
-    given = query(folder, "--camera", video, "--k", 1, "--window", 3)
+    given = query(town_map, "--camera", video, "--k", 1, "--window", 3)
     assert main([str(part) for part in given]) == 0
     out, error = capfd.readouterr()
     lines = [json.loads(line) for line in out.splitlines()]
@@ -205,12 +196,12 @@ def test_a_camera_of_a_video(folder, tmp_path, capfd):
     ("number", "code", "words"),
     [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "ended by SIGTERM")],
 )
-def test_a_watch_ends_by_a_signal_with_its_summary(shared, folder, tmp_path, number, code, words):
+def test_a_watch_ends_by_a_signal_with_its_summary(shared, town_map, tmp_path, number, code, words):
     """In a process of its own, as a shell starts it: the signal must reach no other test."""
     image = list_images(shared / "town" / "images" / "test" / "database")[2]
     (tmp_path / "in").mkdir()
     shutil.copy(image, tmp_path / "in" / "old.jpg")
-    given = query(folder, "--watch", tmp_path / "in", "--k", 1)
+    given = query(town_map, "--watch", tmp_path / "in", "--k", 1)
     with (tmp_path / "errors").open("w") as errors:
         child = subprocess.Popen(
             [sys.executable, "-m", "crisalad_jax", *map(str, given)],
@@ -252,5 +243,5 @@ def test_a_watch_ends_by_a_signal_with_its_summary(shared, folder, tmp_path, num
         ((), "images: found none, expected at least one image"),
     ],
 )
-def test_bad_live_queries_are_one_line(folder, capfd, flags, words):
-    fails(capfd, *query(folder, *(flag.format(map=folder) for flag in flags)), words=(words,))
+def test_bad_live_queries_are_one_line(town_map, capfd, flags, words):
+    fails(capfd, *query(town_map, *(flag.format(map=town_map) for flag in flags)), words=(words,))

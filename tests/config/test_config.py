@@ -466,7 +466,7 @@ def test_one_patch_more_than_clusters_is_enough():
         (MultiSimilarityConfig, {"beta": 0.0}, "MultiSimilarityConfig.beta: found 0.0"),
         (LossConfig, {"miner_margin": -0.1}, "LossConfig.miner_margin: found -0.1"),
         (LossConfig, {"kind": "softmax"}, "^LossConfig.kind: found 'softmax', expected one of c"),
-        (LossConfig, {"kind": "fast-ap"}, "expected 'none': it ranks all images"),
+        (LossConfig, {"kind": "fast-ap"}, "expected 'none' for loss fast-ap, which ranks all"),
         (
             ContrastiveConfig,
             {"negative_margin": 2.1},

@@ -7,7 +7,6 @@ save.
 import dataclasses
 import os
 import pathlib
-import random
 import signal
 import subprocess
 import sys
@@ -108,29 +107,6 @@ def assert_same_end(found: pathlib.Path, expected: pathlib.Path) -> None:
     assert sorted(path.relative_to(found) for path in found.rglob("*.safetensors")) == weights
     for name in weights:
         assert (found / name).read_bytes() == (expected / name).read_bytes(), name
-
-
-@pytest.mark.slow  # tests/attack kills training too
-@pytest.mark.parametrize("kills", [1, 50])
-def test_a_run_killed_at_random_moments_ends_with_the_same_bits(start, whole, tmp_path, kills):
-    generator = random.Random(kills)
-    out, killed = tmp_path / "run", 0
-    while killed < kills:
-        program = start(out)
-        wait_for_lines(program, out, lines_in(out) + 1)
-        # A step and its save take some hundredths of a second, a start some seconds.
-        time.sleep(generator.uniform(0, 0.5))
-        if program.poll() is None:
-            program.kill()
-            killed += 1
-        program.communicate()
-        if program.returncode == 0:
-            assert_same_end(out, whole)
-            out = tmp_path / f"run{killed}"
-    program = start(out)
-    _, errors = program.communicate()
-    assert program.returncode == 0, errors
-    assert_same_end(out, whole)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

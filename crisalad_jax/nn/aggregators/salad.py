@@ -142,7 +142,7 @@ class SaladConfig(TransportAggregator):
     draws them to their marginals. With both sides free, high scores make masses that overflow
     outside of logarithms."""
     column_tau: float = 1.0
-    """The same as `row_tau` for the clusters' masses."""
+    """The same as `row_tau` for the masses of the clusters and the dustbin."""
     sinkhorn: SinkhornConfig = SinkhornConfig()
     """Solver of the transport."""
 

@@ -1,4 +1,9 @@
-"""Dustbins, which take the patches that belong to no cluster, and their marginals."""
+"""Dustbins, which take the patches that belong to no cluster, and their marginals.
+
+The mass of a dustbin is decided here, in `marginals`: what the clusters leave for "column" and
+"token" (`log_marginals`), all patches for "row and column", a learnt share for "mass". The score
+that it appends is another thing.
+"""
 
 import dataclasses
 import math

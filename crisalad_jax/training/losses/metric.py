@@ -2,13 +2,14 @@
 
 import dataclasses
 import functools
+import math
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from crisalad_jax.config.checks import require, takes
+from crisalad_jax.config.checks import require, require_field, require_range, takes
 from crisalad_jax.config.part import OrName
 from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.config.short_repr import short_repr
@@ -40,15 +41,10 @@ class LossConfig:
     def __post_init__(self) -> None:
         """Check the ranges."""
         resolve_names(self)
-        require(
-            self.miner_margin >= 0,
-            f"LossConfig.miner_margin: found {self.miner_margin}, expected at least 0",
-        )
-        require(
-            not self.kind.ranks_all or self.miner == "none",
-            f"LossConfig.miner: found {self.miner!r} with the loss {self.kind.part_name!r}, "
-            "expected 'none': it ranks all images",
-        )
+        require_range(self, 0, math.inf, "miner_margin")
+        fits = not self.kind.ranks_all or self.miner == "none"
+        name = self.kind.part_name
+        require_field(self, "miner", fits, f"'none' for loss {name}, which ranks all images")
 
 
 class LossResult(NamedTuple):

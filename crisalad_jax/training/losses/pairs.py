@@ -30,7 +30,7 @@ def all_pairs(labels: Int[Array, " image"], *, valid: Bool[Array, " image"] | No
 
 
 def mine(similarities: Similarities, pairs: Pairs, *, margin: float) -> Pairs:
-    """Choose the pairs that violate the order within their row by less than `margin`.
+    """Choose the pairs that violate the order within their row, or keep it by less than `margin`.
 
     The miner of the multi-similarity loss (Wang et al., CVPR 2019). A positive is kept if it is
     less similar than the hardest negative plus the margin, a negative if it is more similar than

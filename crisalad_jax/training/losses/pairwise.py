@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from crisalad_jax.config.checks import require, require_fraction, require_positive
+from crisalad_jax.config.checks import require_fraction, require_positive, require_range
 from crisalad_jax.training.losses.base import (
     LOSSES,
     Loss,
@@ -60,9 +60,7 @@ class ContrastiveConfig(Loss):
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        for name in ("positive_margin", "negative_margin"):
-            value = getattr(self, name)
-            require(0 <= value <= 2, f"ContrastiveConfig.{name}: found {value}, expected 0 to 2")
+        require_range(self, 0, 2, "positive_margin", "negative_margin")
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Average the violations of each margin, without the squares of the paper."""

@@ -413,15 +413,6 @@ def _rows_first(problem: Problem, potentials: Potentials) -> Potentials:
     return Potentials(problem.log_mu - problem.lse_columns(column), column)
 
 
-@register_step("test-float64-by-the-kernel")
-def _by_the_kernel(problem: Problem, potentials: Potentials) -> Potentials:
-    """The published step, from the scores themselves."""
-    log_sum = jax.nn.logsumexp
-    column = problem.log_nu - log_sum(problem.kernel + potentials.row[..., None], axis=-2)
-    row = problem.log_mu - log_sum(problem.kernel + column[..., None, :], axis=-1)
-    return Potentials(row, column)
-
-
 @pytest.mark.parametrize(
     "config",
     [
@@ -450,24 +441,6 @@ def test_a_step_of_ones_own(config: SinkhornConfig) -> None:
         assert result.iterations < 300
     if config.gradient.part_name != "stop":
         assert_close(gradient, long_gradient(), 1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("domain", ["scaling", "log"])
-def test_a_step_may_read_the_kernel(domain: Any) -> None:
-    """In the scaling domain too, where the built-in step reads exponentials of it."""
-
-    def of(at: Inputs, step: str) -> Any:
-        result = solve(at, SinkhornConfig(step=step, domain=domain))
-        row, column = result.potentials
-        shift = column.mean()
-        return score(result.log_plan, row + shift, column - shift)
-
-    ours, published = (
-        jax.grad(of)(inputs(), step) for step in ("test-float64-by-the-kernel", "sinkhorn")
-    )
-    # The same sums in another order.
-    assert_close(ours, published, 1e-11)
 
 
 # Second order and forward mode
