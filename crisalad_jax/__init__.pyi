@@ -16,12 +16,12 @@ from .data.benchmarks import open_benchmark as open_benchmark
 from .data.images import read_image as read_image
 from .data.live import Camera as Camera
 from .data.live import FolderWatch as FolderWatch
-from .data.loader import image_batches as image_batches
 from .data.loader import training_batches as training_batches
 from .data.places import read_places as read_places
 from .data.query_set import QuerySet as QuerySet
 from .data.query_set import read_query_set as read_query_set
 from .data.reading import Reading as Reading
+from .data.reading import image_batches as image_batches
 from .data.resize import resize_image as resize_image
 from .evaluation.calibrate import calibrate as calibrate
 from .evaluation.evaluate import evaluate as evaluate

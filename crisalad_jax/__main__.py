@@ -1,9 +1,11 @@
 """The program `crisalad`, also `python -m crisalad_jax`: the command line as a process."""
 
+import io
+import os
 import sys
+from typing import Any
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.output import keep_on_without_reader
 from crisalad_jax.utils.signals import end_at_signals
 
 
@@ -22,6 +24,43 @@ def main() -> None:
             print(f"crisalad: {error}", file=sys.stderr)
             code = 2
     sys.exit(code)
+
+
+def keep_on_without_reader() -> None:
+    """Let the program go on where the reader of its output is gone, as after `| head`.
+
+    A full disk raises an `InputError` once, at the write or flush that meets it. Letters that the
+    encoding lacks are escaped. Standard error stays as it is: who reads that knows that the program
+    goes on.
+    """
+    if sys.stdout is None:  # it was closed, as by `>&-`
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    else:
+        sys.stdout = io.TextIOWrapper(
+            io.BufferedWriter(_Output(sys.stdout.fileno(), "w", closefd=False)),
+            encoding=sys.stdout.encoding,
+            errors="backslashreplace",
+            line_buffering=sys.stdout.isatty(),
+        )
+
+
+class _Output(io.FileIO):
+    """A file that drops what is written after its reader is gone, or after an error was raised.
+
+    Python flushes once more at its end, and would end with a traceback of its own.
+    """
+
+    _failed = False
+
+    def write(self, data: Any) -> int:
+        if not self._failed:
+            try:
+                return super().write(data)
+            except OSError as error:
+                self._failed = True
+                if not isinstance(error, BrokenPipeError):
+                    raise InputError(f"standard output: {error.strerror}") from error
+        return memoryview(data).nbytes
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ A step, a dustbin or a gradient of your own is registered as the built-in ones a
     solve(scores, log_mu, log_nu, config=SinkhornConfig(step="capacity"))
 """
 
-from crisalad_jax.nn.transport.checks import marginal_error
 from crisalad_jax.nn.transport.config import GRADIENTS, Gradient, SinkhornConfig, Solution
 from crisalad_jax.nn.transport.differentiate import Implicit, Optimistix, Stop, Unrolled
 from crisalad_jax.nn.transport.dustbin import (
@@ -31,7 +30,7 @@ from crisalad_jax.nn.transport.dustbin import (
     log_marginals,
 )
 from crisalad_jax.nn.transport.iterate import iterate
-from crisalad_jax.nn.transport.problem import SCALING_RANGE, Potentials, Problem
+from crisalad_jax.nn.transport.problem import SCALING_RANGE, Potentials, Problem, marginal_error
 from crisalad_jax.nn.transport.solve import SinkhornResult, assign_with_dustbin, solve
 from crisalad_jax.nn.transport.steps import (
     STEPS,

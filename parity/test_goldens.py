@@ -8,7 +8,7 @@ the few hundred additions of these layers; a wrong constant or axis shows at 1e-
 
 import functools
 import pathlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -17,10 +17,8 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.formats import to_params, to_state
-from crisalad_jax.checkpoints.formats.format import encoder_lines
-from crisalad_jax.checkpoints.formats.forms import Entry, Extra
-from crisalad_jax.checkpoints.formats.heads import head_lines
-from crisalad_jax.checkpoints.formats.vit import adapter_lines
+from crisalad_jax.checkpoints.formats.families import HEADS, TABLES
+from crisalad_jax.checkpoints.formats.rows import Form, Rows, expand
 from crisalad_jax.nn.adapter import AdapterConfig, adapter, init_adapter
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.aggregators.base import to_descriptor
@@ -54,23 +52,19 @@ class Names(NamedTuple):
     theirs: Callable[[Any], dict[str, np.ndarray]]
 
 
-def part_names(
-    prefix: str, lines: Iterable[Entry | Extra], template: Any, public: str | None = None
-) -> Names:
-    """For one part of a model, whose names lack the `prefix` that the table's have.
+def part_names(rows: Rows, template: Any, prefix: str = "", public: str = "") -> Names:
+    """For one part of a model, by its table, and what comes before all names that it has.
 
-    Of `template` only the structure counts. `public` is the prefix of the public names, where that
-    is another.
+    Of `template` only the structure counts.
     """
-    public = prefix if public is None else public
-    entries = [line for line in lines if isinstance(line, Entry)]
     structure = jax.tree.structure(template)
-    order = [f"{prefix}.{name}" for name in named_leaves(template)]
+    order = [prefix + name for name in named_leaves(template)]
+    entries = [row for row in expand(rows, order) if isinstance(row.form, Form)]
 
     def ours(state: State) -> Any:
         found: dict[str, np.ndarray] = {}
         for entry in entries:
-            arrays = (state[name.removeprefix(f"{public}.")] for name in entry.theirs)
+            arrays = (state[name.removeprefix(public)] for name in entry.theirs)
             found |= zip(entry.ours, entry.form.ours(*arrays), strict=True)
         return jax.tree.unflatten(structure, [jnp.asarray(found[name]) for name in order])
 
@@ -79,7 +73,7 @@ def part_names(
         found: dict[str, np.ndarray] = {}
         for entry in entries:
             arrays = entry.form.theirs(*(leaves[name] for name in entry.ours))
-            names = (name.removeprefix(f"{public}.") for name in entry.theirs)
+            names = (name.removeprefix(public) for name in entry.theirs)
             found |= zip(names, arrays, strict=True)
         return found
 
@@ -183,7 +177,7 @@ def test_multi_resolution_adapter() -> None:
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
         return {"tokens": adapter(params, inputs["tokens"], (5, 5))[0]}
 
-    names = part_names("adapter", adapter_lines(config, "adapter", "adapter"), template)
+    names = part_names(TABLES["adapter"], template)
     check(function, golden, names, {"tokens": jnp.asarray(golden["in.tokens"])})
 
 
@@ -203,7 +197,7 @@ def test_salad() -> None:
     template = jax.eval_shape(
         lambda key: config.init(key, model.backbone, (4, 6)), jax.random.key(0)
     )
-    names = part_names("aggregator", head_lines(model), template)
+    names = part_names(HEADS["salad"].rows, template)
     inputs = {name: jnp.asarray(golden[f"in.{name}"]) for name in ("features", "token")}
     # A constant added to a column of scores is absorbed by the column's potential: the dustbin's
     # score and the score network's last bias have no effect, their gradients are rounding noise.
@@ -253,5 +247,5 @@ def test_cross_image_encoder() -> None:
         return {"tokens": cross_image_encoder(params, inputs["tokens"], config, key=None)}
 
     template = jax.eval_shape(lambda key: init_cross_image(key, 16, config), jax.random.key(0))
-    names = part_names("cross_image", encoder_lines(config), template, "encoder")
+    names = part_names(TABLES["encoder"], template, "cross_image.", "encoder.")
     check(function, golden, names, {"tokens": jnp.asarray(golden["in.tokens"])})

@@ -32,7 +32,7 @@ from transformers import (
 )
 
 from crisalad_jax.checkpoints.formats import to_state
-from crisalad_jax.checkpoints.formats.format import encoder_lines
+from crisalad_jax.checkpoints.formats.families import TABLES
 from crisalad_jax.checkpoints.public import read_checkpoint, write_checkpoint
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
@@ -351,7 +351,7 @@ def test_masked_encoder_is_torchs() -> None:
     encoder = nn.TransformerEncoder(layer, 2, enable_nested_tensor=False).eval()
     shake(encoder)
     template = jax.eval_shape(lambda key: init_cross_image(key, 16, config), jax.random.key(0))
-    names = part_names("cross_image", encoder_lines(config), template, "encoder")
+    names = part_names(TABLES["encoder"], template, "cross_image.", "encoder.")
     params = names.ours({name: x.numpy() for name, x in encoder.state_dict().items()})
     mask = np.tri(5, dtype=bool)
     mask[1, 3] = True

@@ -19,7 +19,7 @@ from crisalad_jax.checkpoints.formats import infer, to_params, to_state
 from crisalad_jax.checkpoints.public import vocabulary_model
 from crisalad_jax.nn.aggregators.queries import decode
 from crisalad_jax.nn.aggregators.selavpr import local_features
-from crisalad_jax.nn.aggregators.vlad import AnyLoc, nearest_words, vlad_buff
+from crisalad_jax.nn.aggregators.vlad import AnyLoc, nearest_words
 from crisalad_jax.nn.backbones import Features
 from crisalad_jax.nn.layers import l2_normalise
 from crisalad_jax.nn.model import Crisalad, extract_features, unit_features
@@ -114,8 +114,8 @@ def selavpr(params: Crisalad, features: Features, config: Any) -> dict[str, jax.
 
 
 def vladbuff(params: Crisalad, features: Features, config: Any) -> dict[str, jax.Array]:
-    vlad = l2_normalise(vlad_buff(params.aggregator, features.patches).reshape(2, -1))
-    return {"vlad": vlad[:, ::4]}
+    local = config.aggregator.apply(params.aggregator, features, config.grid, key=None).local
+    return {"vlad": l2_normalise(local.reshape(2, -1))[:, ::4]}
 
 
 STEPS: dict[str, Callable[[Crisalad, Features, Any], dict[str, jax.Array]]] = {

@@ -26,8 +26,6 @@ class FileServer:
     """Bytes after which the next answers break off."""
     stalls: int = 0
     """How many of the next answers stop after ten bytes, the connection open."""
-    crawls: bool = False
-    """Whether a byte comes each hundredth of a second."""
     moved: dict[str, str] = dataclasses.field(default_factory=dict)
     """Paths that are elsewhere now."""
     waits: float = 0.0
@@ -94,11 +92,6 @@ class _Handler(http.server.BaseHTTPRequestHandler):
                 self.wfile.write(data[:10])
                 self.wfile.flush()
                 state.released.wait(10)
-            elif state.crawls:
-                for byte in data:
-                    self.wfile.write(bytes([byte]))
-                    if state.released.wait(0.01):
-                        break
             else:
                 self.wfile.write(data)
 

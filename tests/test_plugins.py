@@ -84,7 +84,7 @@ import crisalad_jax as cj
 @dataclasses.dataclass
 class Thawed:
     scale: float = 1.0
-""", "register_loss 'thawed': found Thawed, which is no frozen dataclass, expected @dataclasses."),
+""", "register_loss 'thawed': found Thawed, expected a subclass of Loss with @datac"),
     "thawed loss": ("""
 import dataclasses
 import crisalad_jax as cj
@@ -93,7 +93,7 @@ import crisalad_jax as cj
 @dataclasses.dataclass
 class Thawed(cj.Loss):
     scale: float = 1.0
-""", "found a part that is no frozen dataclass in line 6, expected @dataclasses.dataclass(frozen="),
+""", "cannot be loaded: it raises TypeError in line 6: cannot inherit non-frozen dataclass from a"),
     "bare": ("""
 import crisalad_jax as cj
 
@@ -101,7 +101,7 @@ import crisalad_jax as cj
 class Bare(cj.Aggregator):
     def token_shape(self, dim):
         return cj.TokenShape(dim, 0, dim)
-""", "register_aggregator 'bare': found Bare, which is no frozen dataclass, expected @"),
+""", "register_aggregator 'bare': found Bare, expected a subclass of Aggregator with @"),
     "recipe": ("""
 import crisalad_jax as cj
 
@@ -138,14 +138,6 @@ def test_a_file_or_module_that_is_not_there(given: str, words: str, capfd: Captu
         load_plugin(given)
     assert str(error.value) == words
     fails(capfd, "info", f"--plugin={given}", words=(words,))
-
-
-def test_a_file_of_gigabytes_is_not_read(tmp_path: pathlib.Path) -> None:
-    path = tmp_path / "mine.py"
-    with path.open("wb") as file:
-        file.truncate(2**32)
-    with pytest.raises(InputError, match=r"mine\.py: found 4294967296 bytes, expected a"):
-        load_plugin(str(path))
 
 
 def test_in_a_process_of_its_own(tmp_path: pathlib.Path) -> None:
@@ -741,7 +733,7 @@ def test_a_field_or_a_preset_of_another_name_is_refused() -> None:
     with pytest.raises(InputError, match=r"found a field 'apply', which has another meaning here$"):
         cj.register_loss("odd")(made)
     made = dataclasses.make_dataclass("Odd", [("scale", int, 1)], bases=(base,), frozen=True)
-    with pytest.raises(InputError, match=r"found scal in a preset, expected alpha, beta, base, sc"):
+    with pytest.raises(InputError, match=r"unexpected keyword argument 'scal'; expected all meth"):
         cj.register_loss("odd", tiny={"scal": 2})(made)
 
 

@@ -13,13 +13,12 @@ from typing import Any
 
 import jax
 
+from crisalad_jax.checkpoints.download import MissingFileError, download
 from crisalad_jax.checkpoints.matlab_io import MATLAB_SUFFIX
 from crisalad_jax.checkpoints.public import Checkpoint, read_checkpoint, read_vocabulary
 from crisalad_jax.checkpoints.published import PUBLISHED, Published
 from crisalad_jax.checkpoints.weights import save_weights
-from crisalad_jax.nn.model import Model
 from crisalad_jax.utils.checksums import sha256_of
-from crisalad_jax.utils.download import MissingFileError, download
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, user_cache, write_json
 from crisalad_jax.utils.locks import lock
@@ -63,11 +62,11 @@ def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
             has no address of its own; torch is needed and not installed; or the cache cannot be
             written to.
     """
-    try:
-        if not _is_ready(model):
+    if not _is_ready(model):
+        try:
             _make(model, quiet=quiet)
-    except InputError as error:
-        raise InputError(f"{model.name}: {error}") from error
+        except InputError as error:
+            raise InputError(f"{model.name}: {error}") from error
     return _weights(model)
 
 
@@ -75,13 +74,16 @@ def _make(model: Published, *, quiet: bool) -> None:
     """Download a published model if need be, and convert it."""
     published = _folder(model) / model.file
     if not published.is_file():
-        _check_obtainable(model)
+        _addresses(model)  # before a folder is made
+    needs_none = published.suffix in (MATLAB_SUFFIX, ".safetensors")
+    if not needs_none and importlib.util.find_spec("torch") is None:
+        raise InputError(
+            f"found no torch, expected it to read {model.file}: pip install 'crisalad-jax[convert]'"
+        )
     with lock(_folder(model), wait=True):
         if not _is_ready(model):
-            _check_torch(model)
-            address = None
-            if not published.is_file():
-                address = _download(model, published, quiet=quiet)
+            is_here = published.is_file()
+            address = None if is_here else _download(model, published, quiet=quiet)
             _convert(model, published, address, quiet=quiet)
 
 
@@ -108,42 +110,31 @@ def _record(model: Published) -> dict[str, Any]:
     return read_json(path, "the record of a download") if path.exists() else {}
 
 
-def _check_obtainable(model: Published) -> None:
-    """Check that a file may be downloaded, before a folder is made for it."""
+def _addresses(model: Published) -> list[str]:
+    """Return where to look for the file: the mirror, if there is one, and its published address.
+
+    Raises:
+        InputError: there is no place to look.
+    """
     if is_offline():
         raise InputError(
             f"found none in the cache {user_cache()}, expected it there: {OFFLINE} forbids the "
             "network"
         )
-    if not _addresses(model):
+    mirror = os.environ.get(MIRROR)
+    if mirror and not mirror.startswith(("http://", "https://", "file://")):
+        raise InputError(
+            f"{MIRROR}: found {mirror!r}, expected https://HOST/PATH or file:///FOLDER"
+        )
+    mirrors = [f"{mirror.rstrip('/')}/{urllib.parse.quote(model.file)}"] if mirror else []
+    addresses = mirrors + ([] if model.url is None else [model.url])
+    if not addresses:
         raise InputError(
             f"found no address of its own for {model.file}, expected it as "
             f"{_folder(model) / model.file} (download it by hand from {model.repository}: "
             f"{model.note})"
         )
-    _check_torch(model)
-
-
-def _check_torch(model: Published) -> None:
-    """Check that what reads the file is installed, before it is downloaded."""
-    needs_none = pathlib.Path(model.file).suffix in (MATLAB_SUFFIX, ".safetensors")
-    if not needs_none and importlib.util.find_spec("torch") is None:
-        raise InputError(
-            f"found no torch, expected it to read {model.file}: pip install 'crisalad-jax[convert]'"
-        )
-
-
-def _addresses(model: Published) -> list[str]:
-    """Return where to look for the file: the mirror, if there is one, and its published address."""
-    addresses = [] if model.url is None else [model.url]
-    mirror = os.environ.get(MIRROR)
-    if not mirror:
-        return addresses
-    if not mirror.startswith(("http://", "https://", "file://")):
-        raise InputError(
-            f"{MIRROR}: found {mirror!r}, expected https://HOST/PATH or file:///FOLDER"
-        )
-    return [f"{mirror.rstrip('/')}/{urllib.parse.quote(model.file)}", *addresses]
+    return addresses
 
 
 def _download(model: Published, target: pathlib.Path, *, quiet: bool) -> str:
@@ -196,8 +187,7 @@ def _convert(
         if address is not None:
             published.unlink()
         raise
-    converted = Model(checkpoint.params, checkpoint.config)
-    save_weights(_weights(model), converted, extras=checkpoint.extras)
+    save_weights(_weights(model), checkpoint.model, extras=checkpoint.extras)
     url = address or record.get("url")
     known = {"url": url, "file": model.file, "sha256": digest, "version": VERSION}
     write_json(_folder(model) / _RECORD, known)

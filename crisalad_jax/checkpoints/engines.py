@@ -10,7 +10,6 @@ import numpy as np
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.output import warn
 
 EngineName = Literal["onnxruntime", "openvino"]
@@ -78,14 +77,13 @@ def load_program(
         A function of the program's inputs.
 
     Raises:
-        InputError: the engine is unknown, is not installed, or cannot read the file.
+        InputError: the engine is unknown, or cannot read the file.
+        ModuleNotFoundError: it is not installed.
     """
     load = choose("runtime", engine, _ENGINES)
     try:
         return load(path, precision)
-    except ModuleNotFoundError as error:
-        raise InputError(missing_extra(error, f"runtime {engine}")) from error
-    except InputError:
+    except (ModuleNotFoundError, InputError):
         raise
     except Exception as error:  # each engine has its own, and some are of no class of theirs
         reason = " ".join(str(error).split())[:200]
@@ -93,15 +91,8 @@ def load_program(
 
 
 def convert_to_openvino(program: pathlib.Path, out: pathlib.Path) -> None:
-    """Convert an ONNX program to OpenVINO's two files, `out` and the weights beside it (.bin).
-
-    Raises:
-        InputError: OpenVINO is not installed.
-    """
-    try:
-        openvino = import_openvino()
-    except ModuleNotFoundError as error:
-        raise InputError(missing_extra(error, "format openvino")) from error
+    """Convert an ONNX program to OpenVINO's two files, `out` and the weights beside it (.bin)."""
+    openvino = import_openvino()
     model = openvino.Core().read_model(program)
     # By default the weights lose half of their bits.
     openvino.save_model(model, out, compress_to_fp16=False)

@@ -10,7 +10,6 @@ import dataclasses
 import hashlib
 import os
 import pathlib
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
 
@@ -32,7 +31,6 @@ from crisalad_jax.checkpoints.runtime import (
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
 from crisalad_jax.config.checks import PATH, check_count, check_types, takes
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.data.prepare import normalised
 from crisalad_jax.nn.config import ModelConfig
@@ -50,7 +48,6 @@ from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.compiler import number_types
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.files import atomic_folder, check_new_folder, write_json
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.pytree import named_leaves
@@ -106,20 +103,19 @@ class ExportConfig:
     def __post_init__(self) -> None:
         """Check the values."""
         check_types(self)
-        if self.grouping == "any" and self.format == "stablehlo":
+        is_lacking = {
+            "stablehlo": self.grouping == "any" or not self.platforms,
+            "onnx": False,
+            "openvino": self.weights_inside,
+        }
+        if is_lacking[self.format]:
             raise InputError(
-                "grouping: found any with format stablehlo, expected single or batch, or format "
-                "onnx or openvino"
-            )
-        if self.format == "openvino" and self.weights_inside:
-            raise InputError(
-                "weights inside: found with format openvino, which has them in a file next to its "
-                "program, expected format onnx or stablehlo"
+                f"format: found {self.format} with grouping {self.grouping}, {len(self.platforms)} "
+                f"platforms and weights inside {self.weights_inside}, expected onnx or openvino "
+                "for grouping any, some platform for stablehlo, and no weights inside of openvino"
             )
         if self.batch_size is not None:
             check_count("batch size", self.batch_size)
-        if not self.platforms:
-            raise InputError("platforms: found none, expected some of cpu, cuda, rocm, tpu")
 
 
 def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -> None:
@@ -248,8 +244,12 @@ def write_export(
     params, config = model
     check_new_folder(out)
     check_exportable(params, config, how)
-    if calibration is not None:
-        _check_calibration(calibration, config, how)
+    is_one_program = how.grouping != "any" and how.batch_size is None and not how.weights_inside
+    if calibration is not None and (how.format == "stablehlo" or not is_one_program):
+        raise InputError(
+            "int8: found with format stablehlo, grouping any, weights inside or a batch size, "
+            "expected a program of onnx or openvino for any number of images"
+        )
     if config.preprocessing.size_rule != "fixed":
         size = " x ".join(map(str, config.input_size))
         warn(
@@ -286,19 +286,6 @@ def write_export(
     return manifest
 
 
-def _check_calibration(images: np.ndarray, config: ModelConfig, how: ExportConfig) -> None:
-    if how.format == "stablehlo" or how.grouping == "any" or how.weights_inside or how.batch_size:
-        raise InputError(
-            "int8: found with format stablehlo, grouping any, weights inside or a batch size, "
-            "expected a program of onnx or openvino for any number of images"
-        )
-    shape = (*config.input_size, 3)
-    if images.shape[1:] != shape or not len(images):
-        raise InputError(
-            f"calibration: found shape {images.shape}, expected images of {shape}, at least one"
-        )
-
-
 def _write_stablehlo(
     folder: pathlib.Path, params: Crisalad, config: ModelConfig, how: ExportConfig
 ) -> dict[str, Any]:
@@ -329,10 +316,8 @@ def _write_onnx(
     calibration: np.ndarray | None,
 ) -> dict[str, Any]:
     """Write the files of ONNX or OpenVINO, check them, and return what the manifest says."""
-    try:
-        from crisalad_jax.checkpoints.onnx_format.program import OPSET, write_onnx
-    except ModuleNotFoundError as error:
-        raise InputError(missing_extra(error, f"format {how.format}")) from error
+    from crisalad_jax.checkpoints.onnx_format.program import OPSET, write_onnx
+
     run, weights, images = _program(params, config, how)
     parts = {DESCRIBE: (run, weights, {"images": images}, "descriptors")}
     if how.grouping == "any":
@@ -348,8 +333,10 @@ def _write_onnx(
                 path, function, arrays, inputs, output, words=words, beside=beside
             )
         if calibration is not None:
+            from crisalad_jax.checkpoints.onnx_format.quantise import quantise
+
             # OpenVINO fails to move scales of columns past a reshape.
-            _quantise(path, calibration, products, per_channel=how.format == "onnx")
+            quantise(path, calibration, products, per_channel=how.format == "onnx")
         if how.format == "openvino":
             convert_to_openvino(path, path.with_suffix(".xml"))
             for suffix in SUFFIXES["onnx"]:
@@ -373,23 +360,6 @@ def _write_onnx(
         "products": "float32" if calibration is None else "int8",
         "checked": {"engine": engine, "largest_difference": difference},
     }
-
-
-def _quantise(
-    program: pathlib.Path, calibration: np.ndarray, products: list[str], *, per_channel: bool
-) -> None:
-    """Quantise a program in its place."""
-    try:
-        from crisalad_jax.checkpoints.onnx_format.quantise import quantise
-    except ModuleNotFoundError as error:
-        raise InputError(missing_extra(error, "int8")) from error
-    # It finds its weights by their name, so they keep it.
-    whole = program.parent / "float32"
-    whole.mkdir()
-    for each in (program, program.with_name(f"{program.name}.data")):
-        each.rename(whole / each.name)
-    quantise(whole / program.name, program, calibration, products, per_channel=per_channel)
-    shutil.rmtree(whole)
 
 
 def _halves(
@@ -466,14 +436,11 @@ def _images(config: ModelConfig, how: ExportConfig) -> dict[str, Any]:
     """Say how images are prepared for the program, which has one size, whatever the rule."""
     chain, size = config.preprocessing, config.input_size
     fixed = dataclasses.replace(chain, size_rule="fixed", round_to_patch=False)
-    words = fixed.in_words(size)
-    if words == PreprocessingConfig().in_words(size):
-        words = "Pillow's BILINEAR to (height, width)"
     values = {
         "shape": [how.batch_size or "batch", *size, 3],
         "dtype": "uint8",
         "layout": "RGB, rows from the top, not normalised",
-        "resize": f"{words}, aspect ratio not kept",
+        "resize": f"{fixed.in_words(size)}, aspect ratio not kept",
     }
     if not _takes_bytes(config, how):
         values["dtype"] = "float32"

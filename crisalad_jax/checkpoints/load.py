@@ -42,10 +42,8 @@ def load(path: str | os.PathLike[str], *, verify: bool = True) -> "Model":
     """
     # Imported here: the formats of public checkpoints take a tenth of a second, and few need them.
     from crisalad_jax.checkpoints.public import read_checkpoint
-    from crisalad_jax.nn.model import Model
 
-    checkpoint = read_checkpoint(find_weights(path), verify=verify)
-    return Model(checkpoint.params, checkpoint.config)
+    return read_checkpoint(find_weights(path), verify=verify).model
 
 
 def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False) -> pathlib.Path:
@@ -74,7 +72,8 @@ def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False)
         crisalad_jax.utils.errors.InputError: megalok: found no such file, ...; nearest: megaloc...
     """
     if weights is None:
-        return starter.default_weights()
+        starter.tell_taken()
+        return starter.FILE
     path = pathlib.Path(weights)
     name = os.fspath(weights)
     if path.suffix and os.path.isfile(path):

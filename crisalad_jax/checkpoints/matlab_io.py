@@ -5,30 +5,23 @@ Names and axes of the result are those of hloc's own module.
 """
 
 import pathlib
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from crisalad_jax.checkpoints.formats.cnn import vgg_numbers
+from crisalad_jax.checkpoints.torch_io import Content
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.mat_files import load_mat
 
 MATLAB_SUFFIX = ".mat"
 _EXPECTED = "a MATLAB file of NetVLAD: net.layers with weights, and its averageImage"
+CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
+"""Numbers of the layers of VGG-16 that have weights."""
 _SCORES, _WHITENING = 30, 33
 """Numbers of the layers of NetVLAD's clusters, and of the whitening."""
 
 
-class MatlabNetwork(NamedTuple):
-    """What a file holds."""
-
-    state: dict[str, np.ndarray]
-    """Weights by the names of hloc's module."""
-    mean: tuple[float, ...]
-    """Red, green and blue that are subtracted from pixels of 0 to 255."""
-
-
-def read_matlab(path: pathlib.Path) -> MatlabNetwork:
+def read_matlab(path: pathlib.Path) -> Content:
     """Read the weights of a network, and the mean of its images.
 
     Raises:
@@ -46,7 +39,7 @@ def read_matlab(path: pathlib.Path) -> MatlabNetwork:
         # hloc subtracts the first pixel from all, whatever the image's size.
         red, green, blue = map(_as_written, network.meta.normalization.averageImage[0, 0])
         state: dict[str, Any] = {}
-        for _, number in vgg_numbers():
+        for number in CONVOLUTIONS:
             kernel, bias = network.layers[number].weights
             state |= {
                 f"backbone.{number}.weight": kernel.transpose(3, 2, 0, 1),
@@ -66,7 +59,7 @@ def read_matlab(path: pathlib.Path) -> MatlabNetwork:
         raise InputError(
             f"{path}: found another network ({reason}), expected {_EXPECTED}"
         ) from error
-    return MatlabNetwork(arrays, (red, green, blue))
+    return Content(arrays, mean=(red / 255, green / 255, blue / 255))
 
 
 def _as_written(value: Any) -> float:

@@ -32,34 +32,29 @@ from crisalad_jax.checkpoints.torch_io import (
     read_torch,
     write_torch,
 )
-from crisalad_jax.checkpoints.weights import FORMAT, check_sizes, save_weights, unpack_weights
+from crisalad_jax.checkpoints.weights import (
+    FORMAT,
+    Checkpoint,
+    check_sizes,
+    save_weights,
+    unpack_weights,
+    with_metadata,
+)
 from crisalad_jax.config.checks import PATH, choose, takes
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.aggregators.vlad import AnyLoc, AnyLocConfig
 from crisalad_jax.nn.backbones import Backbone
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import Crisalad, Model
+from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, check_target, is_html, parse_json
 
 SUFFIXES = {"torch": (".pth", ".pt", ".ckpt"), "safetensors": (".safetensors",)}
 """Suffixes of files that can be written, by `Format.stored`."""
-
-
-@brief
-class Checkpoint(NamedTuple):
-    """A model from any file we can read."""
-
-    params: Crisalad
-    config: ModelConfig
-    extras: dict[str, np.ndarray]
-    format: str | None
-    """Public format of the file; None for a file of this package."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,18 +85,11 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
         raise InputError(f"{path}: found a page of HTML, expected a checkpoint")
     # Torch files are zip archives, older ones pickles. safetensors begin with a length and a brace.
     if path.suffix == MATLAB_SUFFIX:
-        network = read_matlab(path)
-        checkpoint = _model_of(Content(network.state), str(path))
-        red, green, blue = network.mean
-        mean = red / 255, green / 255, blue / 255
-        chain = dataclasses.replace(checkpoint.config.preprocessing, mean=mean)
-        config = dataclasses.replace(checkpoint.config, preprocessing=chain)
-        return checkpoint._replace(config=config)
-    if start[8:9] == b"{" or (path.suffix == ".safetensors" and not start.startswith(b"PK")):
+        content = read_matlab(path)
+    elif start[8:9] == b"{" or (path.suffix == ".safetensors" and not start.startswith(b"PK")):
         metadata, state = read_safetensors(path, "a checkpoint")
         if FORMAT in metadata:
-            ours = unpack_weights(path, metadata, state, verify=verify)
-            return Checkpoint(ours.params, ours.config, ours.extras, None)
+            return unpack_weights(path, metadata, state, verify=verify)
         content = Content(state, metadata.get(DECLARED))
     else:
         content = read_torch(path)
@@ -110,39 +98,33 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
 
 def _model_of(content: Content, source: str) -> Checkpoint:
     """Make a model of the arrays of a public checkpoint."""
-    state, declared = content.state, None
     if content.declared is None:
-        name, config, state = identify(state, source=source)
+        name, config, state = identify(content.state, source=source)
+        own: Mapping[str, Any] = {}
     else:
         value = parse_json(content.declared, f"{source} ({DECLARED})", "a configuration")
+        check_sizes(value, content.state.values(), source)
         declared = from_plain(_Declared, value, source=f"{source} ({DECLARED})")
-        name, config = declared.format, declared.config
-        check_sizes(config, state.values(), source)
-        state = renamed_to(state, public_shapes(config, name).keys())
+        name, config, own = declared.format, declared.config, declared.aggregator
+        state = renamed_to(content.state, public_shapes(config, name).keys())
+    if content.mean is not None:
+        chain = dataclasses.replace(config.preprocessing, mean=content.mean)
+        config = dataclasses.replace(config, preprocessing=chain)
     state = {key: _float32(key, array, source) for key, array in state.items()}
     params, extras = to_params(state, config, name, source=source)
-    params = jax.tree.map(jnp.asarray, params)
-    if declared is not None and declared.aggregator:
-        own = config.aggregator.with_metadata(params.aggregator, declared.aggregator)
-        config.aggregator.check_backbone(own, params.backbone, source)
-        params = dataclasses.replace(params, aggregator=own)
+    params = with_metadata(jax.tree.map(jnp.asarray, params), config, own, source)
     return Checkpoint(params, config, extras, name)
 
 
 def _float32(name: str, array: np.ndarray, source: str) -> np.ndarray:
-    if name.endswith("num_batches_tracked"):
-        if array.dtype != np.int64:
-            raise InputError(f"{source}: {name} found {array.dtype}, expected int64")
-        return array
-    if array.dtype.name in ("float16", "bfloat16"):
-        array = array.astype(np.float32)
-    if array.dtype != np.float32:
-        raise InputError(
-            f"{source}: {name} found {array.dtype}, expected float32, float16 or bfloat16"
-        )
-    if not np.isfinite(array).all():
+    """Return an array in float32; counts of batches stay integers."""
+    is_count = name.endswith("num_batches_tracked")
+    kinds = ["int64"] if is_count else ["float32", "float16", "bfloat16"]
+    if array.dtype.name not in kinds:
+        raise InputError(f"{source}: {name} found {array.dtype}, expected {' or '.join(kinds)}")
+    if not np.isfinite(np.asarray(array, np.float32)).all():
         raise InputError(f"{source}: {name} holds NaN or infinity")
-    return array
+    return array if is_count else np.asarray(array, np.float32)
 
 
 def read_vocabulary(
@@ -242,8 +224,9 @@ def write_checkpoint(
         metadata = {} if text is None else {DECLARED: text}
         write_safetensors(path, state, {"format": "pt"} | metadata)
     else:
-        named = {f"{form.module}{name}": array for name, array in state.items()}
-        write_torch(path, named, under=form.under, bare=form.bare, declared=text)
+        under, _, module = form.inside.partition("/")
+        named = {f"{module}{name}": array for name, array in state.items()}
+        write_torch(path, named, under=under, bare=form.bare, declared=text)
 
 
 class Conversion(NamedTuple):
@@ -301,10 +284,10 @@ def convert(
         checkpoint = read_vocabulary(source, backbone, fields)
     if pathlib.Path(target).exists() and os.path.samefile(source, target):
         raise InputError(f"{target}: found the source itself, expected another file")
-    params, config, extras, found = checkpoint
+    config, found = checkpoint.config, checkpoint.format
     if found is None and not half:
         format = format or format_for(config, target)
-        write_checkpoint(target, params, config, format, extras)
+        write_checkpoint(target, checkpoint.params, config, format, checkpoint.extras)
         return Conversion(None, format, config)
     if format is not None:
         kind = "half precision" if found is None else f"a public checkpoint ({found})"
@@ -313,7 +296,7 @@ def convert(
             "this package, in full precision"
         )
     check_target(target, ".safetensors")
-    save_weights(target, Model(params, config), extras=extras, half=half)
+    save_weights(target, checkpoint.model, extras=checkpoint.extras, half=half)
     return Conversion(found, None, config)
 
 

@@ -4,18 +4,18 @@ Of a file of weights the export is made once, and kept in the user's cache.
 """
 
 import concurrent.futures
-import contextlib
 import dataclasses
 import functools
 import hashlib
 import json
 import os
 import pathlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from crisalad_jax.checkpoints import safetensors_io
 from crisalad_jax.checkpoints.engines import EngineName, Precision, Program, load_program
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.io import from_plain, to_plain
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 FORMAT = "crisalad-jax export 1"
 MANIFEST = "manifest.json"
+_EXPECTED = "the manifest of `crisalad export`"
 DESCRIBE, TOKENS, ATTEND = "describe", "tokens", "attend"
 """Names of programs: of images to descriptors, or of the two halves of that."""
 SUFFIXES = {"onnx": (".onnx", ".onnx.data"), "openvino": (".xml", ".bin")}
@@ -180,7 +181,6 @@ def open_runtime(
     preprocessing: PreprocessingConfig | Mapping[str, Any] | None = None,
     precision: Precision = "float32",
     any_grouping: bool = False,
-    digest: str | None = None,
     verify: bool = True,
 ) -> Runtime:
     """Open a model in an engine.
@@ -196,7 +196,6 @@ def open_runtime(
         precision: type of the matrix products: bfloat16 is OpenVINO's alone.
         any_grouping: whether images are to look at each other in other ways than `source`, a file,
             would be exported for: each alone.
-        digest: the model that it has to be; None is any.
         verify: whether to compare files with their checksums.
 
     Returns:
@@ -204,7 +203,7 @@ def open_runtime(
 
     Raises:
         InputError: the engine is not installed; there is no such folder or file, or it is damaged,
-            of another format, model or image size; or what `write_export` raises.
+            of another format or for other images; or what `write_export` raises.
 
     Example:
         >>> import jax, numpy as np
@@ -219,24 +218,24 @@ def open_runtime(
     """
     choose("runtime", engine, _READS)
     path = pathlib.Path(source)
-    is_folder = path.is_dir()
-    if not is_folder:
+    if preprocessing is not None and not isinstance(preprocessing, PreprocessingConfig):
+        preprocessing = from_plain(PreprocessingConfig, preprocessing, source="preprocessing")
+    if not path.is_dir():
         path = _exported(path, engine, image_size, preprocessing, any_grouping)
-    manifest = _manifest(path, engine)
-    if digest is not None and manifest["model_sha256"] != digest:
+    manifest = read_json(path / MANIFEST, _EXPECTED)
+    if manifest.get("format") != FORMAT:
         raise InputError(
-            f"{source}: found a program of other weights (model {manifest['model_sha256'][:12]}), "
-            f"expected one of model {digest[:12]}"
+            f"{path / MANIFEST}: found format {manifest.get('format')!r}, expected {FORMAT!r}: "
+            f"{_EXPECTED}"
         )
-    chain = from_plain(PreprocessingConfig, manifest["model"]["preprocessing"], source=str(path))
-    own = Preparation(tuple(manifest["model"]["image_size"]), chain, int(manifest["side_multiple"]))
-    wanted = own
-    if image_size is not None:
-        wanted = dataclasses.replace(wanted, image_size=tuple(image_size))
-    if preprocessing is not None:
-        wanted = dataclasses.replace(wanted, preprocessing=_as_config(preprocessing))
-    _check_prepared(path, manifest, own, wanted)
-    loaded = _load(path, manifest, engine, precision, verify=verify)
+    if manifest["program_format"] not in _READS[engine]:
+        raise InputError(
+            f"{path}: found a program of format {manifest['program_format']}, expected "
+            f"{' or '.join(_READS[engine])} for {engine}: `crisalad export --format "
+            f"{_READS[engine][0]}`"
+        )
+    preparation = _preparation(path, manifest, image_size, preprocessing)
+    first, *second = _load(path, manifest, engine, precision, verify=verify)
     count, height, width, _ = manifest["images"]["shape"]
     return Runtime(
         folder=path,
@@ -247,60 +246,57 @@ def open_runtime(
         dim=manifest["descriptors"]["shape"][1],
         input_size=(height, width),
         fixed_batch=count if isinstance(count, int) else None,
-        preparation=wanted,
+        preparation=preparation,
         precision=precision,
         model=manifest["model"],
-        _first=loaded[0],
-        _second=loaded[1] if len(loaded) > 1 else None,
+        _first=first,
+        _second=second[0] if second else None,
     )
 
 
-def _as_config(preprocessing: PreprocessingConfig | Mapping[str, Any]) -> PreprocessingConfig:
-    if isinstance(preprocessing, PreprocessingConfig):
-        return preprocessing
-    return from_plain(PreprocessingConfig, preprocessing, source="preprocessing")
+def _preparation(
+    folder: pathlib.Path,
+    manifest: Mapping[str, Any],
+    image_size: Size | None,
+    preprocessing: PreprocessingConfig | None,
+) -> Preparation:
+    """Return how images are prepared, as asked for or as the model says, if the program takes them.
 
-
-def _manifest(folder: pathlib.Path, engine: EngineName) -> dict[str, Any]:
-    """Read the manifest of an export that the engine reads."""
-    path = folder / MANIFEST
-    expected = "the manifest of `crisalad export`"
-    manifest = read_json(path, expected)
-    found = manifest.get("format")
-    if found != FORMAT:
-        raise InputError(f"{path}: found format {found!r}, expected {FORMAT!r}: {expected}")
-    kind = manifest["program_format"]
-    if kind not in _READS[engine]:
+    Raises:
+        InputError: it does not.
+    """
+    model, images = manifest["model"], manifest["images"]
+    own = from_plain(PreprocessingConfig, model["preprocessing"], source=str(folder))
+    chain = preprocessing or own
+    _check_fixed(folder, chain.size_rule)
+    height, width = image_size or model["image_size"]
+    wanted = Preparation((height, width), chain, int(manifest["side_multiple"]))
+    taken = _words(images["shape"][1:3], images["dtype"], own)
+    given = _words(wanted.size_of(wanted.image_size), np.dtype(wanted.dtype), chain)
+    if taken != given:
         raise InputError(
-            f"{folder}: found a program of format {kind}, expected {' or '.join(_READS[engine])} "
-            f"for {engine}: `crisalad export --format {_READS[engine][0]}`"
+            f"{folder}: found a program for images of {taken}, expected {given} (`crisalad "
+            "export` with these flags, and --pixels)"
         )
-    return manifest
+    return wanted
 
 
-def _check_prepared(
-    folder: pathlib.Path, manifest: Mapping[str, Any], own: Preparation, wanted: Preparation
-) -> None:
-    """Check that images which are prepared as wanted are those that the program takes."""
-    rule = wanted.preprocessing.size_rule
+def _words(size: Sequence[int], dtype: object, chain: PreprocessingConfig) -> str:
+    """Name what a program depends on: sizes, types and normalisation of images."""
+    height, width = size
+    return (
+        f"{height} x {width}, {dtype}, normalised by {chain.normalisation} {chain.mean} "
+        f"{chain.deviation}"
+    )
+
+
+def _check_fixed(source: pathlib.Path, rule: str) -> None:
+    """Check that images have one size, as a program takes them."""
     if rule != "fixed":
         raise InputError(
-            f"{folder}: found images of size rule {rule}, expected fixed: a program takes one size "
+            f"{source}: found images of size rule {rule}, expected fixed: a program takes one size "
             "(--resize fixed)"
         )
-    size, expected = wanted.size_of(wanted.image_size), tuple(manifest["images"]["shape"][1:3])
-    if size != expected:
-        words = (" x ".join(map(str, each)) for each in (expected, size))
-        raise InputError(f"{folder}: found a program for images of {'; expected '.join(words)}")
-    dtype = np.dtype(wanted.dtype)
-    if str(dtype) != manifest["images"]["dtype"]:
-        raise InputError(
-            f"{folder}: found a program of {manifest['images']['dtype']}, expected {dtype}, which "
-            "this model's images are resized to (`crisalad export --pixels`)"
-        )
-    same = ("normalisation", "mean", "deviation")
-    if any(getattr(own.preprocessing, n) != getattr(wanted.preprocessing, n) for n in same):
-        raise InputError(f"{folder}: found another normalisation than was asked for")
 
 
 def _load(
@@ -314,60 +310,65 @@ def _load(
     """Load the programs, while the bytes of their files are compared with their checksums."""
     parts = [manifest, manifest[ATTEND]] if ATTEND in manifest else [manifest]
     entries = [part[name] for part in parts for name in ("program", "weights") if part[name]]
-    for entry in entries:
-        path = folder / entry["file"]
-        found = path.stat().st_size if path.is_file() else None
-        if found != entry["bytes"]:
-            words = "no such file" if found is None else f"{found} bytes"
-            raise InputError(f"{path}: found {words}, expected {entry['bytes']} bytes")
     with concurrent.futures.ThreadPoolExecutor() as pool:
         digests = [pool.submit(sha256_of, folder / entry["file"]) for entry in entries if verify]
-        failure = None
-        programs: list[Program] = []
         try:
-            for part in parts:
-                programs.append(load_program(engine, folder / part["program"]["file"], precision))
-        except InputError as error:  # which a changed file explains better
-            failure = error
-        for entry, digest in zip(entries, digests, strict=False):
-            if digest.result() != entry["sha256"]:
-                raise InputError(
-                    f"{folder / entry['file']}: found other bytes than {MANIFEST} says, expected "
-                    "the file as it was exported"
-                )
-        if failure is not None:
-            raise failure
-    return programs
+            return [
+                load_program(engine, folder / part["program"]["file"], precision) for part in parts
+            ]
+        finally:  # a changed file explains best why an engine cannot load it
+            for entry, digest in zip(entries, digests, strict=False):
+                if digest.result() != entry["sha256"]:
+                    raise InputError(
+                        f"{folder / entry['file']}: found other bytes than {MANIFEST} says, "
+                        "expected the file as it was exported"
+                    )
 
 
 def _exported(
     weights: pathlib.Path,
     engine: EngineName,
     image_size: Size | None,
-    preprocessing: PreprocessingConfig | Mapping[str, Any] | None,
+    preprocessing: PreprocessingConfig | None,
     any_grouping: bool,
 ) -> pathlib.Path:
     """Return the exported folder of a file of weights in the cache; export it the first time."""
     header = read_header(weights)
-    plain = header["config"]
-    settings = {  # a damaged file may lack some, which `_export` refuses
-        "image_size": list(image_size or plain.get("image_size", ())),
-        "preprocessing": plain.get("preprocessing")
-        if preprocessing is None
-        else to_plain(_as_config(preprocessing)),
+    config = header["config"]
+    chain = config["preprocessing"] if preprocessing is None else to_plain(preprocessing)
+    settings = {
+        "model": header["model_sha256"],
+        "image_size": list(image_size or config["image_size"]),
+        "preprocessing": chain,
         "format": _READS[engine][0],
         "grouping": "any" if any_grouping else "single",
         "version": VERSION,
     }
-    folder = _cached(header["model_sha256"], settings)
+    key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+    folder = user_cache() / "exports" / key[:32]
     if not (folder / MANIFEST).is_file():
+        _check_fixed(weights, chain["size_rule"])
         _export(weights, settings, folder)
     return folder
 
 
-def _cached(digest: str, settings: Mapping[str, Any]) -> pathlib.Path:
-    key = json.dumps({"model": digest, **settings}, sort_keys=True)
-    return user_cache() / "exports" / hashlib.sha256(key.encode()).hexdigest()[:32]
+def _export(weights: pathlib.Path, settings: Mapping[str, Any], folder: pathlib.Path) -> None:
+    from crisalad_jax.checkpoints.export import ExportConfig, write_export
+    from crisalad_jax.checkpoints.weights import load_weights
+
+    model = load_weights(weights)
+    chain = from_plain(PreprocessingConfig, settings["preprocessing"], source=str(weights))
+    config = dataclasses.replace(
+        model.config,
+        image_size=tuple(settings["image_size"]),
+        preprocessing=chain,
+        compute_dtype="float32",
+    )
+    with lock(folder.parent, wait=True):
+        if not (folder / MANIFEST).is_file():
+            warn(f"{weights}: exporting it for --runtime, once; into {folder}")
+            how = ExportConfig(settings["grouping"], format=settings["format"])
+            write_export(folder, model._replace(config=config), how)
 
 
 def read_header(weights: str | os.PathLike[str]) -> dict[str, Any]:
@@ -384,18 +385,9 @@ def read_header(weights: str | os.PathLike[str]) -> dict[str, Any]:
     Raises:
         InputError: what `load_weights` raises, for a file without such metadata.
     """
-    import safetensors
-
-    with contextlib.suppress(safetensors.SafetensorError, OSError, ValueError):
-        with safetensors.safe_open(weights, framework="numpy") as file:
-            values = [json.loads(value) for value in (file.metadata() or {}).values()]
-        for value in values:
-            if isinstance(value, dict) and {"model_sha256", "config"} <= value.keys():
-                return value
-    from crisalad_jax.checkpoints.weights import load_weights
-
-    load_weights(weights)
-    raise AssertionError("no header")  # which `load_weights` has told of
+    return safetensors_io.read_header(
+        weights, safetensors_io.WEIGHTS, safetensors_io.EXPECTED_WEIGHTS
+    )
 
 
 def read_model(source: str | os.PathLike[str]) -> "ModelConfig":
@@ -407,31 +399,7 @@ def read_model(source: str | os.PathLike[str]) -> "ModelConfig":
     from crisalad_jax.nn.config import ModelConfig
 
     if os.path.isdir(source):
-        manifest = read_json(pathlib.Path(source) / MANIFEST, "the manifest of `crisalad export`")
+        manifest = read_json(pathlib.Path(source) / MANIFEST, _EXPECTED)
         plain = {**manifest["model"], "compute_dtype": "float32"}  # which its numbers are
         return from_plain(ModelConfig, plain, source=str(source))
     return from_plain(ModelConfig, read_header(source)["config"], source=f"{source} (metadata)")
-
-
-def _export(weights: pathlib.Path, settings: Mapping[str, Any], folder: pathlib.Path) -> None:
-    from crisalad_jax.checkpoints.export import ExportConfig, write_export
-    from crisalad_jax.checkpoints.weights import load_weights
-    from crisalad_jax.nn.model import Model
-
-    params, config = load_weights(weights)
-    config = dataclasses.replace(
-        config,
-        image_size=tuple(settings["image_size"]),
-        preprocessing=_as_config(settings["preprocessing"]),
-        compute_dtype="float32",
-    )
-    if config.preprocessing.size_rule != "fixed":
-        raise InputError(
-            f"{weights}: found images of size rule {config.preprocessing.size_rule}, expected "
-            "fixed: a program takes one size (--resize fixed)"
-        )
-    with lock(folder.parent, wait=True):
-        if not (folder / MANIFEST).is_file():
-            warn(f"{weights}: exporting it for --runtime, once; into {folder}")
-            how = ExportConfig(settings["grouping"], format=settings["format"])
-            write_export(folder, Model(params, config), how)

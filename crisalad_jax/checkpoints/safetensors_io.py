@@ -3,11 +3,12 @@
 The checksum is the SHA-256 of the object and of every array's name, type, shape and bytes.
 """
 
+import contextlib
 import hashlib
 import json
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -19,6 +20,13 @@ from crisalad_jax.utils.checksums import CHECKSUM, ChangedFileError
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source, is_html, parse_json
 
+WEIGHTS = "crisalad-jax 4"
+"""Format of a weight file, the only key of its metadata. Its value is JSON: the file's checksum,
+and a `weights.Header`."""
+EXPECTED_WEIGHTS = (
+    f"a .safetensors file of weights ({WEIGHTS!r}), as this package writes it; `crisalad convert` "
+    "reads public checkpoints"
+)
 _OTHERS = {b"PK\3\4": "a torch file", b"\x80\2": "a torch file", b"MATLAB": "a MATLAB file"}
 """What files of other kinds begin with; torch's are archives, older ones pickles."""
 
@@ -83,6 +91,21 @@ def _checksum(value: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str
     return digest.hexdigest()
 
 
+@contextlib.contextmanager
+def _opened(path: str | os.PathLike[str], expected: str) -> Iterator[Any]:
+    """Open a file; what is wrong with it is told in one line."""
+    check_source(path, expected)
+    try:
+        with safetensors.safe_open(path, framework="numpy") as file:
+            yield file
+    except AttributeError as error:  # safetensors' error for a type that numpy lacks
+        raise InputError(f"{path}: found a type that numpy does not know: {error}") from error
+    except (safetensors.SafetensorError, OSError) as error:
+        found = _other_kind(pathlib.Path(path))
+        problem = f"found {found}" if found else f"not a whole safetensors file ({error})"
+        raise InputError(f"{path}: {problem}, expected {expected}") from error
+
+
 def read_safetensors(
     path: str | os.PathLike[str], expected: str
 ) -> tuple[dict[str, str], dict[str, np.ndarray]]:
@@ -95,17 +118,20 @@ def read_safetensors(
     Raises:
         InputError: the file is missing, not whole, of another kind, or has a type that NumPy lacks.
     """
-    check_source(path, expected)
-    try:
-        with safetensors.safe_open(path, framework="numpy") as file:
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return file.metadata() or {}, arrays
-    except AttributeError as error:  # safetensors' error for a type that numpy lacks
-        raise InputError(f"{path}: found a type that numpy does not know: {error}") from error
-    except (safetensors.SafetensorError, OSError) as error:
-        found = _other_kind(pathlib.Path(path))
-        problem = f"found {found}" if found else f"not a whole safetensors file ({error})"
-        raise InputError(f"{path}: {problem}, expected {expected}") from error
+    with _opened(path, expected) as file:
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return file.metadata() or {}, arrays
+
+
+def read_header(path: str | os.PathLike[str], form: str, expected: str) -> dict[str, Any]:
+    """Read the object of a file that `write_sealed` wrote, without its arrays.
+
+    Raises:
+        InputError: what `read_sealed` raises, but nothing is compared with the checksum.
+    """
+    with _opened(path, expected) as file:
+        metadata = file.metadata() or {}
+    return _value(path, metadata, form, expected)[0]
 
 
 def _other_kind(path: pathlib.Path) -> str | None:
@@ -149,12 +175,19 @@ def unseal(
     Raises:
         InputError: it is of another format, or changed.
     """
+    value, checksum = _value(path, metadata, form, expected)
+    if verify and checksum != _checksum(value, arrays):
+        raise ChangedFileError(path)
+    return Contents(value, arrays)
+
+
+def _value(
+    path: str | os.PathLike[str], metadata: Mapping[str, str], form: str, expected: str
+) -> tuple[dict[str, Any], Any]:
+    """Return the object in the metadata, and its checksum."""
     if form not in metadata:
         raise InputError(f"{path}: found metadata {sorted(metadata)}, expected {expected}")
     value = parse_json(metadata[form], f"{path} (metadata)", expected)
     if not isinstance(value, dict) or CHECKSUM not in value:
         raise InputError(f"{path} (metadata): found no {CHECKSUM}, expected one in {form!r}")
-    checksum = value.pop(CHECKSUM)
-    if verify and checksum != _checksum(value, arrays):
-        raise ChangedFileError(path)
-    return Contents(value, arrays)
+    return value, value.pop(CHECKSUM)

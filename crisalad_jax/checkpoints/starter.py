@@ -20,12 +20,6 @@ BEST = "megaloc"
 """The published model that recalls the most, which a note names."""
 
 
-def default_weights() -> pathlib.Path:
-    """Return the file of the model in this package, and tell that it was taken."""
-    tell_taken()
-    return FILE
-
-
 def tell_taken() -> None:
     """Tell that the model in this package was taken."""
     warn(

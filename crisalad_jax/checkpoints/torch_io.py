@@ -29,6 +29,8 @@ class Content(NamedTuple):
     """Arrays by name."""
     declared: str | None = None
     """What it says of its model, as JSON, where we wrote it."""
+    mean: tuple[float, float, float] | None = None
+    """Red, green and blue that are subtracted from pixels of 0 to 1, where it says so."""
 
 
 class _Unread:
@@ -75,24 +77,25 @@ def read_torch(path: pathlib.Path) -> Content:
     """Read the state in a file, under whatever key it is.
 
     Raises:
-        InputError: the file is not whole, asks to run code, or has anything but tensors by name; or
-            torch is not installed.
+        InputError: the file is not whole, asks to run code, or has anything but tensors by name.
+        ModuleNotFoundError: torch is not installed.
     """
+    import torch
+
     state = _load(path)
-    for key in _UNDER:
-        if isinstance(state, Mapping) and isinstance(state.get(key), Mapping):
-            state = state[key]
-            break
-    if not isinstance(state, dict) or not state:
-        raise InputError(
-            f"{path}: found {_kind(state)}, expected a dictionary of tensors by name: {HOW}"
-        )
-    is_tensor = _torch(f"read {path}").is_tensor
-    strange = [str(n) for n, x in state.items() if not isinstance(n, str) or not is_tensor(x)]
-    if strange:
-        raise InputError(
-            f"{path}: found {few(sorted(strange))}, expected nothing but tensors by name: {HOW}"
-        )
+    if isinstance(state, Mapping):
+        inside = (state[key] for key in _UNDER if isinstance(state.get(key), Mapping))
+        state = next(inside, state)
+    found = _kind(state)
+    if isinstance(state, dict) and state:
+        strange = [
+            str(name)
+            for name, each in state.items()
+            if not (isinstance(name, str) and torch.is_tensor(each))
+        ]
+        found = few(sorted(strange)) if strange else None
+    if found is not None:
+        raise InputError(f"{path}: found {found}, expected nothing but tensors by name: {HOW}")
     metadata = getattr(state, "_metadata", None)  # as of any module's state_dict
     declared = metadata.get(DECLARED) if isinstance(metadata, dict) else None
     return Content({name: _array(path, name, x) for name, x in state.items()}, declared)
@@ -116,15 +119,13 @@ def read_tensor(path: pathlib.Path) -> np.ndarray:
     Raises:
         InputError: as `read_torch`; or it is not one.
     """
-    value = _load(path)
-    if not _torch(f"read {path}").is_tensor(value):
-        raise InputError(f"{path}: found {type(value).__name__}, expected one tensor by itself")
-    return _array(path, "the tensor", value)
+    return _array(path, "the content", _load(path))
 
 
 def _load(path: pathlib.Path) -> Any:
     """Read a file, with stand-ins for all classes and functions that it names."""
-    torch = _torch(f"read {path}")
+    import torch
+
     is_archive, others = _is_archive(path), []
     try:
         with warnings.catch_warnings():
@@ -132,23 +133,24 @@ def _load(path: pathlib.Path) -> Any:
             if is_archive:
                 named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
                 others = sorted(set(named) - set(_NUMPY))
-            stand_ins = [(_stand_in(name), name) for name in others]
+            stand_ins: list[Any] = [(_stand_in(name), name) for name in others]
             stand_ins += [(_Unread, name) for name in _NUMPY]
             with torch.serialization.safe_globals(stand_ins):
                 return torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        # Torch's message is a page of advice on how to run the code anyway: shorten it.
-        refused = re.search(r"(?:GLOBAL|Unsupported \w+) ([a-zA-Z_][\w.]*)", str(error))
-        what = f"asks for {refused[1]}" if refused else "is no plain pickle of tensors"
-        raise InputError(
-            f"{path}: refused: it {what}, expected nothing but tensors (loading anything else "
-            f"could run code): {HOW}"
-        ) from error
     except Exception as error:  # a damaged pickle may raise any exception
         reason = " ".join([type(error).__name__, *str(error).splitlines()[:1]])[:200]
+        problem = f"not a whole torch checkpoint: {reason}"
         if others:
-            reason += f" (it has {', '.join(others[:3])} with the weights: {HOW})"
-        raise InputError(f"{path}: not a whole torch checkpoint: {reason}") from error
+            problem += f" (it has {', '.join(others[:3])} with the weights: {HOW})"
+        if isinstance(error, pickle.UnpicklingError):
+            # Torch's message is a page of advice on how to run the code anyway: shorten it.
+            refused = re.search(r"(?:GLOBAL|Unsupported \w+) ([a-zA-Z_][\w.]*)", str(error))
+            what = f"asks for {refused[1]}" if refused else "is no plain pickle of tensors"
+            problem = (
+                f"refused: it {what}, expected nothing but tensors (loading anything else could "
+                f"run code): {HOW}"
+            )
+        raise InputError(f"{path}: {problem}") from error
 
 
 def _is_archive(path: pathlib.Path) -> bool:
@@ -181,21 +183,11 @@ def _is_archive(path: pathlib.Path) -> bool:
     return True
 
 
-def _torch(purpose: str) -> Any:
-    try:
-        import torch
-    except ImportError as error:
-        raise InputError(
-            f"to {purpose} torch is needed and not installed: pip install torch"
-        ) from error
-    return torch
-
-
 def _array(path: pathlib.Path, name: str, tensor: Any) -> np.ndarray:
     try:
         half = str(tensor.dtype) in ("torch.float16", "torch.bfloat16")
         return (tensor.float() if half else tensor).detach().numpy()
-    except (TypeError, RuntimeError) as error:  # sparse, quantised, 8-bit or meta tensors
+    except (AttributeError, TypeError, RuntimeError) as error:  # sparse, 8-bit or meta tensors
         raise InputError(f"{path}: {name} is no plain tensor: {error}") from error
 
 
@@ -203,7 +195,7 @@ def write_torch(
     path: pathlib.Path,
     state: Mapping[str, np.ndarray],
     *,
-    under: str | None,
+    under: str,
     bare: bool,
     declared: str | None,
 ) -> None:
@@ -212,19 +204,21 @@ def write_torch(
     Args:
         path: the file.
         state: arrays by name.
-        under: key of the file's dictionary that holds the state; None: the file is the state.
+        under: key of the file's dictionary that holds the state; empty: the file is the state.
         bare: whether the file is the one tensor by itself.
         declared: see `Content`.
 
     Raises:
-        InputError: the file cannot be made, or torch is not installed.
+        InputError: the file cannot be made.
+        ModuleNotFoundError: torch is not installed.
     """
-    torch = _torch(f"write {path}")
+    import torch
+
     content: Any = {name: torch.from_numpy(np.array(array)) for name, array in state.items()}
     if declared is not None:
         content = collections.OrderedDict(content)
         content._metadata = {DECLARED: declared}
-    if under is not None:
+    if under:
         content = {under: content}
     if bare:
         (content,) = content.values()

@@ -59,11 +59,7 @@ class StateStore:
     """The resumable states of a run (orbax): each step is written whole or not at all."""
 
     def __init__(self, folder: str | os.PathLike[str], *, keep: int = 2) -> None:
-        """Open or make the folder; the last `keep` states stay.
-
-        Raises:
-            InputError: the folder cannot be made or read.
-        """
+        """Open or make the folder; the last `keep` states stay."""
         folder = pathlib.Path(folder).absolute()
         self._folder, self._dropped = folder, folder / _DROPPED
         # Only the primary process has a store: without this orbax would wait for the others.
@@ -79,18 +75,15 @@ class StateStore:
             cleanup_tmp_directories=True,
             multiprocessing_options=alone,
         )
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._manager = ocp.CheckpointManager(
-                folder,
-                options=options,
-                item_handlers={
-                    "state": ocp.StandardCheckpointHandler(multiprocessing_options=alone),
-                    "record": ocp.JsonCheckpointHandler(multiprocessing_options=alone),
-                },
-            )
-        except OSError as error:
-            raise InputError(f"{folder}: cannot keep states here: {error.strerror}") from error
+        folder.mkdir(parents=True, exist_ok=True)
+        self._manager = ocp.CheckpointManager(
+            folder,
+            options=options,
+            item_handlers={
+                "state": ocp.StandardCheckpointHandler(multiprocessing_options=alone),
+                "record": ocp.JsonCheckpointHandler(multiprocessing_options=alone),
+            },
+        )
         self._clear()
 
     def save(self, step: int, state: PyTree, record: dict[str, Any]) -> None:

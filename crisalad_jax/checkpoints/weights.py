@@ -5,16 +5,21 @@ import hashlib
 import json
 import os
 import pathlib
-from collections.abc import Collection, Iterator, Mapping
+import re
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from crisalad_jax.checkpoints.safetensors_io import EXPECTED_WEIGHTS as EXPECTED
+from crisalad_jax.checkpoints.safetensors_io import WEIGHTS as FORMAT
 from crisalad_jax.checkpoints.safetensors_io import read_safetensors, unseal, write_sealed
+from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.part import fingerprint_fields, with_non_semantic_fields_of
 from crisalad_jax.config.plugins import changed_sources, sources_of
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.diff_trees import diff_trees, not_finite
 from crisalad_jax.nn.model import Crisalad, Model, check_params, parameter_shapes
@@ -25,14 +30,8 @@ from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.version import VERSION
 
-FORMAT = "crisalad-jax 4"
-"""Only key of a weight file's metadata. Its value is JSON: the file's checksum, and a `Header`."""
 EXTRA = "extra."
 """Prefix of the names of arrays that only a conversion to a public checkpoint needs."""
-EXPECTED = (
-    f"a .safetensors file of weights ({FORMAT!r}), as this package writes it; `crisalad convert` "
-    "reads public checkpoints"
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,17 +49,26 @@ class Header:
     """The `model_hash` of the parameters."""
 
 
-class Weights(NamedTuple):
-    """A model from a file of this package."""
+@brief
+class Checkpoint(NamedTuple):
+    """A model from any file we can read."""
 
     params: Crisalad
     config: ModelConfig
-    digest: str
-    """The `model_hash` of the parameters."""
     extras: dict[str, np.ndarray]
     """Arrays of a public checkpoint that no descriptor needs."""
+    format: str | None = None
+    """Public format of the file; None for a file of this package."""
+    digest: str | None = None
+    """The `model_hash` of the parameters, where a file of this package says it."""
+
+    @property
+    def model(self) -> Model:
+        """The parameters and the configuration."""
+        return Model(self.params, self.config)
 
 
+@takes(path=PATH, model=Model)
 def save_weights(
     path: str | os.PathLike[str],
     model: Model,
@@ -92,15 +100,12 @@ def save_weights(
         >>> loaded.config == config
         True
     """
-    if not isinstance(model, tuple):
-        raise InputError(f"model: found {type(model).__name__}, expected a Model(params, config)")
     params, config = model
-    check_params(params, config, stored=True)
     stored = params
     if half:
         stored = jax.tree.map(_halved, params)
         params = jax.tree.map(lambda leaf, half: half.astype(leaf.dtype), params, stored)
-        check_params(params, config, stored=True)
+    check_params(params, config, stored=True)
     config.aggregator.check_backbone(params.aggregator, params.backbone, str(path))
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(stored).items()}
     arrays |= {EXTRA + name: array for name, array in (extras or {}).items()}
@@ -156,17 +161,16 @@ def load_weights(
         wrong = differences(_as_free_as(expected, found.config), expected)
         if wrong:
             raise InputError(f"{path}: these weights are of another model: {'; '.join(wrong)}")
-    return Model(found.params, found.config)
+    return found.model
 
 
-def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Weights:
+def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkpoint:
     """Read all that `save_weights` wrote; see `load_weights`.
 
     Raises:
         InputError: what `load_weights` raises.
     """
-    metadata, arrays = read_safetensors(path, EXPECTED)
-    return unpack_weights(path, metadata, arrays, verify=verify)
+    return unpack_weights(path, *read_safetensors(path, EXPECTED), verify=verify)
 
 
 def unpack_weights(
@@ -175,7 +179,7 @@ def unpack_weights(
     arrays: dict[str, np.ndarray],
     *,
     verify: bool = True,
-) -> Weights:
+) -> Checkpoint:
     """Make a model of what `read_safetensors` read; the arrays are used up.
 
     Raises:
@@ -187,24 +191,37 @@ def unpack_weights(
         if user_cache() in pathlib.Path(path).parents:
             raise InputError(f"{error}; remove it, and the same command makes it again") from error
         raise
+    extras = {
+        name.removeprefix(EXTRA): arrays.pop(name)
+        for name in list(arrays)
+        if name.startswith(EXTRA)
+    }
+    check_sizes(value.get("config"), arrays.values(), str(path))
     header = from_plain(Header, value, source=f"{path} (metadata)")
-    extras = {name: arrays.pop(name) for name in list(arrays) if name.startswith(EXTRA)}
     config = header.config
-    params = _fill(config, arrays, path)
-    own = config.aggregator.with_metadata(params.aggregator, header.aggregator)
-    config.aggregator.check_backbone(own, params.backbone, str(path))
+    params = with_metadata(_fill(config, arrays, path), config, header.aggregator, str(path))
     changed = changed_sources(config, header.parts)
     if changed:
         warn(
             f"{path}: found another source of {', '.join(changed)} than these weights were written "
             "with; descriptors may differ"
         )
-    return Weights(
-        dataclasses.replace(params, aggregator=own),
-        config,
-        header.model_sha256,
-        {name.removeprefix(EXTRA): array for name, array in extras.items()},
-    )
+    return Checkpoint(params, config, extras, None, header.model_sha256)
+
+
+def with_metadata(
+    params: Crisalad, config: ModelConfig, metadata: Mapping[str, Any], source: str
+) -> Crisalad:
+    """Return parameters with what an aggregator keeps besides arrays.
+
+    Raises:
+        InputError: it is a vocabulary of another backbone.
+    """
+    if not metadata:
+        return params
+    own = config.aggregator.with_metadata(params.aggregator, metadata)
+    config.aggregator.check_backbone(own, params.backbone, source)
+    return dataclasses.replace(params, aggregator=own)
 
 
 def _as_free_as(expected: ModelConfig, config: ModelConfig) -> ModelConfig:
@@ -217,7 +234,6 @@ def _as_free_as(expected: ModelConfig, config: ModelConfig) -> ModelConfig:
 def _fill(
     config: ModelConfig, arrays: dict[str, np.ndarray], path: str | os.PathLike[str]
 ) -> Crisalad:
-    check_sizes(config, arrays.values(), str(path))
     template = parameter_shapes(config)
     wanted = named_leaves(template)
     halves = {name: array for name, array in arrays.items() if array.dtype == np.float16}
@@ -229,34 +245,27 @@ def _fill(
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
-def check_sizes(config: ModelConfig, arrays: Collection[np.ndarray], source: str) -> None:
+def check_sizes(plain: Any, arrays: Collection[np.ndarray], source: str) -> None:
     """Check that a configuration may be that of some arrays.
 
-    Before a template is made of it: a file may claim any sizes.
+    Before anything is made of it: a file may claim any sizes.
+
+    Args:
+        plain: the configuration, as JSON values.
+        arrays: the arrays.
+        source: the file, for messages.
 
     Raises:
-        InputError: it has many more layers, or far larger ones, naming `source`.
+        InputError: it has many more layers, or far larger ones.
     """
-    sizes = dict(_whole_numbers(to_plain(config)))
-    layers = sum(size for name, size in sizes.items() if name.endswith((".layers", ".depth")))
-    largest = max(sizes.values())
-    # Blocks of a backbone may be stacked.
-    if layers > len(arrays) + config.backbone.depth or largest > max(
-        2**20, sum(array.size for array in arrays)
-    ):
+    text = json.dumps(plain)
+    layers = sum(map(int, re.findall(r'"layers": (\d+)', text)))
+    largest = max(map(int, re.findall(r": (\d+)[,}]", text)), default=0)
+    if layers > len(arrays) or largest > max(2**20, sum(array.size for array in arrays)):
         raise InputError(
             f"{source}: found {len(arrays)} arrays, far from the sizes that its configuration "
             f"says: {layers} layers, and up to {largest}"
         )
-
-
-def _whole_numbers(plain: Any, name: str = "") -> Iterator[tuple[str, int]]:
-    """Yield all whole numbers of a configuration by their dotted names."""
-    if isinstance(plain, Mapping):
-        for key, value in plain.items():
-            yield from _whole_numbers(value, f"{name}.{key}")
-    elif type(plain) is int:
-        yield name, plain
 
 
 def model_hash(params: Crisalad, config: ModelConfig) -> str:

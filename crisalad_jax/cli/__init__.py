@@ -7,7 +7,6 @@ SIGTERM, 129 by SIGHUP, 1 anything else.
 import dataclasses
 import difflib
 import importlib
-import itertools
 import os
 import re
 import signal
@@ -43,7 +42,10 @@ _COMMANDS = {
     "info": "Print what a model is made of: parameters, what trains, multiply-accumulates.",
     "completion": "Print a script that lets bash, zsh or fish complete what is typed.",
 }
-"""Summaries of the commands in the order of the help; each command is a module here."""
+"""Summaries of the commands in the order of the help; each command is a module here.
+
+Its function `run` takes the parsed flags, and may return what --json writes or prints.
+"""
 
 
 def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
@@ -79,13 +81,11 @@ def _usage() -> str:
 
 def _plugins(given: Sequence[str]) -> Iterator[str]:
     """Yield the plug-ins after each --plugin."""
-    for place, argument in enumerate(given):
-        flag, equals, value = argument.partition("=")
-        if flag == "--plugin":
-            after = itertools.takewhile(lambda each: not each.startswith("--"), given[place + 1 :])
-            names = [value] if equals else list(after)
-            require(bool(names), "--plugin: found no value, expected FILE.py or MODULE")
-            yield from names
+    from crisalad_jax.config.flags import flag_values
+
+    for names in flag_values(given, "--plugin"):
+        require(bool(names), "--plugin: found no value, expected FILE.py or MODULE")
+        yield from names
 
 
 def _limit_pixels(given: Sequence[str]) -> None:
@@ -107,7 +107,9 @@ def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
     load_entry_points()
     for plugin in _plugins(arguments):
         load_plugin(plugin)
-    module = importlib.import_module(f"{__name__}.{name.replace('-', '_')}")
+    from crisalad_jax.cli.common import emit_json, prepare_json
+
+    module = importlib.import_module(f"{__name__}.{name}")
     if hasattr(module, "prepare"):
         arguments = module.prepare(arguments)
     chosen = _parse(name, module, arguments)
@@ -122,7 +124,11 @@ def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
         compiler.configure()
         if keep_programs and not has_plugins():
             executable_cache.cache_executables()
-    module.run(chosen)
+    file = getattr(chosen, "json", None)
+    prepare_json(file, getattr(chosen, "json_suffixes", ()))
+    values = module.run(chosen)
+    if values is not None:
+        emit_json(file, values)
 
 
 def _numbers(flag: str, value: Any) -> Iterator[tuple[str, int]]:

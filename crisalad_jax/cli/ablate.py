@@ -1,38 +1,22 @@
 """`crisalad ablate`."""
 
 import dataclasses
+from typing import Any
 
 import tyro
 
-from crisalad_jax.cli.common import prepare_json
-from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison, settings_of
+from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison
 
 COMMON = (
-    "test",
-    "out",
-    "train",
-    "rows",
-    "row",
-    "reference",
-    "jobs",
-    "backbone",
-    "preset",
-    "seeds",
-    "epochs",
-    "image-size",
-    "grouping",
-    "batch-size",
-    "page",
-    "json",
-    "on-bad-image",
-    "quiet",
+    "test out train rows row reference jobs backbone preset seeds epochs image-size grouping "
+    "batch-size page json on-bad-image quiet"
 )
 EXAMPLE = (
     "crisalad ablate --test pitts30k_test.mat --train gsv --backbone dinov2-vitb14 --out ablated"
 )
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Ablate(ComparisonFlags):
     """Train CriSALAD with one part changed at a time; what its adapters cost (Tables 2 and 3)."""
 
@@ -41,20 +25,18 @@ class Ablate(ComparisonFlags):
     no-adapter, no-encoder, no-encoder-step. Any registered part is a row too, as NAME or KIND:NAME:
     CriSALAD with it in place. With --row the default is crisalad alone."""
     row: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A row of your own, as "NAME: flag=value, flag=value" with any flags of `train` that set the
-    model, loss, optimiser, augmentation or training, and recipe=NAME for another start than
-    crisalad. Give --row again for each row. Spaces part the numbers of a flag (image-size=224 224);
-    a value with a comma stands in quotes."""
+    """A custom row, as "NAME: flag=value, flag=value" with any flags of `train` that set the model,
+    loss, optimiser, augmentation or training, and recipe=NAME for another start than crisalad. Give
+    --row again for each row. Spaces part the numbers of a flag (image-size=224 224); a value with a
+    comma stands in quotes."""
 
 
-def run(arguments: Ablate) -> None:
+def run(arguments: Ablate) -> dict[str, Any]:
     """Train the rows of the ablation, and print the tables."""
-    from crisalad_jax.experiments.comparison import ABLATIONS, ComparisonConfig
+    from crisalad_jax.experiments.comparison import ABLATIONS
 
-    prepare_json(arguments.json)  # before a download
     if arguments.rows is not None:
         names = names_of(arguments.rows)
     else:
         names = ("crisalad",) if arguments.row else tuple(ABLATIONS)
-    config = ComparisonConfig("ablate", names, **settings_of(arguments), rows=arguments.row)
-    run_comparison(config, arguments)
+    return run_comparison(arguments, "ablate", names, rows=arguments.row)

@@ -2,13 +2,14 @@
 
 import dataclasses
 import pathlib
+from typing import Any
 
-from crisalad_jax.cli.common import find_given, give_json, open_set, prepare_json, say, show
+from crisalad_jax.cli.common import echo, find_given, open_set, show
 from crisalad_jax.cli.flags import JsonFlag, ReadFlags, SetFlags
 from crisalad_jax.cli.tables import points_table
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.evaluation.calibrate import calibrate, operating_point_of
-from crisalad_jax.evaluation.operating_point import caveats, check_precision
+from crisalad_jax.evaluation.operating_point import caveats
 from crisalad_jax.retrieval.maps.calibration import CALIBRATION
 from crisalad_jax.retrieval.maps.map import Map
 
@@ -36,10 +37,8 @@ class Calibrate(ReadFlags, SetFlags, JsonFlag):
     huge."""
 
 
-def run(arguments: Calibrate) -> None:
+def run(arguments: Calibrate) -> dict[str, Any]:
     """Calibrate the map, and print what it remembers."""
-    prepare_json(arguments.json)
-    check_precision(arguments.precision)
     with Map.open(arguments.map, verify=arguments.verify, calibrated=False) as places:
         places.load_model(find_given(arguments.weights, quiet=arguments.quiet))
         benchmark = open_set(arguments)
@@ -47,9 +46,9 @@ def run(arguments: Calibrate) -> None:
     point = operating_point_of(calibration)
     show(points_table({"single": point}))
     for words in caveats(point):
-        say(words)
-    say(
+        echo(words)
+    echo(
         f"{arguments.map / CALIBRATION}: answers below similarity {point.min_similarity:.9g} are "
         "unknown from now on"
     )
-    give_json(arguments.json, to_plain(calibration))
+    return to_plain(calibration)

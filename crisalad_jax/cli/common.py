@@ -5,14 +5,15 @@ import json
 import pathlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import rich.console
 import rich.table
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.config.checks import check_seed
+from crisalad_jax.cli.flags import ModelFlags, RuntimeName, SetFlags, SizeFlags
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_format, check_target, write_json
@@ -24,9 +25,6 @@ if TYPE_CHECKING:  # commands that load no model of a file start without these
     from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.model import Model
 
-RuntimeName = Literal["jax", "onnxruntime", "openvino"]
-"""What computes a model: JAX, or another engine (`checkpoints.engines.EngineName`)."""
-
 _WIDE = 10_000
 """Columns that no table fills."""
 # A file or a pipe has room for all columns. Brackets and colons in names are text.
@@ -35,7 +33,7 @@ console = rich.console.Console(
 )
 
 
-def say(line: str) -> None:
+def echo(line: str) -> None:
     """Print a line without wrapping it to the terminal's width."""
     console.print(printable(line), soft_wrap=True, highlight=False)
 
@@ -46,7 +44,7 @@ def show(table: rich.table.Table) -> None:
     A terminal has no room for a column that is wider than itself, and breaks its lines.
     """
     if table.title:
-        say(str(table.title))
+        echo(str(table.title))
         table.title = None
     for part in _parts(table):
         console.print(part, crop=False)
@@ -81,53 +79,49 @@ STDOUT = pathlib.Path("-")
 """Name of the terminal, or of what reads the output, in place of a file of JSON."""
 
 
-def talk_beside(file: pathlib.Path | None) -> None:
-    """Say everything on standard error where JSON is printed on standard output."""
+def prepare_json(file: pathlib.Path | None, suffixes: Sequence[str] = (".json",)) -> None:
+    """Check a flag --json before any work; where it is `STDOUT`, print all else on stderr.
+
+    Raises:
+        InputError: the file cannot be written, or its name says another format than `suffixes`.
+    """
     console.stderr = file == STDOUT
+    if file not in (None, STDOUT):
+        check_format("--json", file, *suffixes)
+        check_target(file)
 
 
-def write_or_print_json(path: pathlib.Path, value: Mapping[str, Any]) -> None:
-    """Write an object as JSON, or print it where the file is `STDOUT`.
+def emit_json(file: pathlib.Path | None, value: Mapping[str, Any]) -> None:
+    """Write a command's result as JSON, or print it where the file is `STDOUT`; None does neither.
 
     Raises:
         InputError: the file cannot be written.
     """
-    if path == STDOUT:
+    if file == STDOUT:
         print(json.dumps(value, indent=2))
-    else:
-        write_json(path, value)
+    elif file is not None:
+        write_json(file, value)
 
 
-def check_json(path: pathlib.Path | None, suffixes: Sequence[str] = (".json",)) -> None:
-    """Check that `write_or_print_json` can write the file, before any work.
-
-    Raises:
-        InputError: it cannot, or the name says another format than those of `suffixes`.
-    """
-    if path is None or path == STDOUT:
-        return
-    check_format("--json", path, *suffixes)
-    check_target(path)
+def pick(flags: Any, *names: str) -> dict[str, Any]:
+    """Return some flags by name, for a function whose arguments have the same names."""
+    return {name: getattr(flags, name) for name in names}
 
 
-def prepare_json(file: pathlib.Path | None) -> None:
-    """Check a flag --json before any work, and keep standard output for it where it is `STDOUT`.
+def refuse_with(flag: str, **others: Any) -> None:
+    """Raise InputError where one of the other flags, which exclude `flag`, has a value."""
+    for name, given in others.items():
+        require(
+            given in (None, False, ()),
+            f"--{name.replace('_', '-')}: found with {flag}, expected only one of the two",
+        )
 
-    Raises:
-        InputError: the file cannot be written.
-    """
-    check_json(file)
-    talk_beside(file)
 
-
-def give_json(file: pathlib.Path | None, value: Mapping[str, Any]) -> None:
-    """Write or print a command's result, where --json asks for it.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
-    if file is not None:
-        write_or_print_json(file, value)
+def waiting_words(result: Any) -> str | None:
+    """Say what a described share of the images waits for; None where all are described."""
+    if result.shares_left:
+        return f"shares still to be done: {result.shares_left}; the last one joins all"
+    return "another process joins all" if result.joined_elsewhere else None
 
 
 def find_given(
@@ -142,70 +136,84 @@ def find_given(
     return find_weights(weights, quiet=quiet)
 
 
-def check_one_model(weights: pathlib.Path | None, preset: str | None) -> None:
-    """Raise InputError where a preset is given beside weights, which have their own sizes."""
-    if weights is not None and preset is not None:
-        raise InputError("--preset: found beside --weights, expected only one of the two")
-
-
-def open_set(arguments: Any) -> "Benchmark":
-    """Open the evaluation set that a command's flags name, and say what it is.
-
-    Args:
-        arguments: has the flags of `evaluate` that say which set, how it lies and what is right.
+def open_set(flags: Any) -> "Benchmark":
+    """Open the evaluation set that `SetFlags` and `ReadFlags` name, and say what it is.
 
     Raises:
         InputError: what `open_benchmark` raises.
     """
     from crisalad_jax.data.benchmarks import open_benchmark
 
-    benchmark = open_benchmark(
-        arguments.data,
-        arguments.split,
-        arguments.radius,
-        images=arguments.images,
-        max_heading_difference=arguments.max_heading_difference,
-        frames=arguments.frames,
-        queries=arguments.queries,
-        ignore_zones=arguments.ignore_zones,
-        layout=arguments.layout,
-        on_bad_image=arguments.on_bad_image,
-    )
-    say(
+    names = [field.name for field in dataclasses.fields(SetFlags) if field.name != "data"]
+    benchmark = open_benchmark(flags.data, **pick(flags, *names, "on_bad_image"))
+    echo(
         f"{benchmark.name}: {len(benchmark.queries)} queries, {len(benchmark.database)} database "
         f"images; positive: {benchmark.rule}"
     )
     return benchmark
 
 
+def load_model(weights: pathlib.Path, flags: SizeFlags, *, quiet: bool = False) -> "Model":
+    """Load a model of JAX's by its file or name, changed by flags.
+
+    Raises:
+        InputError: what `find_weights`, `load_weights` and `ModelConfig.resized` raise.
+    """
+    from crisalad_jax.checkpoints.weights import load_weights
+
+    model = load_weights(find_weights(weights, quiet=quiet))
+    return model._replace(config=flags.applied_to(model.config))
+
+
+class OpenedModel(NamedTuple):
+    """A model as the flags of a command name it."""
+
+    model: "Model | Runtime"
+    name: str
+    """Its name for tables and titles."""
+    file: pathlib.Path
+    """The file, or for other engines the exported folder."""
+
+
 def open_model(
-    weights: pathlib.Path,
-    flags: Any,
+    flags: ModelFlags,
+    weights: pathlib.Path | None = None,
     *,
+    quiet: bool = False,
     groupings: Sequence[str] = ("single",),
     like: "ModelConfig | None" = None,
-) -> "tuple[Model | Runtime, str]":
-    """Load a model for JAX, or open it in another engine.
+) -> OpenedModel:
+    """Load the model of --weights for JAX, or open it in the engine of --runtime.
 
     Args:
-        weights: the file, a published model's name, or for other engines an exported folder.
-        flags: has those of `flags.ModelFlags` and `flags.ReadFlags`.
+        flags: which model, and how it describes images.
+        weights: a file in place of --weights.
+        quiet: whether to show no progress of a download.
         groupings: the groupings that images will be described in.
         like: configuration of a map, whose image size and types the flags then change.
-
-    Returns:
-        The model, and its name for tables and titles.
 
     Raises:
         InputError: what `find_weights`, `load_weights`, `ModelConfig.resized` and `open_runtime`
             raise.
     """
+
+    def changed(config: "ModelConfig") -> "ModelConfig":
+        return flags.applied_to(
+            config if like is None else with_non_semantic_fields_of(like, config)
+        )
+
+    given = weights or flags.weights
+    file = find_given(given, runtime=flags.runtime, quiet=quiet) or find_weights(None)
+    short = f"{file.parent.name}/{file.name}" if file.parent.name else file.name
+    name = starter.named(file) if file in starter.FILES.values() else short
+    if flags.runtime == "jax":
+        from crisalad_jax.checkpoints.weights import load_weights
+
+        model = load_weights(file, verify=flags.verify)
+        return OpenedModel(model._replace(config=changed(model.config)), name, file)
     from crisalad_jax.checkpoints.runtime import open_runtime, read_model
 
-    file = find_given(weights, runtime=flags.runtime, quiet=flags.quiet) or weights
-    if flags.runtime == "jax":
-        return load_model(file, flags, like=like, verify=flags.verify)
-    config = _changed(read_model(file), flags, like)
+    config = changed(read_model(file))
     if config.compute_dtype == "float64":
         raise InputError(f"--runtime: found {flags.runtime} with a model of float64, expected jax")
     attends = bool(config.cross_image.layers)
@@ -218,43 +226,4 @@ def open_model(
         any_grouping=attends and set("/".join(groupings).split("/")) != {"single"},
         verify=flags.verify,
     )
-    return model, f"{_name(file)}, {flags.runtime}"
-
-
-def load_model(
-    file: pathlib.Path, flags: Any, *, like: "ModelConfig | None" = None, verify: bool = True
-) -> "tuple[Model, str]":
-    """Load a model of JAX's, changed by flags; see `open_model`."""
-    from crisalad_jax.checkpoints.weights import load_weights
-
-    model = load_weights(file, verify=verify)
-    return model._replace(config=_changed(model.config, flags, like)), _name(file)
-
-
-def untrained(preset: str, flags: Any) -> "tuple[Model, str]":
-    """Make an untrained model of a preset, with the flags of `evaluate`."""
-    import jax
-
-    from crisalad_jax.nn.model import Model, init_crisalad
-    from crisalad_jax.training.recipes import recipe
-
-    check_seed("seed", flags.seed)
-    config = recipe(preset).model
-    params = init_crisalad(jax.random.key(flags.seed), config)
-    return Model(params, _changed(config, flags)), f"untrained {preset}, seed {flags.seed}"
-
-
-def _changed(config: "ModelConfig", flags: Any, like: "ModelConfig | None" = None) -> "ModelConfig":
-    """Change how images are resized and computed to what the map and the flags say."""
-    if like is not None:
-        config = with_non_semantic_fields_of(like, config)
-    if flags.compute_dtype is not None:
-        config = dataclasses.replace(config, compute_dtype=flags.compute_dtype)
-    return config.resized(flags.image_size, flags.resize)
-
-
-def _name(weights: pathlib.Path) -> str:
-    """Return what a file of weights is called in tables and titles."""
-    if weights in starter.FILES.values():
-        return starter.named(weights)
-    return f"{weights.parent.name}/{weights.name}" if weights.parent.name else weights.name
+    return OpenedModel(model, f"{name}, {flags.runtime}", file)

@@ -1,35 +1,18 @@
 """`crisalad compare`."""
 
 import dataclasses
+from typing import Any
 
-from crisalad_jax.cli.common import prepare_json
-from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison, settings_of
+from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison
 
 COMMON = (
-    "test",
-    "out",
-    "train",
-    "methods",
-    "weights",
-    "backbone",
-    "preset",
-    "seeds",
-    "epochs",
-    "image-size",
-    "grouping",
-    "batch-size",
-    "rerank",
-    "reference",
-    "jobs",
-    "page",
-    "json",
-    "on-bad-image",
-    "quiet",
+    "test out train methods weights backbone preset seeds epochs image-size grouping batch-size "
+    "rerank reference jobs page json on-bad-image quiet"
 )
 EXAMPLE = "crisalad compare --test pitts30k_test.mat --weights salad megaloc --out compared"
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Compare(ComparisonFlags):
     """Train or load the methods of the paper's Table 1, evaluate them alike, and table that."""
 
@@ -44,20 +27,15 @@ class Compare(ComparisonFlags):
     weights are that method's, which is not trained. Any other name is a line of its own, whatever
     model the file holds."""
     rerank: int = 20
-    """So many first retrievals Patch-NetVLAD and TransVPR rank anew."""
+    """How many first retrievals Patch-NetVLAD and TransVPR rank again."""
 
 
-def run(arguments: Compare) -> None:
+def run(arguments: Compare) -> dict[str, Any]:
     """Compare the methods, and print the tables."""
-    from crisalad_jax.experiments.comparison import ComparisonConfig, names_to_compare
+    from crisalad_jax.experiments.comparison import names_to_compare
 
-    prepare_json(arguments.json)  # before a download
     methods = None if arguments.methods is None else names_of(arguments.methods)
-    config = ComparisonConfig(
-        "compare",
-        names_to_compare(methods, arguments.weights),
-        **settings_of(arguments),
-        weights=arguments.weights,
-        rerank=arguments.rerank,
+    names = names_to_compare(methods, arguments.weights)
+    return run_comparison(
+        arguments, "compare", names, weights=arguments.weights, rerank=arguments.rerank
     )
-    run_comparison(config, arguments)

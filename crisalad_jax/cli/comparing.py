@@ -2,18 +2,16 @@
 
 import dataclasses
 import pathlib
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import rich.console
 
-from crisalad_jax.cli.common import find_given, give_json, say, show
-
-if TYPE_CHECKING:
-    from crisalad_jax.experiments.comparison import ComparisonConfig
+from crisalad_jax.cli.common import echo, find_given, pick, show
+from crisalad_jax.cli.flags import JsonFlag, ReadFlags, SizeFlags
 
 
-@dataclasses.dataclass(frozen=True)
-class ComparisonFlags:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ComparisonFlags(ReadFlags, SizeFlags, JsonFlag):
     """The flags of both commands."""
 
     test: tuple[pathlib.Path, ...]
@@ -33,14 +31,6 @@ class ComparisonFlags:
     """Runs of each, of seed 0, 1 and so on."""
     epochs: int | None = None
     """By default the recipes'; from nothing 6."""
-    image_size: tuple[int, int] | None = None
-    """Height and width, multiples of the patch size; by default the preset's, or a file's."""
-    resize: tuple[str, ...] = ()
-    """Words in place of every model's way: fixed, shorter-side, longer-side or native; bilinear,
-    bicubic or area; antialias or no-antialias; bytes or floats; round;
-    high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
-    batch_size: int = 16
-    """Images described together, which a grouping lets attend to each other."""
     grouping: str = "single"
     """Comma-separated, as `evaluate` takes them, for methods with a cross-image encoder."""
     reference: str | None = None
@@ -52,35 +42,6 @@ class ComparisonFlags:
     page: pathlib.Path | None = None
     """Also put the tables into this Markdown page, between its comments <!-- NAME --> and <!-- end
     of NAME -->, where NAME is the name of the folder --out."""
-    json: pathlib.Path | None = None
-    """File for the result as JSON; - prints it."""
-    on_bad_image: Literal["stop", "skip"] = "stop"
-    """Stop at an unreadable image, or leave it out of training and of the sets, and say so."""
-    max_pixels: int = 2**28
-    """Pixels that an image file may have; larger ones are not decoded."""
-    plugin: tuple[str, ...] = ()
-    """Files FILE.py or modules that register parts of your own; their code is run."""
-    quiet: bool = False
-    """No progress."""
-
-
-def settings_of(flags: ComparisonFlags) -> dict[str, Any]:
-    """Return the settings of a `ComparisonConfig` that both commands' flags set."""
-
-    backbone = find_given(flags.backbone, quiet=flags.quiet)
-    return {
-        "test": tuple(map(str, flags.test)),
-        "train": None if flags.train is None else str(flags.train),
-        "backbone": None if backbone is None else str(backbone),
-        "preset": flags.preset,
-        "epochs": flags.epochs,
-        "image_size": flags.image_size,
-        "resize": flags.resize,
-        "batch_size": flags.batch_size,
-        "grouping": flags.grouping,
-        "seeds": flags.seeds,
-        "reference": flags.reference,
-    }
 
 
 def names_of(text: str) -> tuple[str, ...]:
@@ -88,24 +49,47 @@ def names_of(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(","))
 
 
-def run_comparison(config: "ComparisonConfig", flags: ComparisonFlags) -> None:
-    """Carry out a comparison, and print its tables."""
-    from crisalad_jax.experiments.comparison import compare
+def run_comparison(
+    flags: ComparisonFlags,
+    command: Literal["compare", "ablate"],
+    names: tuple[str, ...],
+    **more: Any,
+) -> dict[str, Any]:
+    """Carry out a comparison, and print its tables.
+
+    Args:
+        flags: of both commands.
+        command: "compare" or "ablate".
+        names: what is compared.
+        **more: the settings of the `ComparisonConfig` that one command alone has.
+
+    Returns:
+        The result as JSON values.
+    """
+    from crisalad_jax.experiments.comparison import ComparisonConfig, compare
     from crisalad_jax.experiments.comparison.tables import as_json, tables_of
 
+    backbone = find_given(flags.backbone, quiet=flags.quiet)
+    config = ComparisonConfig(
+        command,
+        names,
+        test=tuple(map(str, flags.test)),
+        train=None if flags.train is None else str(flags.train),
+        backbone=None if backbone is None else str(backbone),
+        **pick(flags, "preset", "epochs", "image_size", "resize", "batch_size", "grouping"),
+        **pick(flags, "seeds", "reference"),
+        **more,
+    )
     notes = rich.console.Console(stderr=True, markup=False, emoji=False, quiet=flags.quiet)
     summary = compare(
         config,
         flags.out,
-        page=flags.page,
-        on_bad_image=flags.on_bad_image,
-        jobs=flags.jobs,
+        **pick(flags, "page", "on_bad_image", "jobs", "quiet"),
         say=lambda line: notes.print(line, soft_wrap=True, highlight=False),
-        quiet=flags.quiet,
     )
     for table in tables_of(summary).values():
         show(table.terminal())
     for note in summary.notes:
-        say(note)
-    say(f"table.md, table.csv, results.json, and a page: {flags.out / 'index.html'}")
-    give_json(flags.json, as_json(summary))
+        echo(note)
+    echo(f"table.md, table.csv, results.json, and a page: {flags.out / 'index.html'}")
+    return as_json(summary)

@@ -2,17 +2,17 @@
 
 import dataclasses
 import pathlib
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from crisalad_jax.checkpoints.formats import FORMATS
-from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.public import convert
 from crisalad_jax.checkpoints.published import PUBLISHED
-from crisalad_jax.cli.common import give_json, prepare_json, say
+from crisalad_jax.cli.common import echo, find_given, pick
+from crisalad_jax.cli.flags import JsonFlag, PluginFlag
+from crisalad_jax.config.checks import require
 from crisalad_jax.training.summary import model_words
-from crisalad_jax.utils.errors import InputError
 
 
 def _sources() -> str:
@@ -27,12 +27,12 @@ def _formats() -> str:
     )
 
 
-COMMON = ("source", "target", "format", "backbone", "json")
+COMMON = "source target format backbone json"
 EXAMPLE = "crisalad convert dino_salad.ckpt salad.safetensors"
 
 
-@dataclasses.dataclass(frozen=True)
-class Convert:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Convert(PluginFlag, JsonFlag):
     """Convert a public torch checkpoint to a file of this package, or such a file back."""
 
     source: Annotated[
@@ -54,47 +54,38 @@ class Convert:
     half: bool = False
     """Write a file of this package in half precision, in half the room; of a source of this package
     too."""
-    json: pathlib.Path | None = None
-    """File for the result as JSON; - prints it."""
-    plugin: tuple[str, ...] = ()
-    """Files FILE.py or modules that register parts of your own; their code is run."""
 
 
-def run(arguments: Convert) -> None:
+def run(arguments: Convert) -> dict[str, Any]:
     """Convert the file, and print both formats and the model."""
-    prepare_json(arguments.json)
-    given = {name: getattr(arguments, name) for name in ("layer", "facet", "assignment")}
+    source, target, backbone = arguments.source, arguments.target, arguments.backbone
+    given = pick(arguments, "layer", "facet", "assignment")
     fields = {name: value for name, value in given.items() if value is not None}
-    if fields and arguments.backbone is None:
-        raise InputError(f"--{next(iter(fields))}: found without --backbone, expected both")
-    if str(arguments.source) in PUBLISHED and not arguments.source.exists():
-        raise InputError(
-            f"{arguments.source}: found the name of a published model, expected a file; --weights "
-            f"{arguments.source} converts it by itself"
-        )
-    backbone = None if arguments.backbone is None else find_weights(arguments.backbone)
+    require(
+        not fields or backbone is not None,
+        f"--{next(iter(fields), '')}: found without --backbone, expected both",
+    )
+    require(
+        str(source) not in PUBLISHED or source.exists(),
+        f"{source}: found the name of a published model, expected a file; --weights {source} "
+        "converts it by itself",
+    )
     done = convert(
-        arguments.source,
-        arguments.target,
+        source,
+        target,
         arguments.format,
-        backbone=backbone,
+        backbone=find_given(backbone),
         fields=fields,
         half=arguments.half,
     )
-    source, target = map(_format_words, (done.source, done.target))
-    say(
-        f"{arguments.source} ({source}) -> {arguments.target} ({target}): "
-        + model_words(done.config)
-    )
-    give_json(
-        arguments.json,
-        {
-            "source": {"file": str(arguments.source), "format": source},
-            "target": {"file": str(arguments.target), "format": target},
-            "model": model_words(done.config),
-        },
-    )
-
-
-def _format_words(name: str | None) -> str:
-    return "crisalad-jax" if name is None else FORMATS[name].holds
+    formats = {
+        path: "crisalad-jax" if name is None else FORMATS[name].holds
+        for path, name in ((source, done.source), (target, done.target))
+    }
+    ends = " -> ".join(f"{path} ({name})" for path, name in formats.items())
+    echo(f"{ends}: {model_words(done.config)}")
+    return {
+        "source": {"file": str(source), "format": formats[source]},
+        "target": {"file": str(target), "format": formats[target]},
+        "model": model_words(done.config),
+    }

@@ -2,50 +2,45 @@
 
 import dataclasses
 import pathlib
+from typing import Any
 
-from crisalad_jax.cli.common import give_json, prepare_json, say, show
+from crisalad_jax.cli.common import echo, show
+from crisalad_jax.cli.flags import JsonFlag, QuietFlag
 from crisalad_jax.retrieval.grouping import grouping_words
 
 EXAMPLE = "crisalad demo --out demo"
 
 
-@dataclasses.dataclass(frozen=True)
-class Demo:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Demo(JsonFlag, QuietFlag):
     """Render a synthetic city, train a tiny model on it, and show Recall@K before and after."""
 
     out: pathlib.Path = pathlib.Path("demo")
     """Folder for the city, the run, the tables and the pictures."""
     seed: int = 0
     """Draws the city and the run."""
-    json: pathlib.Path | None = None
-    """File for the result as JSON; - prints it."""
-    quiet: bool = False
-    """No progress bars."""
 
 
-def run(arguments: Demo) -> None:
+def run(arguments: Demo) -> dict[str, Any]:
     """Run the demo, and print its table."""
     from crisalad_jax.experiments.demo import GROUPINGS, DemoConfig, run_demo
     from crisalad_jax.experiments.report import recall_table
 
-    prepare_json(arguments.json)
     summary = run_demo(DemoConfig(seed=arguments.seed), arguments.out, quiet=arguments.quiet)
     show(recall_table(summary.rows, "Recall@K in percent, synthetic city").terminal())
-    say(f"A descriptor of this model may depend on its batch: {grouping_words(GROUPINGS)}.")
-    say(
+    echo(f"A descriptor of this model may depend on its batch: {grouping_words(GROUPINGS)}.")
+    echo(
         f"{summary.seconds:.0f} s in all, {summary.training_seconds:.0f} s of it training. "
         f"Pictures: {', '.join(str(p) for p in summary.pictures)}"
     )
-    give_json(
-        arguments.json,
-        {
-            "out": str(arguments.out),
-            "rows": [
-                row._asdict() | {"recalls": {f"R@{k}": v for k, v in row.recalls.items()}}
-                for row in summary.rows
-            ],
-            "seconds": summary.seconds,
-            "training_seconds": summary.training_seconds,
-            "pictures": [str(picture) for picture in summary.pictures],
-        },
-    )
+    rows = [
+        row._asdict() | {"recalls": {f"R@{k}": v for k, v in row.recalls.items()}}
+        for row in summary.rows
+    ]
+    return {
+        "out": str(arguments.out),
+        "rows": rows,
+        "seconds": summary.seconds,
+        "training_seconds": summary.training_seconds,
+        "pictures": [str(picture) for picture in summary.pictures],
+    }

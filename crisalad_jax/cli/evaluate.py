@@ -4,57 +4,25 @@ import contextlib
 import dataclasses
 import pathlib
 
-from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import (
-    check_json,
-    check_one_model,
-    open_model,
-    open_set,
-    say,
-    show,
-    talk_beside,
-    untrained,
-    write_or_print_json,
-)
+from crisalad_jax.cli.common import echo, emit_json, open_model, open_set, pick, refuse_with, show
 from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags, SetFlags
 from crisalad_jax.cli.tables import grouping_table, points_table
-from crisalad_jax.config.checks import check_count, check_seed
-from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.evaluation.operating_point import check_precision
+from crisalad_jax.config.checks import require
+from crisalad_jax.evaluation.evaluate import check_evaluation, evaluate
 from crisalad_jax.evaluation.record import evaluation_settings, results_json, table_notes
 from crisalad_jax.evaluation.similarity import FirstSimilarities
-from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Model
-from crisalad_jax.retrieval.grouping import DEFAULT_GROUPINGS, parse_groupings
+from crisalad_jax.retrieval.grouping import DEFAULT_GROUPINGS
 from crisalad_jax.retrieval.pca import load_pca
 from crisalad_jax.retrieval.reranking import Reranking, parse_reranking
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target, write_json
 from crisalad_jax.utils.locks import staged_folder
 
 COMMON = (
-    "data",
-    "weights",
-    "preset",
-    "image-size",
-    "resize",
-    "grouping",
-    "batch-size",
-    "split",
-    "images",
-    "queries",
-    "radius",
-    "precision",
-    "pca",
-    "rerank",
-    "report",
-    "out",
-    "json",
-    "on-bad-image",
-    "seeds",
-    "quiet",
+    "data weights preset image-size resize grouping batch-size split images queries radius "
+    "precision pca rerank report out json on-bad-image seeds quiet"
 )
 EXAMPLE = "crisalad evaluate --data pitts30k_test.mat --weights salad --report pitts30k"
 
@@ -92,67 +60,49 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, JsonFlag):
 
 def run(arguments: Evaluate) -> None:
     """Evaluate the model, print the table, and write the files that are asked for."""
-    groupings = arguments.grouping.split(",")
-    parse_groupings(groupings)
-    reading = arguments.reading
-    check_seed("seed", arguments.seed)
-    check_count("seeds", arguments.seeds)
-    if arguments.precision is not None:
-        check_precision(arguments.precision)
-    _check_files(arguments)
-    talk_beside(arguments.json)
-    if arguments.rerank is not None:
-        parse_reranking(arguments.rerank)
-    is_default = arguments.weights is None and arguments.preset is None
-    if is_default:
-        arguments = dataclasses.replace(arguments, weights=starter.FILE)
-    if arguments.weights is None:
-        model, model_name = untrained(arguments.preset or "", arguments)
-    else:
-        model, model_name = open_model(arguments.weights, arguments, groupings=groupings)
-    rerank = _reranking(arguments, model.config)
-    pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
+    groupings, weights, reading = arguments.grouping.split(","), None, arguments.reading
+    check_evaluation(groupings, **pick(arguments, "seed", "seeds", "precision"))
+    _check_flags(arguments)
+    rerank = _reranking(arguments)
     benchmark = open_set(arguments)
-    if is_default:  # told once nothing else is wrong
-        starter.tell_taken()
-    say(model_name)
-    say(f"images at {model.config.images_in_words}")
+    if arguments.preset is not None:
+        model, name = _untrained(arguments.preset, arguments)
+    else:
+        model, name, file = open_model(arguments, quiet=arguments.quiet, groupings=groupings)
+        weights = arguments.weights or file
+    config = model.config
+    pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
+    echo(name)
+    echo(f"images at {config.images_in_words}")
     similarities = FirstSimilarities()
     results = evaluate(
         model,
         benchmark,
         groupings=groupings,
-        seed=arguments.seed,
-        seeds=arguments.seeds,
         pca=pca,
         observe=None if arguments.report is None else similarities,
         rerank=rerank,
-        precision=arguments.precision,
         reading=reading,
+        **pick(arguments, "seed", "seeds", "precision"),
     )
     settings = evaluation_settings(
         benchmark,
-        model.config,
-        weights=arguments.weights,
-        batch_size=arguments.batch_size,
-        seed=arguments.seed,
-        seeds=arguments.seeds,
-        pca=arguments.pca,
-        rerank=arguments.rerank,
-        rerank_weights=arguments.rerank_weights,
+        config,
+        weights=weights,
+        **pick(arguments, "batch_size", "seed", "seeds", "pca", "rerank", "rerank_weights"),
     )
     show(grouping_table(results))
     if points := {each.label: each.operating_point for each in results if each.operating_point}:
         show(points_table(points))
     for note in table_notes(results, settings):
-        say(note)
+        echo(note)
     readable = results[0].skipped.rest_of(benchmark)
     with contextlib.ExitStack() as staged:  # so that all files appear, or none
         if arguments.out is not None:
             from crisalad_jax.experiments.report import write_galleries
 
             folder = staged.enter_context(staged_folder(arguments.out))
-            write_galleries(folder, readable, results, model_name=model_name)
+            write_galleries(folder, readable, results, model_name=name)
             write_json(folder / "config.json", settings)
         if arguments.report is not None and isinstance(model, Model):
             from crisalad_jax.experiments.report import write_report
@@ -162,46 +112,52 @@ def run(arguments: Evaluate) -> None:
                 readable,
                 results,
                 params=model.params,
-                config=model.config,
-                model_name=model_name,
+                config=config,
+                model_name=name,
                 settings=settings,
                 similarities=similarities.map,
             )
-        if arguments.json is not None:
-            values = results_json(results, settings, model_name=model_name, benchmark=benchmark)
-            write_or_print_json(arguments.json, values)
+        values = results_json(results, settings, model_name=name, benchmark=benchmark)
+        emit_json(arguments.json, values)
     if arguments.report is not None:
-        say(f"report: {arguments.report / 'index.html'}")
+        echo(f"report: {arguments.report / 'index.html'}")
 
 
-def _check_files(arguments: Evaluate) -> None:
+def _check_flags(arguments: Evaluate) -> None:
     """Check before any work that files can be written and flags go together."""
-    check_json(arguments.json)
-    if arguments.out is not None:
-        check_target(arguments.out / "config.json")
-    if arguments.report is not None:
-        check_target(arguments.report / "index.html")
-    check_one_model(arguments.weights, arguments.preset)
+    for folder, file in ((arguments.out, "config.json"), (arguments.report, "index.html")):
+        if folder is not None:
+            check_target(folder / file)
+    if arguments.weights is not None:
+        refuse_with("--weights", preset=arguments.preset)
     if arguments.runtime != "jax":
-        for name, given in (("report", arguments.report), ("preset", arguments.preset)):
-            if given is not None:
-                raise InputError(
-                    f"--{name}: found with --runtime {arguments.runtime}, expected jax"
-                )
-    if arguments.rerank is None and arguments.rerank_weights is not None:
-        raise InputError(
-            "--rerank-weights: found without --rerank, expected both, as in --rerank transvpr:100"
-        )
+        refuse_with(f"--runtime {arguments.runtime}", **pick(arguments, "report", "preset"))
+    require(
+        arguments.rerank is not None or arguments.rerank_weights is None,
+        "--rerank-weights: found without --rerank, expected both, as in --rerank transvpr:100",
+    )
 
 
-def _reranking(arguments: Evaluate, config: ModelConfig) -> Reranking | None:
-    """Load the second stage, and check that it fits the first."""
+def _untrained(preset: str, arguments: Evaluate) -> tuple[Model, str]:
+    """Make an untrained model of a preset."""
+    import jax
+
+    from crisalad_jax.nn.model import init_crisalad
+    from crisalad_jax.training.recipes import recipe
+
+    config = recipe(preset).model
+    params = init_crisalad(jax.random.key(arguments.seed), config)
+    model = Model(params, arguments.applied_to(config))
+    return model, f"untrained {preset}, seed {arguments.seed}"
+
+
+def _reranking(arguments: Evaluate) -> Reranking | None:
+    """Make the second stage, with the model of --rerank-weights if there is one."""
     if arguments.rerank is None:
         return None
     rerank = parse_reranking(arguments.rerank)
     if arguments.rerank_weights is not None:
-        own = find_weights(arguments.rerank_weights, quiet=arguments.quiet)
-        own_params, own_config = load_weights(own, verify=arguments.verify)
-        rerank = dataclasses.replace(rerank, params=own_params, config=own_config)
-    rerank.check(config)
+        weights = find_weights(arguments.rerank_weights, quiet=arguments.quiet)
+        params, config = load_weights(weights, verify=arguments.verify)
+        rerank = dataclasses.replace(rerank, params=params, config=config)
     return rerank

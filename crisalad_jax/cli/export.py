@@ -2,10 +2,10 @@
 
 import dataclasses
 import pathlib
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.cli.common import give_json, load_model, prepare_json, say
+from crisalad_jax.cli.common import echo, load_model
+from crisalad_jax.cli.flags import ComputeFlags, JsonFlag, PluginFlag
 from crisalad_jax.config.checks import require
 
 if TYPE_CHECKING:
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 EXAMPLE = "crisalad export --weights salad --out exported"
 
 
-@dataclasses.dataclass(frozen=True)
-class Export:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Export(ComputeFlags, PluginFlag, JsonFlag):
     """Write a model as a program that runs without this package: StableHLO, ONNX or OpenVINO's."""
 
     weights: pathlib.Path
@@ -27,18 +27,13 @@ class Export:
     format: Literal["stablehlo", "onnx", "openvino"] = "stablehlo"
     """stablehlo, for JAX; onnx, for onnxruntime, TensorRT and others; or openvino. The last two are
     run once, and compared with this package (docs/export.md)."""
-    image_size: tuple[int, int] | None = None
-    """Height and width, multiples of the patch size; by default the model's."""
-    resize: tuple[str, ...] = ()
-    """Words in place of the model's way: bilinear, bicubic or area; antialias or no-antialias;
-    bytes or floats; fixed; round; high-byte or contrast-stretch (docs/resizing.md)."""
     batch_size: int | Literal["symbolic"] = "symbolic"
     """Images in a call, or symbolic: any number."""
     grouping: Literal["single", "batch", "any"] = "single"
-    """Every image described alone, or the images of a call looking at each other; any is two
-    programs of onnx or openvino, and a mask says who looks at whom."""
+    """Every image described independently, or the images of a call attending to each other; any is
+    two programs of onnx or openvino, and a mask says which image attends to which."""
     weights_inside: bool = False
-    """The weights as constants of the program, and no file of them beside it."""
+    """Store the weights as constants in the program, not in a file next to it."""
     pixels: Literal["bytes", "floats"] | None = None
     """Bytes, which the program normalises, or floats that already are; by default what the model
     resizes."""
@@ -48,20 +43,12 @@ class Export:
     (docs/export.md)."""
     platforms: str | None = None
     """Of stablehlo, comma-separated: cpu, cuda, rocm, tpu; by default cpu,cuda."""
-    compute_dtype: Literal["float32", "bfloat16"] | None = None
-    """Type of the matrix products, by default the model's; docs/performance.md shows what bfloat16
-    gains and loses."""
-    json: pathlib.Path | None = None
-    """File for the result as JSON; - prints it."""
-    plugin: tuple[str, ...] = ()
-    """Files FILE.py or modules that register parts of your own; their code is run."""
 
 
-def run(arguments: Export) -> None:
+def run(arguments: Export) -> dict[str, Any]:
     """Export the model, and print what was written."""
     from crisalad_jax.checkpoints.export import ExportConfig, write_export
 
-    prepare_json(arguments.json)
     require(
         arguments.platforms is None or arguments.format == "stablehlo",
         f"--platforms: found with --format {arguments.format}, expected --format stablehlo",
@@ -74,7 +61,7 @@ def run(arguments: Export) -> None:
         format=arguments.format,
         pixels=arguments.pixels,
     )
-    model, _ = load_model(find_weights(arguments.weights), arguments)
+    model = load_model(arguments.weights, arguments)
     calibration = None
     if arguments.int8 is not None:
         calibration = read_calibration(arguments.int8, model.config)
@@ -92,11 +79,11 @@ def run(arguments: Export) -> None:
             f"{checked['largest_difference']:.1g} from this package"
         )
     inside = "inside" if how.weights_inside else "beside"
-    say(
+    echo(
         f"{arguments.out}: images {' -> descriptors '.join(shapes)}; "
         f"{manifest['grouping_means']}; weights {inside}; {last}"
     )
-    give_json(arguments.json, {"out": str(arguments.out), "manifest": manifest})
+    return {"out": str(arguments.out), "manifest": manifest}
 
 
 _MOST = 256

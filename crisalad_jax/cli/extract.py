@@ -2,32 +2,17 @@
 
 import dataclasses
 import pathlib
+from typing import Any
 
-from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.cli.common import give_json, open_model, prepare_json, say
+from crisalad_jax.cli.common import echo, open_model, pick, waiting_words
 from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
 from crisalad_jax.utils.output import counted
 
 COMMON = (
-    "weights",
-    "images",
-    "out",
-    "image-size",
-    "resize",
-    "grouping",
-    "batch-size",
-    "runtime",
-    "compute-dtype",
-    "root",
-    "pairs",
-    "database",
-    "k",
-    "pca",
-    "on-bad-image",
-    "json",
-    "quiet",
+    "weights images out image-size resize grouping batch-size runtime compute-dtype root pairs "
+    "database k pca on-bad-image json quiet"
 )
 EXAMPLE = "crisalad extract --weights salad --images photos --out photos.npy"
 SEVERAL = "quote a pattern, or list the images in a .txt"
@@ -42,7 +27,7 @@ class Extract(ReadFlags, ModelFlags, JsonFlag):
     """Folder, searched with its subfolders; or a file, a pattern, a list, a table or a video
     (docs/how-to/image-sources.md)."""
     out: pathlib.Path
-    """descriptors.npy (names beside it in .names.txt) or features.h5 (hloc)."""
+    """descriptors.npy (with names in .names.txt) or features.h5 (hloc)."""
     fps: float | None = None
     """Frames a second taken of a video, by default 1."""
     grouping: str = "single"
@@ -65,65 +50,42 @@ class Extract(ReadFlags, ModelFlags, JsonFlag):
     joins all. Of the grouping single."""
 
 
-def run(arguments: Extract) -> None:
+def run(arguments: Extract) -> dict[str, Any] | None:
     """Describe the images, and print what was written."""
-    prepare_json(arguments.json)
+    out, how = arguments.out, pick(arguments, "grouping", "seed", "pairs", "database", "k", "share")
     reading = arguments.reading
-    check_extraction(
-        arguments.out,
-        grouping=arguments.grouping,
-        seed=arguments.seed,
-        pairs=arguments.pairs,
-        database=arguments.database,
-        k=arguments.k,
-        share=arguments.share,
-    )
-    weights = find_weights(arguments.weights, quiet=arguments.quiet)
-    model, _ = open_model(weights, arguments, groupings=[arguments.grouping])
+    check_extraction(out, **how)
+    opened = open_model(arguments, quiet=arguments.quiet, groupings=[arguments.grouping])
+    model = opened.model
     result = extract(
         model,
         arguments.images,
-        arguments.out,
-        fps=arguments.fps,
-        weights=weights,
-        grouping=arguments.grouping,
-        seed=arguments.seed,
-        root=arguments.root,
-        pairs=arguments.pairs,
-        database=arguments.database,
-        k=arguments.k,
-        pca=arguments.pca,
-        share=arguments.share,
-        verify=arguments.verify,
+        out,
+        weights=opened.file,
+        **how,
+        **pick(arguments, "fps", "root", "pca", "verify"),
         reading=reading,
     )
     described = counted(len(result.names), "descriptor")
-    if result.shares_left or result.joined_elsewhere:
-        rest = (
-            f"shares still to be done: {result.shares_left}; the last one joins all"
-            if result.shares_left
-            else "another process joins all"
-        )
-        say(f"{arguments.out}: share {arguments.share}: {described}; {rest}")
-        return
+    if waiting := waiting_words(result):
+        echo(f"{out}: share {arguments.share}: {described}; {waiting}")
+        return None
+    pairs = None
     if result.pairs is not None:
-        say(f"{arguments.pairs}: {len(result.pairs)} pairs")
+        pairs = {"file": str(arguments.pairs), "count": len(result.pairs)}
+        echo(f"{arguments.pairs}: {len(result.pairs)} pairs")
     skipped = f"; {len(result.skipped)} unreadable images left out" if result.skipped else ""
-    say(
-        f"{arguments.out}: {described} of {result.descriptors.shape[1]} "
-        f"numbers, grouping {arguments.grouping} ({GROUPINGS[arguments.grouping]}), images at "
-        f"{model.config.images_in_words}{skipped}"
+    length, images = result.descriptors.shape[1], model.config.images_in_words
+    echo(
+        f"{out}: {described} of {length} numbers, grouping {arguments.grouping} "
+        f"({GROUPINGS[arguments.grouping]}), images at {images}{skipped}"
     )
-    pairs = {"file": str(arguments.pairs), "count": len(result.pairs or ())}
-    give_json(
-        arguments.json,
-        {
-            "out": str(arguments.out),
-            "descriptors": len(result.names),
-            "length": result.descriptors.shape[1],
-            "grouping": arguments.grouping,
-            "images": model.config.images_in_words,
-            "skipped": result.skipped,
-            "pairs": None if result.pairs is None else pairs,
-        },
-    )
+    return {
+        "out": str(out),
+        "descriptors": len(result.names),
+        "length": length,
+        "grouping": arguments.grouping,
+        "images": images,
+        "skipped": result.skipped,
+        "pairs": pairs,
+    }

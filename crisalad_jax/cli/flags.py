@@ -2,28 +2,58 @@
 
 import dataclasses
 import pathlib
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
-from crisalad_jax.cli.common import RuntimeName
-
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # commands that load no model of a file start without these
     from crisalad_jax.data.reading import Reading
+    from crisalad_jax.nn.config import ModelConfig
+
+RuntimeName = Literal["jax", "onnxruntime", "openvino"]
+"""What computes a model: JAX, or another engine (`checkpoints.engines.EngineName`)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ReadFlags:
-    """How images are read."""
+class JsonFlag:
+    """Where the result goes as JSON."""
 
-    batch_size: int = 16
-    """Number of images described together."""
-    on_bad_image: Literal["stop", "skip"] = "stop"
-    """Stop at an unreadable image, or leave it out and say so."""
-    max_pixels: int = 2**28
-    """Pixels that an image file may have; larger ones are not decoded."""
+    json_suffixes: ClassVar[tuple[str, ...]] = (".json",)
+    """What the file's name may end with."""
+    json: pathlib.Path | None = None
+    """File for the result as JSON; - prints it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PluginFlag:
+    """Where custom parts come from."""
+
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register custom parts; their code is run."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class QuietFlag:
+    """Whether progress is shown."""
+
     quiet: bool = False
     """No progress bars."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DecodeFlags(PluginFlag, QuietFlag):
+    """How large an image may be."""
+
+    max_pixels: int = 2**28
+    """Pixels that an image file may have; larger ones are not decoded."""
+    batch_size: int = 16
+    """Number of images described together."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReadFlags(DecodeFlags):
+    """How images are read."""
+
+    on_bad_image: Literal["stop", "skip"] = "stop"
+    """Stop at an unreadable image, or leave it out and say so."""
 
     @property
     def reading(self) -> "Reading":
@@ -34,34 +64,48 @@ class ReadFlags:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ModelFlags:
-    """Which model describes images, and how."""
+class SizeFlags:
+    """At which size images are described, and how they get it."""
 
-    weights: pathlib.Path | None = None
-    """By default starter, the small model in this package; or hog, a baseline that learns nothing;
-    or a .safetensors file, or a published model's name (`crisalad models`)."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; by default the model's, or the map's."""
     resize: tuple[str, ...] = ()
     """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
     bicubic or area; antialias or no-antialias; bytes or floats; round;
     high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
-    runtime: RuntimeName = "jax"
-    """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
-    for it once; --weights may be an exported folder."""
-    compute_dtype: Literal["float32", "bfloat16"] | None = None
-    """Type of the matrix products, by default the model's, or the map's; docs/performance.md shows
-    what bfloat16 gains and loses."""
-    verify: bool = True
-    """Check all files against their checksums; --no-verify skips that, where they are huge."""
+
+    def applied_to(self, config: "ModelConfig") -> "ModelConfig":
+        """Change how a model prepares and computes images to what the flags say."""
+        return config.resized(self.image_size, self.resize)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class JsonFlag:
-    """Where the result goes as JSON."""
+class ComputeFlags(SizeFlags):
+    """At which size and in which type images are described."""
 
-    json: pathlib.Path | None = None
-    """File for the result as JSON; - prints it."""
+    compute_dtype: Literal["float32", "bfloat16"] | None = None
+    """Type of the matrix products, by default the model's, or the map's; docs/performance.md shows
+    what bfloat16 gains and loses."""
+
+    def applied_to(self, config: "ModelConfig") -> "ModelConfig":
+        """Change how a model prepares and computes images to what the flags say."""
+        if self.compute_dtype is not None:
+            config = dataclasses.replace(config, compute_dtype=self.compute_dtype)
+        return super().applied_to(config)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ModelFlags(ComputeFlags):
+    """Which model describes images, and how."""
+
+    weights: pathlib.Path | None = None
+    """By default starter, the small model in this package; or hog, a baseline that learns nothing;
+    or a .safetensors file, or a published model's name (`crisalad models`)."""
+    runtime: RuntimeName = "jax"
+    """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
+    for it once; --weights may be an exported folder."""
+    verify: bool = True
+    """Check all files against their checksums; --no-verify skips that, where they are huge."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

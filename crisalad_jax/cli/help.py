@@ -1,7 +1,7 @@
 """The help of a command: the flags that people use, or all of them.
 
-A command's module names those of `--help` in `COMMON`, in their order, and shows one call in
-`EXAMPLE`. Without `COMMON` all flags are common.
+A command's module names those of `--help` in `COMMON`, in their order and with spaces between them,
+and shows one call in `EXAMPLE`. Without `COMMON` all flags are common.
 """
 
 import argparse
@@ -37,7 +37,7 @@ def class_of(name: str, module: Any, arguments: Sequence[str]) -> type:
     """Return the class that a command's arguments are parsed into."""
     if hasattr(module, "command"):
         return module.command(arguments)
-    return getattr(module, "".join(map(str.capitalize, name.split("-"))))
+    return getattr(module, name.capitalize())
 
 
 def flags_parser(kind: type, program: str) -> argparse.ArgumentParser:
@@ -73,7 +73,7 @@ def short_help(name: str, module: Any, kind: type) -> str:
         formatter_class=lambda prog: _Formatter(prog, max_help_position=_COLUMN, width=width),
     )
     group = shown.add_argument_group()
-    for flag in getattr(module, "COMMON", named):
+    for flag in getattr(module, "COMMON", " ".join(named)).split():
         group._add_action(named[flag])
     return shown.format_help().rstrip()
 

@@ -2,10 +2,9 @@
 
 import dataclasses
 import pathlib
-from typing import Literal
+from typing import Any, Literal
 
-from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.cli.common import give_json, open_model, prepare_json, say
+from crisalad_jax.cli.common import echo, open_model, pick, waiting_words
 from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
@@ -19,25 +18,8 @@ from crisalad_jax.retrieval.maps.metadata import (
 from crisalad_jax.utils.output import counted
 
 COMMON = (
-    "images",
-    "out",
-    "weights",
-    "fps",
-    "positions",
-    "store",
-    "dtype",
-    "pca",
-    "search",
-    "share",
-    "image-size",
-    "resize",
-    "batch-size",
-    "runtime",
-    "compute-dtype",
-    "on-bad-image",
-    "json",
-    "plugin",
-    "quiet",
+    "images out weights fps positions store dtype pca search share image-size resize batch-size "
+    "runtime compute-dtype on-bad-image json plugin quiet"
 )
 EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
 SEVERAL = "quote a pattern; other folders are added by the same command again"
@@ -76,57 +58,36 @@ class Index(ReadFlags, ModelFlags, JsonFlag):
     joins all."""
 
 
-def run(arguments: Index) -> None:
+def run(arguments: Index) -> dict[str, Any]:
     """Index the images, and print what became of them."""
-    prepare_json(arguments.json)
-    reading = arguments.reading
-    weights, config = _there(arguments)
-    model, _ = open_model(weights, arguments, like=config)
+    out, weights, like, reading = arguments.out, None, None, arguments.reading
+    metadata = read_metadata(out) if has_images(out) else None
+    if metadata is not None:
+        like = model_config(metadata, out)
+        weights = None if arguments.weights else weights_of(metadata, out)
+    opened = open_model(arguments, weights, quiet=arguments.quiet, like=like)
+    config = opened.model.config
     result = index(
-        model,
+        opened.model,
         arguments.images,
-        arguments.out,
-        weights=weights,
-        fps=arguments.fps,
-        positions=arguments.positions,
-        store=arguments.store,
-        dtype=arguments.dtype,
-        pca=arguments.pca,
-        search=arguments.search,
-        share=arguments.share,
+        out,
+        weights=opened.file,
+        **pick(arguments, "fps", "positions", "store", "dtype", "pca", "search", "share"),
         reading=reading,
     )
-    described = f"{counted(result.added, 'image')} described"
-    if result.shares_left:
-        say(
-            f"{arguments.out}: share {arguments.share}: {described}; "
-            f"shares still to be done: {result.shares_left}; the last one joins all"
-        )
-    elif result.joined_elsewhere:
-        say(f"{arguments.out}: share {arguments.share}: {described}; another process joins all")
+    if waiting := waiting_words(result):
+        described = f"{counted(result.added, 'image')} described"
+        echo(f"{out}: share {arguments.share}: {described}; {waiting}")
     else:
-        say(f"{arguments.out}: {'; '.join(_words(result, model.config))}")
-    metadata = result.metadata
+        echo(f"{out}: {'; '.join(_words(result, config))}")
     counts = {name: value for name, value in result._asdict().items() if name != "metadata"}
-    give_json(
-        arguments.json,
-        {"out": str(arguments.out)}
-        | counts
-        | {
-            "length": metadata.descriptor_length,
-            "store": metadata.store,
-            "resized": model.config.images_in_words,
-        },
-    )
-
-
-def _there(arguments: Index) -> tuple[pathlib.Path, ModelConfig | None]:
-    """Find the model's file and, of an existing map, the configuration of its images."""
-    metadata = read_metadata(arguments.out) if has_images(arguments.out) else None
-    config = None if metadata is None else model_config(metadata, arguments.out)
-    if metadata is not None and arguments.weights is None:
-        return weights_of(metadata, arguments.out), config
-    return find_weights(arguments.weights, quiet=arguments.quiet), config
+    return {
+        "out": str(out),
+        **counts,
+        "length": result.metadata.descriptor_length,
+        "store": result.metadata.store,
+        "resized": config.images_in_words,
+    }
 
 
 def _words(result: Indexed, config: ModelConfig) -> list[str]:

@@ -4,30 +4,19 @@ import dataclasses
 import pathlib
 from typing import Any
 
-from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import (
-    check_one_model,
-    give_json,
-    prepare_json,
-    say,
-    show,
-)
+from crisalad_jax.cli.common import echo, load_model, refuse_with, show
+from crisalad_jax.cli.flags import JsonFlag, PluginFlag, SizeFlags
 from crisalad_jax.cli.tables import fact_lines, summary_table
+from crisalad_jax.config.checks import require
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.training.recipes import recipe
-from crisalad_jax.training.summary import (
-    model_summary,
-    summary_json,
-    summary_lines,
-)
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.training.summary import model_summary, summary_json, summary_lines
 
 EXAMPLE = "crisalad info --preset b14"
 
 
-@dataclasses.dataclass(frozen=True)
-class Info:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Info(SizeFlags, PluginFlag, JsonFlag):
     """Print what a model is made of: parameters, what trains, multiply-accumulates an image."""
 
     preset: str | None = None
@@ -38,61 +27,50 @@ class Info:
     """Describe the map in this folder instead."""
     verify: bool = False
     """Read all of the map's descriptors, and compare them with their digests."""
-    image_size: tuple[int, int] | None = None
-    """Height and width, multiples of the patch size; by default the model's."""
-    resize: tuple[str, ...] = ()
-    """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
-    bicubic or area; antialias or no-antialias; bytes or floats; round;
-    high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
     trainable: str | None = None
     """head, adapters+head, last-N-blocks+head or all; by default the recipe's, of
     a file adapters+head, or head where it has no adapter."""
     batch_size: int = 16
-    """Images that look at each other in the cross-image encoder."""
-    json: pathlib.Path | None = None
-    """File for the table as JSON; - prints it."""
-    plugin: tuple[str, ...] = ()
-    """Files FILE.py or modules that register parts of your own; their code is run."""
+    """Images that attend to each other in the cross-image encoder."""
 
 
-def run(arguments: Info) -> None:
-    """Print the table of a model or a map, and write it as JSON where that is asked for."""
-    if arguments.verify and arguments.map is None:
-        raise InputError("--verify: found without --map, expected both")
-    prepare_json(arguments.json)
-    values = _model(arguments) if arguments.map is None else _map(arguments.map, arguments)
-    give_json(arguments.json, values)
+def run(arguments: Info) -> dict[str, Any]:
+    """Print the table of a model or a map."""
+    require(
+        not arguments.verify or arguments.map is not None,
+        "--verify: found without --map, expected both",
+    )
+    return _model(arguments) if arguments.map is None else _map(arguments.map, arguments)
 
 
 def _model(arguments: Info) -> dict[str, Any]:
-    check_one_model(arguments.weights, arguments.preset)
+    trainable = arguments.trainable
     if arguments.weights is not None:
-        _, config = load_weights(find_weights(arguments.weights))
-        name, trainable = str(arguments.weights), arguments.trainable
+        refuse_with("--weights", preset=arguments.preset)
+        name, config = str(arguments.weights), load_model(arguments.weights, arguments).config
     else:
         name = arguments.preset or "b14"
         defaults = recipe(name)
-        config = defaults.model
-        trainable = arguments.trainable or defaults.trainable
-    config = config.resized(arguments.image_size, arguments.resize)
+        config = arguments.applied_to(defaults.model)
+        trainable = trainable or defaults.trainable
     summary = model_summary(config, trainable, images=arguments.batch_size)
     show(summary_table(summary, name))
-    say("\n".join(summary_lines(summary)))
+    echo("\n".join(summary_lines(summary)))
     return summary_json(summary, name)
 
 
 def _map(folder: pathlib.Path, arguments: Info) -> dict[str, Any]:
-    for field in dataclasses.fields(Info):
-        of_maps = field.name in ("map", "verify", "json", "plugin")
-        if not of_maps and getattr(arguments, field.name) != field.default:
-            raise InputError(
-                f"--{field.name.replace('_', '-')}: found beside --map, expected it for a model"
-            )
+    of_models = {
+        field.name: getattr(arguments, field.name) != field.default
+        for field in dataclasses.fields(Info)
+        if field.name not in ("map", "verify", "json", "plugin")
+    }
+    refuse_with("--map", **of_models)
     with Map.open(folder, verify=False) as places:
         summary = places.summary(verify=arguments.verify)
     extent = summary["extent"] or {}
     ends = {axis: f"{low:.9g} to {high:.9g}" for axis, (low, high) in extent.items()}
     known = {name: value for name, value in summary.items() if value not in (None, "none")}
     for line in fact_lines(known | ({"extent": ends} if ends else {})):
-        say(line)
+        echo(line)
     return summary

@@ -1,7 +1,6 @@
 """`crisalad models`."""
 
 import dataclasses
-import pathlib
 from typing import Annotated, Any
 
 import jax
@@ -11,44 +10,40 @@ from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.cache import is_cached
 from crisalad_jax.checkpoints.published import PUBLISHED, Published, published_model
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import give_json, prepare_json, say, show
+from crisalad_jax.cli.common import echo, show
+from crisalad_jax.cli.flags import JsonFlag
 from crisalad_jax.cli.tables import fact_lines, models_table
 from crisalad_jax.utils.files import user_cache
 
 EXAMPLE = "crisalad models salad"
 
 
-@dataclasses.dataclass(frozen=True)
-class Models:
-    """List the models that others published, which --weights takes by name, or tell of one."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Models(JsonFlag):
+    """List the models that others published, which --weights takes by name, or describe one."""
 
     name: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="NAME")] = None
-    """Tell all that is known of this one."""
-    json: pathlib.Path | None = None
-    """File for the list as JSON; - prints it."""
+    """Print all that is known of this one."""
 
 
-def run(arguments: Models) -> None:
-    """Print the table of models or the facts of one, and write them as JSON if asked for."""
-    prepare_json(arguments.json)
-    if arguments.name is None:
-        models = tuple(PUBLISHED.values())
-        show(models_table(models))
-        say(f"{len(models)} models; * in the cache, {user_cache()}")
-        say(
-            f"{starter.NAME}: the small model in this package, which extract, index and evaluate "
-            "take by default"
-        )
-        say("hog: histograms of oriented gradients, a baseline without parameters, by its name too")
-        say("crisalad models NAME tells all of one: its images, paper, file and address")
-        values = {"cache": str(user_cache()), "models": [_facts(model) for model in models]}
-    else:
-        name = arguments.name
-        own = name in starter.FILES
-        values = _own_facts(name) if own else _facts(published_model(name))
-        for line in fact_lines(values):
-            say(line)
-    give_json(arguments.json, values)
+def run(arguments: Models) -> dict[str, Any]:
+    """Print the table of models or the facts of one."""
+    name = arguments.name
+    if name is not None:
+        facts = _own_facts(name) if name in starter.FILES else _facts(published_model(name))
+        for line in fact_lines(facts):
+            echo(line)
+        return facts
+    models = tuple(PUBLISHED.values())
+    show(models_table(models))
+    echo(f"{len(models)} models; * in the cache, {user_cache()}")
+    echo(
+        f"{starter.NAME}: the small model in this package, which extract, index and evaluate take "
+        "by default"
+    )
+    echo("hog: histograms of oriented gradients, a baseline without parameters, by its name too")
+    echo("crisalad models NAME prints all of one: its images, paper, file and address")
+    return {"cache": str(user_cache()), "models": [_facts(model) for model in models]}
 
 
 def _facts(model: Published) -> dict[str, Any]:

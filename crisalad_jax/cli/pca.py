@@ -2,10 +2,12 @@
 
 import dataclasses
 import pathlib
+from typing import Any
 
 from crisalad_jax.checkpoints.load import find_weights, load
 from crisalad_jax.checkpoints.weights import save_weights
-from crisalad_jax.cli.common import give_json, prepare_json, say
+from crisalad_jax.cli.common import echo, pick
+from crisalad_jax.cli.flags import JsonFlag, QuietFlag
 from crisalad_jax.config.checks import require
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.descriptor_files import open_npy
@@ -15,8 +17,8 @@ from crisalad_jax.utils.files import check_target
 EXAMPLE = "crisalad pca --descriptors photos.npy --dim 512 --out pca.safetensors"
 
 
-@dataclasses.dataclass(frozen=True)
-class Pca:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Pca(JsonFlag, QuietFlag):
     """Fit principal components to descriptors, for shorter ones (extract, evaluate --pca)."""
 
     descriptors: pathlib.Path
@@ -37,15 +39,10 @@ class Pca:
     """Draws them."""
     verify: bool = True
     """Check descriptors against their checksums; --no-verify skips that, where files are huge."""
-    json: pathlib.Path | None = None
-    """File for the result as JSON; - prints it."""
-    quiet: bool = False
-    """No progress bar."""
 
 
-def run(arguments: Pca) -> None:
+def run(arguments: Pca) -> dict[str, Any]:
     """Fit components, write them, and print their share of the variance."""
-    prepare_json(arguments.json)
     check_target(arguments.out, ".safetensors")
     model = None
     if arguments.weights is not None:
@@ -58,10 +55,8 @@ def run(arguments: Pca) -> None:
         descriptors,
         arguments.dim,
         PcaConfig(arguments.whiten, arguments.renormalise),
-        samples=arguments.samples,
-        seed=arguments.seed,
         name=str(arguments.descriptors),
-        quiet=arguments.quiet,
+        **pick(arguments, "samples", "seed", "quiet"),
     )
     if model is None:
         save_pca(arguments.out, pca)
@@ -72,17 +67,14 @@ def run(arguments: Pca) -> None:
         config = dataclasses.replace(model.config, projection=projection)
         save_weights(arguments.out, Model(params, config))
     fitted = min(arguments.samples, len(descriptors))
-    say(
+    echo(
         f"{arguments.out}: {arguments.dim} of {descriptors.shape[1]} components, "
         f"{100 * pca.kept:.1f} % of the variance of {fitted} descriptors"
     )
-    give_json(
-        arguments.json,
-        {
-            "out": str(arguments.out),
-            "components": arguments.dim,
-            "of": descriptors.shape[1],
-            "variance": float(pca.kept),
-            "descriptors": fitted,
-        },
-    )
+    return {
+        "out": str(arguments.out),
+        "components": arguments.dim,
+        "of": descriptors.shape[1],
+        "variance": float(pca.kept),
+        "descriptors": fitted,
+    }

@@ -4,20 +4,27 @@ import contextlib
 import dataclasses
 import importlib
 import pathlib
-from typing import Annotated, Literal
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import tyro
 
-from crisalad_jax.cli import live
-from crisalad_jax.cli.answers import answer_lines
-from crisalad_jax.cli.common import STDOUT, RuntimeName, check_json, say, talk_beside
-from crisalad_jax.cli.flags import ReadFlags
-from crisalad_jax.retrieval.maps.calibration import Calibration
+from crisalad_jax.cli.common import STDOUT, echo, find_given, pick, refuse_with
+from crisalad_jax.cli.flags import JsonFlag, ReadFlags, RuntimeName
+from crisalad_jax.config.checks import require
+from crisalad_jax.data.live import Camera, FolderWatch
+from crisalad_jax.retrieval.maps.live import latency_words, query_live
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.files import atomic_path, check_format, check_target, real_path
-from crisalad_jax.utils.output import counted
+from crisalad_jax.utils.output import counted, printable
+from crisalad_jax.utils.signals import defer_signals
+
+if TYPE_CHECKING:
+    from crisalad_jax.checkpoints.runtime import Runtime
+    from crisalad_jax.nn.model import Model
 
 _ROWS = 24
 """Largest number of queries in a gallery."""
@@ -26,30 +33,17 @@ _COLUMNS = 8
 
 
 COMMON = (
-    "images",
-    "map",
-    "watch",
-    "camera",
-    "fps",
-    "window",
-    "weights",
-    "k",
-    "min-similarity",
-    "sequence",
-    "json",
-    "gallery",
-    "map-images",
-    "batch-size",
-    "on-bad-image",
-    "quiet",
+    "images map watch camera fps window weights k min-similarity sequence json gallery map-images "
+    "batch-size on-bad-image quiet"
 )
 EXAMPLE = "crisalad query new.jpg --map map --json -"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Query(ReadFlags):
+class Query(ReadFlags, JsonFlag):
     """Find the images of a map that are most similar to others, and say where they were taken."""
 
+    json_suffixes: ClassVar[tuple[str, ...]] = (".json", ".jsonl")
     images: Annotated[
         tuple[pathlib.Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE...")
     ]
@@ -101,43 +95,35 @@ def needs_jax(arguments: Query) -> bool:
 
 
 def run(arguments: Query) -> None:
-    """Query the map, and print or write its answers."""
+    """Query the map, and print or write its answers, also as images come."""
     if arguments.watch is not None or arguments.camera is not None:
-        live.run(arguments)
+        _run_live(arguments)
         return
-    file = None if arguments.json == STDOUT else arguments.json
-    talk_beside(arguments.json)
-    _check_files(file, arguments)
-    sequence = live.sequence_of(arguments)
-    opened = Map.open(
-        arguments.map, verify=arguments.verify, calibrated=arguments.min_similarity is None
-    )
-    with opened as places:
+    _check_files(arguments)
+    sequence = _sequence_of(arguments)
+    with _opened(arguments) as places:
         answers = query(
             places,
             arguments.images,
-            model=live.model_of(places, arguments),
-            k=arguments.k,
-            fps=arguments.fps,
-            window=arguments.window,
-            exact=arguments.exact,
-            min_similarity=arguments.min_similarity,
+            model=_model_of(places, arguments),
             sequence=sequence,
-            reading=arguments.reading,
+            **pick(arguments, "k", "fps", "window", "exact", "min_similarity", "reading"),
         )
-    unknown = _unknown(answers, places.calibration)
     if answers.unreadable:
-        say(f"{len(answers.unreadable)} unreadable left out, {answers.unreadable[0]} the first")
+        echo(f"{len(answers.unreadable)} unreadable left out, {answers.unreadable[0]} the first")
     asked = f"{len(answers.queries)} {'query' if len(answers.queries) == 1 else 'queries'}"
-    of = f"in a map of {counted(len(answers.images), 'image')}{unknown}"
-    if arguments.json is None:
-        say(f"{arguments.map}, {counted(len(answers.images), 'image')}{unknown}")
-        say("\n".join(answer_lines(answers)))
-    elif file is None:
+    images = counted(len(answers.images), "image")
+    unknown = _unknown_words(answers, places)
+    file, gallery = arguments.json, arguments.gallery
+    if file is None:
+        echo(f"{arguments.map}, {images}{unknown}")
+        echo("\n".join(answer_lines(answers)))
+    elif file == STDOUT:
         for line in json_lines(answers):
             print(line)
+    written = {}
     with contextlib.ExitStack() as staged:  # so that both files appear, or none
-        if arguments.gallery is not None:
+        if gallery is not None:
             from crisalad_jax.experiments.report import save, show_retrievals
 
             figure = show_retrievals(
@@ -147,37 +133,162 @@ def run(arguments: Query) -> None:
                 columns=_COLUMNS,
                 title=str(arguments.map),
             )
-            save(figure, staged.enter_context(atomic_path(arguments.gallery)))
-        if file is not None:
+            save(figure, staged.enter_context(atomic_path(gallery)))
+            written[gallery] = f"{_ROWS} of {asked}" if len(answers.queries) > _ROWS else asked
+        if file not in (None, STDOUT):
             write_answers(file, answers)
-    if arguments.gallery is not None:
-        shown = f"{_ROWS} of " if len(answers.queries) > _ROWS else ""
-        say(f"{arguments.gallery}: {shown}{asked} {of}")
-    if file is not None:
-        say(f"{file}: {asked} {of}")
+            written[file] = asked
+    for path, words in written.items():
+        echo(f"{path}: {words} in a map of {images}{unknown}")
 
 
-def _unknown(answers: Answers, measured: Calibration | None) -> str:
-    """Say how many queries are of unknown places; nothing where any similarity counts.
+def _check_files(arguments: Query) -> None:
+    """Check before any work that the files can be written."""
+    gallery, file = arguments.gallery, arguments.json
+    if gallery is None:
+        require(
+            arguments.map_images is None, "--map-images: found without --gallery, expected both"
+        )
+        return
+    importlib.import_module("crisalad_jax.experiments.report")  # or its extra is missing
+    check_format("--gallery", gallery, ".png")
+    check_target(gallery)
+    require(
+        file in (None, STDOUT) or real_path(file) != real_path(gallery),
+        f"--gallery: found {gallery}, as --json, expected two files",
+    )
 
-    Also what the similarity rests on, where it was measured.
+
+def _sequence_of(arguments: Query) -> BayesFilter | None:
+    """Make the filter that the flags ask for; None where they ask for none."""
+    reach = arguments.sequence_reach
+    require(
+        reach is None or arguments.sequence is not None,
+        "--sequence-reach: found without --sequence bayes, expected both",
+    )
+    if arguments.sequence is None:
+        return None
+    return BayesFilter() if reach is None else BayesFilter(reach=reach)
+
+
+def _opened(arguments: Query) -> Map:
+    calibrated = arguments.min_similarity is None
+    return Map.open(arguments.map, verify=arguments.verify, calibrated=calibrated)
+
+
+def _model_of(places: Map, arguments: Query) -> "Model | Runtime":
+    """Load the map's model, or open it in the engine that the flags ask for."""
+    runtime = arguments.runtime
+    return places.load_model(
+        find_given(arguments.weights, runtime=runtime, quiet=arguments.quiet),
+        engine=runtime,
+        groupings=["single" if arguments.window == 1 else "window"],
+        verify=arguments.verify,
+    )
+
+
+def _unknown_words(answers: Answers, places: Map) -> str:
+    """Say how many queries are of unknown places, and what their similarity rests on.
+
+    Nothing where any similarity counts.
     """
     if answers.min_similarity is None:
         return ""
     count, least = int((~answers.known).sum()), f"{answers.min_similarity:.9g}"
+    measured = places.calibration
     rests = "" if measured is None else f" (rests on {counted(measured.answered, 'answer')})"
     return f"; {count} of {len(answers.queries)} unknown, below similarity {least}{rests}"
 
 
-def _check_files(file: pathlib.Path | None, arguments: Query) -> None:
-    """Check before any work that the files can be written."""
-    gallery = arguments.gallery
-    check_json(file, (".json", ".jsonl"))
-    if gallery is not None:
-        importlib.import_module("crisalad_jax.experiments.report")  # or its extra is missing
-        check_format("--gallery", gallery, ".png")
-        check_target(gallery)
-    elif arguments.map_images is not None:
-        raise InputError("--map-images: found without --gallery, expected both")
-    if gallery is not None and file is not None and real_path(file) == real_path(gallery):
-        raise InputError(f"--gallery: found {gallery}, as --json, expected two files")
+def answer_lines(answers: Answers) -> Iterator[str]:
+    """Yield the name of each query, and below it its answers; an unknown place has one line.
+
+    Numbers stand in columns, and names at the ends of lines: a name that a terminal has no room for
+    runs on in its next line, and is copied whole.
+    """
+    followed = answers.probabilities is not None
+    probability = ["probability"] if followed else []
+    position = ", ".join(answers.axes or ("position",))
+    if answers.zone is not None:
+        position += f" (zone {answers.zone})"
+    head = ["rank", "similarity", *probability, position, "name"]
+    asked: list[str | None] = []
+    rows = [head]
+    for name, known, (_, ranked) in zip(answers.names, answers.known, answers.rows(), strict=True):
+        for answer in ranked if known else ranked[:1]:
+            at = answers.position(answer.image) if known else None
+            asked.append(name if answer.rank == 1 else None)
+            rows.append(
+                [
+                    str(answer.rank) if known else "-",
+                    f"{answer.similarity:.3f}",
+                    *([f"{answer.probability:.3f}"] if followed else []),
+                    "-" if at is None else ", ".join(f"{value:.9g}" for value in at.values()),
+                    answer.image.name if known else "unknown",
+                ]
+            )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:-1]
+    lines = (
+        "  ".join((*(cell.rjust(width) for cell, width in zip(row, widths, strict=False)), row[-1]))
+        for row in rows
+    )
+    yield next(lines)
+    for name, line in zip(asked, lines, strict=True):
+        if name is not None:
+            yield name
+        yield line
+
+
+def _run_live(arguments: Query) -> None:
+    """Print an answer for each image that comes, until a signal or the end of a video."""
+    name = "--camera" if arguments.watch is None else "--watch"
+    require(not arguments.images, f"IMAGE: found with {name}, expected only one of the two")
+    refuse_with(name, **pick(arguments, "gallery", "map_images"))
+    if name == "--watch":
+        refuse_with(name, **pick(arguments, "camera", "fps"))
+    require(
+        arguments.json in (None, STDOUT),
+        f"--json: found {arguments.json} with {name}, expected -: answers go to the standard "
+        "output as they come",
+    )
+    sequence = _sequence_of(arguments)
+    with contextlib.ExitStack() as stack:
+        # First, for its errors: loading a model takes seconds.
+        if arguments.watch is not None:
+            source = FolderWatch(arguments.watch)
+            verb = "is" if source.there == 1 else "are"
+            there = f"{counted(source.there, 'image')} {verb} there"
+            words = f"watching {arguments.watch} ({there}, and left out)"
+        else:
+            assert arguments.camera is not None
+            source = stack.enter_context(Camera(arguments.camera, fps=arguments.fps))
+            words = f"taking frames from {source.name}"
+        places = stack.enter_context(_opened(arguments))
+        model = _model_of(places, arguments)
+        latencies: list[float] = []
+        state = stack.enter_context(defer_signals())
+
+        def ready() -> None:
+            state.has_work = True  # the summary
+            _log(f"ready, {words}")
+
+        answers = query_live(
+            places,
+            source,
+            model=model,
+            sequence=sequence,
+            ready=ready,
+            check=state.check,
+            **pick(arguments, "k", "window", "min_similarity"),
+        )
+        try:
+            for answer in answers:
+                print(answer.json_line(), flush=True)
+                latencies.append(answer.latency_ms)
+        finally:
+            dropped = f"; {source.dropped} frames passed over" if source.dropped else ""
+            _log(f"{latency_words(latencies)}{dropped}")
+
+
+def _log(line: str) -> None:
+    print(f"crisalad: {printable(line)}", file=sys.stderr, flush=True)

@@ -2,8 +2,10 @@
 
 import dataclasses
 import pathlib
+from typing import Any
 
-from crisalad_jax.cli.common import give_json, prepare_json, say
+from crisalad_jax.cli.common import echo
+from crisalad_jax.cli.flags import JsonFlag, QuietFlag
 from crisalad_jax.synthetic import (
     SCENERIES,
     VARIATIONS,
@@ -19,8 +21,8 @@ from crisalad_jax.utils.progress import progress_bar
 EXAMPLE = "crisalad render --out world --scenes 2400"
 
 
-@dataclasses.dataclass(frozen=True)
-class Render:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Render(JsonFlag, QuietFlag):
     """Render a world of streets, corridors and country: places to train on, and others to test."""
 
     out: pathlib.Path
@@ -45,15 +47,10 @@ class Render:
     of these."""
     seed: int = WorldConfig.seed
     """Draws the world."""
-    json: pathlib.Path | None = None
-    """File for the result as JSON; - prints it."""
-    quiet: bool = False
-    """No progress bars."""
 
 
-def run(arguments: Render) -> None:
+def run(arguments: Render) -> dict[str, Any]:
     """Render the world, and print what is in it."""
-    prepare_json(arguments.json)
     fields = {field.name for field in dataclasses.fields(WorldConfig)}
     given = {name: value for name, value in vars(arguments).items() if name in fields}
     config = WorldConfig(**given)
@@ -65,12 +62,9 @@ def run(arguments: Render) -> None:
         ) as bar:
             write_world(arguments.out, config, progress=bar.advance)
     tests = config.test_scenes * config.stations
-    say(
+    echo(
         f"{arguments.out}: {'there already, ' * is_there}{counted(places, 'place')} with "
         f"{counted(config.images_per_place, 'image')} each in {arguments.out / 'train'}; "
         f"{counted(tests, 'other place')} in {arguments.out / 'test'}"
     )
-    give_json(
-        arguments.json,
-        {"out": str(arguments.out), "places": places, "test_places": tests} | given,
-    )
+    return {"out": str(arguments.out), "places": places, "test_places": tests} | given

@@ -4,15 +4,16 @@ import dataclasses
 import os
 import pathlib
 
-from crisalad_jax.cli.common import find_given, say
+from crisalad_jax.cli.common import echo, find_given
+from crisalad_jax.cli.flags import DecodeFlags
 from crisalad_jax.retrieval.serve import serve_map
 from crisalad_jax.utils.files import read_text
 
 EXAMPLE = "crisalad serve --map corridor.map --port 8000"
 
 
-@dataclasses.dataclass(frozen=True)
-class Serve:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Serve(DecodeFlags):
     """Answer over HTTP, and in a browser, where photographs were taken."""
 
     map: pathlib.Path
@@ -33,17 +34,9 @@ class Serve:
     """Answers to a picture, where the request names no number."""
     max_bytes: int = 20 * 2**20
     """Bytes that a request may have."""
-    batch_size: int = 16
-    """Pictures described at once, each as if it were alone."""
     verify: bool = True
     """Check the map's descriptors against their checksums; --no-verify skips that, where files are
     huge."""
-    max_pixels: int = 2**28
-    """Pixels that a picture may have; larger ones are not decoded."""
-    plugin: tuple[str, ...] = ()
-    """Files FILE.py or modules that register parts of your own; their code is run."""
-    quiet: bool = False
-    """No progress bar."""
 
 
 def run(arguments: Serve) -> None:
@@ -56,7 +49,7 @@ def run(arguments: Serve) -> None:
     def ready(address: str) -> None:
         needs = " with the token" if token else ""
         appends = ", and adds images to it" if arguments.append else ""
-        say(f"{address}{needs}: answers for {arguments.map}{appends}; Ctrl-C ends it")
+        echo(f"{address}{needs}: answers for {arguments.map}{appends}; Ctrl-C ends it")
 
     given = vars(arguments) | {"token": token, "ready": ready}
     given["weights"] = find_given(arguments.weights, quiet=arguments.quiet)

@@ -4,11 +4,12 @@ import dataclasses
 import os
 import pathlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.runtime import read_model
-from crisalad_jax.cli.common import console, give_json, prepare_json
+from crisalad_jax.cli.common import console, pick, refuse_with
+from crisalad_jax.cli.flags import JsonFlag, PluginFlag, QuietFlag
 from crisalad_jax.cli.help import asked_for
 from crisalad_jax.config.flags import find_flag, parse_settings, with_settings
 from crisalad_jax.config.io import read_config
@@ -17,37 +18,16 @@ from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.errors import InputError
 
-if TYPE_CHECKING:
-    from crisalad_jax.training.loop import FitResult
-
-
 COMMON = (
-    "data",
-    "out",
-    "place-radius",
-    "place-frames",
-    "val",
-    "weights",
-    "backbone",
-    "preset",
-    "recipe",
-    "config",
-    "image-size",
-    "epochs",
-    "seed",
-    "places-per-batch",
-    "images-per-place",
-    "optimiser.learning-rate",
-    "trainable",
-    "model.aggregator",
-    "on-bad-image",
-    "json",
+    "data out place-radius place-frames val weights backbone preset recipe config image-size "
+    "epochs seed places-per-batch images-per-place optimiser.learning-rate trainable "
+    "model.aggregator on-bad-image json"
 )
 EXAMPLE = "crisalad train --data gsv --out runs/a --val pitts30k_val.mat --backbone dinov2-vitb14"
 
 
-@dataclasses.dataclass(frozen=True)
-class Train:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Train(JsonFlag, PluginFlag, QuietFlag):
     """Train on places, each with several images; go on with the run if OUT holds one."""
 
     data: pathlib.Path
@@ -95,10 +75,6 @@ class Train:
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
     max_pixels: int = 2**28
     """Pixels that an image file may have; larger ones are not decoded."""
-    json: pathlib.Path | None = None
-    """File for the result as JSON; - prints it."""
-    plugin: tuple[str, ...] = ()
-    """Files FILE.py or modules that register parts of your own; their code is run."""
     image_size: tuple[int, int] | None = None
     """Height and width, multiples of the patch size; replaces --model.image-size."""
     on_bad_image: Literal["stop", "skip"] = "stop"
@@ -121,13 +97,11 @@ class Train:
     num_threads: int | None = None
     """Threads that read the training images; by default one for each core that this process may
     use."""
-    quiet: bool = False
-    """No progress bars."""
 
 
 def parse(program: str, arguments: Sequence[str]) -> Train:
     """Parse the flags, with one for every field of the configuration and of its parts."""
-    return parse_settings(Train, program, arguments, defaults(arguments), ("data", "out"))
+    return parse_settings(Train, program, arguments, defaults(arguments))
 
 
 def prepare(arguments: Sequence[str]) -> Sequence[str]:
@@ -162,7 +136,7 @@ def _check_cached(weights: str) -> None:
 
 def command(arguments: Sequence[str]) -> type:
     """Return the class that these arguments are parsed into, for help and completion."""
-    return with_settings(Train, arguments, defaults(arguments), ("data", "out"))[0]
+    return with_settings(Train, arguments, defaults(arguments))
 
 
 def defaults(arguments: Sequence[str]) -> TrainConfig:
@@ -176,9 +150,8 @@ def defaults(arguments: Sequence[str]) -> TrainConfig:
     """
     given = find_flag(arguments, "--config")
     if given is not None:
-        for flag in ("--preset", "--recipe"):
-            if find_flag(arguments, flag) is not None:
-                raise InputError(f"{flag}: found beside --config, expected only one of the two")
+        given_too = {name: find_flag(arguments, f"--{name}") for name in ("preset", "recipe")}
+        refuse_with("--config", **given_too)
         return read_config(TrainConfig, pathlib.Path(given))
     weights = find_flag(arguments, "--weights")
     model = read_model(weights) if weights is not None and os.path.isfile(weights) else None
@@ -186,7 +159,7 @@ def defaults(arguments: Sequence[str]) -> TrainConfig:
     return recipe(preset, find_flag(arguments, "--recipe"), model=model)
 
 
-def run(arguments: Train) -> None:
+def run(arguments: Train) -> dict[str, Any] | None:
     """Train the model, and print how the run ended."""
     from crisalad_jax.experiments.train import train
     from crisalad_jax.utils import distributed
@@ -197,50 +170,35 @@ def run(arguments: Train) -> None:
     elif which != (None, None, None):
         raise InputError(
             "--num-processes, --process-id, --local-device-ids: found no --coordinator-address, "
-            "expected it beside them"
+            "expected it with them"
         )
     console.quiet = not distributed.is_primary()
-    prepare_json(arguments.json)
     config: TrainConfig = arguments.settings
     result = train(
         config,
         arguments.data,
         arguments.out,
-        place_radius=arguments.place_radius,
-        place_frames=arguments.place_frames,
-        positions=arguments.positions,
-        fps=arguments.fps,
         images=arguments.data_images,
         validation=arguments.val,
         validation_images=arguments.val_images,
-        weights=arguments.weights,
-        backbone=arguments.backbone,
-        on_bad_image=arguments.on_bad_image,
-        num_threads=arguments.num_threads,
-        shard_state=arguments.shard_state,
+        **pick(arguments, "place_radius", "place_frames", "positions", "fps"),
+        **pick(arguments, "weights", "backbone", "on_bad_image", "num_threads", "shard_state"),
         quiet=arguments.quiet,
         say=lambda line: console.print(line, soft_wrap=True),
     )
-    words = f"{result.steps} steps"
+    out, words, best = arguments.out, [f"{result.steps} steps"], None
     if result.stopped_early:
-        words += ", stopped early"
+        words.append("stopped early")
     if result.best_recall is not None:
-        best = f"{100 * result.best_recall:.1f}"
-        words += f", best {config.monitor} {best} in best.safetensors"
+        file, recall = out / "best.safetensors", result.best_recall
+        best = {"name": config.monitor, "recall": recall, "file": str(file)}
+        words.append(f"best {config.monitor} {100 * recall:.1f} in {file.name}")
     if result.skipped_images:
-        words += f", {result.skipped_images} unreadable images skipped"
-    picture = arguments.out / "curves.png"
-    console.print(f"{arguments.out}: {words}; curves in {picture}", soft_wrap=True)
-    if distributed.is_primary():
-        give_json(arguments.json, _as_json(arguments.out, config, result))
-
-
-def _as_json(out: pathlib.Path, config: TrainConfig, result: "FitResult") -> dict[str, Any]:
-    """Put what the last line says into JSON values."""
-    best = None
-    if result.best_recall is not None:
-        file = str(out / "best.safetensors")
-        best = {"name": config.monitor, "recall": result.best_recall, "file": file}
+        words.append(f"{result.skipped_images} unreadable images skipped")
+    curves = out / "curves.png"
+    console.print(f"{out}: {', '.join(words)}; curves in {curves}", soft_wrap=True)
+    if not distributed.is_primary():
+        return None
     return {
         "out": str(out),
         "epochs": config.epochs,
@@ -249,5 +207,5 @@ def _as_json(out: pathlib.Path, config: TrainConfig, result: "FitResult") -> dic
         "best": best,
         "skipped_images": result.skipped_images,
         "last": str(out / "last.safetensors"),
-        "curves": str(out / "curves.png"),
+        "curves": str(curves),
     }

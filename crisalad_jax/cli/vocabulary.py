@@ -2,37 +2,22 @@
 
 import dataclasses
 import pathlib
-from typing import Literal
+from typing import Any
 
-from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import find_given, give_json, prepare_json, say
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.cli.common import echo, find_given, load_model, pick, refuse_with
+from crisalad_jax.cli.flags import JsonFlag, ReadFlags, SizeFlags
+from crisalad_jax.nn.model import Model
 from crisalad_jax.training.vocabulary import (
     IMAGES,
     build_vocabulary,
     start_vocabulary,
     vocabulary_words,
 )
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target
 
 COMMON = (
-    "images",
-    "out",
-    "weights",
-    "backbone",
-    "preset",
-    "aggregator",
-    "clusters",
-    "image-size",
-    "max-images",
-    "batch-size",
-    "on-bad-image",
-    "seed",
-    "json",
-    "quiet",
+    "images out weights backbone preset aggregator clusters image-size max-images batch-size "
+    "on-bad-image seed json quiet"
 )
 EXAMPLE = (
     "crisalad vocabulary --images photos --backbone dinov2-vitg14 --preset "
@@ -42,8 +27,8 @@ SEVERAL = "quote a pattern, or list the images in a .txt"
 """What to do in place of several values of --images."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Vocabulary:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Vocabulary(ReadFlags, SizeFlags, JsonFlag):
     """Build AnyLoc's vocabulary from a folder of images: a whole model; or NetVLAD's, to train."""
 
     images: pathlib.Path
@@ -73,82 +58,46 @@ class Vocabulary:
     """What of that block AnyLoc takes: query, key, value or token; by default its values."""
     assignment: str | None = None
     """What AnyLoc's nearest word of a patch is nearest by: cosine (as published) or euclidean."""
-    image_size: tuple[int, int] | None = None
-    """Height and width, multiples of the patch size; by default the model's."""
-    resize: tuple[str, ...] = ()
-    """Words in place of the model's way: fixed, shorter-side, longer-side or native; bilinear,
-    bicubic or area; antialias or no-antialias; bytes or floats; round;
-    high-byte or contrast-stretch, for 16 bits and floats (docs/resizing.md)."""
     max_images: int = IMAGES
     """Read at most so many images, drawn at random."""
-    batch_size: int = 16
-    """Images described together."""
-    on_bad_image: Literal["stop", "skip"] = "stop"
-    """Stop at an unreadable image, or leave it out."""
     seed: int = 0
     """Draws the images, patches of each, the first centroids, and a random backbone."""
-    max_pixels: int = 2**28
-    """Pixels that an image file may have; larger ones are not decoded."""
-    json: pathlib.Path | None = None
-    """File for the result as JSON; - prints it."""
-    plugin: tuple[str, ...] = ()
-    """Files FILE.py or modules that register parts of your own; their code is run."""
-    quiet: bool = False
-    """No progress bar."""
 
 
-def run(arguments: Vocabulary) -> None:
+def run(arguments: Vocabulary) -> dict[str, Any]:
     """Build the vocabulary, write the model, and print its size."""
-    prepare_json(arguments.json)
     check_target(arguments.out, ".safetensors")
-    params, config = _model(arguments)
+    model = _model(arguments)
     built = build_vocabulary(
-        params,
-        config,
+        model,
         arguments.images,
         arguments.out,
-        fps=arguments.fps,
-        max_images=arguments.max_images,
-        seed=arguments.seed,
-        batch_size=arguments.batch_size,
-        on_bad_image=arguments.on_bad_image,
-        quiet=arguments.quiet,
+        **pick(arguments, "fps", "max_images", "seed", "batch_size", "on_bad_image", "quiet"),
     )
-    say(
-        f"{arguments.out}: {vocabulary_words(config)}, {built.words} words from {built.images} "
-        f"images at {config.images_in_words}, descriptors of {config.descriptor_dim} numbers"
+    words, config = vocabulary_words(model.config), model.config
+    echo(
+        f"{arguments.out}: {words}, {built.words} words from {built.images} images at "
+        f"{config.images_in_words}, descriptors of {config.descriptor_dim} numbers"
     )
-    give_json(
-        arguments.json,
-        {
-            "out": str(arguments.out),
-            "vocabulary": vocabulary_words(config),
-            "words": built.words,
-            "images": built.images,
-            "length": config.descriptor_dim,
-            "resized": config.images_in_words,
-        },
-    )
-
-
-def _model(arguments: Vocabulary) -> tuple[Crisalad, ModelConfig]:
-    fields = {
-        name: value
-        for name in ("clusters", "layer", "facet", "assignment")
-        if (value := getattr(arguments, name)) is not None
+    return {
+        "out": str(arguments.out),
+        "vocabulary": words,
+        "words": built.words,
+        "images": built.images,
+        "length": config.descriptor_dim,
+        "resized": config.images_in_words,
     }
-    if arguments.weights is None:
-        return start_vocabulary(
-            arguments.aggregator or "anyloc",
-            arguments.preset or "b14",
-            backbone=find_given(arguments.backbone, quiet=arguments.quiet),
-            fields=fields,
-            image_size=arguments.image_size,
-            resize=arguments.resize,
-            seed=arguments.seed,
-        )
-    for name in ("backbone", "preset", "aggregator", *fields):
-        if getattr(arguments, name) is not None:
-            raise InputError(f"--{name}: found beside --weights, expected only one of the two")
-    params, config = load_weights(find_weights(arguments.weights, quiet=arguments.quiet))
-    return params, config.resized(arguments.image_size, arguments.resize)
+
+
+def _model(arguments: Vocabulary) -> Model:
+    given = pick(arguments, "clusters", "layer", "facet", "assignment")
+    if arguments.weights is not None:
+        refuse_with("--weights", **pick(arguments, "backbone", "preset", "aggregator"), **given)
+        return load_model(arguments.weights, arguments, quiet=arguments.quiet)
+    return start_vocabulary(
+        arguments.aggregator or "anyloc",
+        arguments.preset or "b14",
+        backbone=find_given(arguments.backbone, quiet=arguments.quiet),
+        fields={name: value for name, value in given.items() if value is not None},
+        **pick(arguments, "image_size", "resize", "seed"),
+    )

@@ -6,7 +6,7 @@ import inspect
 import math
 import os
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -191,32 +191,32 @@ def in_words(hint: Any) -> str:
     return hint.__name__.rpartition(".")[2] if hasattr(hint, "__name__") else str(hint)
 
 
+def require_field(config: object, name: str, holds: bool, expected: str) -> None:
+    """Check a field of a configuration; the message says what was expected of it."""
+    found = getattr(config, name)
+    require(holds, f"{type(config).__name__}.{name}: found {found!r}, expected {expected}")
+
+
 def require_range(config: object, least: float, most: float, *names: str) -> None:
     """Check that fields are from `least` to `most`, both included."""
     limits = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
-    for name in names:
-        value = getattr(config, name)
-        require(
-            least <= value <= most,
-            f"{type(config).__name__}.{name}: found {value}, expected {limits}",
-        )
+    _require_each(config, names, lambda value: least <= value <= most, limits)
 
 
 def require_positive(config: object, *names: str) -> None:
     """Check that fields, of whose types `check_types` takes care, are positive and finite."""
-    for name in names:
-        value = getattr(config, name)
-        require(
-            0 < value < math.inf,
-            f"{type(config).__name__}.{name}: found {value}, expected more than 0, and finite",
-        )
+    _require_each(config, names, lambda value: 0 < value < math.inf, "more than 0, and finite")
 
 
 def require_fraction(config: object, *names: str) -> None:
     """Check that fields are at least 0 and less than 1."""
+    _require_each(config, names, lambda value: 0 <= value < 1, "at least 0 and less than 1")
+
+
+def _require_each(
+    config: object, names: Iterable[str], is_fit: Callable[[Any], bool], expected: str
+) -> None:
     for name in names:
         value = getattr(config, name)
-        require(
-            0 <= value < 1,
-            f"{type(config).__name__}.{name}: found {value}, expected at least 0 and less than 1",
-        )
+        where = f"{type(config).__name__}.{name}"
+        require(is_fit(value), f"{where}: found {value}, expected {expected}")

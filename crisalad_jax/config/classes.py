@@ -40,11 +40,8 @@ class ClassesConfig:
     def __post_init__(self) -> None:
         """Check the ranges."""
         check_types(self)
-        require_positive(
-            self,
-            *("groups", "cell", "sector", "spacing", "sector_spacing"),
-            *("focal_distance", "view_angle"),
-        )
+        require_positive(self, "groups", "cell", "sector", "spacing", "sector_spacing")
+        require_positive(self, "focal_distance", "view_angle")
         if self.steps is not None:
             require_positive(self, "steps")
         turn = self.sector * self.sector_spacing

@@ -21,92 +21,83 @@ from crisalad_jax.config.registry import Registry
 from crisalad_jax.config.short_repr import field_docs
 from crisalad_jax.utils.errors import InputError
 
-_NAME = "part_name"
+_KIND = "_kind"
+"""Attribute of a dataclass that `flags_of` makes: the configuration's class."""
 
 
-@dataclasses.dataclass
-class Flags:
-    """A configuration while its flags are parsed, before any of it is checked."""
+def flags_of(config: Any, arguments: Sequence[str], preset: str, path: str = "") -> Any:
+    """Make a stand-in for a configuration, with the same fields and values but without checks.
 
-    kind: type
-    """Class of the configuration."""
-    values: dict[str, Any]
-    """Values of the fields, by name; nested configurations are `Flags` themselves."""
-    registry: Registry[Any] | None = None
-    """Registry of a part's kind; None for a configuration that is no part."""
-
-
-def flags_of(config: Any) -> Flags:
-    """Turn a configuration into flags, with its values as defaults."""
-    values = {}
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        values[field.name] = flags_of(value) if dataclasses.is_dataclass(value) else value
-    return Flags(type(config), values, config.registry if isinstance(config, Part) else None)
-
-
-def choose_parts(flags: Flags, arguments: Sequence[str], preset: str, prefix: str = "") -> Flags:
-    """Replace parts by those that arguments name, so that there are flags for their fields.
+    tyro gives every field of its class a flag. Parts that the arguments name replace those of the
+    configuration, so that there are flags for their fields.
 
     Args:
-        flags: the configuration's.
+        config: the configuration.
         arguments: the command line's.
         preset: the size of the model, which parts come in.
-        prefix: beginning of the names of this configuration's flags.
+        path: dotted name of this configuration's own flag.
 
     Raises:
         InputError: no such part.
     """
-    values = dict(flags.values)
-    for name, value in values.items():
-        if not isinstance(value, Flags):
-            continue
-        path = f"{prefix}{name}"
-        chosen = None if value.registry is None else find_flag(arguments, f"--{path}")
-        if chosen is not None and value.registry is not None:
-            kind = value.registry.find(chosen)
-            if kind is not value.kind:
-                value = flags_of(value.registry.make(chosen, preset))
-        values[name] = choose_parts(value, arguments, preset, f"{path}.")
-    return dataclasses.replace(flags, values=values)
+    fields: list[tuple[str, Any, Any]] = []
+    if isinstance(config, Part):
+        registry: Registry[Any] = config.registry
+        chosen = find_flag(arguments, f"--{path}")
+        if chosen is not None and registry.find(chosen) is not type(config):
+            config = registry.make(chosen, preset)
+        help_text = f"Which {registry.kind}; its own settings follow."
+        names = Literal[tuple(registry.names())]  # pyright: ignore
+        hint = Annotated[names, tyro.conf.arg(name="", help=help_text)]
+        fields.append(("part_name", hint, config.part_name))
+    kind = type(config)
+    hints, docs = get_type_hints(kind), field_docs(kind)
+    for field in dataclasses.fields(kind):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            value = flags_of(value, arguments, preset, f"{path}.{field.name}".strip("."))
+            hint = type(value)
+        else:
+            hint = Annotated[hints[field.name], tyro.conf.arg(help=docs.get(field.name))]
+        fields.append((field.name, hint, dataclasses.field(default=value)))
+    namespace = {"__doc__": kind.__doc__, _KIND: kind}
+    made = dataclasses.make_dataclass(kind.__name__, fields, frozen=True, namespace=namespace)
+    return made()
+
+
+def config_of(flags: Any) -> Any:
+    """Make the configuration from a stand-in of `flags_of` that was parsed.
+
+    Raises:
+        InputError: what the configuration's own checks raise.
+    """
+    kind = getattr(flags, _KIND)
+    given = {field.name: getattr(flags, field.name) for field in dataclasses.fields(kind)}
+    values = {
+        name: config_of(value) if hasattr(value, _KIND) else value for name, value in given.items()
+    }
+    return kind(**values)
+
+
+def flag_values(arguments: Sequence[str], name: str) -> list[list[str]]:
+    """List the values of each occurrence of a flag, as FLAG VALUE ... or FLAG=VALUE."""
+    found = []
+    for place, argument in enumerate(arguments, 1):
+        flag, equals, value = argument.partition("=")
+        if flag.replace("_", "-") == name.replace("_", "-"):
+            after = itertools.takewhile(lambda each: not each.startswith("--"), arguments[place:])
+            found.append([value] if equals else list(after))
+    return found
+
+
+def last_values(arguments: Sequence[str], name: str) -> list[str]:
+    """Return the values of the last occurrence of a flag; none where there is none."""
+    return (flag_values(arguments, name) or [[]])[-1]
 
 
 def find_flag(arguments: Sequence[str], name: str) -> str | None:
-    """Return the value after the last occurrence of a flag; None where it is not given."""
-    last = None
-    for position, argument in enumerate(arguments):
-        flag, equals, value = argument.partition("=")
-        if not _same_flag(flag, name):
-            continue
-        if equals:
-            last = value
-        elif position + 1 < len(arguments):
-            last = arguments[position + 1]
-    return last
-
-
-def _same_flag(given: str, name: str) -> bool:
-    return given.replace("_", "-") == name.replace("_", "-")
-
-
-def type_of(flags: Flags) -> tuple[type, Any]:
-    """Make a dataclass with a flag for every field, and an instance with the defaults."""
-    fields: list[tuple[str, Any, Any]] = []
-    if flags.registry is not None:
-        names = tuple(flags.registry.names())
-        words = f"Which {flags.registry.kind}; its own settings follow."
-        here = tyro.conf.arg(name="", help=words)
-        fields.append((_NAME, Annotated[Literal[names], here], flags.kind.part_name))  # pyright: ignore
-    hints, docs = get_type_hints(flags.kind), field_docs(flags.kind)
-    for name, value in flags.values.items():
-        if isinstance(value, Flags):
-            kind, default = type_of(value)
-        else:
-            kind, default = Annotated[hints[name], tyro.conf.arg(help=docs.get(name))], value
-        fields.append((name, kind, dataclasses.field(default=default)))
-    made = dataclasses.make_dataclass(flags.kind.__name__, fields, frozen=True)
-    made.__doc__ = flags.kind.__doc__
-    return made, made()
+    """Return the first value of the last occurrence of a flag; None where there is none."""
+    return next(iter(last_values(arguments, name)), None)
 
 
 def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str) -> Any:
@@ -125,18 +116,17 @@ def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str)
         InputError: no such flag or part, or a value that does not fit; one line.
     """
     try:
-        flags = choose_parts(flags_of(config), arguments, preset)
-        kind, default = type_of(flags)
+        default = flags_of(config, arguments, preset)
         with refusals(arguments):
             parsed = tyro.cli(
-                kind,
+                type(default),
                 prog=what,
                 args=arguments,
                 default=default,
                 add_help=False,
                 config=(tyro.conf.FlagConversionOff,),
             )
-        return config_of(flags, parsed)
+        return config_of(parsed)
     except InputError as error:
         raise InputError(f"{what}: {error}") from error
 
@@ -217,6 +207,11 @@ def _expected(metavar: str) -> str:
     return f"a {kind}" if len(parts) == 1 else f"{len(parts)} {kind}s"
 
 
+_NO_NUMBER = (
+    r"Error parsing (\S+): (?:invalid literal for|could not convert) .*?(int|float).*?: (.*)"
+)
+
+
 def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
     """Say in our words what tyro says; what we do not know stays as it is.
 
@@ -226,10 +221,9 @@ def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
     """
     said: list[str] = []
     for text in texts:
-        if found := re.match(r"Error parsing (\S+): invalid literal for int\(\).*?: (.*)", text):
-            said.append(f"{found[1]}: found {found[2]}, expected a whole number")
-        elif found := re.match(r"Error parsing (\S+): could not convert .* float: (.*)", text):
-            said.append(f"{found[1]}: found {found[2]}, expected a number")
+        if found := re.match(_NO_NUMBER, text):
+            kind = "a whole number" if found[2] == "int" else "a number"
+            said.append(f"{found[1]}: found {found[3]}, expected {kind}")
         elif found := re.match(
             r"Error parsing (\S+): no type matching (.+) could .*? (\[.*\])", text
         ):
@@ -239,7 +233,7 @@ def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
             names = ", ".join(name for name in ast.literal_eval(found[3]) if name != "None")
             said.append(f"{found[2]}: found {found[1]}, expected one of {names}")
         elif found := re.match(r"Missing value for argument '(.*)'. Expected (\d+) values", text):
-            values = " ".join(_values_after(found[1], arguments))
+            values = " ".join(last_values(arguments, found[1]))
             words = "a value" if found[2] == "1" else f"{found[2]} values"
             said.append(f"{found[1]}: found {_or_none(values)}, expected {words}")
         elif found := re.match(r"Missing from .*?: (-.*|[A-Z].*)", text):
@@ -259,13 +253,6 @@ def _or_none(values: str) -> str:
     return repr(values) if values else "none"
 
 
-def _values_after(flag: str, arguments: Sequence[str]) -> list[str]:
-    """Return the values after the last occurrence of a flag."""
-    places = [place for place, each in enumerate(arguments) if _same_flag(each, flag)]
-    after = arguments[places[-1] + 1 :] if places else ()
-    return list(itertools.takewhile(lambda each: not each.startswith("--"), after))
-
-
 def _unknown(tokens: Sequence[str], arguments: Sequence[str]) -> str:
     """Say what is wrong with arguments that tyro does not take: flags, or values too many."""
     if not tokens:  # with commas or spaces in them
@@ -277,15 +264,13 @@ def _unknown(tokens: Sequence[str], arguments: Sequence[str]) -> str:
     flag = next((each for each in reversed(list(before)) if each.startswith("--")), None)
     if flag is None:
         return f"found {tokens[0]!r} without a flag before it"
-    values = _values_after(flag, arguments)
+    values = last_values(arguments, flag)
     most = len(values) - sum(each in values for each in tokens)
     words = ("no value", "one value")[most] if most < 2 else f"{most} values"
     return f"{flag}: found {' '.join(values)!r}, expected {words}"
 
 
-def parse_settings(
-    kind: type, program: str, arguments: Sequence[str], defaults: Any, required: Sequence[str]
-) -> Any:
+def parse_settings(kind: type, program: str, arguments: Sequence[str], defaults: Any) -> Any:
     """Parse a command's flags, with one for every field of a configuration and of its parts.
 
     Args:
@@ -294,7 +279,6 @@ def parse_settings(
         program: the command's name, for messages.
         arguments: the command line's.
         defaults: the configuration that flags start from.
-        required: fields of `kind` without a default.
 
     Returns:
         An instance of `kind`.
@@ -302,52 +286,26 @@ def parse_settings(
     Raises:
         InputError: no such part, or what the configuration's checks raise.
     """
-    made, flags = with_settings(kind, arguments, defaults, required)
-    parsed: Any = tyro.cli(made, prog=program, args=arguments)
+    parsed: Any = tyro.cli(with_settings(kind, arguments, defaults), prog=program, args=arguments)
     given = parsed.settings
     if parsed.image_size is not None:
         # Before the checks: the preset's own size may not fit another backbone.
         model = dataclasses.replace(given.model, image_size=parsed.image_size)
         given = dataclasses.replace(given, model=model)
-    return dataclasses.replace(parsed, settings=config_of(flags, given))
+    return dataclasses.replace(parsed, settings=config_of(given))
 
 
-def with_settings(
-    kind: type, arguments: Sequence[str], defaults: Any, required: Sequence[str]
-) -> tuple[type, Flags]:
+def with_settings(kind: type, arguments: Sequence[str], defaults: Any) -> type:
     """Make a command's class with a flag for every field of a configuration; see `parse_settings`.
 
     Raises:
         InputError: no such part.
     """
-    preset = find_flag(arguments, "--preset") or "b14"
-    flags = choose_parts(flags_of(defaults), arguments, preset)
-    settings, default = type_of(flags)
-    fields = [
-        (
-            field.name,
-            Annotated[settings, tyro.conf.arg(name="")],
-            dataclasses.field(default=default),
-        )
-        if field.name == "settings"
-        else (field.name, field.type, field)
-        for field in dataclasses.fields(kind)
-    ]
-    # Dataclasses take fields without a default first.
-    fields.sort(key=lambda field: field[0] not in required)
-    made = dataclasses.make_dataclass(kind.__name__, fields, frozen=True, bases=(kind,))
+    default = flags_of(defaults, arguments, find_flag(arguments, "--preset") or "b14")
+    hint = Annotated[type(default), tyro.conf.arg(name="")]
+    field = ("settings", hint, dataclasses.field(default=default))
+    made = dataclasses.make_dataclass(
+        kind.__name__, [field], frozen=True, bases=(kind,), kw_only=True
+    )
     made.__doc__ = kind.__doc__
-    return made, flags
-
-
-def config_of(flags: Flags, parsed: Any) -> Any:
-    """Make the configuration from a parsed instance of `type_of`'s class.
-
-    Raises:
-        InputError: what the configuration's own checks raise.
-    """
-    values = {}
-    for name, value in flags.values.items():
-        given = getattr(parsed, name)
-        values[name] = config_of(value, given) if isinstance(value, Flags) else given
-    return flags.kind(**values)
+    return made

@@ -12,7 +12,7 @@ import numpy as np
 from crisalad_jax.config.checks import fits, in_words
 from crisalad_jax.config.part import NAME, Part
 from crisalad_jax.config.plugins import home_of
-from crisalad_jax.config.short_repr import fields_in_use
+from crisalad_jax.config.short_repr import default_of, fields_in_use
 from crisalad_jax.utils.checksums import CHECKSUM, ChangedFileError
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
@@ -78,12 +78,8 @@ def _config(kind: Any, value: Any, path: str) -> Any:
         except InputError as error:
             raise InputError(f"{error} @ {path}") from error
     fields = {field.name: field for field in dataclasses.fields(kind)}
-    needed = [
-        name
-        for name, field in fields.items()
-        if field.default is field.default_factory is dataclasses.MISSING
-    ]
-    unknown, missing = sorted(value.keys() - fields.keys()), sorted(set(needed) - value.keys())
+    needed = {name for name, field in fields.items() if default_of(field) is dataclasses.MISSING}
+    unknown, missing = sorted(value.keys() - fields.keys()), sorted(needed - value.keys())
     if unknown or missing:
         found = f"found {', '.join(unknown)}" if unknown else f"found no {', '.join(missing)}"
         raise InputError(f"{found}, expected {', '.join(fields)} @ {path}")

@@ -8,7 +8,8 @@ import os
 import pathlib
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from importlib.machinery import ModuleSpec
 from typing import Any
 
 from crisalad_jax.config.checks import takes
@@ -23,8 +24,6 @@ _FROM_FILE = "crisalad_plugin_"
 """Beginning of the names of modules that are loaded from plug-in files."""
 _LOADED: dict[str, str] = {}
 """What `load_plugin` loaded, in that order, of a file its whole path; and its module's name."""
-_LARGEST = 2**24
-"""Most bytes of a plug-in's file: Python reads and copies it whole."""
 
 
 @takes(plugin=str)
@@ -53,13 +52,25 @@ def load_plugin(plugin: str) -> None:
         >>> ModelConfig(aggregator="patch-mean", cross_image=alone).descriptor_dim
         768
     """
+    spec = _spec_of(plugin)
+    if spec is None or spec.origin is None:  # a folder without __init__.py has no origin
+        kind = "file" if plugin.endswith(".py") else "module"
+        raise InputError(f"plugin {plugin}: found no such {kind}, expected FILE.py or MODULE")
     try:
-        if plugin.endswith(".py"):
-            _load_file(plugin)
-        else:
-            _load_module(plugin)
+        _import(spec)
     except InputError as error:
         raise InputError(f"plugin {plugin}: {error}") from error
+    except (Exception, SystemExit) as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [frame.lineno for frame in frames if frame.filename == spec.origin]
+        if isinstance(error, SyntaxError) and error.lineno is not None:
+            lines.append(error.lineno)
+        where = f" in line {lines[-1]}" if lines else ""
+        raise InputError(
+            f"plugin {plugin}: cannot be loaded: it raises {type(error).__name__}{where}: "
+            f"{' '.join(str(error).split())}"
+        ) from error
+    _LOADED[spec.origin if plugin.endswith(".py") else plugin] = spec.name
 
 
 def has_plugins() -> bool:
@@ -72,59 +83,33 @@ def loaded_plugins() -> list[str]:
     return list(_LOADED)
 
 
-def _load_module(name: str) -> None:
-    try:
-        spec = importlib.util.find_spec(name)
-    except (ImportError, ValueError):
-        spec = None
-    if spec is None or spec.origin is None:  # a folder without __init__.py has no origin
-        raise InputError("found no such module, expected FILE.py or MODULE")
-    _run(lambda: importlib.import_module(name), spec.origin)
-    _LOADED[name] = name
-
-
-def _load_file(file: str) -> None:
-    path = real_path(file)
+def _spec_of(plugin: str) -> ModuleSpec | None:
+    """Find the code of a plug-in; None where there is none."""
+    if not plugin.endswith(".py"):
+        try:
+            return importlib.util.find_spec(plugin)
+        except (ImportError, ValueError):
+            return None
+    path = real_path(plugin)
     if not path.is_file():
-        raise InputError("found no such file, expected FILE.py or MODULE")
-    if (size := path.stat().st_size) > _LARGEST:
-        raise InputError(f"found {size} bytes, expected a file of Python, of at most {_LARGEST}")
+        return None
     # Files of the same name are different modules.
     name = f"{_FROM_FILE}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
-    if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, path)
-        assert spec is not None
+    return importlib.util.spec_from_file_location(name, path)
+
+
+def _import(spec: ModuleSpec) -> None:
+    """Import a module, once."""
+    if not spec.name.startswith(_FROM_FILE):
+        importlib.import_module(spec.name)
+    elif spec.name not in sys.modules:
+        module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
         assert spec.loader is not None
-        module, loader = importlib.util.module_from_spec(spec), spec.loader
-        sys.modules[name] = module
         try:
-            _run(lambda: loader.exec_module(module), str(path))
+            spec.loader.exec_module(module)
         except BaseException:
-            del sys.modules[name]
+            del sys.modules[spec.name]
             raise
-    _LOADED[str(path)] = name
-
-
-def _run(load: Callable[[], object], file: str) -> None:
-    """Run a plug-in's import, and report in one line what it raises, and where."""
-    try:
-        load()
-    except InputError:
-        raise
-    except (Exception, SystemExit) as error:
-        lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == file]
-        if isinstance(error, SyntaxError):
-            lines.append(error.lineno)
-        where = f" in line {lines[-1]}" if lines else ""
-        what = " ".join(str(error).split())
-        if "non-frozen dataclass" in what:  # a part's, before it is registered
-            raise InputError(
-                f"found a part that is no frozen dataclass{where}, expected "
-                "@dataclasses.dataclass(frozen=True)"
-            ) from error
-        raise InputError(
-            f"cannot be loaded: it raises {type(error).__name__}{where}: {what}"
-        ) from error
 
 
 def plugin_failure(error: BaseException) -> str | None:

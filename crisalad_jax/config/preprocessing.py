@@ -87,12 +87,9 @@ class PreprocessingConfig:
             )
             return
         require(
-            all(0 < value < math.inf for value in self.deviation),
-            f"PreprocessingConfig.deviation: found {self.deviation}, expected numbers above 0",
-        )
-        require(
-            all(map(math.isfinite, self.mean)),
-            f"PreprocessingConfig.mean: found {self.mean}, expected finite numbers",
+            all(map(math.isfinite, (*self.mean, *self.deviation))) and min(self.deviation) > 0,
+            f"PreprocessingConfig: found mean {self.mean} and deviation {self.deviation}, expected "
+            "finite numbers, and deviations above 0",
         )
 
     @property

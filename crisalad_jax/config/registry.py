@@ -73,12 +73,7 @@ class Registry(Generic[P]):
 
     def _class_of(self, part: Callable[..., Any]) -> type[P]:
         """Return a part's class, that of a plain function included."""
-        if not inspect.isclass(part):
-            if self._of_function is None or not callable(part):
-                raise InputError(
-                    f"found {type(part).__name__}, expected a frozen dataclass that inherits from "
-                    f"{self.base.__name__}"
-                )
+        if self._of_function is not None and callable(part) and not inspect.isclass(part):
             members = {
                 "__doc__": part.__doc__ or f"The {self.kind} {part.__name__}.",
                 "__module__": part.__module__,
@@ -87,36 +82,25 @@ class Registry(Generic[P]):
             }
             made = type(part.__name__, (self.base,), members)
             return cast(type[P], dataclasses.dataclass(frozen=True)(made))
-        parameters = part.__dict__.get("__dataclass_params__")
+        is_part = isinstance(part, type) and issubclass(part, self.base)
+        parameters = vars(part).get("__dataclass_params__") if is_part else None
         if parameters is None or not parameters.frozen:
             raise InputError(
-                f"found {part.__qualname__}, which is no frozen dataclass, expected "
-                "@dataclasses.dataclass(frozen=True) below the registration"
+                f"found {getattr(part, '__qualname__', type(part).__name__)}, expected a subclass "
+                f"of {self.base.__name__} with @dataclasses.dataclass(frozen=True) below the "
+                "registration"
             )
-        if not issubclass(part, self.base):
-            raise InputError(
-                f"found {part.__qualname__}, expected a subclass of {self.base.__name__}"
-            )
-        for field in dataclasses.fields(part):
+        for field in dataclasses.fields(cast(Any, part)):
             if field.name in _RESERVED or callable(getattr(self.base, field.name, None)):
                 raise InputError(f"found a field {field.name!r}, which has another meaning here")
-        if missing := sorted(getattr(part, "__abstractmethods__", ())):
-            raise InputError(f"found no method {', '.join(missing)}, expected it")
-        try:
-            hash(part())
-        except TypeError as error:
-            raise InputError(
-                f"{error}; expected a default for every field, and values that can be hashed, such "
-                "as tuples for lists"
-            ) from error
-        return part
+        return cast(type[P], part)
 
     def _add(self, name: str, part: type[P], presets: Mapping[str, Mapping[str, Any]]) -> None:
-        there = self._parts.get(name)
+        existing = self._parts.get(name)
         # A notebook's cell or a plug-in's file that runs again registers the same part.
-        if there is not None and _home(there) != _home(part):
+        if existing is not None and _home(existing) != _home(part):
             raise InputError(
-                f"found the name taken by {there.__module__}.{there.__qualname__}, expected "
+                f"found the name taken by {existing.__module__}.{existing.__qualname__}, expected "
                 f"another name for {part.__qualname__}"
             )
         earlier = vars(part).get("part_name", name)
@@ -125,16 +109,18 @@ class Registry(Generic[P]):
                 f"found {part.__qualname__} registered as {earlier!r}, expected one name for a "
                 "class"
             )
-        fields = [field.name for field in dataclasses.fields(part)]
-        unknown = [each for preset in presets.values() for each in preset if each not in fields]
-        if unknown:
+        try:
+            for fields in ({}, *presets.values()):
+                hash(part(**fields))
+        except TypeError as error:
             raise InputError(
-                f"found {', '.join(unknown)} in a preset, expected {', '.join(fields)}"
-            )
+                f"{error}; expected all methods, a default for every field, values that can be "
+                "hashed, such as tuples for lists, and presets of these fields"
+            ) from error
         part.part_name = name
         self._parts[name], self._presets[name] = with_field_docs(part), presets
         try:
-            from_plain(self.base, to_plain(part()), source="settings")  # files can keep them
+            from_plain(self.base, to_plain(part()), source="settings")  # files can store them
         except InputError:
             del self._parts[name], self._presets[name]
             raise
@@ -199,15 +185,10 @@ class Registry(Generic[P]):
                 # `where` says what kind of part it is for.
                 words = str(error).removeprefix(f"{self.kind}: ")
                 raise InputError(f"{where}: {words}") from error
-        if not isinstance(value, self.base):
-            raise InputError(
-                f"{where}: found {in_one_line(value)}, expected a {self.kind} or its name"
-            )
-        if "part_name" not in vars(type(value)):
-            raise InputError(
-                f"{where}: found {type(value).__qualname__}, which is not registered, expected "
-                f"@register_{self.kind}(NAME) above it: files keep parts by name"
-            )
+        is_part = isinstance(value, self.base)
+        if not is_part or "part_name" not in vars(type(value)):
+            found = f"{in_one_line(value)}{', which is not registered' if is_part else ''}"
+            raise InputError(f"{where}: found {found}, expected a {self.kind} or its name")
         return value
 
 

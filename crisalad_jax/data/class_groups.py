@@ -5,10 +5,8 @@ classes. A group is a training set of its own (`Places`) whose places are the cl
 """
 
 import dataclasses
-import math
-import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,10 +14,8 @@ from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.data.metres import continuous, to_metres
 from crisalad_jax.data.places import Places
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.shapes import Bool, Float64, Int64
+from crisalad_jax.utils.shapes import Bool, Float64, Int32, Int64
 
-_NAME = re.compile(r".*?_\d{7,}_\d{4,}_\d{2,}_(\d{3,})_([^_]+)_([^_]+)_")
-"""`data.places` writes a row's northdeg, latitude and longitude into its image's name."""
 _WIDEST = 60.0
 """Degrees of longitude of a city's images; a plane of more stretches distances by over 15 %."""
 _ADVICE = "; --loss.kind.classes.kind places takes its places for classes"
@@ -28,8 +24,9 @@ _ONE_SPOT = 1e-3
 
 
 class Views(NamedTuple):
-    """Position and heading of every image; metres are of one UTM zone for each city."""
+    """City, position and heading of every image; metres are of one UTM zone for each city."""
 
+    city: Int32[np.ndarray, " images"]
     east: Float64[np.ndarray, " images"]
     north: Float64[np.ndarray, " images"]
     """UTM north in metres; negative south of the equator, where maps add 10,000 km."""
@@ -40,21 +37,17 @@ class Views(NamedTuple):
 
 
 def views_of(places: Places) -> Views:
-    """Read positions and headings; a city's UTM zone is that of its median longitude.
+    """Project positions to UTM; a city's zone is that of its median longitude.
 
     Raises:
-        InputError: in the layout of GSV-Cities, a file is not named in its way, or bears no
-            latitude or longitude; or a city is wider than a plane can be.
+        InputError: a city is wider than a plane can be.
     """
-    if places.names is None:
-        fields = np.array([_fields(places, file) for file in places.files])
-        heading, latitude, longitude = fields.T
-    elif places.views is not None:
-        latitude, longitude, heading = places.views.T
-    else:
-        latitude, longitude, heading = np.zeros((3, len(places.files)))
+    count = len(places.files)
+    latitude, longitude, heading = (
+        np.zeros((count, 3)) if places.views is None else places.views
+    ).T
     city = places.place_city[places.image_place]
-    east, north = np.empty(len(city)), np.empty(len(city))
+    east, north = np.empty(count), np.empty(count)
     known = np.zeros(len(places.cities), bool)
     for number in np.unique(city):
         of = city == number
@@ -67,22 +60,7 @@ def views_of(places: Places) -> Views:
             )
         known[number] = np.ptp(latitude[of]) > 0 or np.ptp(here) > 0
         east[of], north[of] = to_metres(latitude[of], here)
-    return Views(east, north, heading % 360, known)
-
-
-def _fields(places: Places, file: str) -> list[float]:
-    """Read the heading, latitude and longitude in an image's name."""
-    match = _NAME.match(file.rpartition("/")[2])
-    try:
-        heading, latitude, longitude = map(float, match.groups() if match else ())
-    except ValueError:
-        latitude = longitude = heading = math.nan
-    if not (abs(latitude) < 90 and abs(longitude) <= 180):
-        raise InputError(
-            f"{places.root / file}: found a name without direction and position, expected "
-            "city_place_year_month_northdeg_lat_lon_panoid, in degrees"
-        )
-    return [heading, latitude, longitude]
+    return Views(city, east, north, heading % 360, known)
 
 
 class Class(NamedTuple):
@@ -113,10 +91,9 @@ def class_groups(
     """
     sets = _classes(places, config, min_images)
     if not all(sets):
-        largest = min(max(map(_size, each), default=0) for each in _classes(places, config, 1))
         raise InputError(
-            f"{places.root}: found at most {largest} images {_KINDS[config.kind]}, expected "
-            f"classes of at least {min_images}{_ADVICE if config.kind != 'places' else ''}"
+            f"{places.root}: found no class of at least {min_images} images, which "
+            f"loss.kind.classes.kind {config.kind!r} asks for{_ADVICE}"
         )
     chosen: list[list[list[Class]]] = []
     for classes in sets:
@@ -136,65 +113,34 @@ def class_groups(
     return tuple(_regrouped(places, group) for turn in turns for group in turn)
 
 
-_KINDS = {
-    "places": "of one place",
-    "cells": "in one cell and sector",
-    "viewpoints": "of one cell that look at one of its focal points",
-}
-"""What the images of a class have in common."""
-
-
-def _size(each: Class) -> int:
-    return len(each.images)
-
-
 def _classes(places: Places, config: ClassesConfig, min_images: int) -> list[list[Class]]:
     """Make the sets of classes: one, or the lateral and the frontal one."""
     views = views_of(places)
     if config.kind == "places":
         return [_place_classes(places, views, config, min_images)]
-    lacking = None
-    if places.names is not None and (places.views is None or np.isnan(places.views).any()):
-        what = "positions (lat,lon)" if places.views is None else "headings (heading)"
-        lacking = f"no {what} of the images, which", "a table name,place,lat,lon,heading"
-    elif not views.known.all():
-        city = places.cities[int(np.argmin(views.known))]
-        lacking = f"one position (lat, lon) for all images of {city}, which", "where each was taken"
-    if lacking is not None:
+    if np.isnan(views.heading).any() or not views.known.all():
         raise InputError(
-            f"{places.root}: found {lacking[0]} loss.kind.classes.kind {config.kind!r} cannot use, "
-            f"expected {lacking[1]}{_ADVICE}"
+            f"{places.root}: found no headings, or no positions, or one position for all images of "
+            "a city, expected a table name,place,lat,lon,heading or the layout of GSV-Cities, for "
+            f"loss.kind.classes.kind {config.kind!r}{_ADVICE}"
         )
-    city = places.place_city[places.image_place]
     if config.kind == "cells":
-        return [cell_classes(views, city, config, min_images=min_images)]
-    return focal_classes(views, city, config, min_images=min_images)
+        return [cell_classes(views, config, min_images)]
+    return focal_classes(views, config, min_images)
 
 
-def cell_classes(
-    views: Views,
-    city: Int64[np.ndarray, " images"],
-    config: ClassesConfig,
-    *,
-    min_images: int,
-) -> list[Class]:
+def cell_classes(views: Views, config: ClassesConfig, min_images: int) -> list[Class]:
     """Make CosPlace's classes: a square cell and a sector of headings (Berton et al. 2022, sec. 3).
 
     Two classes of a group are at least `spacing - 1` cells, or `sector_spacing - 1` sectors, apart.
     """
     sector = np.floor(views.heading / config.sector).astype(np.int64)
-    group, cells = _cells(views, config)
+    group, keys = _cells(views, config)
     group = group * config.sector_spacing + sector % config.sector_spacing
-    return _by_key(np.column_stack([city, *cells, sector]), group, min_images)
+    return _by_key(np.column_stack([keys, sector]), group, min_images)
 
 
-def focal_classes(
-    views: Views,
-    city: Int64[np.ndarray, " images"],
-    config: ClassesConfig,
-    *,
-    min_images: int,
-) -> list[list[Class]]:
+def focal_classes(views: Views, config: ClassesConfig, min_images: int) -> list[list[Class]]:
     """Make EigenPlaces' lateral and frontal classes of square cells (Berton et al. 2023, sec. 3).
 
     The first principal direction of a cell's positions is the direction of its street. A class
@@ -203,9 +149,9 @@ def focal_classes(
     within `view_angle` of the direction from its position to the focal point. Each line has two
     focal points, of which the one that more images look at is taken.
     """
-    group, cells = _cells(views, config)
+    group, keys = _cells(views, config)
     sides: list[list[Class]] = [[], []]
-    for cell in _by_key(np.column_stack([city, *cells]), group, min_images):
+    for cell in _by_key(keys, group, min_images):
         positions = np.column_stack([views.east[cell.images], views.north[cell.images]])
         points = focal_points(positions, config.focal_distance)
         if points is None:
@@ -243,64 +189,41 @@ def _place_classes(
 
     A place that is a neighbour in every group is of no class.
     """
-    large = np.flatnonzero(places.image_counts >= min_images)
+    from scipy.spatial import KDTree  # takes a fifth of a second
+
     group = np.full(len(places.place_id), -1)
-    for city in range(len(places.cities)):
-        here = large[places.place_city[large] == city]
-        if places.near is not None:
-            _deal(group, here, [places.near[place] for place in here], config)
-        elif views.known[city] and len(here):
-            _deal(group, here, _near(_centres(places, views), here, config), config)
-        else:
-            group[here] = np.arange(len(here)) % config.groups
+    is_large = places.image_counts >= min_images
     start = places.place_start
+    points = np.column_stack([views.east, views.north])
+    centres = np.add.reduceat(points, start[:-1], axis=0) / places.image_counts[:, None]
+    for city, known in enumerate(views.known):
+        here = np.flatnonzero(is_large & (places.place_city == city))
+        near: Sequence[Any] = [[]] * len(here)
+        if places.near is not None:
+            near = [places.near[place] for place in here]
+        elif known and len(here):
+            tree = KDTree(centres[here])
+            found = tree.query_ball_point(centres[here], config.cell * (config.spacing - 1))
+            near = [here[others] for others in found]
+        sizes = np.zeros(config.groups, np.int64)
+        for place, others in zip(here, near, strict=True):
+            free = np.setdiff1d(np.arange(config.groups), group[others])
+            if len(free):
+                group[place] = free[sizes[free].argmin()]
+                sizes[group[place]] += 1
     return [
         Class(np.arange(start[place], start[place + 1]), int(group[place]))
         for place in np.flatnonzero(group >= 0)
     ]
 
 
-def _centres(places: Places, views: Views) -> Float64[np.ndarray, "places 2"]:
-    positions = np.column_stack([views.east, views.north])
-    sums = np.add.reduceat(positions, places.place_start[:-1], axis=0)
-    return sums / places.image_counts[:, None]
-
-
-def _near(
-    centres: Float64[np.ndarray, "places 2"],
-    here: Int64[np.ndarray, " some"],
-    config: ClassesConfig,
-) -> list[Int64[np.ndarray, " _"]]:
-    """Find the places that are as near each of these as CosPlace forbids."""
-    from scipy.spatial import KDTree
-
-    tree = KDTree(centres[here])
-    found = tree.query_ball_point(centres[here], config.cell * (config.spacing - 1))
-    return [here[others] for others in found]
-
-
-def _deal(
-    group: Int64[np.ndarray, " places"],
-    here: Int64[np.ndarray, " some"],
-    near: Sequence[Int64[np.ndarray, " _"]],
-    config: ClassesConfig,
-) -> None:
-    """Put each of these places into the smallest group that has none near it, if there is one."""
-    sizes = np.zeros(config.groups, np.int64)
-    for place, others in zip(here, near, strict=True):
-        free = np.setdiff1d(np.arange(config.groups), group[others])
-        if len(free):
-            group[place] = free[sizes[free].argmin()]
-            sizes[group[place]] += 1
-
-
 def _cells(
     views: Views, config: ClassesConfig
-) -> tuple[Int64[np.ndarray, " images"], Int64[np.ndarray, "2 images"]]:
-    """Return the group and the cell of each image."""
+) -> tuple[Int64[np.ndarray, " images"], Int64[np.ndarray, "images 3"]]:
+    """Return the group of each image, and its city and cell."""
     cells = np.floor(np.stack([views.east, views.north]) / config.cell).astype(np.int64)
     east, north = cells % config.spacing
-    return east * config.spacing + north, cells
+    return east * config.spacing + north, np.column_stack([views.city, *cells])
 
 
 def _by_key(
@@ -322,11 +245,10 @@ def _regrouped(places: Places, classes: Sequence[Class]) -> Places:
     return dataclasses.replace(
         places,
         files=tuple(places.files[image] for image in images),
-        image_place=np.repeat(np.arange(len(classes), dtype=np.int32), counts),
+        place_start=start,
         place_city=places.place_city[old],
         place_id=places.place_id[old],
-        place_start=start,
-        names=None if places.names is None else tuple(places.names[place] for place in old),
-        near=None,
+        names=tuple(places.names[place] for place in old),
         views=None if places.views is None else places.views[images],
+        near=None,
     )

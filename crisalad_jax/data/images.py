@@ -42,14 +42,8 @@ content."""
 SELF_CHECKED = (*_OF_JPEG, ".png")
 """Suffixes of images that `decode_image` finds cut short by their own marks."""
 _FORMATS = f"an image ({' '.join(IMAGE_SUFFIXES)})"
-_FOREIGN = {
-    ".heic": (4, (b"ftyphei", b"ftyphev", b"ftypmif1", b"ftypmsf1")),
-    ".jxl": (0, (b"\xff\x0a", b"\x00\x00\x00\x0cJXL ")),
-    ".npz or another zip archive": (0, (b"PK\x03\x04",)),
-    ".npy": (0, (b"\x93NUMPY",)),
-}
-"""Offset and first bytes of what users take for images that can be read."""
-
+_PNG_SIDE = 1_000_000
+"""Largest side that libpng decodes; of a larger one it writes lines to stderr."""
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _AVIF = (b"ftypavif", b"ftypavis")
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
@@ -138,8 +132,6 @@ def decode_image(
     Raises:
         InputError: as `read_image`.
     """
-    if not data:
-        raise InputError(f"{path}: found an empty file, expected {_FORMATS}")
     # Check before decoding: OpenCV 4 fills missing parts of a JPEG with grey, and libpng and
     # libjpeg write warnings to stderr that OpenCV's log level does not silence.
     if (data.startswith(b"\xff\xd8") and not _jpeg_is_whole(data)) or (
@@ -149,26 +141,16 @@ def decode_image(
             f"{path}: found an image cut short after {len(data)} bytes, or damaged, expected a "
             "whole one"
         )
-    if data.startswith(_PNG_SIGNATURE):
-        _check_png_size(data, path)
+    image, found = None, f"{len(data)} bytes that do not decode" if data else "an empty file"
     try:
         with QUIET:
-            image = _decoded(np.frombuffer(data, np.uint8), data[:12], _reduction(data, enough))
+            if data:
+                image = _decoded(np.frombuffer(data, np.uint8), data[:12], _reduction(data, enough))
     except cv2.error as error:
-        reason = " ".join(error.err.split())
-        if "MAX_IMAGE_PIXELS" in reason:
-            reason = (
-                f"found more than {os.environ.get(MAX_PIXELS)} pixels, expected fewer "
-                "(--max-pixels raises that)"
-            )
-        raise InputError(f"{path}: OpenCV cannot decode this image: {reason}") from error
+        found = " ".join(error.err.split())
+        if "MAX_IMAGE_PIXELS" in found:
+            found = f"more than {os.environ.get(MAX_PIXELS)} pixels (--max-pixels raises that)"
     if image is None:
-        foreign = (
-            f"a file of the format {name}, which is not read"
-            for name, (start, marks) in _FOREIGN.items()
-            if data.startswith(marks, start)
-        )
-        found = next(foreign, f"{len(data)} bytes that do not decode")
         raise InputError(f"{path}: found {found}, expected {_FORMATS}")
     return _turned(image, data) if data[4:12] in _AVIF else image
 
@@ -222,7 +204,7 @@ def _reduction(data: bytes, enough: tuple[int, int] | None) -> int:
 
 
 def _png_is_whole(data: bytes) -> bool:
-    """Return whether a PNG has a size, and chunks up to IEND with right checksums.
+    """Return whether a PNG has a size that decodes, and chunks up to IEND with right checksums.
 
     Chunks whose name begins with a small letter are not needed for the pixels.
     """
@@ -231,28 +213,15 @@ def _png_is_whole(data: bytes) -> bool:
         length = int.from_bytes(data[position : position + 4], "big")
         kind = data[position + 4 : position + 8]
         end = position + 8 + length
-        if kind[:1].isupper() and data[end : end + 4] != _crc(data[position + 4 : end]):
+        if kind[:1].isupper() and zlib.crc32(data[position + 4 : end]) != int.from_bytes(
+            data[end : end + 4], "big"
+        ):
             return False
         position = end + 4
         if kind == b"IEND":
-            return bytes(4) not in (data[16:20], data[20:24])
+            sides = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
+            return all(0 < side <= _PNG_SIDE for side in sides)
     return False
-
-
-_PNG_SIDE = 1_000_000
-"""Largest side that libpng decodes; of a larger one it writes lines of its own."""
-
-
-def _check_png_size(data: bytes, path: str | os.PathLike[str]) -> None:
-    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
-    if max(width, height) > _PNG_SIDE:
-        raise InputError(
-            f"{path}: found {width} x {height} pixels, expected sides of at most {_PNG_SIDE}"
-        )
-
-
-def _crc(data: bytes) -> bytes:
-    return zlib.crc32(data).to_bytes(4, "big")
 
 
 def _turned(image: np.ndarray, data: bytes) -> np.ndarray:
@@ -288,8 +257,6 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
     Raises:
         InputError: the folder is missing, is a file, or holds no image.
     """
-    if not os.fspath(folder):
-        raise InputError("images: found an empty name, expected a folder of images")
     folder = pathlib.Path(folder)
     if not folder.is_dir():
         kind = "a file" if folder.exists() else "nothing"
@@ -317,10 +284,8 @@ def is_image(path: str | os.PathLike[str]) -> bool:
     return os.fspath(path).lower().endswith(IMAGE_SUFFIXES)
 
 
-_NO_IMAGES = (".csv", ".db", ".ini")
+_UNCOUNTED = (".csv", ".db", ".ini")
 """Suffixes that no note counts: tables of positions, and what Windows leaves in folders."""
-
-
 _KINDS = 4
 """Number of suffixes that a note names."""
 
@@ -345,19 +310,15 @@ def only_images(
     for file in files:
         (images if is_image(file) or (videos and is_video(file)) else others).append(file)
     # The names of the images, with and without their suffixes.
-    known = {name for image in images for name in (image, image.with_suffix(""))} if others else ()
+    known = {name for image in images for name in (image, image.with_suffix(""))}
     kinds = collections.Counter(
-        file.suffix.lower() or "without a suffix"
-        for file in others
-        if file.suffix.lower() not in _NO_IMAGES
-        and file not in known
-        and file.with_suffix("") not in known
+        sorted(
+            file.suffix.lower() or "without a suffix"
+            for file in others
+            if file.suffix.lower() not in _UNCOUNTED and not known & {file, file.with_suffix("")}
+        )
     )
-    # In the order of the counts, then of the names: that of a folder is any.
-    first = sorted(kinds.items(), key=lambda kind: (-kind[1], kind[0]))[:_KINDS]
-    words = ", ".join(f"{count:,} {kind}" for kind, count in first)
-    if rest := kinds.total() - sum(count for _, count in first):
-        words += f", {rest:,} more"
+    words = ", ".join(f"{count:,} {kind}" for kind, count in kinds.most_common(_KINDS))
     if not images:
         among = f" among {counted(kinds.total(), 'file')} ({words})" if kinds else ""
         raise InputError(

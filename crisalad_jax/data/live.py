@@ -45,10 +45,6 @@ class Frame(NamedTuple):
     """`time.perf_counter()` when it was in hand: a whole file, or a frame from the camera."""
 
 
-def _go_on() -> None:
-    """Check nothing."""
-
-
 class FolderWatch:
     """The images that appear in a folder and its subfolders, each once, when it is whole.
 
@@ -96,13 +92,14 @@ class FolderWatch:
                 if is_image(name) and not name.startswith("."):
                     yield pathlib.Path(parent, name)
 
-    def frames(self, check: Callable[[], None] = _go_on) -> Iterator[Frame]:
+    def frames(self, check: Callable[[], None] = lambda: None) -> Iterator[Frame]:
         """Yield images as they appear, without end; the oldest first where there are several.
 
         Args:
             check: called several times a second; it may raise, to end this.
         """
-        waiting: dict[pathlib.Path, _Arriving] = {}
+        waiting: dict[pathlib.Path, tuple[tuple[int, int], float]] = {}
+        """Size and time of change of a file, and since when it has these."""
         while True:
             check()
             begun = time.monotonic()
@@ -111,53 +108,32 @@ class FolderWatch:
                 if path not in self._done:
                     with contextlib.suppress(OSError):  # gone again
                         there = path.stat()
-                        arriving = waiting.setdefault(path, _Arriving())
-                        if arriving.may_be_whole(path, (there.st_size, there.st_mtime_ns)):
+                        state = (there.st_size, there.st_mtime_ns)
+                        if path not in waiting or waiting[path][0] != state:
+                            waiting[path] = state, begun
+                        waits = 0.0 if path.suffix.lower() in SELF_CHECKED else _SETTLED
+                        if begun - waiting[path][1] >= waits:
                             found.append((there.st_mtime, path))
+            arrived = False
             for changed, path in sorted(found):
                 check()
                 taken = time.perf_counter()
                 try:
                     image = read_pixels(path)
                 except InputError as error:
-                    if waiting[path].still_for() > _PATIENCE:
+                    if begun - waiting[path][1] > _PATIENCE:
                         self._done.add(path)
-                        del waiting[path]
                         if path.exists():
                             warn(f"{error}; it is left out")
                     continue
+                arrived = True
                 self._done.add(path)
-                del waiting[path]
-                name = path.relative_to(self._folder).as_posix()
-                yield Frame(name, changed, image, taken)
-            time.sleep(max(_POLL, 4 * (time.monotonic() - begun)) if not found else 0)
+                yield Frame(path.relative_to(self._folder).as_posix(), changed, image, taken)
+            if not arrived:
+                time.sleep(max(_POLL, 4 * (time.monotonic() - begun)))
 
     def close(self) -> None:
         """Do nothing: no file is open."""
-
-
-class _Arriving:
-    """What is known of a file that is perhaps not whole yet."""
-
-    def __init__(self) -> None:
-        self._state: tuple[int, int] | None = None
-        self._since = 0.0
-        self._tried = False
-
-    def may_be_whole(self, path: pathlib.Path, state: tuple[int, int]) -> bool:
-        """Return whether to read the file, which has this size and time of change now."""
-        if state != self._state:
-            self._state, self._since, self._tried = state, time.monotonic(), False
-        waits = 0.0 if path.suffix.lower() in SELF_CHECKED else _SETTLED
-        # What was unreadable is read again when it has changed, and for the last time at the end.
-        if (self._tried and self.still_for() <= _PATIENCE) or self.still_for() < waits:
-            return False
-        self._tried = True
-        return state[0] > 0 or self.still_for() > _PATIENCE
-
-    def still_for(self) -> float:
-        """Return the seconds since the file changed."""
-        return time.monotonic() - self._since
 
 
 class Camera:
@@ -231,7 +207,7 @@ class Camera:
         """Close the camera."""
         self.close()
 
-    def frames(self, check: Callable[[], None] = _go_on) -> Iterator[Frame]:
+    def frames(self, check: Callable[[], None] = lambda: None) -> Iterator[Frame]:
         """Yield the newest frame, time and again, until the camera or the video ends.
 
         Args:
@@ -258,7 +234,7 @@ class Camera:
                 if not self._ended:
                     self._came.clear()
             if frame is not None:
-                due = now + (0 if self._fps is None else 1 / self._fps)
+                due = 0 if self._fps is None else time.monotonic() + 1 / self._fps
                 yield frame
         if not self._is_file and not self._closing.is_set():
             raise InputError(f"camera: found no more frames from {self.name}, expected it to go on")

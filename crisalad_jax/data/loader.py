@@ -20,7 +20,6 @@ from crisalad_jax.data.opencv import ONE_THREAD
 from crisalad_jax.data.places import Order, Places, epoch_batches
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.resize import Pixels
-from crisalad_jax.data.video import frame_time
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.shapes import Bool, Float32, Int, Int32, Int64, UInt8
@@ -31,8 +30,6 @@ if TYPE_CHECKING:  # who only reads images starts sooner without them
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 BATCHES_AHEAD = 2
-_IMAGES_PER_TASK = 8
-"""Largest number of images that a thread reads per task, because every task has an overhead."""
 THREADS = usable_cores()
 """OpenCV decodes outside of Python's lock: two cores decode some 500 photographs a second."""
 
@@ -82,7 +79,8 @@ class ImageCache:
         key = (os.fspath(path), how, quickly)
         image = self._images.get(key)
         if image is None:
-            image = _read(path, how, check, quickly=quickly)
+            pixels = read_pixels(path, enough=how.image_size if quickly else None)
+            image = how.prepare(pixels, check, os.fspath(path))
             image.setflags(write=False)
             with self._lock:
                 if key not in self._images and image.nbytes <= self._room:
@@ -92,21 +90,10 @@ class ImageCache:
 
     def fill(self, paths: Iterable[str | os.PathLike[str]], how: Preparation) -> None:
         """Read images in this order, as far as there is room; `read` tells of unreadable ones."""
-        for path in paths:
+        for path in paths if self._room else ():
             with contextlib.suppress(InputError):
                 if self.read(path, how, quickly=True).nbytes > self._room:
                     return
-
-
-def _read(
-    path: str | os.PathLike[str],
-    how: Preparation,
-    check: Callable[[Size], None] | None = None,
-    *,
-    quickly: bool = False,
-) -> Pixels:
-    image = read_pixels(path, enough=how.image_size if quickly else None)
-    return how.prepare(image, check, os.fspath(path))
 
 
 @takes(places=Places)
@@ -250,28 +237,28 @@ def batches_of_groups(
     Raises:
         InputError: as `training_batches`.
     """
-    if not 0 <= start_step <= len(chosen):
-        raise InputError(f"start_step: found {start_step}, expected 0 to {len(chosen)}")
     _, groups, images_per_group = chosen.shape
     batch_size = groups * images_per_group
     number, parts = part
-    if not 0 <= number < parts or batch_size % parts:
-        raise InputError(f"part: found {part}, expected the i-th of n, which divides {batch_size}")
+    if not (0 <= start_step <= len(chosen) and 0 <= number < parts and batch_size % parts == 0):
+        raise InputError(
+            f"start_step, part: found {start_step} and {part}, expected 0 to {len(chosen)}, and "
+            f"the i-th of n equal parts of {batch_size} images"
+        )
     how = Preparation(image_size, preprocessing.for_training())
     from crisalad_jax.data.augmentations.base import AUGMENTATIONS
 
+    cache = cache or ImageCache(0)
     if any("#t=" in file for file in files.files):
         threads = min(threads, 1)  # more would read a video each, from its beginning
-        if cache is not None:
-            # In order: the frames of a batch are far from each other, with all others in between.
-            cache.fill(map(files.path, np.unique(chosen)), how)
+        # In order: the frames of a batch are far from each other, with all others in between.
+        cache.fill(map(files.path, np.unique(chosen)), how)
     indices = chosen.reshape(-1)
     slots = np.arange(indices.size).reshape(len(chosen), parts, batch_size // parts)
-    read = _read if cache is None else cache.read
     augment = AUGMENTATIONS.resolve(augmentation, "augmentation")
 
     def load(position: int) -> Pixels:
-        image = read(files.path(indices[position]), how, quickly=True)
+        image = cache.read(files.path(indices[position]), how, quickly=True)
         step, slot = divmod(position, batch_size)
         # The spawn key makes this stream, one for each place, independent of each image's.
         place = (*seed, step, slot // images_per_group)
@@ -286,7 +273,7 @@ def batches_of_groups(
             )
         return augmented
 
-    return _batches(
+    return read_batches(
         load,
         labels=labels.reshape(-1),
         indices=indices,
@@ -298,71 +285,7 @@ def batches_of_groups(
     )
 
 
-def image_batches(
-    paths: Sequence[str | os.PathLike[str]],
-    *,
-    image_size: Size,
-    batch_size: int,
-    preprocessing: PreprocessingConfig = PreprocessingConfig(),
-    side_multiple: int = 1,
-    check_size: Callable[[Size], None] | None = None,
-    on_bad_image: OnBadImage = "stop",
-    threads: int = THREADS,
-    cache: ImageCache | None = None,
-) -> Iterator[ImageBatch]:
-    """Yield batches of the images in `paths`, in order; the last one is padded to `batch_size`.
-
-    Where a rule gives images sizes of their own, consecutive images of one size make a batch, and
-    every change of size ends and pads one: then a `batch_size` of 1 saves work.
-
-    Under "skip" an image that cannot be read is not valid but keeps its index. The other arguments
-    are those of `training_batches`.
-
-    Args:
-        paths: image files.
-        image_size: height and width in pixels that images are resized to, or what the rule of
-            `preprocessing` takes from them.
-        batch_size: number of images of a batch.
-        preprocessing: how images are resized, and floats normalised.
-        side_multiple: number of pixels that sides are rounded to multiples of.
-        check_size: raises InputError for a height and width that no image may have.
-        on_bad_image: "stop" at an unreadable image, or "skip" it.
-        threads: how many decode ahead; 0 decodes in the caller's thread.
-        cache: holds decoded images.
-
-    Yields:
-        The batches: pixels, indices into `paths`, and which images are valid.
-
-    Raises:
-        InputError: at once for arguments out of range; while iterating under "stop" for an image
-            that cannot be read.
-
-    Example:
-        >>> paths = sorted(pictures.iterdir())
-        >>> batches = list(image_batches(paths, image_size=(98, 98), batch_size=3))
-        >>> [batch.valid.tolist() for batch in batches]
-        [[True, True, True], [True, False, False]]
-    """
-    if batch_size < 1:
-        raise InputError(f"batch_size: found {batch_size}, expected at least 1")
-    if any(frame_time(path) is not None for path in paths):
-        threads = min(threads, 1)  # more would read a video each, from its beginning
-    read = _read if cache is None else cache.read
-    how = Preparation(image_size, preprocessing, side_multiple)
-    indices = np.arange(len(paths))
-    return _batches(
-        lambda position: read(paths[position], how, check_size),
-        labels=indices,
-        indices=indices,
-        positions=indices,
-        how=how,
-        batch_size=batch_size,
-        on_bad_image=on_bad_image,
-        threads=threads,
-    )
-
-
-def _batches(
+def read_batches(
     load: Callable[[int], Pixels],
     *,
     labels: np.ndarray,
@@ -381,26 +304,21 @@ def _batches(
     choose("on_bad_image", on_bad_image, {"skip": None, "stop": None})
     if threads < 0:
         raise InputError(f"threads: found {threads}, expected at least 0")
-    # A chunk is smaller than a batch, so that all threads work on the next batch.
-    size = max(1, min(_IMAGES_PER_TASK, batch_size // max(threads, 1)))
-    tasks = [
-        positions[first : min(first + size, start + batch_size)].tolist()
-        for start in range(0, len(positions), batch_size)
-        for first in range(start, min(start + batch_size, len(positions)), size)
-    ]
 
-    def load_all(task: list[int]) -> list[Pixels | InputError]:
-        return [_result_or_error(load, position) for position in task]
+    def load_or_skip(position: int) -> Pixels | None:
+        try:
+            return load(position)
+        except InputError as error:
+            if on_bad_image == "stop":
+                raise InputError(f"{error} (--on-bad-image skip leaves it out)") from error
+            return None
 
     def batches() -> Generator[ImageBatch, None, None]:
-        ahead = max(-(-BATCHES_AHEAD * batch_size // size), threads)
-        read = read_ahead(load_all, tasks, ahead=ahead, threads=threads)
+        ahead = max(BATCHES_AHEAD * batch_size, threads)
+        read = read_ahead(load_or_skip, positions.tolist(), ahead=ahead, threads=threads)
         with ONE_THREAD, contextlib.closing(read):
             start = 0
-            for run in _same_size_runs(itertools.chain.from_iterable(read), batch_size):
-                for image in run:
-                    if on_bad_image == "stop" and isinstance(image, InputError):
-                        raise InputError(f"{image} (--on-bad-image skip leaves it out)") from image
+            for run in _same_size_runs(read, batch_size):
                 part = positions[start : start + len(run)]
                 start += len(run)
                 yield _batch_of(run, labels[part], indices[part], how, batch_size)
@@ -446,21 +364,14 @@ def one_ahead(stream: Generator[_Item, None, None]) -> Generator[_Item, None, No
             yield item
 
 
-def _result_or_error(load: Callable[[int], Pixels], position: int) -> Pixels | InputError:
-    try:
-        return load(position)
-    except InputError as error:
-        return error
-
-
 def _same_size_runs(
-    images: Iterable[Pixels | InputError], batch_size: int
-) -> Iterator[list[Pixels | InputError]]:
-    """Yield runs of at most `batch_size` consecutive images of one size; errors are of any size."""
-    run: list[Pixels | InputError] = []
+    images: Iterable[Pixels | None], batch_size: int
+) -> Iterator[list[Pixels | None]]:
+    """Yield runs of at most `batch_size` consecutive images of one size; None is of any size."""
+    run: list[Pixels | None] = []
     shape: tuple[int, ...] | None = None
     for image in images:
-        own = None if isinstance(image, InputError) else image.shape
+        own = None if image is None else image.shape
         if None not in (own, shape) and own != shape:
             yield run
             run, shape = [], None
@@ -474,25 +385,22 @@ def _same_size_runs(
 
 
 def _batch_of(
-    run: Sequence[Pixels | InputError],
+    run: Sequence[Pixels | None],
     labels: np.ndarray,
     indices: np.ndarray,
     how: Preparation,
     batch_size: int,
 ) -> ImageBatch:
     """Make a padded batch; where none of its images can be read, they have the model's size."""
-    sizes = (image.shape[:2] for image in run if not isinstance(image, InputError))
-    size = next(sizes, how.size_of(how.image_size))
+    sizes = (image.shape[:2] for image in run if image is not None)
     batch = ImageBatch(
-        images=np.zeros((batch_size, *size, 3), how.dtype),
+        images=np.zeros((batch_size, *next(sizes, how.size_of(how.image_size)), 3), how.dtype),
         labels=np.full(batch_size, -1, np.int32),
         valid=np.zeros(batch_size, np.bool_),
         indices=np.full(batch_size, -1, np.int64),
     )
-    batch.labels[: len(run)] = labels
-    batch.indices[: len(run)] = indices
+    batch.labels[: len(run)], batch.indices[: len(run)] = labels, indices
     for slot, image in enumerate(run):
-        if not isinstance(image, InputError):
-            batch.images[slot] = image
-            batch.valid[slot] = True
+        if image is not None:
+            batch.images[slot], batch.valid[slot] = image, True
     return batch

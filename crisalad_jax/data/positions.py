@@ -190,8 +190,8 @@ def utm_positions(names: Sequence[str]) -> Positions:
 class ImageTable(NamedTuple):
     """A table of images, with their positions as far as it has them."""
 
-    rows: list[tuple[int, str]]
-    """Line and name of each image, in the table's order."""
+    names: list[str]
+    """In the table's order."""
     positions: Positions | None
     """Positions by name; None where the table has no such columns."""
 
@@ -260,7 +260,7 @@ def read_image_table(path: str | os.PathLike[str], *, all_positions: bool = Fals
             if all_positions or any(row.fields[axis] for axis in axes)
         }
         positions = Positions(axes, of)
-    return ImageTable([(row.line, name) for name, row in rows], positions)
+    return ImageTable([name for name, _ in rows], positions)
 
 
 def _axes(path: pathlib.Path, columns: Sequence[str], must: bool) -> tuple[str, str] | None:

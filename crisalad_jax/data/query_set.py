@@ -8,8 +8,8 @@ import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.benchmarks.benchmark import Benchmark, check_radius, within
-from crisalad_jax.data.benchmarks.msls import is_msls, read_msls
+from crisalad_jax.data.benchmarks.benchmark import within
+from crisalad_jax.data.benchmarks.msls import is_msls
 from crisalad_jax.data.benchmarks.on_disk import has_split
 from crisalad_jax.data.benchmarks.open import open_benchmark
 from crisalad_jax.data.images import OnBadImage
@@ -74,32 +74,28 @@ def read_query_set(
         [4, 5, 6, 7]
     """
     root = pathlib.Path(root)
-    split = "train" if root.is_dir() and (has_split(root) or is_msls(root)) else None
-    check_radius(positive_radius)
-    check_radius(negative_radius)
-    if root.is_dir() and is_msls(root):
+    raw_msls = root.is_dir() and is_msls(root)
+    split = "train" if raw_msls or (root.is_dir() and has_split(root)) else None
+    benchmark = open_benchmark(root, split, images=images, on_bad_image=on_bad_image)
+    there, asked = benchmark.database_positions, benchmark.query_positions
+    radii = (positive_radius, negative_radius)
+    if raw_msls:
         # Images of different cities match in no radius, whatever their positions.
-        benchmark = open_benchmark(
-            root, split, negative_radius, images=images, on_bad_image=on_bad_image
+        positives, near = (
+            open_benchmark(root, split, radius, on_bad_image=on_bad_image).ground_truth()
+            for radius in radii
         )
-        near = benchmark.ground_truth()
-        positives = read_msls(
-            root, split, positive_radius, on_bad_image=on_bad_image
-        ).ground_truth()
+    elif there is not None and asked is not None:
+        positives, near = (within(there, asked, radius) for radius in radii)
     else:
-        benchmark = open_benchmark(root, split, images=images, on_bad_image=on_bad_image)
-        positives, near = _matches(benchmark, positive_radius, negative_radius)
+        positives = near = benchmark.ground_truth()
     kept = [query for query, matches in enumerate(positives) if matches.size]
-    if not kept:
-        raise InputError(
-            f"{root}: found no query of {len(benchmark.queries)} with a database image within "
-            f"{positive_radius:g} m, expected some"
-        )
     count = len(benchmark.database)
-    if all(len(near[query]) == count for query in kept):
+    if not any(len(near[query]) < count for query in kept):
         raise InputError(
-            f"{root}: found all {count} database images within {negative_radius:g} m of every "
-            "query, expected some farther, as negatives"
+            f"{root}: found {len(kept)} of {len(benchmark.queries)} queries with a database image "
+            f"within {positive_radius:g} m, and none of them with one farther than "
+            f"{negative_radius:g} m, expected positives and negatives"
         )
     return QuerySet(
         root=benchmark.root,
@@ -109,22 +105,3 @@ def read_query_set(
         positives=tuple(positives[query] for query in kept),
         near=tuple(near[query] for query in kept),
     )
-
-
-_Matches = tuple[Int64[np.ndarray, " _"], ...]
-
-
-def _matches(
-    benchmark: Benchmark, positive_radius: float, negative_radius: float
-) -> tuple[_Matches, _Matches]:
-    """Find the positives, and what is no negative, of all queries."""
-    there, asked = benchmark.database_positions, benchmark.query_positions
-    if there is None or asked is None:
-        if benchmark.positives is None:
-            raise InputError(
-                f"{benchmark.root}: found neither positions nor ground truth, expected one of the "
-                "two, for positives and negatives"
-            )
-        return benchmark.positives, benchmark.positives
-    positives, near = (within(there, asked, each) for each in (positive_radius, negative_radius))
-    return positives, near

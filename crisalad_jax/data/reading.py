@@ -5,12 +5,15 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import Self
 
-from crisalad_jax.config.checks import check_count, check_types
-from crisalad_jax.config.preprocessing import Size
+import numpy as np
+
+from crisalad_jax.config.checks import check_count, check_types, require
+from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.config.short_repr import with_field_docs
 from crisalad_jax.data.images import OnBadImage
-from crisalad_jax.data.loader import THREADS, ImageBatch, ImageCache, image_batches
+from crisalad_jax.data.loader import THREADS, ImageBatch, ImageCache, read_batches
 from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.data.video import frame_time
 
 _SMALL = 16
 """Largest number of images that is padded to a power of two, so that few sizes are compiled."""
@@ -40,7 +43,8 @@ class Reading:
     def __post_init__(self) -> None:
         """Check the fields."""
         check_types(self)
-        check_count("batch size", self.batch_size)
+        check_count("batch_size", self.batch_size)
+        require(self.threads >= 0, f"threads: found {self.threads}, expected at least 0")
 
     def fitted(self, images: int) -> Self:
         """Return a smaller batch size where the batches of so few images would be mostly padding.
@@ -58,7 +62,11 @@ class Reading:
         preparation: Preparation,
         check_size: Callable[[Size], None] | None = None,
     ) -> Iterator[ImageBatch]:
-        """Yield batches of image files as a model takes them; see `image_batches`.
+        """Yield batches of image files, in order; the last one is padded.
+
+        Where a rule gives images sizes of their own, consecutive images of one size make a batch,
+        and every change of size ends and pads one: then a `batch_size` of 1 saves work. Under
+        "skip" an image that cannot be read is not valid but keeps its index.
 
         Args:
             paths: the files.
@@ -66,16 +74,68 @@ class Reading:
             check_size: raises InputError for a height and width that the model cannot describe.
 
         Raises:
-            InputError: what `image_batches` raises.
+            InputError: while iterating under "stop" for an image that cannot be read.
         """
-        return image_batches(
-            paths,
-            image_size=preparation.image_size,
+        threads = self.threads
+        if any(frame_time(path) is not None for path in paths):
+            threads = min(threads, 1)  # more would read a video each, from its beginning
+        cache = self.cache or ImageCache(0)
+        indices = np.arange(len(paths))
+        return read_batches(
+            lambda position: cache.read(paths[position], preparation, check_size),
+            labels=indices,
+            indices=indices,
+            positions=indices,
+            how=preparation,
             batch_size=self.batch_size,
-            preprocessing=preparation.preprocessing,
-            side_multiple=preparation.side_multiple,
-            check_size=check_size,
             on_bad_image=self.on_bad_image,
-            threads=self.threads,
-            cache=self.cache,
+            threads=threads,
         )
+
+
+def image_batches(
+    paths: Sequence[str | os.PathLike[str]],
+    *,
+    image_size: Size,
+    batch_size: int,
+    preprocessing: PreprocessingConfig = PreprocessingConfig(),
+    side_multiple: int = 1,
+    check_size: Callable[[Size], None] | None = None,
+    on_bad_image: OnBadImage = "stop",
+    threads: int = THREADS,
+    cache: ImageCache | None = None,
+) -> Iterator[ImageBatch]:
+    """Yield batches of the images in `paths`, in order; the last one is padded to `batch_size`.
+
+    See `Reading.batches`.
+
+    Args:
+        paths: image files.
+        image_size: height and width in pixels that images are resized to, or what the rule of
+            `preprocessing` takes from them.
+        batch_size: number of images of a batch.
+        preprocessing: how images are resized, and floats normalised.
+        side_multiple: number of pixels that sides are rounded to multiples of.
+        check_size: raises InputError for a height and width that no image may have.
+        on_bad_image: "stop" at an unreadable image, or "skip" it.
+        threads: how many decode ahead; 0 decodes in the caller's thread.
+        cache: holds decoded images.
+
+    Yields:
+        The batches: pixels, indices into `paths`, and which images are valid.
+
+    Raises:
+        InputError: at once for arguments out of range; while iterating under "stop" for an image
+            that cannot be read.
+
+    Example:
+        >>> paths = sorted(pictures.iterdir())
+        >>> batches = list(image_batches(paths, image_size=(98, 98), batch_size=3))
+        >>> [batch.valid.tolist() for batch in batches]
+        [[True, True, True], [True, False, False]]
+    """
+    reading = Reading(
+        batch_size=batch_size, on_bad_image=on_bad_image, threads=threads, cache=cache
+    )
+    how = Preparation(image_size, preprocessing, side_multiple)
+    return reading.batches(paths, how, check_size)

@@ -3,7 +3,7 @@
 import functools
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import cv2
@@ -59,7 +59,14 @@ def resize_image(
     """
     choose("pixels", pixels, {"bytes": None, "floats": None})
     choose("filter", filter, {**_KERNELS, "area": None})
-    _check_pixels(image, (np.uint8,) if pixels == "bytes" else (np.uint8, np.float32))
+    kinds = (np.uint8,) if pixels == "bytes" else (np.uint8, np.float32)
+    shape = np.shape(image)
+    if len(shape) != 3 or shape[2] != 3 or 0 in shape or image.dtype not in kinds:
+        found = f"{image.dtype} of shape {shape}" if shape else type(image).__name__
+        raise InputError(
+            f"image: found {found}, expected uint8 of shape (height, width, 3) with sides of at "
+            "least 1, as of `read_image`"
+        )
     sides = image_size if isinstance(image_size, tuple | list) else ()
     if [isinstance(side, int | np.integer) and side >= 1 for side in sides] != [True, True]:
         raise InputError(
@@ -82,17 +89,6 @@ def resize_image(
         resample(flat.astype(np.float32), *taps, resized, pixels == "bytes")
     resized = resized.reshape(*image_size, 3)
     return resized.astype(np.uint8) if pixels == "bytes" else resized
-
-
-def _check_pixels(image: Any, kinds: Sequence[type]) -> None:
-    """Check that an image is RGB, of one of the types."""
-    expected = "uint8 of shape (height, width, 3) with sides of at least 1"
-    if not isinstance(image, np.ndarray):
-        raise InputError(
-            f"image: found {type(image).__name__}, expected {expected}, as of `read_image`"
-        )
-    if image.dtype not in kinds or image.ndim != 3 or image.shape[2] != 3 or not image.size:
-        raise InputError(f"image: found {image.dtype} of shape {image.shape}, expected {expected}")
 
 
 def _resize_by_area(image: Pixels, image_size: tuple[int, int], pixels: str) -> Pixels:
@@ -296,18 +292,12 @@ def _resample_floats(
 
 def _step(pixels: np.ndarray, line_taps: _Taps, column_taps: _Taps, resized: np.ndarray) -> None:
     """Resample as `_resample` does, to the bit, by numpy."""
-    lines = _sums(pixels, line_taps)
-    near = lines.reshape(len(lines), -1, 3).swapaxes(0, 1)
-    result = _sums(near, column_taps, 0.5).swapaxes(0, 1)
-    resized[:] = result.astype(np.uint8).reshape(resized.shape)
+    near = _sums(pixels, line_taps).reshape(len(resized), -1, 3).swapaxes(0, 1)
+    resized[:] = _sums(near, column_taps, 0.5).swapaxes(0, 1).reshape(resized.shape)
 
 
 def _step_floats(
-    pixels: np.ndarray,
-    line_taps: _Taps,
-    column_taps: _Taps,
-    resized: np.ndarray,
-    rounds: bool,
+    pixels: np.ndarray, line_taps: _Taps, column_taps: _Taps, resized: np.ndarray, rounds: bool
 ) -> None:
     """Resample as `_resample_floats` does, to the bit, by numpy."""
 

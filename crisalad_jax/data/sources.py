@@ -8,13 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.images import (
-    OnBadImage,
-    is_image,
-    list_images,
-    names_in,
-    only_images,
-)
+from crisalad_jax.data.images import OnBadImage, list_images, names_in, only_images
 from crisalad_jax.data.positions import Positions, read_image_table
 from crisalad_jax.data.tables import Disk
 from crisalad_jax.data.video import (
@@ -36,7 +30,6 @@ _FORMS = (
 )
 _PATTERN = re.compile(r"[*?\[]")
 _AN_IMAGE = "an image file"
-_ARRAYS = (".npy", ".npz")
 
 
 @brief
@@ -78,64 +71,53 @@ def open_source(
         InputError: no such source, no image in it, a path twice, or a file that is missing or that
             no line of text can name.
     """
-    frames = _Frames(1.0 if fps is None else fps, on_bad_image)
-    source = _opened(images, frames)
-    if fps is None and frames.taken < frames.there:
-        warn(f"{images}: {frames.taken} of {frames.there} frames, 1 per second: --fps")
-    return source
-
-
-class _Frames:
-    """Put a video's frames in its place, and count them."""
-
-    def __init__(self, fps: float, on_bad_image: OnBadImage) -> None:
-        check_rate(fps)
-        self.fps, self.taken, self.there = fps, 0, 0
-        self._skips = on_bad_image == "skip"
-
-    def of(self, paths: Sequence[pathlib.Path]) -> list[pathlib.Path]:
-        """List images, of a video its frames; single frames are named by their own times.
-
-        What is missing stays as it is under "skip", to be skipped by who reads it.
-        """
-        return [each for path in paths for each in self._of_one(path)]
-
-    def _of_one(self, path: pathlib.Path) -> list[pathlib.Path]:
-        if self._skips and not file_of(path).is_file():
-            return [path]
-        check_source(file_of(path), _AN_IMAGE)
-        if not is_video(path):
-            return [name_frame(path)]
-        chosen = list_frames(path, self.fps)
-        self.taken += len(chosen)
-        self.there += count_frames(path)
-        return chosen
-
-
-def _opened(images: str | os.PathLike[str], frames: _Frames) -> ImageSource:
     if not os.fspath(images):
         raise InputError(f"images: found an empty name, expected {_FORMS}")
+    check_rate(1.0 if fps is None else fps)
     path = pathlib.Path(images)
     if path.is_dir():
         return _source(path, list_images(path), path)
-    if not path.exists() and frame_time(path) is None:
-        if _PATTERN.search(str(path)):
-            root, found = _matching(path)
-            return _source(root, frames.of(found), path)
-        if not is_image(path):
-            raise InputError(f"{path}: found nothing, expected {_FORMS}")
     suffix = path.suffix.lower()
     if suffix == ".txt":
-        lines = enumerate(read_text(path, "a list of images, a path a line").splitlines(), 1)
-        return _listed(path, [(number, line.strip()) for number, line in lines], None, frames)
+        text = read_text(path, "a list of images, a path a line")
+        names = [line.strip() for line in text.splitlines() if line.strip()]
+        return _listed(path, names, None, fps, on_bad_image)
     if suffix == ".csv":
-        table = read_image_table(path)
-        return _listed(path, table.rows, table.positions, frames)
-    if suffix in _ARRAYS:
-        raise InputError(
-            f"{path}: found arrays of NumPy, expected {_FORMS}; `describe_images` takes arrays"
-        )
-    return _source(path.parent, frames.of([path]), path)
+        return _listed(path, *read_image_table(path), fps, on_bad_image)
+    root, found = path.parent, [path]
+    if _PATTERN.search(str(path)) and not path.exists() and frame_time(path) is None:
+        root, found = _matching(path)
+    skips: OnBadImage = on_bad_image if suffix else "stop"  # a folder is no image to be skipped
+    return _source(root, _frames(found, path, _FORMS, fps, skips), path)
+
+
+def _frames(
+    found: Sequence[pathlib.Path],
+    given: pathlib.Path,
+    expected: str,
+    fps: float | None,
+    on_bad_image: OnBadImage,
+) -> list[pathlib.Path]:
+    """Put a video's frames in its place, and name single frames by their own times.
+
+    What is missing stays as it is under "skip", to be skipped by who reads it.
+    """
+    paths: list[pathlib.Path] = []
+    taken = there = 0
+    for path in found:
+        if on_bad_image == "skip" and not file_of(path).is_file():
+            paths.append(path)
+            continue
+        check_source(file_of(path), expected)
+        if is_video(path):
+            frames = list_frames(path, 1.0 if fps is None else fps)
+            taken, there = taken + len(frames), there + count_frames(path)
+            paths += frames
+        else:
+            paths.append(name_frame(path))
+    if fps is None and taken < there:
+        warn(f"{given}: {taken} of {there} frames, 1 per second: --fps")
+    return paths
 
 
 def check_rate_used(fps: float | None, paths: Iterable[pathlib.Path]) -> None:
@@ -182,48 +164,33 @@ def _matching(pattern: pathlib.Path) -> tuple[pathlib.Path, list[pathlib.Path]]:
 
 def _listed(
     source: pathlib.Path,
-    rows: Sequence[tuple[int, str]],
+    names: Sequence[str],
     positions: Positions | None,
-    frames: _Frames,
+    fps: float | None,
+    on_bad_image: OnBadImage,
 ) -> ImageSource:
     """List the images that a text or table names, with the positions by the source's own names."""
     folder, disk = source.parent, Disk()
-    paths: list[pathlib.Path] = []
-    lines: dict[pathlib.Path, int] = {}
-    for number, line in rows:
-        if not line:
-            continue
+    found: list[pathlib.Path] = []
+    for name in names:
         # Written out, so that a name has no .. in it, and a path that is there twice is found.
-        text = os.path.normpath(line)
+        text = os.path.normpath(name)
         file = os.fspath(file_of(text))
         path = disk.find(folder, file) or folder / file
-        path = pathlib.Path(os.path.normpath(f"{path}{text[len(file) :]}"))
-        where = f"{source}: line {number}"
-        try:
-            listed = frames.of([path])
-            if not is_video(path):
-                (path,) = listed  # a frame of a video by its own name
-            if path in lines:
-                raise InputError(
-                    f"found {line!r}, which is on line {lines[path]} too, expected it once"
-                )
-            lines[path] = number
-            if positions is not None and is_video(path):
-                raise InputError(
-                    f"{path}: found a video, expected {_AN_IMAGE}, or a frame such as "
-                    f"{path.name}#t=12.500"
-                )
-            paths += listed
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from error
-    if not paths:
-        raise InputError(f"{source}: found no image, expected a path a line")
+        found.append(pathlib.Path(os.path.normpath(f"{path}{text[len(file) :]}")))
+    if not found or (positions is not None and any(map(is_video, found))):
+        videos = f"the video {next(filter(is_video, found))}" if found else "no image"
+        raise InputError(f"{source}: found {videos}, expected images, or frames as walk.mp4#t=12.5")
+    try:
+        paths = _frames(found, source, _AN_IMAGE, fps, on_bad_image)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
     root = pathlib.Path(os.path.normpath(folder))
     if not all(_is_below(root, path) for path in paths):
         paths = [pathlib.Path(os.path.abspath(path)) for path in paths]
         root = pathlib.Path(paths[0].anchor)
     if positions is not None:
-        names = dict(zip((line for _, line in rows), names_in(root, paths), strict=True))
-        of = {names[name]: position for name, position in positions.of.items()}
+        own = dict(zip(names, names_in(root, paths), strict=True))
+        of = {own[name]: position for name, position in positions.of.items()}
         positions = positions._replace(of=of) if of else None
     return _source(root, paths, source, positions)

@@ -30,6 +30,16 @@ class Row(NamedTuple):
         """What a message about the row begins with: the file and the line."""
         return f"{self.path}: line {self.line}"
 
+    def text(self, column: str) -> str:
+        """Return a field that may not be empty.
+
+        Raises:
+            InputError: it is.
+        """
+        if not self.fields[column]:
+            raise InputError(f"{self.where}: found no {column}, expected one")
+        return self.fields[column]
+
     def number(self, column: str, most: float = math.inf) -> float:
         """Return a finite number of at most this size; next to a point, commas mean thousands.
 
@@ -72,9 +82,7 @@ class Table(NamedTuple):
         """
         lines: dict[str, int] = {}
         for row in self.rows():
-            name = spelled(row.fields["name"])
-            if not name:
-                raise InputError(f"{row.where}: found no name, expected an image's")
+            name = spelled(row.text("name"))
             if (before := lines.setdefault(normal_name(name), row.line)) != row.line:
                 raise InputError(
                     f"{row.where}: found {name!r} twice, on line {before} too, expected it once"

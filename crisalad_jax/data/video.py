@@ -14,7 +14,7 @@ import os
 import pathlib
 import re
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -114,8 +114,13 @@ def list_frames(video: str | os.PathLike[str], fps: float = 1.0) -> list[pathlib
         InputError: no file, no video, or a rate out of range.
     """
     check_rate(fps)
-    chosen = _sampled(_frame_times(video), fps)
-    return [pathlib.Path(frame_name(video, time)) for time in chosen]
+    chosen: list[pathlib.Path] = []
+    due = 0.0
+    for time in _frame_times(video):
+        if time + 1 > due:  # times are rounded to a millisecond
+            chosen.append(pathlib.Path(frame_name(video, time)))
+            due = (int((time + 1) * fps / 1000) + 1) * 1000 / fps
+    return chosen
 
 
 def count_frames(video: str | os.PathLike[str]) -> int:
@@ -148,22 +153,16 @@ def name_frame(path: pathlib.Path) -> pathlib.Path:
     return pathlib.Path(frame_name(video, times[at] if at < len(times) else wanted))
 
 
-def _sampled(times: Iterable[int], fps: float) -> list[int]:
-    """Choose the first time at or after each multiple of 1 / fps seconds."""
-    chosen: list[int] = []
-    due = 0.0
-    for time in times:
-        if time + 1 > due:  # times are rounded to a millisecond
-            chosen.append(time)
-            due = (int((time + 1) * fps / 1000) + 1) * 1000 / fps
-    return chosen
+def _identity(video: str | os.PathLike[str]) -> tuple[str, int, int]:
+    """Return the name, size and time of change of a video that is there."""
+    check_source(video, _VIDEO)
+    there = os.stat(video)
+    return os.path.abspath(video), there.st_size, there.st_mtime_ns
 
 
 def _frame_times(video: str | os.PathLike[str]) -> Sequence[int]:
     """Read the times of all frames in milliseconds, in order, each once."""
-    check_source(video, _VIDEO)
-    there = os.stat(video)
-    return _times_as_of(os.fspath(video), there.st_size, there.st_mtime_ns)
+    return _times_as_of(*_identity(video))
 
 
 @functools.lru_cache(maxsize=_OPEN)  # a list may name thousands of frames of a video
@@ -191,7 +190,6 @@ def _grabbed_times(video: str | os.PathLike[str], *, decoded: bool) -> list[int]
 
 
 def _opened(video: str | os.PathLike[str]) -> cv2.VideoCapture:
-    check_source(video, _VIDEO)
     with QUIET:
         capture = cv2.VideoCapture(os.fspath(video), cv2.CAP_FFMPEG)
     if not capture.isOpened():
@@ -256,9 +254,7 @@ def read_frame(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
     time = frame_time(path)
     assert time is not None
     video = file_of(path)
-    check_source(video, _VIDEO)
-    there = video.stat()
-    key = (os.path.abspath(video), there.st_size, there.st_mtime_ns)
+    key = _identity(video)
     with _lock:
         reader = _readers.get(key)
         if reader is None:

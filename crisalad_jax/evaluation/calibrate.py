@@ -18,6 +18,9 @@ from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import lock
 
+_MEASURED = ("min_similarity", "answered", "right", "queries", "unknown", "unknown_answered")
+"""Fields that an operating point and a calibration share."""
+
 
 @takes(places=Map, benchmark=Benchmark)
 def calibrate(
@@ -87,22 +90,15 @@ def calibrate(
         raise InputError(f"precision: {caveats(point)[0]}, on {benchmark.name}")
     check_supported(point, benchmark.name)
     calibration = Calibration(
-        min_similarity=point.min_similarity,
         precision=precision,
-        answered=point.answered,
-        right=point.right,
-        queries=point.queries,
-        unknown=point.unknown,
-        unknown_answered=point.unknown_answered,
+        **{name: getattr(point, name) for name in _MEASURED},
         database=len(benchmark.database),
         benchmark=benchmark.name,
         rule=benchmark.rule,
         model=places.metadata.model,
         created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     )
-    with lock(
-        places.folder, wait=True
-    ):  # an addition removes temporary files beside the description
+    with lock(places.folder, wait=True):  # an addition removes temporary files there
         write_calibration(places.folder, calibration)
     places.calibration = calibration
     return calibration
@@ -110,12 +106,5 @@ def calibrate(
 
 def operating_point_of(calibration: Calibration) -> OperatingPoint:
     """Return the operating point that a map remembers."""
-    return OperatingPoint(
-        asked=calibration.precision,
-        min_similarity=calibration.min_similarity,
-        answered=calibration.answered,
-        right=calibration.right,
-        queries=calibration.queries,
-        unknown=calibration.unknown,
-        unknown_answered=calibration.unknown_answered,
-    )
+    measured = {name: getattr(calibration, name) for name in _MEASURED}
+    return OperatingPoint(asked=calibration.precision, **measured)

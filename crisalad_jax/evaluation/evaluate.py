@@ -99,11 +99,7 @@ def evaluate(
         >>> result.recalls[1]
         1.0
     """
-    parsed = parse_groupings(groupings)
-    check_seed("seed", seed)
-    check_count("seeds", seeds)
-    if precision is not None:
-        check_precision(precision)
+    parsed = check_evaluation(groupings, seed=seed, seeds=seeds, precision=precision)
     describer = describer_of(model, groupings)
     config = describer.config
     if pca is not None:
@@ -178,6 +174,21 @@ def evaluate(
                     )
                 )
     return results
+
+
+def check_evaluation(
+    groupings: Sequence[str], *, seed: int, seeds: int, precision: float | None
+) -> list[Grouping]:
+    """Check arguments of `evaluate` before any work, and return the groupings parsed.
+
+    Raises:
+        InputError: what `parse_groupings` raises, or a number out of range.
+    """
+    check_seed("seed", seed)
+    check_count("seeds", seeds)
+    if precision is not None:
+        check_precision(precision)
+    return parse_groupings(groupings)
 
 
 def _first(neighbours: Neighbours, count: int) -> Neighbours:

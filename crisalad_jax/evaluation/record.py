@@ -49,19 +49,21 @@ def evaluation_settings(
     Returns:
         The values by name.
     """
-    files = {"weights": weights, "pca": pca, "rerank_weights": rerank_weights}
-    words = {name: None if file is None else starter.named(file) for name, file in files.items()}
+
+    def words(file: StrPath | None) -> str | None:
+        return None if file is None else starter.named(file)
+
     return {
-        "weights": words["weights"],
+        "weights": words(weights),
         "benchmark": benchmark.name,
         "rule": benchmark.rule,
         "same_place": same_place_rule(benchmark),
         "batch_size": batch_size,
         "seed": seed,
         "seeds": seeds,
-        "pca": words["pca"],
+        "pca": words(pca),
         "rerank": rerank,
-        "rerank_weights": words["rerank_weights"],
+        "rerank_weights": words(rerank_weights),
         "model": to_plain(config),
     }
 
@@ -71,7 +73,7 @@ def results_json(
     settings: dict[str, Any],
     *,
     model_name: str,
-    benchmark: Benchmark | None = None,
+    benchmark: Benchmark,
 ) -> dict[str, Any]:
     """Put what an evaluation found into JSON values, with its settings.
 
@@ -85,13 +87,13 @@ def results_json(
         The values by name.
     """
     names = {"benchmark": settings["benchmark"], "model": model_name}
-    values = settings | {"results": [names | to_json(result) for result in results]}
-    if benchmark is None:
-        return values
-    sides = {"queries": benchmark.queries, "database": benchmark.database}
     skipped = results[0].skipped._asdict()
-    return values | {
-        "skipped": {side: [str(paths[i]) for i in skipped[side]] for side, paths in sides.items()}
+    return settings | {
+        "results": [names | to_json(result) for result in results],
+        "skipped": {
+            side: [str(getattr(benchmark, side)[number]) for number in numbers]
+            for side, numbers in skipped.items()
+        },
     }
 
 

@@ -117,17 +117,19 @@ def _run(config: DemoConfig, out: pathlib.Path, quiet: bool) -> DemoSummary:
         for model, of_model in results.items()
         for result in of_model
     ]
-    pictures = [out / name for name in ("recall.png", "training.png", "gallery.png")]
-    recall_curves(
-        pictures[0],
-        {f"{row.model}, {row.grouping}": row.recalls for row in rows if row.grouping != "shuffled"},
+    curves = {f"{r.model}, {r.grouping}": r.recalls for r in rows if r.grouping != "shuffled"}
+    titles = (
         "Recall@K on places never seen in training",
-        wide=True,
+        "Queries and what the trained model finds, every image described independently",
     )
-    training_curves(pictures[1], read_metrics(out / "run" / "metrics.jsonl"))
-    title = "Queries and what the trained model finds, every image described independently"
-    gallery = show_retrievals(results["trained"][0], benchmark, rows=6, title=title)
-    save(gallery, pictures[2])
+    figures = {
+        "recall.png": recall_curves(curves, titles[0], wide=True),
+        "training.png": training_curves(read_metrics(out / "run" / "metrics.jsonl")),
+        "gallery.png": show_retrievals(results["trained"][0], benchmark, rows=6, title=titles[1]),
+    }
+    for name, figure in figures.items():
+        save(figure, out / name)
+    pictures = [out / name for name in figures]
     write_text(out / "recalls.md", recall_table(rows).markdown())
     summary = DemoSummary(rows, pictures, time.monotonic() - started, training_seconds)
     write_json(

@@ -8,10 +8,9 @@ from typing import Any
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.images import OnBadImage
-from crisalad_jax.data.named_places import TABLE
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.data.query_set import QuerySet, read_query_set
-from crisalad_jax.experiments.report import training_curves
+from crisalad_jax.experiments.report import save, training_curves
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import FitResult, check_learns, fit
@@ -113,13 +112,12 @@ def train(
             "Note: no --weights or --backbone, so the frozen part of the model "
             f"({config.trainable} trains) is random. --trainable all trains everything."
         )
-    groups = f"{len(places.files)} images"
     if isinstance(places, QuerySet):
-        groups = f"{len(places.queries)} queries with positives, {groups}"
+        groups = f"{len(places.queries)} queries with positives"
     else:
-        groups = f"{len(places.place_id)} places, {groups}"
+        groups = f"{len(places.place_id)} places"
     on = "" if benchmark is None else f"; validation on {benchmark.name}"
-    say(f"{data}: {groups}{on}")
+    say(f"{data}: {groups}, {len(places.files)} images{on}")
     if weights is None:
         distributed.run_on_primary(lambda: check_run(out, config))
         initial = with_vocabulary_of(
@@ -137,7 +135,7 @@ def train(
         quiet=quiet,
     )
     if distributed.is_primary():
-        training_curves(out / "curves.png", read_metrics(out / "metrics.jsonl"))
+        save(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
     return result
 
 
@@ -149,29 +147,20 @@ def _read_set(
     on_bad_image: OnBadImage,
 ) -> Places | QuerySet:
     """Read the training set: places, or queries of which tuples are mined."""
+    unused = grouping if config.mines else {"data_images": images}
+    given = [f"--{name.replace('_', '-')}" for name, value in unused.items() if value is not None]
+    if given:
+        what = "mines tuples of queries" if config.mines else "trains on places"
+        raise InputError(
+            f"{', '.join(given)}: found for a recipe that {what}, expected no such flag"
+        )
     if not config.mines:
-        if images is not None:
-            raise InputError("--data-images: found for places, expected it for queries alone")
         return read_places(
             data,
             cities=config.cities,
             min_images=config.min_images_of_place,
             on_bad_image=on_bad_image,
             **grouping,
-        )
-    given = [f"--{name.replace('_', '-')}" for name in grouping if grouping[name] is not None]
-    if given:
-        raise InputError(
-            f"{', '.join(given)}: found for a recipe that mines tuples, expected it for one that "
-            "trains on places"
-        )
-    folder = pathlib.Path(data)
-    if images is not None and folder.is_dir():
-        raise InputError(f"--data-images: found with the folder {data}, expected it for a file")
-    if (folder / "Dataframes").is_dir() or (folder / TABLE).is_file():
-        raise InputError(
-            f"{data}: found places, expected queries and a database, "
-            "such as pitts30k_train.mat or MSLS: this recipe mines tuples"
         )
     return read_query_set(
         data,

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import check_types, require, require_positive
+from crisalad_jax.config.checks import check_types, require_field, require_positive
 from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.convolutions import ConvNorm, conv_norm
@@ -70,11 +70,8 @@ class AdapterConfig:
         if self.kind != "none":
             require_positive(self, "bottleneck")
         if self.kind == "depthwise":
-            require_positive(self, "kernel_size")
-            require(
-                self.kernel_size % 2 == 1,
-                f"AdapterConfig.kernel_size: found {self.kernel_size}, expected an odd number",
-            )
+            odd = self.kernel_size > 0 and self.kernel_size % 2 == 1
+            require_field(self, "kernel_size", odd, "an odd number above 0")
 
     def width(self, dim: int) -> int:
         """Return the width of the bottleneck of an adapter in a backbone of width `dim`.
@@ -85,11 +82,9 @@ class AdapterConfig:
         width = int(dim * self.bottleneck)
         # The branches of a multi-resolution adapter take 1/2, 1/4 and 1/16 of the width.
         factor = 16 if self.kind == "multi-resolution" else 1
-        require(
-            self.kind == "none" or (width >= 1 and width % factor == 0),
-            f"AdapterConfig.bottleneck: found {self.bottleneck}, which is a width of {width} for "
-            f"dim {dim}; expected a multiple of {factor}, and at least 1",
-        )
+        fits = self.kind == "none" or (width >= 1 and width % factor == 0)
+        words = f"a width for dim {dim}, {width}, that is at least 1 and a multiple of {factor}"
+        require_field(self, "bottleneck", fits, words)
         return width
 
 

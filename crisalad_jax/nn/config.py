@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-from crisalad_jax.config.checks import require
+from crisalad_jax.config.checks import require, require_field
 from crisalad_jax.config.part import OrName, non_semantic_field
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.config.registry import part_field, resolve_names
@@ -64,57 +64,34 @@ class ModelConfig:
         resolve_names(self)
         request = self.aggregator.features(self.backbone.depth)
         backbone, aggregator = self.backbone, f"aggregator {self.aggregator.part_name}"
-        for is_asked, has, what in (
-            (request.class_token, backbone.class_token, "a class token"),
-            (
-                request.insertion is not None,
-                backbone.supports_prompt_tokens,
-                "blocks through which tokens can run, such as vit",
-            ),
-            (
-                request.class_attention,
-                backbone.exposes_cls_attention,
-                "a class token that attends to patches, such as vit",
-            ),
+        attends, inserts = backbone.exposes_cls_attention, backbone.supports_prompt_tokens
+        for has, is_asked, what in (
+            (backbone.class_token, request.class_token, "a class token"),
+            (attends, request.class_attention, "a class token that attends to patches, as vit's"),
+            (inserts, request.insertion is not None, "blocks that take tokens, such as vit"),
         ):
             require(
                 has or not is_asked,
                 f"backbone: found {backbone.part_name} for {aggregator}, expected one with {what}",
             )
-        rule = self.preprocessing.size_rule
-        require(
-            rule == "fixed" or not self.aggregator.fixed_grid,
-            f"PreprocessingConfig.size_rule: found {rule}, expected fixed: {aggregator} has "
-            "parameters for every patch, and was made for images of one size alone",
-        )
+        fits = self.preprocessing.size_rule == "fixed" or not self.aggregator.fixed_grid
+        words = f"fixed: {aggregator} has parameters for every patch, of images of one size alone"
+        require_field(self.preprocessing, "size_rule", fits, words)
         self.check_image_size(self.input_size)
         shape = self.token_shape
         if self.cross_image.layers:
             self._check_cross_image(shape, aggregator)
 
     def _check_cross_image(self, shape: TokenShape, aggregator: str) -> None:
-        options = self.cross_image
-        require(
-            self.aggregator.trainable,
-            f"CrossImageConfig.layers: found {options.layers} for {aggregator}, with which nothing "
-            "trains, expected 0",
-        )
-        require(
-            shape.token_dim % options.heads == 0,
-            f"CrossImageConfig.heads: found {options.heads}, expected a divisor of the "
-            f"{shape.token_dim} numbers of a token of {aggregator}",
-        )
-        require(
-            not options.global_token or shape.global_dim % shape.token_dim == 0,
-            f"CrossImageConfig.global_token: found True for {aggregator}, whose global token has "
-            f"{shape.global_dim} numbers, expected a multiple of a local one's {shape.token_dim}, "
-            "or False",
-        )
-        require(
-            options.global_token or shape.tokens > 0,
-            f"CrossImageConfig.global_token: found False for {aggregator}, which has no other "
-            "token, expected True, or CrossImageConfig.layers 0",
-        )
+        options, whole, dim = self.cross_image, self.cross_image.global_token, shape.token_dim
+        rest = shape.global_dim % dim
+        for name, fits, expected in (
+            ("layers", self.aggregator.trainable, f"0 for {aggregator}, with which nothing trains"),
+            ("heads", dim % options.heads == 0, f"a divisor of the {dim} numbers of a token"),
+            ("global_token", not whole or not rest, f"False: its width is no multiple of {dim}"),
+            ("global_token", whole or shape.tokens > 0, "True, or layers 0: it is the only token"),
+        ):
+            require_field(options, name, fits, expected)
 
     @property
     def token_shape(self) -> TokenShape:

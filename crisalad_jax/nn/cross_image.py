@@ -4,13 +4,19 @@ Layers are torch's `nn.TransformerEncoderLayer` as CricaVPR uses it: post-norm, 
 """
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import check_types, require, require_fraction, require_positive
+from crisalad_jax.config.checks import (
+    check_types,
+    require_fraction,
+    require_positive,
+    require_range,
+)
 from crisalad_jax.config.part import non_semantic_field
 from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.nn.attention import Attention, dot_product_attention
@@ -41,9 +47,7 @@ class CrossImageConfig:
     def __post_init__(self) -> None:
         """Check the ranges of the fields in use."""
         check_types(self)
-        require(
-            self.layers >= 0, f"CrossImageConfig.layers: found {self.layers}, expected at least 0"
-        )
+        require_range(self, 0, math.inf, "layers")
         if self.layers:
             require_positive(self, "heads", "feedforward")
             require_fraction(self, "dropout")

@@ -16,7 +16,7 @@ import numpy as np
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, UInt8
 
-from crisalad_jax.config.checks import takes
+from crisalad_jax.config.checks import require, takes
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import check_tokens, to_descriptor
@@ -39,7 +39,7 @@ from crisalad_jax.nn.projection import project
 from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import IMAGE, image_mesh, over_images
-from crisalad_jax.utils.errors import InputError, few
+from crisalad_jax.utils.errors import few
 from crisalad_jax.utils.pytree import check_drawn, named_leaves, pytree_dataclass
 
 _ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
@@ -152,16 +152,15 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
                 backbone = jax.eval_shape(config.backbone.join_blocks, params.backbone)
                 joined = dataclasses.replace(params, backbone=backbone)
                 problems = diff_trees(joined, template, dtypes)
-    if problems:
-        raise InputError(f"params: not of this configuration: {few(problems)}")
+    require(not problems, f"params: not of this configuration: {few(problems)}")
 
 
 def _check_64_bit_mode(config: ModelConfig) -> None:
-    if config.compute_dtype == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore
-        raise InputError(
-            "ModelConfig.compute_dtype: found float64 in JAX's 32-bit mode, expected "
-            "JAX_ENABLE_X64=1 in the environment, or jax.config.update('jax_enable_x64', True)"
-        )
+    require(
+        config.compute_dtype != "float64" or jax.config.jax_enable_x64,  # pyright: ignore
+        "ModelConfig.compute_dtype: found float64 in JAX's 32-bit mode, expected JAX_ENABLE_X64=1 "
+        "in the environment, or jax.config.update('jax_enable_x64', True)",
+    )
 
 
 @takes(config=ModelConfig)
@@ -341,10 +340,10 @@ def tokens_and_statistics(
     """
     count = images.shape[0]  # which may be symbolic, where `len` is not
     keys = None if key is None else jax.random.split(key, count)
-    if micro_batch is not None and count % micro_batch:
-        raise InputError(
-            f"micro_batch: found {micro_batch}, expected a divisor of the batch's {count} images"
-        )
+    require(
+        micro_batch is None or count % micro_batch == 0,
+        f"micro_batch: found {micro_batch}, expected a divisor of the batch's {count} images",
+    )
     mesh = image_mesh()
     if mesh is None or valid is not None:
         return _tokens_in_parts(params, images, valid, config, keys, micro_batch)
@@ -446,18 +445,18 @@ def _extract_features(
 ) -> tuple[Features, Crisalad]:
     """Extract features; return parameters with updated statistics, as `Backbone.apply` does."""
     check_params(params, config)
-    if images.ndim != 4 or images.shape[-1] != 3:
-        raise InputError(f"images: found shape {images.shape}, expected (image, height, width, 3)")
-    if images.shape[0] == 0:
-        raise InputError("images: found none, expected at least one")
-    images = jnp.asarray(images)
+    images, are_bytes = jnp.asarray(images), images.dtype == jnp.uint8
+    require(
+        images.ndim == 4
+        and images.shape[-1] == 3
+        and images.shape[0] != 0
+        and (are_bytes or jnp.issubdtype(images.dtype, jnp.floating)),
+        f"images: found {images.dtype} of shape {images.shape}, expected uint8 pixels, or floats "
+        "that are normalised, of shape (image, height, width, 3), and at least one image",
+    )
     config.check_image_size((images.shape[1], images.shape[2]))
-    if images.dtype == jnp.uint8:
+    if are_bytes:
         images = jax.vmap(functools.partial(normalise, how=config.preprocessing))(images)
-    elif not jnp.issubdtype(images.dtype, jnp.floating):
-        raise InputError(
-            f"images: found {images.dtype}, expected uint8 pixels, or floats that are normalised"
-        )
     params = _widened(params, config)
     request = config.aggregator.features(config.backbone.depth)
     if not with_insertion:
@@ -540,18 +539,18 @@ def attend_across_images(
     shape = config.token_shape
     found = tokens.global_token.shape, tokens.local.shape
     expected = (count, shape.global_dim), (count, shape.tokens, shape.token_dim)
-    if found != expected:
-        raise InputError(
-            f"tokens: found a global token of shape {found[0]} and local tokens of {found[1]}, "
-            f"expected {expected[0]} and {expected[1]}"
-        )
+    require(
+        found == expected,
+        f"tokens: found a global token of shape {found[0]} and local tokens of {found[1]}, "
+        f"expected {expected[0]} and {expected[1]}",
+    )
     if params.cross_image is not None:
         if mask is not None:
-            if mask.shape != (count, count):
-                raise InputError(
-                    f"mask: found shape {mask.shape}, expected {(count, count)}, a row and a "
-                    "column for each image"
-                )
+            require(
+                mask.shape == (count, count),
+                f"mask: found shape {mask.shape}, expected {(count, count)}, a row and a column "
+                "for each image",
+            )
             mask = jnp.asarray(mask) | (self_mask(count) & ~mask.any(axis=1, keepdims=True))
         options = config.cross_image
         enter = functools.partial(as_sequence, global_token=options.global_token)
@@ -583,13 +582,12 @@ def transport_masses(
         InputError: the model's aggregator has no transport, or as `describe`.
     """
     features = extract_features(params, images, config)
-    plan = config.aggregator.plan(params.aggregator, features)
-    if plan is None:
-        raise InputError(
-            f"aggregator: found {config.aggregator.part_name}, expected one that transports, such "
-            "as salad"
-        )
-    return plan
+    require(
+        config.aggregator.transports,
+        f"aggregator: found {config.aggregator.part_name}, expected one that transports, such as "
+        "salad",
+    )
+    return config.aggregator.plan(params.aggregator, features)
 
 
 def self_mask(count: Any) -> Bool[Array, "image image"]:

@@ -1,10 +1,11 @@
 """Project whole descriptors by a linear layer, such as MegaLoc's last one or a stored whitening."""
 
 import dataclasses
+import math
 
 from jaxtyping import Array, Float
 
-from crisalad_jax.config.checks import check_types, require
+from crisalad_jax.config.checks import check_types, require_range
 from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.nn.layers import Linear, l2_normalise, linear
 
@@ -27,7 +28,7 @@ class ProjectionConfig:
     def __post_init__(self) -> None:
         """Check the ranges."""
         check_types(self)
-        require(self.dim >= 0, f"ProjectionConfig.dim: found {self.dim}, expected at least 0")
+        require_range(self, 0, math.inf, "dim")
 
 
 def project(

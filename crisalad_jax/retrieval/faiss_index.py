@@ -6,6 +6,7 @@ part of them. What either misses is measured against the exact search: `recall_a
 Descriptors of thousands of numbers are reduced first (`pca`).
 """
 
+import hashlib
 import math
 import os
 import pathlib
@@ -18,7 +19,7 @@ import numpy as np
 from crisalad_jax.config.checks import check_count, choose
 from crisalad_jax.retrieval.chunks import WIDE, as_rows, as_unit_rows, sample
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.utils.checksums import append_checksum, check_appended
+from crisalad_jax.utils.checksums import ChangedFileError, sha256_of, tell_unchecked
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source
 from crisalad_jax.utils.progress import progress_bar
@@ -185,7 +186,7 @@ def save_index(path: str | os.PathLike[str], index: Index) -> None:
             faiss.write_index(index.faiss_index, str(temporary))
         except RuntimeError as error:
             raise InputError(f"{path}: cannot be written: {_first_line(error)}") from error
-        append_checksum(temporary)
+        _append_checksum(temporary)
 
 
 def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
@@ -201,7 +202,7 @@ def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
     path = pathlib.Path(path)
     check_source(path, "a faiss index")
     if verify:
-        check_appended(path)
+        _check_appended(path)
     try:
         index = faiss.read_index(str(path))
     except (RuntimeError, MemoryError) as error:
@@ -236,3 +237,36 @@ def recall_against_exact(found: Int[np.ndarray, "q k"], exact: Int[np.ndarray, "
         )
     pairs = zip(found, exact, strict=True)
     return sum(np.intersect1d(a, b).size for a, b in pairs) / exact.size
+
+
+_APPENDED = b"\nsha256 "
+_APPENDED_SIZE = len(_APPENDED) + 64 + 1
+
+
+def _append_checksum(path: pathlib.Path) -> None:
+    """Append a line with the digest of the bytes before it, where readers of the format stop."""
+    line = _APPENDED + sha256_of(path).encode() + b"\n"
+    with path.open("ab") as file:
+        file.write(line)
+
+
+def _check_appended(path: pathlib.Path) -> None:
+    """Check the line that `_append_checksum` wrote; a note tells of a file without one.
+
+    Raises:
+        InputError: the file has other bytes than the line says.
+    """
+    with path.open("rb") as file:
+        size = max(0, os.fstat(file.fileno()).st_size - _APPENDED_SIZE)
+        file.seek(size)
+        line = file.read()
+        if not line.startswith(_APPENDED):
+            tell_unchecked(path)
+            return
+        file.seek(0)
+        digester = hashlib.sha256()
+        while size and (data := file.read(min(size, 2**20))):
+            digester.update(data)
+            size -= len(data)
+    if line != _APPENDED + digester.hexdigest().encode() + b"\n":
+        raise ChangedFileError(path)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from crisalad_jax.config.checks import check_seed, check_types
+from crisalad_jax.config.checks import check_seed, check_types, require_range
 from crisalad_jax.synthetic.layouts import (
     METRES_PER_DEGREE,
     MONTHS,
@@ -32,7 +32,6 @@ from crisalad_jax.synthetic.view import (
     Season,
     Time,
     View,
-    check_range,
     check_size,
 )
 
@@ -59,8 +58,8 @@ class SyntheticCityConfig:
     def __post_init__(self) -> None:
         """Check the types and ranges."""
         check_types(self)
-        check_range("SyntheticCityConfig.train_places", self.train_places, len(_CITY_NAMES))
-        check_range("SyntheticCityConfig.test_places", self.test_places, 1)
+        require_range(self, len(_CITY_NAMES), math.inf, "train_places")
+        require_range(self, 1, math.inf, "test_places")
         check_seed("SyntheticCityConfig.seed", self.seed)
         check_size("SyntheticCityConfig.image_size", self.image_size)
 

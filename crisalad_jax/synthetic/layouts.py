@@ -3,7 +3,6 @@
 A set is written from a stream of files, each its path within the set's folder and its bytes.
 """
 
-import contextlib
 import dataclasses
 import json
 import os
@@ -18,8 +17,7 @@ from jaxtyping import UInt8
 from crisalad_jax.synthetic.mesh import Rng
 from crisalad_jax.synthetic.view import Season
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json, wrap_os_errors, write_json
-from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
+from crisalad_jax.utils.files import atomic_folder, check_new_folder, read_json, write_json
 
 Files = Iterator[tuple[str, bytes]]
 Progress = Callable[[int], object] | None
@@ -44,21 +42,18 @@ def holds(root: str | os.PathLike[str], file: str, config: Any) -> bool:
     Raises:
         InputError: `root` is a file, or holds anything else.
     """
-    root, identity = pathlib.Path(root), _identity(config)
-    if root.is_dir() and any(root.iterdir()):
-        found = "a folder with other content"
-        with contextlib.suppress(InputError):
-            existing = read_json(root / file, "a rendered set")
-            different = [name for name in identity if existing.get(name) != identity[name]]
-            if not different:
-                return True
-            values = f"{existing.get(different[0], 'default')}, not {identity[different[0]]}"
-            found = f"a rendered set of another configuration ({different[0]}: {values})"
-    elif root.is_dir() or not root.exists():
+    root = pathlib.Path(root)
+    if not (root / file).is_file():
+        check_new_folder(root)
         return False
-    else:
-        found = "a file"
-    raise InputError(f"{root}: found {found}, expected a new or empty folder")
+    existing = read_json(root / file, "a rendered set")
+    for name, value in _identity(config).items():
+        if existing.get(name) != value:
+            raise InputError(
+                f"{root}: found a rendered set of another configuration ({name}: "
+                f"{existing.get(name, 'default')}, not {value}), expected a new or empty folder"
+            )
+    return True
 
 
 def _identity(config: Any) -> dict[str, Any]:
@@ -83,19 +78,14 @@ def write_set(
     """
     if holds(root, file, config):
         return
-    root = pathlib.Path(root)
-    temporary = temporary_beside(root)
-    with made_folder(root.parent), in_use(temporary):
+    with atomic_folder(root) as folder:
         for name, data in files:
-            path = temporary / name
-            with wrap_os_errors(root):
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_bytes(data)
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
             if progress is not None and path.suffix == ".jpg":
                 progress(1)
-        with wrap_os_errors(root):
-            write_json(temporary / file, _identity(config))
-            os.replace(temporary, root)
+        write_json(folder / file, _identity(config))
 
 
 class TrainImage(NamedTuple):

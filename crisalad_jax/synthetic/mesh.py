@@ -139,9 +139,7 @@ class Mesh:
         """Whether the camera sees the ends towards small u of a front, or those towards large u."""
         self.end_normal: Vector = UP
         self._origin, self._axes = np.zeros(3), np.eye(3)
-        self._points: list[np.ndarray] = []
-        self._polygon_sizes: list[np.ndarray] = []
-        self._parts: list[tuple[int, Colour, Vector, int, float]] = []
+        self._parts: list[tuple[np.ndarray, Colour, Vector, int, float]] = []
 
     def front(self, x: float, z: float, side: float) -> "Mesh":
         """Return the same mesh in other axes: those of a vertical plane, in the present layer.
@@ -170,12 +168,10 @@ class Mesh:
         layer: float | None = None,
     ) -> None:
         """Add a part; without polygons it is left out."""
-        count, corners, _ = polygons.shape
-        if count:
-            self._points.append(self.world(polygons).reshape(-1, 3))
-            self._polygon_sizes.append(np.full(count, corners))
+        if len(polygons):
             layer = self.layer if layer is None else layer
-            self._parts.append((count, albedo, normal or self.normal, int(kind), layer))
+            part = self.world(polygons), albedo, normal or self.normal, int(kind), layer
+            self._parts.append(part)
 
     def ground(self, polygons: Polygons, albedo: Colour, kind: Kind = Kind.SOLID) -> None:
         """Add a part of the ground, over those before it."""
@@ -201,9 +197,11 @@ class Mesh:
 
     def scene(self) -> Scene:
         """Make a scene of all parts, of which there has to be at least one."""
-        counts, albedo, normal, kind, layer = map(np.array, zip(*self._parts, strict=True))
-        points, sizes = np.concatenate(self._points), np.concatenate(self._polygon_sizes)
-        return Scene(points, sizes, counts, albedo, normal, kind, layer)
+        parts, *materials = zip(*self._parts, strict=True)
+        points = np.concatenate([part.reshape(-1, 3) for part in parts])
+        counts = np.array([len(part) for part in parts])
+        corners = np.repeat([part.shape[1] for part in parts], counts)
+        return Scene(points, corners, counts, *map(np.array, materials))
 
 
 class Reach(NamedTuple):

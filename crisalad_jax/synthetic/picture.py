@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.synthetic.corridor import corridor
 from crisalad_jax.synthetic.country import country
 from crisalad_jax.synthetic.light import (
@@ -27,7 +28,6 @@ from crisalad_jax.synthetic.view import (
     Camera,
     Scenery,
     View,
-    check_range,
     check_size,
     clip_near,
 )
@@ -60,7 +60,7 @@ def render(
         InputError: a negative seed, or a size out of range.
     """
     check_size("image_size", image_size)
-    check_range("place_seed", place_seed, 0)
+    require(place_seed >= 0, f"place_seed: found {place_seed}, expected at least 0")
     place = build_place(place_seed, scenery)
     scene, picture = place.scene, _Picture(place, view, image_size)
     draw = picture.rng.random(len(scene.polygon_sizes))

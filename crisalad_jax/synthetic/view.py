@@ -1,14 +1,13 @@
 """How a picture is taken: where the camera stands, what it meets there, and what it sees."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
 
-from crisalad_jax.config.checks import check_types, require
+from crisalad_jax.config.checks import check_types, require, require_range
 
 Season = Literal["spring", "summer", "autumn", "winter"]
 Time = Literal["noon", "dusk", "night"]
@@ -62,19 +61,9 @@ class View:
     def __post_init__(self) -> None:
         """Check the types and ranges."""
         check_types(self)
-        check_range("View.noise", self.noise, 0, 255)
-        check_range("View.repaint", self.repaint, 0, 3)
-        check_range("View.field", self.field, 10, 150)
-
-
-def check_range(what: str, value: float, low: float, high: float = math.inf) -> None:
-    """Check a number.
-
-    Raises:
-        InputError: it is out of range; the message names the argument `what`.
-    """
-    expected = f"at least {low}" if high == math.inf else f"{low} to {high}"
-    require(low <= value <= high, f"{what}: found {value}, expected {expected}")
+        require_range(self, 0, 255, "noise")
+        require_range(self, 0, 3, "repaint")
+        require_range(self, 10, 150, "field")
 
 
 def check_size(what: str, size: Sequence[int]) -> None:
@@ -84,7 +73,7 @@ def check_size(what: str, size: Sequence[int]) -> None:
         InputError: one is out of range; the message names the argument `what`.
     """
     for side in size:
-        check_range(what, side, 16, 2048)
+        require(16 <= side <= 2048, f"{what}: found {side}, expected 16 to 2048")
 
 
 class Camera:

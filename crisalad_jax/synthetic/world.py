@@ -2,13 +2,14 @@
 
 import dataclasses
 import itertools
+import math
 import os
 from collections.abc import Iterator, Sequence
 from typing import Literal, get_args
 
 import numpy as np
 
-from crisalad_jax.config.checks import check_seed, check_types
+from crisalad_jax.config.checks import check_seed, check_types, require, require_range
 from crisalad_jax.synthetic.layouts import (
     METRES_PER_DEGREE,
     UTM_ORIGIN,
@@ -31,7 +32,6 @@ from crisalad_jax.synthetic.view import (
     WEATHERS,
     Scenery,
     View,
-    check_range,
     check_size,
 )
 
@@ -83,10 +83,9 @@ class WorldConfig:
         # The order of variations makes no other world.
         varied = tuple(name for name in VARIATIONS if name in self.varied)
         object.__setattr__(self, "varied", varied)
-        for name in ("scenes", "stations", "images_per_place", "test_scenes"):
-            check_range(f"WorldConfig.{name}", getattr(self, name), 1)
-        check_range("WorldConfig.repaint", self.repaint, 0, 3)
-        check_range("WorldConfig.sceneries: length", len(self.sceneries), 1)
+        require_range(self, 1, math.inf, "scenes", "stations", "images_per_place", "test_scenes")
+        require_range(self, 0, 3, "repaint")
+        require(bool(self.sceneries), "WorldConfig.sceneries: found none, expected at least one")
         check_seed("WorldConfig.seed", self.seed)
         check_size("WorldConfig.image_size", self.image_size)
 

@@ -9,6 +9,15 @@ from crisalad_jax.data.places import Places, epoch_batches
 from crisalad_jax.training.config import TrainConfig
 
 
+def prepared_as(config: TrainConfig) -> dict[str, Any]:
+    """Return how a run's images are prepared, as `data.loader` takes it."""
+    return {
+        "image_size": config.model.input_size,
+        "preprocessing": config.model.preprocessing,
+        "augmentation": config.augmentation,
+    }
+
+
 class PlaceBatches:
     """The batches of places, or of groups of classes that epochs take in turn."""
 
@@ -25,7 +34,7 @@ class PlaceBatches:
         Raises:
             InputError: there are too few places, classes or images, or positions are missing.
         """
-        self._config, self._reading = config, reading
+        self._reading = prepared_as(config) | reading
         self._groups: Sequence[Places] = (places,)
         self.classes: tuple[int, ...] = ()
         """Number of classes of each group, where the loss classifies."""
@@ -51,13 +60,9 @@ class PlaceBatches:
 
     def batches(self, step: int) -> Iterator[ImageBatch]:
         """Yield the batches from `step` to the end of its epoch; see `training_batches`."""
-        config = self._config
         epoch, start_step = divmod(step, self.steps_per_epoch)
         return training_batches(
             self._groups[epoch % len(self._groups)],
-            image_size=config.model.input_size,
-            preprocessing=config.model.preprocessing,
-            augmentation=config.augmentation,
             epoch=epoch,
             steps=self.steps_per_epoch,
             start_step=start_step,

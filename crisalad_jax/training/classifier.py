@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.training.losses import Loss
 from crisalad_jax.utils.pytree import check_drawn
 
@@ -21,28 +22,44 @@ class Classifiers(NamedTuple):
 
 
 def init_classifiers(
-    key: PRNGKeyArray, loss: Loss, classes: tuple[int, ...], dim: int
+    key: PRNGKeyArray | None, loss: Loss, classes: tuple[int, ...], dim: int
 ) -> Classifiers | None:
     """Initialise a loss's parameters for each group; None where it has none.
 
     Args:
         key: draws them.
         loss: whose parameters they are.
-        classes: number of classes of each group; (0,) where there are no classes.
+        classes: number of classes of each group; empty where there are no classes.
         dim: width of a descriptor.
+
+    Raises:
+        InputError: there is no key for a loss with parameters, or no classes for one that
+            classifies.
     """
-    keys = jax.random.split(key, len(classes))
-    groups = [loss.init(each, count, dim) for each, count in zip(keys, classes, strict=True)]
-    check_drawn(groups, f"loss {loss.part_name}")
-    if not jax.tree.leaves(groups):
+    name = f"loss {loss.part_name}"
+    shapes = jax.eval_shape(lambda key: loss.init(key, 1, dim), jax.random.key(0))
+    if not jax.tree.leaves(shapes):
         return None
-    largest = max(classes)
+    require(
+        bool(classes) or loss.grouping is None,
+        f"classes: found none for {name}, which classifies, expected the number of classes of "
+        "each group (step_config(..., classes=))",
+    )
+    require(
+        key is not None,
+        f"key: found None for {name}, which has parameters, expected a jax.random.key",
+    )
+    assert key is not None
+    counts = classes or (0,)
+    keys = jax.random.split(key, len(counts))
+    groups = [loss.init(each, count, dim) for each, count in zip(keys, counts, strict=True)]
+    check_drawn(groups, name)
+    largest = max(counts)
 
     def together(*leaves: Array) -> Array:
         # Leaves with a row for each class are padded with zeros.
-        return jnp.stack(
-            [_filled(leaf, n, largest) for leaf, n in zip(leaves, classes, strict=True)]
-        )
+        pairs = zip(leaves, counts, strict=True)
+        return jnp.stack([_filled(leaf, count, largest) for leaf, count in pairs])
 
     weights = jax.tree.map(together, *groups)
     return Classifiers(weights, jax.vmap(optax.adam(loss.learning_rate).init)(weights))

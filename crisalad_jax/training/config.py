@@ -1,17 +1,17 @@
 """Configuration of a training run."""
 
 import dataclasses
-import itertools
 import math
-import operator
+from itertools import pairwise
 from typing import Literal
 
 from crisalad_jax.config.checks import (
     check_seed,
     check_types,
-    require,
+    require_field,
     require_fraction,
     require_positive,
+    require_range,
 )
 from crisalad_jax.config.part import OrName
 from crisalad_jax.config.registry import part_field, resolve_names
@@ -20,12 +20,6 @@ from crisalad_jax.data.augmentations import AUGMENTATIONS, Augmentation
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.trainable import EXPECTED, TRAINABLE
-
-
-def _expect(config: object, name: str, fits: bool, expected: str) -> None:
-    """Check a field of a configuration."""
-    found = getattr(config, name)
-    require(fits, f"{type(config).__name__}.{name}: found {found!r}, expected {expected}")
 
 
 @short_repr()
@@ -81,16 +75,17 @@ class OptimiserConfig:
         for name in ("decay_steps", "clip_norm", "clip_value"):
             if getattr(self, name) is not None:
                 require_positive(self, name)
-        for name in ("end_lr_fraction", "warmup_steps", "warmup_epochs", "weight_decay"):
-            _expect(self, name, getattr(self, name) >= 0, "at least 0")
+        names = "end_lr_fraction", "warmup_steps", "warmup_epochs", "weight_decay"
+        require_range(self, 0, math.inf, *names)
         require_fraction(self, "b1", "b2", "momentum")
-        one = not (self.warmup_steps and self.warmup_epochs)
-        _expect(self, "warmup_epochs", one, f"0 with warmup_steps {self.warmup_steps}")
-        rises = all(itertools.starmap(operator.lt, itertools.pairwise((0, *self.milestones))))
-        fits = self.schedule != "milestones" or (bool(self.milestones) and rises)
-        _expect(self, "milestones", fits, "numbers of epochs that rise")
-        one = self.clip_norm is None or self.clip_value is None
-        _expect(self, "clip_value", one, f"None with clip_norm {self.clip_norm}")
+        rises = bool(self.milestones) and all(a < b for a, b in pairwise((0, *self.milestones)))
+        steps, norm = self.warmup_steps, self.clip_norm
+        for name, fits, expected in (
+            ("warmup_epochs", not (steps and self.warmup_epochs), f"0 with warmup_steps {steps}"),
+            ("milestones", rises or self.schedule != "milestones", "numbers of epochs that rise"),
+            ("clip_value", None in (norm, self.clip_value), f"None with clip_norm {norm}"),
+        ):
+            require_field(self, name, fits, expected)
 
 
 @short_repr(switch=("kind", "none"))
@@ -135,11 +130,10 @@ class MiningConfig:
         for name in ("queries_per_epoch", "margin"):
             if getattr(self, name) is not None:
                 require_positive(self, name)
-        fits = self.negatives <= self.candidates
-        _expect(self, "candidates", fits, f"at least negatives ({self.negatives})")
+        require_range(self, self.negatives, math.inf, "candidates")
         fits = 0 < self.positive_radius <= self.negative_radius < math.inf
         most = f"negative_radius ({self.negative_radius})"
-        _expect(self, "positive_radius", fits, f"metres above 0, and at most {most}")
+        require_field(self, "positive_radius", fits, f"metres above 0, and at most {most}")
 
 
 @short_repr("model", "loss")
@@ -207,31 +201,27 @@ class TrainConfig:
         require_positive(
             self, "places_per_batch", "images_per_place", "epochs", "validate_every", "save_top_k"
         )
-        loss, images = self.loss.kind, self.images_per_place
-        classifies = loss.grouping is not None
-        pairs = images >= 2 or classifies
-        _expect(self, "images_per_place", pairs, "at least 2: the loss needs pairs of one place")
-        batch = self.places_per_batch * images
-        fits = self.micro_batch is None or (self.micro_batch > 0 and batch % self.micro_batch == 0)
-        _expect(self, "micro_batch", fits, f"a divisor of the batch's {batch} images, or None")
-        if classifies:
-            words = f"for loss {loss.part_name}, which classifies"
-            fits = self.optimiser.accumulate == 1
-            _expect(self.optimiser, "accumulate", fits, f"1 {words}")
-            _expect(self.mining, "kind", not self.mines, f"'none' {words}")
-        if self.mines:
-            expected = 2 + self.mining.negatives
-            words = f"{expected} with mined tuples: a query, a positive and mining.negatives"
-            _expect(self, "images_per_place", images == expected, words)
-        else:
-            words = f"'whole' or 'sample' for loss {loss.part_name}, which takes mined tuples"
-            _expect(self.mining, "kind", not loss.of_tuples, words)
-            fits = self.min_images >= images
-            _expect(self, "min_images", fits, f"at least images_per_place ({images})")
-        known = TRAINABLE.fullmatch(self.trainable) is not None
-        _expect(self, "trainable", known, EXPECTED)
-        fits = self.trainable != "adapters+head" or has_adapters(self.model)
-        _expect(self, "trainable", fits, "head, last-N-blocks+head or all without adapters")
+        loss, images, accumulate = self.loss.kind, self.images_per_place, self.optimiser.accumulate
+        batch, size = self.places_per_batch * images, 2 + self.mining.negatives
+        is_tuple = images == size or not self.mines
+        micro_batch = batch if self.micro_batch is None else self.micro_batch
+        divides = micro_batch > 0 and batch % micro_batch == 0
+        classifies, known = loss.grouping is not None, TRAINABLE.fullmatch(self.trainable)
+        adapts = self.trainable != "adapters+head" or has_adapters(self.model)
+        classified = f"for loss {loss.part_name}, which classifies"
+        tuples = f"'whole' or 'sample' for loss {loss.part_name}, which takes mined tuples"
+        for config, name, fits, expected in (
+            (self, "images_per_place", images >= 2 or classifies, "at least 2: losses need pairs"),
+            (self, "micro_batch", divides, f"a divisor of the batch's {batch} images, or None"),
+            (self.optimiser, "accumulate", accumulate == 1 or not classifies, f"1 {classified}"),
+            (self.mining, "kind", not (classifies and self.mines), f"'none' {classified}"),
+            (self.mining, "kind", self.mines or not loss.of_tuples, tuples),
+            (self, "images_per_place", is_tuple, f"{size} with mined tuples"),
+            (self, "min_images", self.min_images >= images or self.mines, f"at least {images}"),
+            (self, "trainable", known is not None, EXPECTED),
+            (self, "trainable", adapts, "head, last-N-blocks+head or all without adapters"),
+        ):
+            require_field(config, name, fits, expected)
         if self.patience is not None:
             require_positive(self, "patience")
         if self.validation_size is not None:

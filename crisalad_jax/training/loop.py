@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import numpy as np
 
-from crisalad_jax.config.checks import PATH, takes
+from crisalad_jax.config.checks import PATH, require, takes
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.plugins import sources_of
 from crisalad_jax.config.short_repr import brief
@@ -119,8 +119,7 @@ def fit(
     """
     check_learns(config)
     threads = THREADS if num_threads is None else num_threads
-    if threads < 0:
-        raise InputError(f"num_threads: found {threads}, expected at least 0")
+    require(threads >= 0, f"num_threads: found {threads}, expected at least 0")
     # What does not fit raises in all processes, before the first file is written.
     checksums = {
         "places": checksum_of_places(places),
@@ -131,30 +130,25 @@ def fit(
     for what, number in (checksums | arguments).items():
         distributed.check_same(what, number)
     cache = ImageCache()
-    validator = Validator(config, validation, on_bad_image=on_bad_image, cache=cache)
-    data = _open_data(
-        *(config, places),
-        part=(jax.process_index(), jax.process_count()),
-        on_bad_image=on_bad_image,
-        threads=threads,
-        cache=cache,
-    )
+    part = jax.process_index(), jax.process_count()
+    reading = {"part": part, "on_bad_image": on_bad_image, "threads": threads, "cache": cache}
+    data = _open_data(config, places, **reading)
     trainer = Trainer(config, data, initial, shard_state=shard_state)
     checksums["weights"] = trainer.initial_checksum
     distributed.check_same("weights", checksums["weights"])
     record = RunRecord(checksums, {name: [*source] for name, source in sources_of(config).items()})
     files = RunFiles(pathlib.Path(out), config, record)
-    steps = data.steps_per_epoch * config.epochs
-    silent = quiet or not distributed.is_primary()
+    validator = Validator(config, validation, on_bad_image=on_bad_image, cache=cache)
     with contextlib.closing(files):
         state = files.load(RunState(trainer.state, data.mined))
         trainer.resume(state.training)
         data.mined = jax.tree.map(np.asarray, state.mined)
         del state  # whose arrays the trainer has copied
-        record = files.record
-        if files.is_extended and record.step:
-            _warn_of_extension(config, record, files.out)
-        bar = progress_bar("training", steps, "steps", quiet=silent, done=record.step)
+        if files.is_extended and files.record.step:
+            _warn_of_extension(config, files.record, files.out)
+        steps, done = data.steps_per_epoch * config.epochs, files.record.step
+        silent = quiet or not distributed.is_primary()
+        bar = progress_bar("training", steps, "steps", quiet=silent, done=done)
         with defer_signals() as signals, bar as bar:
             loop = _Loop(config, data, trainer, validator, files, signals, bar)
             loop.train(steps)
@@ -172,31 +166,31 @@ def check_learns(config: TrainConfig) -> None:
     Raises:
         InputError: nothing of the model trains.
     """
-    if not config.model.aggregator.trainable:
-        raise InputError(
-            f"aggregator: found {config.model.aggregator.part_name}, with which nothing trains, "
-            "expected another; `crisalad vocabulary` makes its models"
-        )
-    if not count_trainable(config.model, config.trainable):
-        names = config.model.backbone.part_name, config.model.aggregator.part_name
-        raise InputError(
-            f"trainable: found {config.trainable}, of which backbone {names[0]} with aggregator "
-            f"{names[1]} has no parameters, expected some"
-        )
+    model, what = config.model, config.trainable
+    require(
+        model.aggregator.trainable,
+        f"aggregator: found {model.aggregator.part_name}, with which nothing trains, expected "
+        "another; `crisalad vocabulary` makes its models",
+    )
+    require(
+        count_trainable(model, what) > 0,
+        f"trainable: found {what}, of which backbone {model.backbone.part_name} with aggregator "
+        f"{model.aggregator.part_name} has no parameters, expected some",
+    )
 
 
 def _open_data(
     config: TrainConfig, places: Places | QuerySet, **reading: Any
 ) -> PlaceBatches | Miner:
     """Make the batches of a training set, of places or of mined tuples."""
-    if config.mines != isinstance(places, QuerySet):
-        found, expected = ("places", "a QuerySet") if config.mines else ("a QuerySet", "places")
-        raise InputError(
-            f"places: found {found} with mining {config.mining.kind!r}, expected {expected}"
-        )
-    if isinstance(places, QuerySet):
-        return Miner(config, places, **reading)
-    return PlaceBatches(config, places, **reading)
+    found, expected = type(places), QuerySet if config.mines else Places
+    require(
+        found is expected,
+        f"places: found {found.__name__} with mining {config.mining.kind!r}, expected "
+        f"{expected.__name__}",
+    )
+    make: Any = Miner if config.mines else PlaceBatches
+    return make(config, places, **reading)
 
 
 def _warn_of_extension(config: TrainConfig, record: RunRecord, out: pathlib.Path) -> None:
@@ -217,7 +211,7 @@ def _warn_of_extension(config: TrainConfig, record: RunRecord, out: pathlib.Path
 
 @dataclasses.dataclass(frozen=True)
 class _Loop:
-    """The parts of a run, and the order in which they act."""
+    """The parts of a run, and the phases in which they act."""
 
     config: TrainConfig
     data: PlaceBatches | Miner
@@ -228,21 +222,19 @@ class _Loop:
     bar: Bar
 
     def train(self, steps: int) -> None:
-        """Take the steps that are left of so many, and save the state at an interruption."""
+        """Take the steps that are left of so many; at an interruption, save the state."""
         if self.data.classes:
             sizes = f"{min(self.data.classes)} to {max(self.data.classes)}"
             self.bar.say(f"classes in {len(self.data.classes)} groups: {sizes}")
         try:
-            try:
-                self._take_rounds(steps)
-                self._stop_together()  # a signal that came while the last validation was saved
-            except LossNotFiniteError:
-                self.save()
-                raise
-            except InputError:
-                # A signal to the process group also ends the workers that read images.
-                self._stop_together()
-                raise
+            self._take_rounds(steps)
+            # A signal may have come while the last validation was saved.
+            (number,) = distributed.all_max(self.signals.number)
+            if number:
+                raise Interrupted(number)
+        except LossNotFiniteError:
+            self.save()
+            raise
         except Interrupted as stopped:
             self.save()
             where = f"after step {self.files.record.step}; the same command goes on"
@@ -254,11 +246,11 @@ class _Loop:
         A round is an epoch, or the part of one for which tuples are mined together.
         """
         while True:
-            record, per_epoch = self.files.record, self.data.steps_per_epoch
-            if self.validator.is_due(record.step, per_epoch, last=record.validated):
-                self._validate()
+            record = self.files.record
+            if self.validator.is_due(record.step, self.data.steps_per_epoch, last=record.validated):
+                record = self._validate()
                 self.save()
-            if self.files.record.step == steps or self.files.record.stopped_early:
+            if record.step == steps or record.stopped_early:
                 return
             if isinstance(self.data, Miner) and self.data.is_due(record.step):
                 self._mine(self.data)
@@ -331,14 +323,12 @@ class _Loop:
                 note += f"  best {self.config.monitor} {100 * record.best[0][0]:.1f}"
             self.bar.advance(1, note=note)
 
-    def _validate(self) -> None:
+    def _validate(self) -> RunRecord:
         """Log the recalls, save the best weights, and decide on an early stop."""
-        record = self.files.record
+        record, params = self.files.record, self.trainer.params()
         epoch = record.step // self.data.steps_per_epoch
-        trainable = self.trainer.gather(self.trainer.state.trainable)
 
         def validate() -> tuple[str, dict[str, Any]]:
-            params = self.trainer.params(trainable)
             with self.signals.at_once():
                 found = self.validator.validate(params)
             line = {"step": record.step, "epoch": epoch, **found.metrics}
@@ -350,11 +340,11 @@ class _Loop:
         words, values = distributed.run_on_primary(validate)
         self.files.record = RunRecord(**values)
         self.bar.say(f"epoch {epoch}, step {record.step}: {words}")
+        return self.files.record
 
     def _mine(self, miner: Miner) -> None:
         """Mine the tuples of the round that begins, by the model as it is."""
-        params = self.trainer.params()
-        describe = functools.partial(self.validator.describe, params)
+        describe = functools.partial(self.validator.describe, self.trainer.params())
 
         def mine() -> str:
             with self.signals.at_once():
@@ -367,14 +357,7 @@ class _Loop:
         """Write the weights and the state to resume from."""
 
         def save() -> None:
-            state = self.trainer.gather(self.trainer.state)
-            params = functools.partial(self.trainer.params, state.trainable)
-            self.files.save(RunState(state, self.data.mined), params)
+            state = RunState(self.trainer.gather(), self.data.mined)
+            self.files.save(state, self.trainer.params())
 
         distributed.raise_together(save)
-
-    def _stop_together(self) -> None:
-        """Raise `Interrupted` in all processes if one of them was signalled."""
-        (number,) = distributed.all_max(self.signals.number)
-        if number:
-            raise Interrupted(number)

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int, Int32, Int64
 
 from crisalad_jax.data.loader import ImageBatch, batches_of_groups
 from crisalad_jax.data.query_set import QuerySet
+from crisalad_jax.training.batches import prepared_as
 from crisalad_jax.training.config import MiningConfig, TrainConfig
 from crisalad_jax.training.losses.pairs import Role, tuple_labels
 from crisalad_jax.utils.errors import InputError
@@ -47,7 +48,8 @@ class Miner:
             queries: the training set.
             **reading: how images are read; see `batches_of_groups`.
         """
-        self._config, self._queries, self._reading = config, queries, reading
+        self._config, self._queries = config, queries
+        self._reading = prepared_as(config) | reading
         rounds, self.steps_per_round = rounds_of(config, queries)
         self.steps_per_epoch = rounds * self.steps_per_round
         self.mined = no_tuples(
@@ -106,9 +108,6 @@ class Miner:
             self._queries,
             self.mined.images.reshape(shape),
             tuple_labels(self.mined.roles).reshape(shape),
-            image_size=config.model.input_size,
-            preprocessing=config.model.preprocessing,
-            augmentation=config.augmentation,
             seed=(config.seed, int(self.mined.step)),
             start_step=step % self.steps_per_round,
             **self._reading,

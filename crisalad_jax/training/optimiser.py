@@ -159,21 +159,19 @@ def make_optimiser(
         steps_per_epoch: number of batches of an epoch.
     """
     schedule = learning_rate_schedule(config, steps, steps_per_epoch)
-    b1, b2 = config.b1, config.b2
-    if config.kind == "adamw":
-        optimiser = optax.adamw(schedule, b1, b2, weight_decay=config.weight_decay)
-    else:
-        decay = optax.add_decayed_weights(config.weight_decay)
-        descent = (
-            optax.adam(schedule, b1, b2)
-            if config.kind == "adam"
-            else optax.sgd(schedule, config.momentum)
-        )
-        optimiser = optax.chain(decay, descent)
+    b1, b2, parts = config.b1, config.b2, []
     if config.clip_norm is not None:
-        optimiser = optax.chain(optax.clip_by_global_norm(config.clip_norm), optimiser)
-    elif config.clip_value is not None:
-        optimiser = optax.chain(optax.clip(config.clip_value), optimiser)
+        parts.append(optax.clip_by_global_norm(config.clip_norm))
+    if config.clip_value is not None:
+        parts.append(optax.clip(config.clip_value))
+    if config.kind == "adamw":
+        parts.append(optax.adamw(schedule, b1, b2, weight_decay=config.weight_decay))
+    else:
+        parts.append(optax.add_decayed_weights(config.weight_decay))
+        is_adam = config.kind == "adam"
+        descent = optax.adam(schedule, b1, b2) if is_adam else optax.sgd(schedule, config.momentum)
+        parts.append(descent)
+    optimiser = optax.chain(*parts)
     if config.accumulate == 1:
         return optimiser
     return _accumulated(optimiser, config.accumulate, steps_per_epoch)

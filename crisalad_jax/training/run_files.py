@@ -6,13 +6,14 @@ import dataclasses
 import pathlib
 import time
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from crisalad_jax.checkpoints.train_state import StateStore
 from crisalad_jax.checkpoints.weights import save_weights
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.io import differences, read_config, to_plain
 from crisalad_jax.config.plugins import changed_sources
 from crisalad_jax.data.benchmarks import Benchmark
@@ -24,7 +25,6 @@ from crisalad_jax.training.log import MetricsLog
 from crisalad_jax.training.mining import Mined
 from crisalad_jax.training.step import TrainState
 from crisalad_jax.utils import distributed
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, wrap_os_errors, write_json
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remove_temporaries
@@ -96,7 +96,7 @@ class RunFiles:
             The state to resume from, which `record` is for.
 
         Raises:
-            InputError: what `acquire_run` raises; another process writes there; or the run started
+            InputError: what `check_run` raises; another process writes there; or the run started
                 from something else.
         """
 
@@ -110,10 +110,11 @@ class RunFiles:
 
     def _load(self, state: RunState) -> RunState:
         out, config = self.out, self._config
-        check_run(out, config)
+        self.is_extended = check_run(out, config)
         with contextlib.ExitStack() as opened:
             opened.enter_context(lock(out))
-            self.is_extended = acquire_run(out, config)
+            if not (out / "config.json").exists():
+                write_json(out / "config.json", to_plain(config))
             for folder in (out, out / "best"):
                 remove_temporaries(folder)
             # A signal, or an error, before the first state leaves no empty folder.
@@ -156,14 +157,14 @@ class RunFiles:
         """Return whether the last saved state is old, by the primary process's clock."""
         return distributed.is_primary() and time.monotonic() - self._saved_at > SAVE_SECONDS
 
-    def save(self, state: RunState, params: Callable[[], Crisalad]) -> None:
+    def save(self, state: RunState, params: Crisalad) -> None:
         """Write the weights and the state, unless they are saved already.
 
         The state is written while training goes on.
         """
         if distributed.is_primary() and self._saved != self.record:
             with wrap_os_errors(self.out):
-                save_weights(self.out / "last.safetensors", Model(params(), self._config.model))
+                save_weights(self.out / "last.safetensors", Model(params, self._config.model))
                 self._states.save(self.record.step, state, dataclasses.asdict(self.record))
                 self._drop_old_best()
             self._saved = copy.deepcopy(self.record)
@@ -189,34 +190,16 @@ def _check_start(
     out: pathlib.Path, config: TrainConfig, started: RunRecord, saved: Mapping[str, Any]
 ) -> None:
     """Check that a saved run started from the same files and code as this one."""
-    for what, checksum in started.checksums.items():
-        if saved["checksums"][what] != checksum:
-            raise InputError(
-                f"{out}: the run started from other {what} than are given now; expected the same, "
-                "or another folder"
-            )
-    changed = changed_sources(config, saved["sources"])
-    if changed:
-        raise InputError(
-            f"{out}: found another source of {', '.join(changed)} than the run began with; "
-            "expected the same, or another folder"
-        )
-
-
-def acquire_run(out: pathlib.Path, config: TrainConfig) -> bool:
-    """Make `out` the folder of a run with this configuration, or check that it is.
-
-    Returns:
-        Whether there is a run of fewer epochs.
-
-    Raises:
-        InputError: what `check_run` raises.
-    """
-    check_run(out, config)
-    path = out / "config.json"
-    if not path.exists():
-        write_json(path, to_plain(config))
-    return read_config(TrainConfig, path).epochs < config.epochs
+    checksums = saved["checksums"]
+    others = [
+        f"other {what}" for what, each in started.checksums.items() if checksums[what] != each
+    ]
+    others += [f"another source of {name}" for name in changed_sources(config, saved["sources"])]
+    require(
+        not others,
+        f"{out}: the run started from {', '.join(others)} than are given now; expected the same, "
+        "or another folder",
+    )
 
 
 def extend_run(out: pathlib.Path, config: TrainConfig, step: int) -> None:
@@ -238,28 +221,30 @@ def extend_run(out: pathlib.Path, config: TrainConfig, step: int) -> None:
     write_json(path, to_plain(config))
 
 
-def check_run(out: pathlib.Path, config: TrainConfig) -> None:
+def check_run(out: pathlib.Path, config: TrainConfig) -> bool:
     """Check that `out` is the folder of a run with this configuration, or can become one.
 
-    A run there may have fewer epochs, which it is then extended by.
+    Returns:
+        Whether there is a run of fewer epochs, which is then extended.
 
     Raises:
         InputError: it is a file, or holds a run of another configuration, or files but no run.
     """
     path = out / "config.json"
-    if path.exists():
-        existing = read_config(TrainConfig, path)
-        epochs = max(existing.epochs, config.epochs)
-        wrong = differences(config, dataclasses.replace(existing, epochs=epochs))
-        if wrong:
-            raise InputError(
-                f"{out}: holds a run of another configuration: {'; '.join(wrong)}; give the same "
-                "to resume it, or another folder"
-            )
-    elif out.exists() and not out.is_dir():
-        raise InputError(f"{out}: found a file, expected the folder of a run, or a new one")
-    elif out.exists() and holds_other_files(out):
-        raise InputError(f"{out}: found files but no run, expected a run or a new or empty folder")
+    if not path.exists():
+        found = "files but no run" if out.is_dir() else "a file"
+        is_free = not out.exists() or (out.is_dir() and not holds_other_files(out))
+        require(is_free, f"{out}: found {found}, expected a run or a new or empty folder")
+        return False
+    existing = read_config(TrainConfig, path)
+    epochs = max(existing.epochs, config.epochs)
+    wrong = differences(config, dataclasses.replace(existing, epochs=epochs))
+    require(
+        not wrong,
+        f"{out}: holds a run of another configuration: {'; '.join(wrong)}; give the same to resume "
+        "it, or another folder",
+    )
+    return existing.epochs < epochs
 
 
 def checksum_of_places(places: Places | QuerySet) -> int:

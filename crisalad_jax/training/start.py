@@ -11,7 +11,7 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
-from crisalad_jax.nn.model import Crisalad, init_crisalad
+from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
 from crisalad_jax.utils import distributed
@@ -93,7 +93,7 @@ def with_vocabulary_of(
     count = places.database if isinstance(places, QuerySet) else len(places.files)
     build = functools.partial(
         with_vocabulary,
-        *(initial, config.model, [places.path(image) for image in range(count)]),
+        *(Model(initial, config.model), [places.path(image) for image in range(count)]),
         images=config.model.aggregator.centroid_images,
         seed=config.seed,
         on_bad_image=on_bad_image,

@@ -27,15 +27,8 @@ from crisalad_jax.nn.pixels import check_pixels
 from crisalad_jax.nn.tokens import TransportStatistics
 from crisalad_jax.training.classifier import Classifiers, init_classifiers, update_classifiers
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.losses import (
-    Loss,
-    LossConfig,
-    LossResult,
-    LossValue,
-    metric_loss,
-    tuple_pairs,
-)
-from crisalad_jax.training.losses.base import call_loss, check_value
+from crisalad_jax.training.losses import LossConfig, LossResult, metric_loss, tuple_pairs
+from crisalad_jax.training.losses.base import GivenLoss
 from crisalad_jax.training.optimiser import (
     count_steps,
     learning_rate_schedule,
@@ -102,7 +95,7 @@ class StepConfig:
     """The static argument of a compiled step."""
 
     model: ModelConfig
-    loss: LossConfig | LossFunction
+    loss: LossConfig
     optimiser: OptimiserConfig | optax.GradientTransformation
     steps: int = 1
     """Number of steps of the run, by which a linear schedule falls."""
@@ -191,30 +184,11 @@ def init_train_state(
         # Copied, because a step uses up the buffers of its state, and `params` are the caller's.
         chosen, statistics = jax.tree.map(jnp.copy, (chosen, statistics))
         optimiser = config.make_optimiser().init(chosen)
-        classifiers = None
-        if isinstance(config.loss, LossConfig):
-            classifiers = _init_loss(key, config.loss.kind, config)
+        dim = config.model.descriptor_dim
+        classifiers = init_classifiers(key, config.loss.kind, config.classes, dim)
         if statistics is not None:
             chosen = eqx.combine(chosen, statistics)
         return TrainState(jnp.zeros((), jnp.int32), chosen, optimiser, classifiers), frozen
-
-
-def _init_loss(key: PRNGKeyArray | None, loss: Loss, config: StepConfig) -> Classifiers | None:
-    """Draw the parameters of a loss, if it has any."""
-    name = loss.part_name
-    if loss.grouping is not None and not config.classes:
-        raise InputError(
-            f"classes: found none for loss {name}, which classifies, expected the number of "
-            "classes of each group (step_config(..., classes=))"
-        )
-    classes, dim = config.classes or (0,), config.model.descriptor_dim
-    if key is not None:
-        return init_classifiers(key, loss, classes, dim)
-    if jax.eval_shape(lambda key: init_classifiers(key, loss, classes, dim), jax.random.key(0)):
-        raise InputError(
-            f"key: found None for loss {name}, which has parameters, expected a jax.random.key"
-        )
-    return None
 
 
 @takes(config=TrainConfig)
@@ -226,6 +200,7 @@ def step_config(
     optimiser: optax.GradientTransformation | None = None,
     loss: LossFunction | None = None,
     classes: tuple[int, ...] = (),
+    shard_over: Mesh | None = None,
 ) -> StepConfig:
     """Make the part of a run's configuration that its compiled step depends on.
 
@@ -234,33 +209,31 @@ def step_config(
         steps: number of steps of the run.
         steps_per_epoch: number of steps of an epoch.
         optimiser: any optimiser of optax, in place of the configuration's.
-        loss: any function of (descriptors, labels) or (descriptors, labels, valid) that returns a
-            number, in place of the configuration's.
+        loss: any function of (descriptors, labels) or (descriptors, labels, valid), or of a
+            `LossBatch`, that returns a number, in place of the configuration's.
         classes: number of classes of each group, for a loss that classifies.
+        shard_over: devices to shard the state over; None replicates it.
 
     Returns:
         A static argument of `train_step`.
 
     Raises:
-        InputError: the loss is no function.
+        InputError: the loss is not a function.
 
     Example:
         >>> from crisalad_jax import recipe
         >>> step_config(recipe("tiny"), steps=100).steps
         100
     """
-    if loss is not None and not callable(loss):
-        raise InputError(
-            f"loss: found {loss!r}, expected a function of (descriptors, labels); a registered "
-            "loss is named in the configuration's"
-        )
+    given = None if loss is None else LossConfig(kind=GivenLoss(loss), miner="none")
     return StepConfig(
         model=config.model,
-        loss=config.loss if loss is None else loss,
-        optimiser=config.optimiser if optimiser is None else optimiser,
+        loss=given or config.loss,
+        optimiser=optimiser or config.optimiser,
         steps=steps,
         steps_per_epoch=steps_per_epoch,
         micro_batch=config.micro_batch,
+        shard_over=shard_over,
         classes=classes,
         batch_norm=config.batch_norm,
         tuples=config.mines,
@@ -366,7 +339,8 @@ def train_step(
             params, tokens, config.model, mask=valid_mask(all_valid), key=cross_key
         )
         descriptors = devices.gather_images(descriptors)
-        dense = devices.gather_images(tokens.dense) if _reads_dense(config) else None
+        reads_dense = config.loss.kind.reads_dense
+        dense = devices.gather_images(tokens.dense) if reads_dense else None
         loss = functools.partial(_loss, config=config)
         if len(all_labels) <= WHOLE_LOSS:
             loss = devices.whole_on_each(loss)
@@ -389,7 +363,6 @@ def train_step(
     updates, new_optimiser = optimiser.update(gradient, state.optimiser, learnt)
     classifiers = state.classifiers
     if classifiers is not None:
-        assert isinstance(config.loss, LossConfig)
         rate = config.loss.kind.learning_rate
         classifiers = update_classifiers(classifiers, group, classifier_gradient, rate)
     trainable = eqx.combine(optax.apply_updates(learnt, updates), statistics)
@@ -435,10 +408,6 @@ def _gathered(
     return devices.gather_images((labels.ravel(), valid.ravel() != 0))
 
 
-def _reads_dense(config: StepConfig) -> bool:
-    return isinstance(config.loss, LossConfig) and config.loss.kind.reads_dense
-
-
 def _loss(
     descriptors: Float[Array, "image descriptor"],
     dense: Float[Array, "image feature local"] | None,
@@ -448,21 +417,14 @@ def _loss(
     group: Int[Array, ""],
     config: StepConfig,
 ) -> LossResult:
-    """Compute the loss of a batch, by the configuration or by a function that was passed in."""
-    pairs = tuple_pairs(labels, valid=valid) if config.tuples else None
-    if isinstance(config.loss, LossConfig):
-        classes = jnp.asarray(config.classes)[group] if config.classes else None
-        return metric_loss(
-            descriptors,
-            labels,
-            config.loss,
-            valid=valid,
-            params=classifier,
-            classes=classes,
-            pairs=pairs,
-            dense=dense,
-        )
-    easy = metric_loss(descriptors, labels, valid=valid, pairs=pairs).easy_anchor_fraction
-    value = call_loss(config.loss, descriptors, labels, valid)
-    check_value(LossValue(value), f"loss {getattr(config.loss, '__name__', 'given')}")
-    return LossResult(value, easy)
+    """Compute the loss of a batch, of places or of mined tuples."""
+    return metric_loss(
+        descriptors,
+        labels,
+        config.loss,
+        valid=valid,
+        params=classifier,
+        classes=jnp.asarray(config.classes)[group] if config.classes else None,
+        pairs=tuple_pairs(labels, valid=valid) if config.tuples else None,
+        dense=dense,
+    )

@@ -1,11 +1,10 @@
 """The training state on the devices, and the compiled steps that change it."""
 
 import collections
-import dataclasses
 import math
 import time
 from collections.abc import Generator, Iterator, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +33,6 @@ from crisalad_jax.utils.output import warn
 
 Batch = tuple[jax.Array, jax.Array, jax.Array]
 """Images, labels, and which images are valid, on the devices."""
-_T = TypeVar("_T")
 
 
 class LossNotFiniteError(InputError):
@@ -64,14 +62,11 @@ class Trainer:
                 "shard_state: found one device to keep the state on, expected several; a CPU's do "
                 "not share a step where all trains"
             )
-        per_epoch = data.steps_per_epoch
-        self._step_config = dataclasses.replace(
-            step_config(
-                config,
-                steps=per_epoch * config.epochs,
-                steps_per_epoch=per_epoch,
-                classes=data.classes,
-            ),
+        self._step_config = step_config(
+            config,
+            steps=data.steps_per_epoch * config.epochs,
+            steps_per_epoch=data.steps_per_epoch,
+            classes=data.classes,
             shard_over=mesh if shard_state else None,
         )
         init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
@@ -90,12 +85,13 @@ class Trainer:
         """Metrics of the steps that the devices may still be computing, number of their images, and
         seconds of waiting for these."""
         self._finished_at = 0.0
+        self._params: Crisalad | None = None
         distributed.raise_together(self._check_memory)
 
     def resume(self, state: TrainState) -> None:
         """Go on from a state, which has to be the same in all processes."""
         # Copied, because a step donates the buffers of its state.
-        self.state = _copied(self._place(state))
+        self.state, self._params = _copied(self._place(state)), None
 
     def on_devices(self, batches: Iterator[ImageBatch]) -> Generator[Batch, None, None]:
         """Yield batches on the devices, each copied while they compute the one before."""
@@ -114,15 +110,9 @@ class Trainer:
         """
         if not self._running:
             self._finished_at = time.monotonic() - waited
-        batch = batch or self._no_images()
-        self.state, metrics = train_step(
-            self.state,
-            self._frozen_on_devices,
-            *batch,
-            self._step_key,
-            self._step_config,
-            self._proceed,
-        )
+        batch, self._params = batch or self._no_images(), None
+        arguments = self.state, self._frozen_on_devices, *batch, self._step_key, self._step_config
+        self.state, metrics = train_step(*arguments, self._proceed)
         self._proceed = metrics.updated
         self._running.append((metrics, len(batch[0]), waited))
 
@@ -162,15 +152,17 @@ class Trainer:
                 "skipped_images": skipped,
             }
 
-    def gather(self, tree: _T) -> _T:
-        """Gather the state, or a part of it; all processes call it together."""
-        return self._devices.gather(tree)
+    def gather(self) -> TrainState:
+        """Gather the state; all processes call it together."""
+        return self._devices.gather(self.state)
 
-    def params(self, trainable: PyTree = None) -> Crisalad:
-        """Join the whole model in float32: with what trains as it is now, or as it was gathered."""
-        if trainable is None:
-            trainable = self.gather(self.state.trainable)
-        return merge_params(trainable, jax.tree.map(jnp.asarray, self._frozen), self._config.model)
+    def params(self) -> Crisalad:
+        """Join the whole model in float32; all processes call it together."""
+        if self._params is None:
+            trainable = self._devices.gather(self.state.trainable)
+            frozen = jax.tree.map(jnp.asarray, self._frozen)
+            self._params = merge_params(trainable, frozen, self._config.model)
+        return self._params
 
     def _batch(self, *parts: np.ndarray) -> Batch:
         images, labels, valid = map(self._devices.shard_batch, parts)
@@ -215,15 +207,12 @@ def _copied(tree: PyTree) -> PyTree:
 
 def _choose_devices(config: TrainConfig) -> Devices:
     """Choose the devices of a step: all that share its images, or one for each process."""
-    spread = shards_batch(config.trainable)
     images = config.places_per_batch * config.images_per_place
-    if images % jax.process_count():
-        raise InputError(
-            f"processes: found {jax.process_count()}, expected a divisor of {images} images"
-        )
-    devices = devices_for(images if spread else jax.process_count(), processes=True)
+    devices = devices_for(images, processes=True)
+    if not shards_batch(config.trainable):
+        return devices_for(jax.process_count(), processes=True)
     found, used = len(jax.devices()), devices.mesh.size
-    if spread and used < found and distributed.is_primary():
+    if used < found and distributed.is_primary():
         warn(
             f"training: found {found} devices for {images} images a step, of which {used} share "
             "them, the most that divide them in each process"

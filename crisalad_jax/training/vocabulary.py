@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32
 
 from crisalad_jax.checkpoints.public import with_backbone_of
 from crisalad_jax.checkpoints.weights import save_weights
-from crisalad_jax.config.checks import check_count, check_seed
+from crisalad_jax.config.checks import check_count, check_seed, require
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.prepare import Preparation
@@ -32,7 +32,6 @@ from crisalad_jax.retrieval.chunks import sample
 from crisalad_jax.training.recipes import RECIPES, mines_tuples, recipe
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, check_target
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import progress_bar
@@ -51,14 +50,8 @@ def needs_vocabulary(config: ModelConfig) -> bool:
     return config.aggregator.starts_from_centroids
 
 
-def vocabulary_aggregators() -> list[str]:
-    """List the names of the registered aggregators that start from centroids."""
-    return [name for name in AGGREGATORS if AGGREGATORS.make(name).starts_from_centroids]
-
-
 def with_vocabulary(
-    params: Crisalad,
-    config: ModelConfig,
+    model: Model,
     paths: Sequence[pathlib.Path],
     *,
     images: int | None = IMAGES,
@@ -74,8 +67,8 @@ def with_vocabulary(
     it with another one raises an error.
 
     Args:
-        params: a model, whose backbone is as it will be used, or as training starts from it.
-        config: the model's, whose aggregator starts from centroids.
+        model: its backbone is as it will be used, or as training starts from it; its aggregator
+            starts from centroids.
         paths: images; not those that are evaluated on.
         images: at most so many of them, drawn at random; None for all, whose features are in memory
             together.
@@ -84,36 +77,37 @@ def with_vocabulary(
         on_bad_image: "stop", or "skip" to leave unreadable images out.
         quiet: no progress bar.
 
+    Returns:
+        The parameters with the centroids.
+
     Raises:
         InputError: a model without a vocabulary; an argument out of range; an image that cannot be
             read, or none that can; fewer features than clusters or than VLAD-BuFF's components,
             or features that are not finite or all alike.
     """
+    params, config = model
+    aggregator = config.aggregator
     _check_vocabulary(config)
     check_seed("seed", seed)
     if images is not None:
         check_count("images", images)
         if images < len(paths):
             paths = [paths[i] for i in sample(len(paths), images, seed)]
-    clusters = config.aggregator.count_centroids(config.backbone.dim)
-    features = _read_features(
-        params, config, paths, seed, batch_size, on_bad_image=on_bad_image, quiet=quiet
+    reading = Reading(batch_size=batch_size, on_bad_image=on_bad_image).fitted(len(paths))
+    features = _read_features(model, paths, reading, seed, quiet=quiet)
+    clusters = aggregator.count_centroids(config.backbone.dim)
+    require(
+        len(features) >= clusters and bool(np.isfinite(features).all()),
+        f"images: found {len(features)} features in those that can be read, expected at least "
+        f"{clusters}, one for each cluster, without NaN or infinity",
     )
-    if len(features) < clusters:
-        raise InputError(
-            f"images: found {len(features)} features in those that can be read, expected at least "
-            f"{clusters}, one for each cluster"
-        )
-    if not np.isfinite(features).all():
-        raise InputError("features: found NaN or infinity, expected a backbone's finite numbers")
-    spherical = config.aggregator.spherical_centroids
     with compiler.number_types():
         there = jnp.asarray(features)
-        reduced = np.asarray(config.aggregator.centroid_features(there))
-        centroids = jnp.asarray(_k_means(reduced, clusters, seed, spherical=spherical))
-        aggregator = config.aggregator.from_centroids(centroids, there)
-    aggregator = config.aggregator.attach_backbone_hash(aggregator, params.backbone)
-    return dataclasses.replace(params, aggregator=aggregator)
+        reduced = np.asarray(aggregator.centroid_features(there))
+        means = _k_means(reduced, clusters, seed, spherical=aggregator.spherical_centroids)
+        learnt = aggregator.from_centroids(jnp.asarray(means), there)
+    learnt = aggregator.attach_backbone_hash(learnt, params.backbone)
+    return dataclasses.replace(params, aggregator=learnt)
 
 
 @brief
@@ -137,7 +131,7 @@ def start_vocabulary(
     image_size: tuple[int, int] | None = None,
     resize: Sequence[str] = (),
     seed: int = 0,
-) -> tuple[Crisalad, ModelConfig]:
+) -> Model:
     """Make a model that lacks only its vocabulary.
 
     Args:
@@ -150,7 +144,7 @@ def start_vocabulary(
         seed: draws what is random.
 
     Returns:
-        (params, config).
+        The model.
 
     Raises:
         InputError: no such preset or aggregator, or one without a vocabulary; a field that it does
@@ -164,11 +158,11 @@ def start_vocabulary(
     _check_vocabulary(config)
     known = [field.name for field in dataclasses.fields(part)]
     for name in fields or {}:
-        if name not in known:
-            raise InputError(
-                f"--{name}: found with --aggregator {part.part_name}, which has no such setting, "
-                f"expected one of {', '.join(known) or 'none'}"
-            )
+        require(
+            name in known,
+            f"--{name}: found with --aggregator {part.part_name}, which has no such setting, "
+            f"expected one of {', '.join(known) or 'none'}",
+        )
     part = dataclasses.replace(part, **(fields or {}))
     config = dataclasses.replace(config, aggregator=part).resized(image_size, resize)
     if backbone is not None:
@@ -176,12 +170,11 @@ def start_vocabulary(
     params = init_crisalad(jax.random.key(seed), config)
     if backbone is not None:
         params = with_backbone_of(params, config, backbone)
-    return params, config
+    return Model(params, config)
 
 
 def build_vocabulary(
-    params: Crisalad,
-    config: ModelConfig,
+    model: Model,
     images: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     out: str | os.PathLike[str],
     *,
@@ -195,8 +188,7 @@ def build_vocabulary(
     """Build the vocabulary of a model from a folder of images, and write the model.
 
     Args:
-        params: a model's parameters; its backbone is as it will be used.
-        config: the model, whose aggregator starts from centroids.
+        model: its backbone is as it will be used; its aggregator starts from centroids.
         images: the folder, searched with its subfolders, or another source of images
             (docs/how-to/image-sources.md), or a list of files; not of images that are evaluated on.
         out: the .safetensors file to write.
@@ -218,9 +210,9 @@ def build_vocabulary(
         >>> from crisalad_jax import PRESETS, CrossImageConfig, init_crisalad, with_aggregator
         >>> alone = CrossImageConfig(layers=0)
         >>> config = with_aggregator(PRESETS["tiny"], "anyloc", "tiny", cross_image=alone)
-        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> model = Model(init_crisalad(jax.random.key(0), config), config)
         >>> out = folder / "anyloc.safetensors"
-        >>> built = build_vocabulary(params, config, pictures, out, quiet=True)
+        >>> built = build_vocabulary(model, pictures, out, quiet=True)
         >>> out.exists()
         True
     """
@@ -231,8 +223,7 @@ def build_vocabulary(
         paths = [pathlib.Path(each) for each in images]
     check_rate_used(fps, paths)
     params = with_vocabulary(
-        params,
-        config,
+        model,
         paths,
         images=max_images,
         seed=seed,
@@ -240,8 +231,8 @@ def build_vocabulary(
         on_bad_image=on_bad_image,
         quiet=quiet,
     )
-    save_weights(out, Model(params, config))
-    words = config.aggregator.count_centroids(config.backbone.dim)
+    save_weights(out, Model(params, model.config))
+    words = model.config.aggregator.count_centroids(model.config.backbone.dim)
     return Vocabulary(params, words, min(max_images, len(paths)))
 
 
@@ -267,37 +258,29 @@ def vocabulary_words(config: ModelConfig) -> str:
 
 
 def _check_vocabulary(config: ModelConfig) -> None:
-    if not needs_vocabulary(config):
-        raise InputError(
-            f"aggregator: found {config.aggregator.part_name}, which has no vocabulary, expected "
-            f"one that starts from centroids: {', '.join(vocabulary_aggregators())}"
-        )
+    has_one = [name for name in AGGREGATORS if AGGREGATORS.make(name).starts_from_centroids]
+    require(
+        needs_vocabulary(config),
+        f"aggregator: found {config.aggregator.part_name}, which has no vocabulary, expected "
+        f"one that starts from centroids: {', '.join(has_one)}",
+    )
 
 
 def _read_features(
-    params: Crisalad,
-    config: ModelConfig,
-    paths: Sequence[pathlib.Path],
-    seed: int,
-    batch_size: int,
-    *,
-    on_bad_image: OnBadImage,
-    quiet: bool,
+    model: Model, paths: Sequence[pathlib.Path], reading: Reading, seed: int, *, quiet: bool
 ) -> Float32[np.ndarray, "feature dim"]:
-    reading = Reading(batch_size=batch_size, on_bad_image=on_bad_image).fitted(len(paths))
+    """Read unit features of the images, of `PATCHES` patches of each."""
+    config = model.config
     how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
-    batches = reading.batches(paths, how, config.check_image_size)
     devices = devices_for(reading.batch_size)
-    params = devices.replicate(cast_params(params, config))
+    params = devices.replicate(cast_params(model.params, config))
     generator = np.random.default_rng(seed)
-    parts: list[np.ndarray] = []
+    parts = [np.empty((0, config.backbone.dim), np.float32)]
     unreadable: list[pathlib.Path] = []
     with progress_bar("vocabulary", len(paths), "images", quiet=quiet) as bar:
-        for batch in batches:
-            features = jax.device_get(
-                unit_features(params, devices.shard_batch(batch.images), config)
-            )
-            for image in features[batch.valid]:
+        for batch in reading.batches(paths, how, config.check_image_size):
+            features = unit_features(params, devices.shard_batch(batch.images), config)
+            for image in jax.device_get(features)[batch.valid]:
                 chosen = np.sort(generator.permutation(len(image))[:PATCHES])
                 parts.append(image[chosen].astype(np.float32))
             there = batch.indices >= 0
@@ -305,7 +288,7 @@ def _read_features(
             bar.advance(int(there.sum()))
     if unreadable:
         warn(f"images: {len(unreadable)} unreadable left out, {unreadable[0]} the first")
-    return np.concatenate(parts) if parts else np.empty((0, config.backbone.dim), np.float32)
+    return np.concatenate(parts)
 
 
 def _k_means(

@@ -91,12 +91,8 @@ def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) 
         with number_types(leaves), _precision_of(leaves), over_devices_of(leaves):
             jitted = outermost()
             if not runs_long and target() == machine():
-
-                def compile(*args: Any, **kwargs: Any) -> Any:
-                    return jitted.lower(*args, **kwargs).compile()
-
                 static = options.get("static_argnames", ())
-                program = cached_executable(function, compile, args, kwargs, static)
+                program = cached_executable(function, jitted, args, kwargs, static)
                 if program is not None:
                     return program()
             return jitted(*args, **kwargs)

@@ -47,27 +47,29 @@ def join_processes(
     Raises:
         InputError: the arguments do not fit each other, or the others cannot be met.
     """
+    port = coordinator.rpartition(":")[2]
     if coordinator == "auto":
-        if (count, index) != (None, None):
-            raise InputError("processes: found auto and a number, expected auto alone")
-        given: dict[str, Any] = {}
-    elif (
-        count is None
-        or index is None
-        or not 0 <= index < count
-        or not re.fullmatch(r".+:\d{1,5}", coordinator)
-        or not 0 < int(coordinator.rpartition(":")[2]) < 2**16
-    ):
+        is_valid = count is None and index is None
+    else:
+        is_valid = (
+            count is not None
+            and index is not None
+            and 0 <= index < count
+            and re.fullmatch(r".+:\d{1,5}", coordinator) is not None
+            and 0 < int(port) < 2**16
+        )
+    if not is_valid:
         raise InputError(
             f"processes: found process {index} of {count} with {coordinator}, expected "
             "--coordinator-address HOST:PORT --num-processes COUNT --process-id INDEX, with a port "
-            "of 1 to 65535, and an index from 0 and below the count"
+            "of 1 to 65535, and an index from 0 and below the count; or auto alone"
         )
-    else:
+    given: dict[str, Any] = {}
+    if coordinator != "auto":
         given = {"num_processes": count, "process_id": index, "coordinator_address": coordinator}
         # Otherwise JAX would ask the scheduler which devices this process has.
         given["cluster_detection_method"] = "deactivate"
-        if local_device_ids is None:
+        if local_device_ids is None and index is not None:
             local_device_ids = _own_device(coordinator, index)
         if index == 0:
             _check_port(coordinator)
@@ -84,12 +86,10 @@ def join_processes(
     try:
         jax.distributed.initialize(**given)
     except (ValueError, RuntimeError) as error:
-        if coordinator == "auto":
-            raise InputError(
-                f"--coordinator-address: found auto, and nothing that tells JAX of the others "
-                f"({error}), expected Slurm, Open MPI, Kubernetes or a Cloud TPU; or HOST:PORT"
-            ) from error
-        raise InputError(f"processes: cannot meet the others: {error}") from error
+        raise InputError(
+            f"processes: cannot meet the others by --coordinator-address {coordinator}: {error} "
+            "(auto needs Slurm, Open MPI, Kubernetes or a Cloud TPU)"
+        ) from error
 
 
 _LAUNCHED = (
@@ -158,27 +158,25 @@ def run_on_primary(work: Callable[[], _T]) -> _T:
     """
     if jax.process_count() == 1:
         return work()
-    message: dict[str, Any] = {"error": "it failed"}
-    value = None
-    try:
-        if is_primary():
+    error: BaseException | None = None
+    value: Any = None
+    message: dict[str, Any] = {}
+    if is_primary():
+        try:
             value = work()
             message = {"value": value}
-    except Interrupted as stopped:
-        message = {"stopped": stopped.number}
-        raise
-    except (InputError, OSError) as error:
-        message = {"error": str(error)}
-        raise
-    finally:
-        received = _broadcast_json(message)
-    if is_primary():
-        return value  # pyright: ignore[reportReturnType]
+        except Interrupted as stopped:
+            error, message = stopped, {"stopped": stopped.number}
+        except BaseException as raised:
+            error, message = raised, {"error": str(raised)[:1000]}
+    received = _broadcast_json(message)
+    if error is not None:
+        raise error
     if "stopped" in received:
         raise Interrupted(received["stopped"])
     if "error" in received:
         raise InputError(f"process 0: {received['error']}")
-    return received["value"]
+    return value if is_primary() else received["value"]
 
 
 def _broadcast_json(value: dict[str, Any]) -> dict[str, Any]:

@@ -26,6 +26,7 @@ import numpy as np
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 
+from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.files import atomic_path, user_cache
 from crisalad_jax.utils.version import VERSION
 
@@ -62,7 +63,7 @@ def cache_executables() -> None:
 
 def cached_executable(
     function: Callable[..., Any],
-    compile: Callable[..., Any],
+    jitted: Any,
     args: Sequence[Any],
     kwargs: Mapping[str, Any],
     static_argnames: str | Sequence[str] = (),
@@ -71,27 +72,28 @@ def cached_executable(
 
     Args:
         function: what is traced, outside of other transformations, for this machine.
-        compile: compiles it for these arguments; returns a `jax.stages.Compiled`.
+        jitted: the same by `jax.jit`.
         args: positional arguments of the call.
         kwargs: arguments by name.
         static_argnames: names of those that are part of the program.
 
     Returns:
-        The call of the program; None where none is cached, as on accelerators.
+        The call of the program; None where none is cached: on accelerators, and of a function that
+        was made within another or has no name, since the key lacks what it has from there.
     """
     if _Folder.path is None or jax.default_backend() != "cpu" or jax.process_count() > 1:
         return None
-    names = {static_argnames} if isinstance(static_argnames, str) else set(static_argnames)
-    places = list(zip(_parameters(function), args, strict=False))
-    static = {n: each for n, each in (*places, *kwargs.items()) if n in names}
-    traced = tuple(each for n, each in places if n not in names)
-    by_name = {n: each for n, each in kwargs.items() if n not in names}
-    leaves, tree = jax.tree.flatten((traced, by_name))
+    if "<" in function.__qualname__:  # <locals>, <lambda>
+        return None
+    given = _signature(function).bind(*args, **kwargs).arguments
+    names = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
+    static = {name: given.pop(name) for name in sorted(names) if name in given}
+    leaves, tree = jax.tree.flatten(((), given))  # positional arguments, and those by name
     arrays = [_as_array(leaf) for leaf in leaves]
-    traced, by_name = jax.tree.unflatten(tree, arrays)
+    _, given = jax.tree.unflatten(tree, arrays)
     signature = (
         function,
-        tuple(sorted(static.items())),
+        tuple(static.items()),
         tree,
         tuple((leaf.aval, leaf.sharding, leaf.committed) for leaf in arrays),
     )
@@ -101,10 +103,10 @@ def cached_executable(
         program = _read(path, tree, _devices(arrays))
         if program is None:
             with _without_jaxs_cache():
-                program = compile(*args, **kwargs)
+                program = jitted.lower(**given, **static).compile()
             _write(path, program, tree)
         _programs[signature] = program
-    return functools.partial(program, *traced, **by_name)
+    return functools.partial(program, **given)
 
 
 @contextlib.contextmanager
@@ -127,13 +129,9 @@ def _as_array(leaf: Any) -> jax.Array:
     return leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf)
 
 
+_signature = functools.cache(inspect.signature)
 _programs: dict[Hashable, Any] = {}
 """Programs of this process, by all that they depend on."""
-
-
-@functools.cache
-def _parameters(function: Callable[..., Any]) -> tuple[str, ...]:
-    return tuple(inspect.signature(function).parameters)
 
 
 def _devices(arrays: Sequence[jax.Array]) -> list[Any]:
@@ -150,17 +148,18 @@ def _key(
     arrays: Sequence[jax.Array],
 ) -> str:
     """Digest all that a program depends on: the same in every process."""
-    words = [f"{function.__module__}.{function.__qualname__}", repr(tree)]
-    words += [f"{name}={_whole(value)}" for name, value in sorted(static.items())]
-    words += [
-        f"{leaf.aval.str_short()} {leaf.aval.weak_type} {leaf.committed} {leaf.sharding!r} "
-        f"{sorted(device.id for device in leaf.sharding.device_set)}"
+    arguments = [
+        (leaf.aval.str_short(), leaf.aval.weak_type, leaf.committed, leaf.sharding, _ids(leaf))
         for leaf in arrays
     ]
-    digest = hashlib.sha256(_surroundings())
-    for word in words:
-        digest.update(f"{len(word)} {word}".encode())
-    return digest.hexdigest()
+    fixed = {name: _whole(value) for name, value in static.items()}
+    name = f"{function.__module__}.{function.__qualname__}"
+    words = repr((_surroundings(), name, tree, fixed, arguments))
+    return hashlib.sha256(words.encode()).hexdigest()
+
+
+def _ids(array: jax.Array) -> list[int]:
+    return sorted(device.id for device in array.sharding.device_set)
 
 
 def _whole(value: Any) -> str:
@@ -175,19 +174,15 @@ def _whole(value: Any) -> str:
 
 
 @functools.cache
-def _surroundings() -> bytes:
+def _surroundings() -> str:
     """Digest what all programs of a process depend on: code, versions, settings, processor."""
-    digest = hashlib.sha256()
-    root = pathlib.Path(__file__).parent.parent
-    for path in sorted(root.rglob("*.py")):
-        digest.update(f"{path.relative_to(root)} {path.stat().st_size} ".encode())
-        digest.update(path.read_bytes())
-    words = [VERSION, sys.version, *(importlib.metadata.version(name) for name in _TRACED_WITH)]
+    code = pathlib.Path(__file__).parent.parent
+    words = [f"{path.relative_to(code)} {sha256_of(path)}" for path in sorted(code.rglob("*.py"))]
+    words += [VERSION, sys.version, *(importlib.metadata.version(name) for name in _TRACED_WITH)]
     words += [f"{k}={v}" for k, v in sorted(os.environ.items()) if k.startswith(_SETTINGS)]
     words += [f"{k}={v}" for k, v in sorted(jax.config.values.items(), key=lambda pair: pair[0])]
     words += [str(jax.devices()), *_processor()]
-    digest.update("\n".join(words).encode())
-    return digest.digest()
+    return hashlib.sha256("\n".join(words).encode()).hexdigest()
 
 
 def _processor() -> list[str]:

@@ -1,7 +1,6 @@
 """Read regular files, and write files so that a reader never sees half of one."""
 
 import contextlib
-import errno
 import io
 import json
 import os
@@ -16,10 +15,8 @@ from numpy.lib.format import dtype_to_descr, write_array_header_1_0
 
 from crisalad_jax.utils.checksums import (
     CHECKSUM,
-    ChangedFileError,
-    check_sealed,
+    check_checksum,
     checksummed_json,
-    has_damaged_key,
 )
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
@@ -53,7 +50,7 @@ def check_source(
         InputError: there is none, one that is larger, or something that is no file: a folder, a
             pipe, a device. Opening a pipe may wait for ever, and a device may never end.
     """
-    found = _no_file(path)
+    found = _found_instead(path)
     if found is None and largest is not None and (size := os.stat(path).st_size) > largest:
         found, expected = f"{size} bytes", f"{expected}, of at most {largest}"
     if found is not None:
@@ -67,22 +64,17 @@ _KINDS = (
     (stat.S_ISBLK, "a device"),
     (stat.S_ISSOCK, "a socket"),
 )
-
-
 _NOTHING = "no such file"
 
 
-def _no_file(path: str | os.PathLike[str]) -> str | None:
-    """Return what there is at `path` in place of a regular file; None where it is one."""
+def _found_instead(path: str | os.PathLike[str]) -> str | None:
+    """Describe what `path` is if it is not a regular file; otherwise return None."""
     try:
         mode = os.stat(path).st_mode
     except (FileNotFoundError, NotADirectoryError):
         return _NOTHING
-    except OSError as error:
-        looped = error.errno == errno.ELOOP
-        return "links in a circle" if looped else f"a file that cannot be read ({error.strerror})"
-    except ValueError as error:
-        return f"a name that no file can have ({error})"
+    except (OSError, ValueError) as error:  # links in a circle, a NUL in the name
+        return f"a name that cannot be made or read ({getattr(error, 'strerror', error)})"
     return next((words for is_kind, words in _KINDS if is_kind(mode)), None)
 
 
@@ -116,15 +108,11 @@ def read_bytes(path: str | os.PathLike[str], expected: str) -> bytes:
         expected: what kind of file, for messages.
 
     Raises:
-        InputError: as `check_source`, or the file cannot be read.
+        InputError: as `check_source`.
+        PermissionError: the file may not be read.
     """
     check_source(path, expected, largest=LARGEST)
-    try:
-        return pathlib.Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read: {error.strerror}, expected {expected}"
-        ) from error
+    return pathlib.Path(path).read_bytes()
 
 
 def check_one_array(path: pathlib.Path) -> None:
@@ -134,9 +122,7 @@ def check_one_array(path: pathlib.Path) -> None:
         InputError: it is one; the message says how to save an array of it.
     """
     try:
-        with zipfile.ZipFile(path) as archive, path.open("rb") as file:
-            if file.read(2) != b"PK":
-                return  # a .npy file whose last bytes happen to look like an archive's
+        with zipfile.ZipFile(path) as archive:
             arrays = [name.removesuffix(".npy") for name in archive.namelist()]
     except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError):
         return  # whoever reads it says what it is
@@ -208,9 +194,7 @@ def read_json(path: str | os.PathLike[str], expected: str, *, sealed: bool = Tru
     data = read_bytes(path, expected)
     value = parse_json(data, str(path), expected)
     if isinstance(value, dict) and CHECKSUM in value:
-        check_sealed(data, value.pop(CHECKSUM), path)
-    elif isinstance(value, dict) and has_damaged_key(value):
-        raise ChangedFileError(path)
+        check_checksum(data, value.pop(CHECKSUM), path)
     elif sealed:
         raise InputError(f"{path}: found no checksum, expected {expected}")
     return value
@@ -240,15 +224,14 @@ def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> Non
         raise InputError(f"{path}: found no name of a file, expected one")
     if suffix is not None and path.suffix != suffix:
         raise InputError(f"{path}: found the suffix {path.suffix!r}, expected {suffix}")
-    try:
-        there = _no_file(path) or "a file"
-        nearest = next(folder for folder in path.parents if folder.exists())
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be made: {error}") from error
-    if "\0" in str(path):  # pathlib treats such a name as a missing file
-        raise InputError(f"{path}: cannot be made: found a NUL in the name")
-    if there not in ("a file", _NOTHING):
-        raise InputError(f"{path}: found {there}, expected a file or nothing yet")
+    if (found := _found_instead(path)) not in (None, _NOTHING):
+        raise InputError(f"{path}: found {found}, expected a file or nothing yet")
+    _check_can_make(path)
+
+
+def _check_can_make(path: pathlib.Path) -> None:
+    """Check that something can be made at `path`, in a folder that may have to be made too."""
+    nearest = next(folder for folder in path.parents if folder.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK):
         raise InputError(
             f"{path}: cannot be made: found {nearest}, expected a folder that can be written to"
@@ -306,15 +289,21 @@ def atomic_path(
     """
     path = pathlib.Path(path)
     check_target(path)
-    with made_folder(path.parent), wrap_os_errors(path):
-        temporary = temporary_beside(path if within is None else within / path.name)
-        with in_use(temporary):
-            yield temporary
-            if durable:
-                _sync(temporary)
-            os.replace(temporary, path)
+    temporary = temporary_beside(path if within is None else within / path.name)
+    with _renamed_to(path, temporary):
+        yield temporary
         if durable:
-            _sync(path.parent)
+            _sync(temporary)
+    if durable:
+        _sync(path.parent)
+
+
+@contextlib.contextmanager
+def _renamed_to(path: pathlib.Path, temporary: pathlib.Path) -> Iterator[None]:
+    """Rename what the block makes as `temporary` to `path` on success, else remove it."""
+    with made_folder(path.parent), wrap_os_errors(path), in_use(temporary):
+        yield
+        os.replace(temporary, path)
 
 
 def _sync(path: pathlib.Path) -> None:
@@ -370,12 +359,10 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """
     path = pathlib.Path(path)
     check_new_folder(path)
-    with made_folder(path.parent), wrap_os_errors(path):
-        temporary = temporary_beside(path)
-        with in_use(temporary):
-            temporary.mkdir()
-            yield temporary
-            os.replace(temporary, path)
+    temporary = temporary_beside(path)
+    with _renamed_to(path, temporary):
+        temporary.mkdir()
+        yield temporary
 
 
 def check_new_folder(path: str | os.PathLike[str]) -> None:
@@ -385,12 +372,14 @@ def check_new_folder(path: str | os.PathLike[str]) -> None:
         InputError: there is a file, or a folder that holds something; or as `check_target`.
     """
     path = pathlib.Path(path)
-    if os.path.isfile(path):
-        raise InputError(f"{path}: found a file, expected a new or empty folder")
-    check_target(path / "any")
-    if path.is_dir() and path.samefile(os.curdir):
+    found = _found_instead(path) or "a file"
+    if found == _NOTHING:
+        _check_can_make(path)
+    elif found != "a folder":
+        raise InputError(f"{path}: found {found}, expected a new or empty folder")
+    elif path.samefile(os.curdir):
         raise InputError(f"{path}: found the folder that this runs in, expected another")
-    if path.is_dir() and any(path.iterdir()):
+    elif any(path.iterdir()):
         raise InputError(f"{path}: found a folder with files in it, expected a new or empty one")
 
 

@@ -1,6 +1,7 @@
 """Locks of folders: one process at a time writes into a run, a map, a comparison or a report."""
 
 import contextlib
+import fcntl
 import os
 import pathlib
 import socket
@@ -43,25 +44,18 @@ def lock(
         InputError: the folder cannot be made or written to.
     """
     folder = pathlib.Path(folder)
-    with contextlib.ExitStack() as held:
-        while True:
-            try:
-                with block_signals(), contextlib.ExitStack() as attempt:
-                    attempt.enter_context(made_folder(folder))
-                    descriptor = _locked(folder, attempt)
-                    attempt.enter_context(in_use(_lock_of(folder)))
-                    held.enter_context(attempt.pop_all())
-                break
-            except BusyFolderError:
-                if not wait:
-                    raise
-                if not quiet:
-                    warn(f"{folder}: waiting for another process{_holder(_lock_of(folder))}")
-                    quiet = True
-                time.sleep(POLL)
-        with contextlib.suppress(OSError):  # a full disk has no room for that
-            os.ftruncate(descriptor, 0)
-            os.write(descriptor, f"{_signature()}\n".encode())
+    while True:
+        try:
+            held = _locked(folder)
+            break
+        except BusyFolderError:
+            if not wait:
+                raise
+            if not quiet:
+                warn(f"{folder}: waiting for another process{_holder(folder)}")
+                quiet = True
+            time.sleep(POLL)
+    with held:
         yield
 
 
@@ -69,54 +63,30 @@ POLL = 0.2
 """Seconds between two looks at a lock that another process holds."""
 
 
-def holder_of(folder: str | os.PathLike[str]) -> str | None:
-    """Return "process P on HOST" of the process that writes into a folder; None without one."""
-    import fcntl
-
-    path = _lock_of(folder)
-    try:
-        with path.open(encoding="utf-8") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return _words(path)
-    except OSError:
-        pass
-    return None
-
-
-def is_here(holder: str) -> bool:
-    """Return whether what `holder_of` returned is another process of this host."""
-    return holder != _signature() and holder.endswith(f" on {socket.gethostname()}")
-
-
-def _signature() -> str:
-    return f"process {os.getpid()} on {socket.gethostname()}"
-
-
-def _lock_of(folder: str | os.PathLike[str]) -> pathlib.Path:
-    return pathlib.Path(folder) / LOCK
-
-
-def _locked(folder: pathlib.Path, stack: contextlib.ExitStack) -> int:
-    """Lock a folder until the stack is closed; return the descriptor of its lock."""
-    import fcntl
-
-    path = _lock_of(folder)
-    try:
-        while True:
-            file = stack.enter_context(path.open("a+", encoding="utf-8"))
+def _locked(folder: pathlib.Path) -> contextlib.ExitStack:
+    """Lock a folder until the returned stack is closed."""
+    path = folder / LOCK
+    with block_signals(), contextlib.ExitStack() as stack:
+        stack.enter_context(made_folder(folder))
+        is_held = False
+        while not is_held:
             try:
+                file = stack.enter_context(path.open("a", encoding="utf-8"))
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise BusyFolderError(
-                    f"{folder}: found another process that writes here{_holder(path)}, "
+                    f"{folder}: found another process that writes here{_holder(folder)}, "
                     "expected to be the only one"
                 ) from error
+            except OSError as error:
+                raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
             # The last holder may have removed the file between the two calls.
-            if _is_still(path, file.fileno()):
-                return file.fileno()
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
+            is_held = os.fstat(file.fileno()).st_nlink > 0
+        stack.enter_context(in_use(path))
+        with contextlib.suppress(OSError):  # a full disk has no room for that
+            os.ftruncate(file.fileno(), 0)
+            os.write(file.fileno(), f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+        return stack.pop_all()
 
 
 @contextlib.contextmanager
@@ -137,22 +107,10 @@ def staged_folder(out: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
                 os.replace(path, out / path.name)
 
 
-def _holder(path: pathlib.Path) -> str:
-    """Return the words of a lock's holder in brackets; nothing while it is still writing them."""
-    words = _words(path)
-    return f" ({words})" if words else ""
-
-
-def _words(path: pathlib.Path) -> str:
+def _holder(folder: pathlib.Path) -> str:
+    """Name the holder of a folder's lock in brackets; nothing while it is still writing that."""
     try:
-        return path.read_text(encoding="utf-8", errors="replace").strip()
+        words = (folder / LOCK).read_text(encoding="utf-8", errors="replace").strip()
     except OSError:
         return ""
-
-
-def _is_still(path: pathlib.Path, descriptor: int) -> bool:
-    """Return whether the open file is the one with this name."""
-    try:
-        return os.path.samestat(os.stat(path), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
+    return f" ({words})" if words else ""

@@ -1,12 +1,7 @@
-"""What a program prints: in any encoding, without escape sequences, also if nobody reads on."""
+"""What a program says: notes to its user, and text without control characters."""
 
-import io
-import os
 import sys
 import warnings
-from typing import Any, TextIO
-
-from crisalad_jax.utils.errors import InputError
 
 _PACKAGE = __name__.partition(".")[0]
 
@@ -53,57 +48,3 @@ def counted(count: int, noun: str) -> str:
         ('1 image', '2 images')
     """
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
-
-
-def keep_on_without_reader() -> None:
-    """Let the program go on where the reader of its output is gone, as after `| head`.
-
-    A full disk raises an `InputError` once, at the write or flush that meets it. Letters that the
-    encoding lacks are escaped. Standard error stays as it is: who reads that knows that the program
-    goes on.
-    """
-    if sys.stdout is None:  # it was closed, as by `>&-`
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
-    else:
-        sys.stdout = _going_on(sys.stdout)
-
-
-def _going_on(stream: TextIO) -> TextIO:
-    raw = _UntilClosed(stream.fileno())
-    return io.TextIOWrapper(
-        io.BufferedWriter(raw),
-        encoding=stream.encoding,
-        errors="backslashreplace",
-        line_buffering=stream.isatty(),
-    )
-
-
-class _UntilClosed(io.RawIOBase):
-    """A file that drops what is written after its reader is gone, or after an error was raised.
-
-    Python flushes once more at its end, and would end with a traceback of its own.
-    """
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-        self._failed = False
-
-    def write(self, data: Any) -> int:
-        if not self._failed:
-            try:
-                return os.write(self._descriptor, data)
-            except BrokenPipeError:
-                pass
-            except OSError as error:
-                self._failed = True
-                raise InputError(f"standard output: {error.strerror}") from error
-        return memoryview(data).nbytes
-
-    def fileno(self) -> int:
-        return self._descriptor
-
-    def isatty(self) -> bool:
-        return os.isatty(self._descriptor)
-
-    def writable(self) -> bool:
-        return True

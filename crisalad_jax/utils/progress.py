@@ -1,6 +1,7 @@
 """Progress on the terminal: a bar with rate and time left, on stderr, silent when asked."""
 
 import contextlib
+import importlib.util
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -11,9 +12,9 @@ from crisalad_jax.utils.output import printable
 class Bar:
     """A progress bar, or only its messages where no bar is drawn."""
 
-    def __init__(self, progress: Any = None, task: Any = None) -> None:
-        """Wrap a task of rich's `progress`; without it nothing is drawn. See `progress_bar`."""
-        self._progress, self._task = progress, task
+    def __init__(self, progress: Any = None, task: Any = None, *, quiet: bool = True) -> None:
+        """Wrap a task of rich's `progress`; without it there are messages, unless `quiet`."""
+        self._progress, self._task, self._quiet = progress, task, quiet
 
     def advance(self, count: float, note: str = "") -> None:
         """Advance by `count` units, and show a short note behind the bar."""
@@ -24,13 +25,8 @@ class Bar:
         """Print a line that stays, above the bar."""
         if self._progress is not None:
             self._progress.console.print(printable(line), soft_wrap=True, highlight=False)
-
-
-class _Lines(Bar):
-    """The messages alone, for installations without rich (every extra installs it)."""
-
-    def say(self, line: str) -> None:
-        print(printable(line), file=sys.stderr)
+        elif not self._quiet:
+            print(printable(line), file=sys.stderr)
 
 
 @contextlib.contextmanager
@@ -46,17 +42,13 @@ def progress_bar(
         quiet: show nothing.
         done: units that were done before, which do not count for the rate.
     """
-    if quiet:
-        yield Bar()
+    if quiet or importlib.util.find_spec("rich") is None:  # every extra installs it
+        yield Bar(quiet=quiet)
         return
-    try:
-        import rich.console
-        import rich.progress as parts
-        import rich.table
-        import rich.text
-    except ModuleNotFoundError:
-        yield _Lines()
-        return
+    import rich.console
+    import rich.progress as parts
+    import rich.table
+    import rich.text
 
     class Rate(parts.ProgressColumn):
         def render(self, task: parts.Task) -> str:

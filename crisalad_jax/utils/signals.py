@@ -9,7 +9,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from types import FrameType
 from typing import Any
 
@@ -47,7 +47,7 @@ _pipe = -1
 
 
 def _watch() -> None:
-    if _pipe >= 0:
+    if _pipe >= 0 and threading.current_thread() is threading.main_thread():
         signal.set_wakeup_fd(_pipe, warn_on_full_buffer=False)
 
 
@@ -88,14 +88,17 @@ def _end_late(numbers: int) -> None:
     Args:
         numbers: a pipe that gets the number of each signal.
     """
+    excused = None
     while data := os.read(numbers, 1):
         state, number = SignalState.current, data[0]
         if number not in _SIGNALS:
             continue
         # The first signal waits for work that has to be saved.
-        if state is None or not state.is_first() or not state.has_work:
-            time.sleep(_PATIENCE)
-            _leave(number)
+        if state is not None and state.has_work and state is not excused:
+            excused = state
+            continue
+        time.sleep(_PATIENCE)
+        _leave(number)
 
 
 _PATIENCE = 2.0
@@ -119,15 +122,14 @@ class SignalState:
     current: "SignalState | None" = None
     """The state while signals are deferred, and after one was."""
 
-    def __init__(self) -> None:
-        """Start without a signal."""
+    def __init__(self, before: Mapping[Any, Any] | None = None) -> None:
+        """Start without a signal; `before` are the handlers of signals until now."""
         self.number = 0
         """Number of the last one; 0 for none."""
         self.has_work = False
         """Whether there is work that has to be saved; without it a command ends at once."""
-        self._asked = False
         self._at_once = False
-        self._before: dict[int, Any] = {}
+        self._before = before or {}
 
     def check(self) -> None:
         """Raise `Interrupted` if a signal has come."""
@@ -157,34 +159,12 @@ class SignalState:
         if self._at_once:
             raise Interrupted(number)
 
-    def is_first(self) -> bool:
-        """Return whether this is the first call; there is one at each signal."""
-        before, self._asked = self._asked, True
-        return not before
-
     def watch(self) -> None:
         """Watch for signals in a second thread again, before a library works in the main thread.
 
         orbax writes by uvloop, which takes the watching for itself, and does not give it back.
         """
-        if threading.current_thread() is threading.main_thread():
-            _watch()
-
-    def defer(self) -> None:
-        """Handle all signals that are not ignored."""
-        self.watch()
-        SignalState.current = self
-        for number in _SIGNALS:
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                self._before[number] = signal.signal(number, self.handle)
-
-    def restore(self) -> None:
-        """Give the signals back to their handlers."""
-        self.watch()
-        if not self.number:
-            SignalState.current = None
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
+        _watch()
 
 
 @contextlib.contextmanager
@@ -194,14 +174,23 @@ def defer_signals() -> Iterator[SignalState]:
     One that came after the last check has its usual effect after the block. Python sets handlers in
     the main thread alone: in other threads this changes nothing.
     """
-    stop = SignalState()
     if threading.current_thread() is not threading.main_thread():
-        yield stop
+        yield SignalState()
         return
-    stop.defer()
+    # Ignored signals, as under nohup, stay ignored.
+    handlers = {number: signal.getsignal(number) for number in _SIGNALS}
+    before = {n: handler for n, handler in handlers.items() if handler is not signal.SIG_IGN}
+    state = SignalState.current = SignalState(before)
+    _watch()
+    for number in before:
+        signal.signal(number, state.handle)
     try:
-        yield stop
+        yield state
     finally:
-        stop.restore()
-    if stop.number:
-        signal.raise_signal(stop.number)
+        _watch()
+        if not state.number:
+            SignalState.current = None
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if state.number:
+        signal.raise_signal(state.number)

@@ -13,7 +13,7 @@ from PIL import Image, ImageOps
 
 folder, *paths = map(pathlib.Path, sys.argv[1:])
 wanted = json.loads((folder / "manifest.json").read_text())["images"]
-if not wanted["resize"].startswith("Pillow's BILINEAR"):
+if "bilinear, antialiased, on bytes" not in wanted["resize"]:
     sys.exit(f"{folder}: found images resized {wanted['resize']}, which is not done here")
 _, height, width, _ = wanted["shape"]
 session = onnxruntime.InferenceSession(folder / "describe.onnx")

@@ -106,7 +106,7 @@ class Crisalad(nn.Module):
             return self.aggregate(self.backbone(images))
         depth, found = self.config.backbone.depth, self.config.aggregator
         if isinstance(found, AnyLocConfig):
-            return self.aggregate(self.backbone.facet(images, found.block(depth), found.facet))
+            return self.aggregate(self.backbone.facet(images, found.layer % depth, found.facet))
         if isinstance(found, TransVprConfig):
             return self.aggregate(self.backbone(images, found.features(depth).levels))
         if isinstance(found, BoqConfig | MixVprConfig) and not found.last_norm:

@@ -51,8 +51,7 @@ import torch  # isort: skip
 from crisalad_jax import synthetic
 from crisalad_jax.config.preprocessing import IMAGENET_DEVIATION, IMAGENET_MEAN
 from crisalad_jax.data.images import list_images, read_image
-from crisalad_jax.data.loader import image_batches
-from crisalad_jax.data.reading import Reading
+from crisalad_jax.data.reading import Reading, image_batches
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import Model

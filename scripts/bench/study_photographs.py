@@ -21,12 +21,13 @@ from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.report import RecallRow, recall_table
+from crisalad_jax.experiments.report.tables import Cell, Table, write_text
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.recipes import recipe
-from crisalad_jax.utils.files import atomic_path, write_json
+from crisalad_jax.utils.files import write_json
 
 TESTS = ("sped_val", "corridor")
 
@@ -98,17 +99,13 @@ def main() -> None:
                 untrained = init_crisalad(jax.random.key(seed), config.model)
                 measure(f"untrained, seed {seed}", untrained, config)
             params, seconds = train(name, config, arguments.data, arguments.out)
-            timings.append(f"| {name} | {seed} | {seconds / 60:.1f} |\n")
+            timings.append([Cell(name), Cell(str(seed)), Cell(f"{seconds / 60:.1f}")])
             measure(f"{name}, seed {seed}", params, config)
     order = {benchmark.name: i for i, benchmark in enumerate(benchmarks)}
     rows.sort(key=lambda row: order[row.benchmark])
-    with atomic_path(arguments.out / "photographs.md") as temporary:
-        temporary.write_text(
-            recall_table(rows).markdown()
-            + "\n| model | seed | training, minutes |\n| --- | ---: | ---: |\n"
-            + "".join(timings),
-            encoding="utf-8",
-        )
+    times = Table(["model", "seed", "training, minutes"], timings).markdown()
+    text = f"{recall_table(rows).markdown()}\n{times}"
+    write_text(arguments.out / "photographs.md", text)
     print(recall_table(rows).markdown())
 
 

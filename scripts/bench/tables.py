@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from crisalad_jax.experiments.report import style, tables
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_target, split_markers
 
-INK, GREY, PALE = "#222222", "#757575", "#e4e4e4"
-# Okabe and Ito's: told apart by the colour-blind.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#222222")
+INK, GREY = style.INK, style.GREY
+COLOURS = (*style.COLOURS, INK)
 
 
 class Table(NamedTuple):
@@ -40,9 +40,8 @@ def number(value: float) -> str:
 
 
 def markdown(table: Table) -> str:
-    rule = ["---"] * table.labels + ["---:"] * (len(table.header) - table.labels)
-    lines = [f"| {' | '.join(cells)} |" for cells in (table.header, rule, *table.rows)]
-    return table.caption + "\n\n" + "\n".join(lines) + "\n"
+    rows = [list(map(tables.Cell, cells)) for cells in table.rows]
+    return f"{table.caption}\n\n{tables.Table(table.header, rows, table.labels).markdown()}"
 
 
 def files_of(name: str, out: pathlib.Path) -> list[pathlib.Path]:
@@ -53,8 +52,7 @@ def files_of(name: str, out: pathlib.Path) -> list[pathlib.Path]:
 def save(name: str, study: Study, out: pathlib.Path) -> None:
     """Write NAME.md, NAME.json and, with a figure, NAME.png."""
     text, numbers, picture = files_of(name, out)
-    with atomic_path(text) as temporary:
-        temporary.write_text(markdown(study.table), encoding="utf-8")
+    tables.write_text(text, markdown(study.table))
     with atomic_path(numbers) as temporary:  # numbers for people: no reader checks them
         temporary.write_text(json.dumps(study.values, indent=2) + "\n", encoding="utf-8")
     if study.figure is not None:
@@ -69,8 +67,7 @@ def splice(page: pathlib.Path, name: str, table: Table) -> None:
         InputError: the page has no such comments.
     """
     before, after = split_markers(page, name)
-    with atomic_path(page) as temporary:
-        temporary.write_text(before + markdown(table) + after, encoding="utf-8")
+    tables.write_text(page, before + markdown(table) + after)
 
 
 def flags(description: str, out: str) -> argparse.ArgumentParser:
@@ -136,12 +133,7 @@ def panels(
     figure = Figure(figsize=(width * count, height), layout="constrained")
     axes = list(figure.subplots(1, count, squeeze=False, sharey=sharey)[0])
     for one, title in zip(axes, titles, strict=True):
-        one.set_title(title, fontsize=10, color=INK, loc="left")
-        one.spines[["top", "right"]].set_visible(False)
-        one.spines[["left", "bottom"]].set_color(GREY)
-        one.tick_params(colors=GREY, labelcolor=INK, labelsize=9)
-        one.grid(axis="y", color=PALE, linewidth=0.8)
-        one.set_axisbelow(True)
+        style.label_axes(one, "", "", title=title)
     return figure, axes
 
 

@@ -10,7 +10,7 @@ import pathlib
 import sys
 from typing import Any
 
-from crisalad_jax.cli.common import check_json, show, talk_beside, write_or_print_json
+from crisalad_jax.cli.common import emit_json, prepare_json, show
 from crisalad_jax.cli.train import defaults
 from crisalad_jax.config.flags import parse_settings
 from crisalad_jax.utils.errors import InputError
@@ -53,10 +53,9 @@ class CompileCheck:
 def main() -> None:
     """Print the table of what was compiled, write it as JSON, and compare it where asked."""
     given = sys.argv[1:]
-    arguments = parse_settings(CompileCheck, "compile_check", given, defaults(given), ())
+    arguments = parse_settings(CompileCheck, "compile_check", given, defaults(given))
     compile_on_cpu()
-    check_json(arguments.json)
-    talk_beside(arguments.json)
+    prepare_json(arguments.json)
     expected = None if arguments.expect is None else read_check(arguments.expect)
     check = compile_check(
         arguments.settings,
@@ -69,8 +68,7 @@ def main() -> None:
     )
     for table in check_tables(check) if check.programs else ():
         show(table)
-    if arguments.json is not None:
-        write_or_print_json(arguments.json, check.as_json())
+    emit_json(arguments.json, check.as_json())
     lines = check.failures if expected is None else differences(check, expected)
     if lines:
         sys.exit("\n".join(lines))

@@ -8,6 +8,7 @@ A table says for each verb and argument what is bad about it; `--most` takes a s
 
 import argparse
 import contextlib
+import io
 import json
 import math
 import os
@@ -102,6 +103,44 @@ def base(verb: str, world: World, folder: pathlib.Path) -> list[str]:
         del given[given.index("--methods") : given.index("--methods") + 2]
         return with_flag([*given, "--rows", "gem"], "--out", f"{out / 'ablation'}")
     return VERBS["extract .npy" if verb == "extract" else verb](world, out)
+
+
+Write = Callable[[pathlib.Path], Any]
+"""Makes the bad file or folder at a path."""
+
+
+def containing(data: bytes | str | Callable[[], bytes]) -> Write:
+    """Write a file of these bytes, or of this text; a function makes them when they are needed."""
+
+    def write(path: pathlib.Path) -> None:
+        path.parent.mkdir(exist_ok=True)
+        made = data() if callable(data) else data
+        path.write_bytes(made.encode() if isinstance(made, str) else made)
+
+    return write
+
+
+def with_file(verb: str, flag: str, name: str, write: Write, value: str | None = None) -> Make:
+    """Make something bad, and give it to a verb's flag.
+
+    Args:
+        verb: a command.
+        flag: a flag of it, or IMAGE, SRC or DST.
+        name: of what `write` makes.
+        write: makes it.
+        value: what the flag gets, below the folder of the case; None is what was made.
+    """
+
+    def make(world: World, bad: pathlib.Path) -> list[str]:
+        write(bad / name)
+        return _put(verb, flag, base(verb, world, bad), str(bad / (value or name)))
+
+    return make
+
+
+def with_more(verb: str, *more: str) -> Make:
+    """Give a verb more arguments than its good ones."""
+    return lambda world, bad: [*base(verb, world, bad), *more]
 
 
 # ---- Something else in place of a file or a folder ----
@@ -244,35 +283,17 @@ def wrong_files() -> Iterator[Case]:
             if (flag, kind) in (("IMAGE", "a folder"), ("IMAGE", "a picture")):
                 continue
 
-            def make(
-                world: World,
-                bad: pathlib.Path,
-                verb: str = verb,
-                flag: str = flag,
-                name: str = name,
-                kind: str = kind,
-            ) -> list[str]:
-                FILES[kind](bad / name)
-                return _put(verb, flag, base(verb, world, bad), str(bad / name))
-
-            needs = _products_of(verb)
+            make, needs = with_file(verb, flag, name, FILES[kind]), _products_of(verb)
             yield Case(f"files: {kind}", f"{verb} {flag} {name}", make, (name, flag), needs=needs)
         for value in ("", "-", "x" * 300, "no\x1b[31mred\nline", "caf\udce9", "/dev/zero"):
-
-            def named(
-                world: World,
-                bad: pathlib.Path,
-                verb: str = verb,
-                flag: str = flag,
-                value: str = value,
-            ) -> list[str]:
-                return _put(verb, flag, base(verb, world, bad), value)
-
             # Empty values are refused before flags are told apart.
             words = (flag, "argument", value[:20], "red", "caf", flag.lower())
-            yield Case(
-                f"names: {value[:12]!r}", f"{verb} {flag}", named, words, needs=_products_of(verb)
-            )
+            make, needs = _with_value(verb, flag, value), _products_of(verb)
+            yield Case(f"names: {value[:12]!r}", f"{verb} {flag}", make, words, needs=needs)
+
+
+def _with_value(verb: str, flag: str, value: str) -> Make:
+    return lambda world, bad: _put(verb, flag, base(verb, world, bad), value)
 
 
 # ---- Targets ----
@@ -349,18 +370,17 @@ def wrong_targets() -> Iterator[Case]:
             if kind == "a folder with files" and verb == "evaluate" and flag != "--json":
                 continue
 
-            def make(
-                world: World,
-                bad: pathlib.Path,
-                verb: str = verb,
-                flag: str = flag,
-                prepare: Callable[[pathlib.Path], pathlib.Path] = prepare,
-            ) -> list[str]:
-                target = prepare(bad / f"target{SUFFIX.get((verb, flag), '')}")
-                return _put(verb, flag, base(verb, world, bad), str(target))
-
             words = ("target", "xxx", "loop", "/proc", "mine")
-            yield Case(f"targets: {kind}", f"{verb} {flag}", make, words, needs=_products_of(verb))
+            make, needs = _with_target(verb, flag, prepare), _products_of(verb)
+            yield Case(f"targets: {kind}", f"{verb} {flag}", make, words, needs=needs)
+
+
+def _with_target(verb: str, flag: str, prepare: Callable[[pathlib.Path], pathlib.Path]) -> Make:
+    def make(world: World, bad: pathlib.Path) -> list[str]:
+        target = prepare(bad / f"target{SUFFIX.get((verb, flag), '')}")
+        return _put(verb, flag, base(verb, world, bad), str(target))
+
+    return make
 
 
 # ---- Numbers and words ----
@@ -450,22 +470,6 @@ def wrong_values() -> Iterator[Case]:
     """Give flags values that are out of range, or nothing of their kind."""
     for verb, flag, values in VALUES:
         for value in values:
-
-            def make(
-                world: World,
-                bad: pathlib.Path,
-                verb: str = verb,
-                flag: str = flag,
-                value: str = value,
-            ) -> list[str]:
-                given = base(verb, world, bad)
-                if flag in ("--recipe", "--preset"):
-                    given = [a for a in given if a not in ("--weights", str(world.weights))]
-                    given = with_flag(given, "--preset", "tiny")
-                if flag == "--rerank" and verb == "compare":
-                    given = with_flag(given, "--methods", "patch-netvlad")
-                return with_flag(given, flag, *value.split())
-
             word = flag.strip("-").split(".")[-1]
             names = (word, word.replace("-", " "), word.replace("-", "_"), value, "aggregator")
             more = {"--split": ("train", "val"), "--layout": ("layout", ".mat", "town")}
@@ -476,8 +480,21 @@ def wrong_values() -> Iterator[Case]:
                 ("train", "--trainable", "last-0-blocks+head"),  # the head alone
                 ("evaluate", "--queries", "../../.."),
             )
-            needs = _products_of(verb)
+            make, needs = _with_values(verb, flag, value.split()), _products_of(verb)
             yield Case(f"values: {flag}", f"{verb} {value}", make, named, fine, needs)
+
+
+def _with_values(verb: str, flag: str, values: Sequence[str]) -> Make:
+    def make(world: World, bad: pathlib.Path) -> list[str]:
+        given = base(verb, world, bad)
+        if flag in ("--recipe", "--preset"):
+            given = [a for a in given if a not in ("--weights", str(world.weights))]
+            given = with_flag(given, "--preset", "tiny")
+        if flag == "--rerank" and verb == "compare":
+            given = with_flag(given, "--methods", "patch-netvlad")
+        return with_flag(given, flag, *values)
+
+    return make
 
 
 def wrong_flags() -> Iterator[Case]:
@@ -491,31 +508,21 @@ def wrong_flags() -> Iterator[Case]:
             "a word too many": ["one", "two", "three"],
             "a surrogate": ["--\udce9"],
         }.items():
-
-            def make(
-                world: World, bad: pathlib.Path, verb: str = verb, more: list[str] = more
-            ) -> list[str]:
-                return [*base(verb, world, bad), *more]
-
             fine = (verb, words) == ("query", "a word too many")
             named = ("argument", "option", "one", "--", "no such", "plugin")
-            yield Case("flags", f"{verb}: {words}", make, named, fine, _products_of(verb))
+            make, needs = with_more(verb, *more), _products_of(verb)
+            yield Case("flags", f"{verb}: {words}", make, named, fine, needs)
     for given in (["x"], ["--frobnicate"], [""], ["train"], ["\x1b[31m"], ["\udce9"], ["help"]):
         yield Case("flags", f"{given}", lambda world, bad, given=given: list(given))
     # A flag given twice: the last one counts, or it is refused.
-    for verb, flag, values in (
-        ("extract", "--seed", ("1", "-1")),
-        ("pca", "--dim", ("3", "0")),
-    ):
-        yield Case(
-            "flags",
-            f"{verb} {flag} twice",
-            lambda world, bad, verb=verb, flag=flag, values=values: [
-                *with_flag(base(verb, world, bad), flag, values[0]), flag, values[1]
-            ],
-            (flag, flag.strip("-")),
-            needs=_products_of(verb),
-        )  # fmt: skip
+    for verb, flag, first, last in (("extract", "--seed", "1", "-1"), ("pca", "--dim", "3", "0")):
+        named, needs = (flag, flag.strip("-")), _products_of(verb)
+        make = _twice(verb, flag, first, last)
+        yield Case("flags", f"{verb} {flag} twice", make, named, needs=needs)
+
+
+def _twice(verb: str, flag: str, first: str, last: str) -> Make:
+    return lambda world, bad: [*with_flag(base(verb, world, bad), flag, first), flag, last]
 
 
 # ---- What is in files ----
@@ -556,142 +563,149 @@ NPY: Mapping[str, bytes] = {
 }
 
 
+def _descriptors(data: bytes, names: bytes | None) -> Write:
+    """Write descriptors, and the file of their names; None is a folder of that name."""
+
+    def write(path: pathlib.Path) -> None:
+        path.write_bytes(data)
+        of_names = path.with_suffix(".names.txt")
+        of_names.mkdir() if names is None else of_names.write_bytes(names)
+
+    return write
+
+
 def arrays() -> Iterator[Case]:
     """Damage .npy files."""
+    needs = ("extract .npy",)
     for kind, data in NPY.items():
-
-        def fit(world: World, bad: pathlib.Path, data: bytes = data) -> list[str]:
-            (bad / "bad.npy").write_bytes(data)
-            return with_flag(base("pca", world, bad), "--descriptors", str(bad / "bad.npy"))
-
-        def pair(world: World, bad: pathlib.Path, data: bytes = data) -> list[str]:
-            (bad / "bad.npy").write_bytes(data)
-            (bad / "bad.names.txt").write_text("".join(f"{n}.jpg\n" for n in range(8)))
-            return with_flag(base("extract", world, bad), "--database", str(bad / "bad.npy"))
-
-        yield Case("arrays: pca", kind, fit, ("bad.npy", "dim"), needs=("extract .npy",))
-        yield Case("arrays: extract --database", kind, pair, ("bad.npy",))
-    for kind, data in {
+        make = with_file("pca", "--descriptors", "bad.npy", containing(data))
+        yield Case("arrays: pca", kind, make, ("bad.npy", "dim"), needs=needs)
+        write = _descriptors(data, b"".join(b"%d.jpg\n" % number for number in range(8)))
+        make = with_file("extract", "--database", "bad.npy", write)
+        yield Case("arrays: extract --database", kind, make, ("bad.npy",))
+    whole = io.BytesIO()
+    np.save(whole, np.eye(8, 584, dtype=np.float32))
+    for kind, names in {
         "not UTF-8": b"caf\xe9.jpg\n" * 8,
         "a NUL": b"a\0b.jpg\n" * 8,
         "UTF-16": "a.jpg\n".encode("utf-16") * 8,
         "too few": b"a.jpg\n",
         "one line of 100 MB": b"x" * 10**8,
         "escapes": b"a\x1b[31m.jpg\n" * 7,
-        "a folder": b"",
+        "a folder": None,
     }.items():
-
-        def named(
-            world: World, bad: pathlib.Path, data: bytes = data, kind: str = kind
-        ) -> list[str]:
-            np.save(bad / "bad.npy", np.eye(8, 584, dtype=np.float32))
-            if kind == "a folder":
-                (bad / "bad.names.txt").mkdir()
-            else:
-                (bad / "bad.names.txt").write_bytes(data)
-            return with_flag(base("extract", world, bad), "--database", str(bad / "bad.npy"))
-
-        yield Case("names of descriptors", kind, named, ("bad.n", "pairs"))
+        write = _descriptors(whole.getvalue(), names)
+        make = with_file("extract", "--database", "bad.npy", write)
+        yield Case("names of descriptors", kind, make, ("bad.n", "pairs"))
 
 
-def _one_bad_picture(bad: pathlib.Path) -> str:
-    """Make a folder that no extraction gets through: it is refused at the latest by its picture."""
-    (bad / "pictures").mkdir()
-    (bad / "pictures" / "broken.jpg").write_bytes(b"\xff\xd8 no picture")
-    return str(bad / "pictures")
-
-
-def _h5(bad: pathlib.Path, kind: str) -> None:
+def _virtual(file: Any) -> None:
     import h5py
 
-    with h5py.File(bad / "bad.h5", "w") as file:
-        if kind == "a TB":
-            file.create_dataset(
-                "a/global_descriptor", (2**38,), "f4", chunks=(2**20,), compression=1
-            )
-        elif kind == "external":
-            file.create_dataset(
-                "a/global_descriptor", (96,), "f4", external=[("/etc/passwd", 0, 384)]
-            )
-        elif kind == "virtual":
-            layout = h5py.VirtualLayout((96,), "f4")
-            layout[:] = h5py.VirtualSource("/etc/passwd", "x", (96,))
-            file.create_virtual_dataset("a/global_descriptor", layout)
-        elif kind == "an external link":
-            file["a"] = h5py.ExternalLink("/etc/passwd", "/x")
-        elif kind == "links in a circle":
-            file["a"] = h5py.SoftLink("/b")
-            file["b"] = h5py.SoftLink("/a")
-        elif kind == "a group in itself":
-            file.create_group("a")["b"] = file["/"]
-        elif kind == "groups 1,000 deep":
-            group = file
-            for _ in range(1000):
-                group = group.create_group("g")
-            group.create_dataset("global_descriptor", data=np.ones(96, "f4"))
-        elif kind == "a number":
-            file.create_dataset("a/global_descriptor", data=1.0)
-        elif kind == "text":
-            file.create_dataset("a/global_descriptor", data="text")
-        elif kind == "fields":
-            file.create_dataset("a/global_descriptor", data=np.zeros(4, [("x", "f4")]))
-        elif kind == "a name with a line break":
-            file.create_dataset("a\nb\x1b[31m/global_descriptor", data=np.ones(96, "f4"))
-        elif kind == "a name that is no UTF-8":
-            file.create_dataset("cafe/global_descriptor", data=np.ones(96, "f4"))
-        elif kind == "lengths that differ":
-            file.create_dataset("a/global_descriptor", data=np.ones(96, "f4"))
-            file.create_dataset("b/global_descriptor", data=np.ones(95, "f4"))
-        elif kind == "empty":
-            file.create_dataset("a/global_descriptor", data=h5py.Empty("f4"))
-        elif kind == "integers":
-            file.create_dataset("a/global_descriptor", data=np.ones(96, "i4"))
-    if kind == "a name that is no UTF-8":
-        data = (bad / "bad.h5").read_bytes()
-        (bad / "bad.h5").write_bytes(data.replace(b"cafe", b"caf\xe9"))
+    layout = h5py.VirtualLayout((96,), "f4")
+    layout[:] = h5py.VirtualSource("/etc/passwd", "x", (96,))
+    file.create_virtual_dataset(DATASET, layout)
 
 
-H5 = (
-    *("a TB", "external", "virtual", "an external link", "links in a circle", "a group in itself"),
-    *("groups 1,000 deep", "a number", "text", "fields", "a name with a line break"),
-    *("a name that is no UTF-8", "lengths that differ", "empty", "integers", "nothing"),
-)
+def _deep_groups(file: Any) -> None:
+    for _ in range(1000):
+        file = file.create_group("g")
+    file.create_dataset("global_descriptor", data=np.ones(96, "f4"))
+
+
+def _links(file: Any) -> None:
+    import h5py
+
+    file["a"], file["b"] = h5py.SoftLink("/b"), h5py.SoftLink("/a")
+
+
+def _external_link(file: Any) -> None:
+    import h5py
+
+    file["a"] = h5py.ExternalLink("/etc/passwd", "/x")
+
+
+def _empty(file: Any) -> None:
+    import h5py
+
+    file.create_dataset(DATASET, data=h5py.Empty("f4"))
+
+
+def _lengths(file: Any) -> None:
+    file.create_dataset(DATASET, data=np.ones(96, "f4"))
+    file.create_dataset("b/global_descriptor", data=np.ones(95, "f4"))
+
+
+def _dataset(name: str, *shape: Any, **options: Any) -> Callable[[Any], Any]:
+    return lambda file: file.create_dataset(name, *shape, **options)
+
+
+DATASET = "a/global_descriptor"
+H5: Mapping[str, Callable[[Any], Any]] = {
+    "a TB": _dataset(DATASET, (2**38,), "f4", chunks=(2**20,), compression=1),
+    "external": _dataset(DATASET, (96,), "f4", external=[("/etc/passwd", 0, 384)]),
+    "virtual": _virtual,
+    "an external link": _external_link,
+    "links in a circle": _links,
+    "a group in itself": lambda file: file.create_group("a").__setitem__("b", file["/"]),
+    "groups 1,000 deep": _deep_groups,
+    "a number": _dataset(DATASET, data=1.0),
+    "text": _dataset(DATASET, data="text"),
+    "fields": _dataset(DATASET, data=np.zeros(4, [("x", "f4")])),
+    "a name with a line break": _dataset("a\nb\x1b[31m/global_descriptor", data=np.ones(96, "f4")),
+    "a name that is no UTF-8": _dataset("cafe/global_descriptor", data=np.ones(96, "f4")),
+    "lengths that differ": _lengths,
+    "empty": _empty,
+    "integers": _dataset(DATASET, data=np.ones(96, "i4")),
+    "nothing": lambda file: None,
+}
+
+
+def _with_h5(write: Callable[[World, pathlib.Path], Any]) -> Make:
+    """Give `extract` a database, and a picture at which it ends at the latest."""
+
+    def make(world: World, bad: pathlib.Path) -> list[str]:
+        write(world, bad / "bad.h5")
+        containing(b"\xff\xd8 no picture")(bad / "pictures" / "broken.jpg")
+        given = with_flag(base("extract", world, bad), "--images", str(bad / "pictures"))
+        return with_flag(given, "--database", str(bad / "bad.h5"))
+
+    return make
+
+
+def _h5(kind: str) -> Callable[[World, pathlib.Path], Any]:
+    def write(_: World, path: pathlib.Path) -> None:
+        import h5py
+
+        with h5py.File(path, "w") as file:
+            H5[kind](file)
+        if kind == "a name that is no UTF-8":
+            path.write_bytes(path.read_bytes().replace(b"cafe", b"caf\xe9"))
+
+    return write
+
+
+def _damaged_h5(place: float, change: bytes, cut: bool) -> Callable[[World, pathlib.Path], Any]:
+    def write(world: World, path: pathlib.Path) -> None:
+        data = bytearray(world.path("d.h5").read_bytes())
+        start = int(place * len(data))
+        data[start : None if cut else start + 8] = b"" if cut else change
+        path.write_bytes(data)
+
+    return write
 
 
 def hdf5(seed: int) -> Iterator[Case]:
     """Damage .h5 files, and let them claim what they do not hold."""
     for kind in H5:
-
-        def make(world: World, bad: pathlib.Path, kind: str = kind) -> list[str]:
-            _h5(bad, kind)
-            given = with_flag(base("extract", world, bad), "--images", _one_bad_picture(bad))
-            return with_flag(given, "--database", str(bad / "bad.h5"))
-
-        yield Case("HDF5", kind, make, ("bad.h5",))
+        yield Case("HDF5", kind, _with_h5(_h5(kind)), ("bad.h5",))
     generator = random.Random(seed)
     for number in range(48):
         place, change, cut = generator.random(), generator.randbytes(8), number % 6 == 0
-
-        def damaged(
-            world: World,
-            bad: pathlib.Path,
-            place: float = place,
-            change: bytes = change,
-            cut: bool = cut,
-        ) -> list[str]:
-            data = bytearray((world.path("d.h5")).read_bytes())
-            start = int(place * len(data))
-            if cut:
-                del data[start:]
-            else:
-                data[start : start + 8] = change
-            (bad / "bad.h5").write_bytes(data)
-            given = with_flag(base("extract", world, bad), "--images", _one_bad_picture(bad))
-            return with_flag(given, "--database", str(bad / "bad.h5"))
-
         words = f"{'cut at' if cut else change.hex() + ' at'} {place:.4f}"
-        named = ("bad.h5", "broken.jpg")
-        yield Case("HDF5: damaged", words, damaged, named, needs=("extract .h5",))
+        named, needs = ("bad.h5", "broken.jpg"), ("extract .h5",)
+        make = _with_h5(_damaged_h5(place, change, cut))
+        yield Case("HDF5: damaged", words, make, named, needs=needs)
 
 
 def _leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -737,26 +751,16 @@ def configurations(seed: int) -> Iterator[Case]:
         "a key twice": json.dumps(to_plain(RECIPE)).replace('"epochs"', '"epochs": 0, "epochs"'),
     }
     for kind, text in texts.items():
-
-        def make(world: World, bad: pathlib.Path, text: str = text) -> list[str]:
-            (bad / "bad.json").write_text(text)
-            return with_flag(base("train", world, bad), "--config", str(bad / "bad.json"))
-
+        make = with_file("train", "--config", "bad.json", containing(text))
         yield Case("configurations", kind, make, ("bad.json", "weights.safetensors"))
     generator = random.Random(seed)
     plain = to_plain(RECIPE)
     places = list(_leaves(plain))
     for _ in range(60):
         place, new = generator.choice(places), generator.choice(STRANGE)
-
-        def made(world: World, bad: pathlib.Path, place: Any = place, new: Any = new) -> list[str]:
-            (bad / "bad.json").write_text(json.dumps(_changed(plain, place, new)))
-            (bad / "no-places").mkdir()
-            given = with_flag(base("train", world, bad), "--config", str(bad / "bad.json"))
-            return with_flag(given, "--data", str(bad / "no-places"))
-
         words = f"{'.'.join(map(str, place))} = {new!r}"
-        yield Case("configurations: strange values", words, made)
+        make = _without_places(containing(json.dumps(_changed(plain, place, new))))
+        yield Case("configurations: strange values", words, make)
     model = to_plain(MODEL)
     places = list(_leaves(model))
     for _ in range(40):
@@ -774,6 +778,17 @@ def configurations(seed: int) -> Iterator[Case]:
     ):
         changed = _changed(model, place, new)
         yield Case("weights: strange configurations", words, _weights_of(changed), ("bad.safe",))
+
+
+def _without_places(write: Write) -> Make:
+    """Give `train` a configuration, and a folder at which it ends at the latest."""
+    with_config = with_file("train", "--config", "bad.json", write)
+
+    def make(world: World, bad: pathlib.Path) -> list[str]:
+        (bad / "no-places").mkdir()
+        return with_flag(with_config(world, bad), "--data", str(bad / "no-places"))
+
+    return make
 
 
 def _weights_of(config: Any) -> Make:
@@ -829,46 +844,43 @@ def _deep_pickle() -> bytes:
     return b"\x80\x02" + b"]" * 100_000 + b"a" * 99_999 + b"."
 
 
+def _without_weights(make: Make) -> Make:
+    def made(world: World, bad: pathlib.Path) -> list[str]:
+        given = make(world, bad)
+        where = given.index("--weights")
+        return given[:where] + given[where + 2 :]
+
+    return made
+
+
 def weights() -> Iterator[Case]:
     """Damage weights and checkpoints."""
     for kind, data in SAFETENSORS.items():
         for verb, flag in (("info", "--weights"), ("convert", "SRC"), ("train", "--backbone")):
-
-            def make(
-                world: World,
-                bad: pathlib.Path,
-                verb: str = verb,
-                flag: str = flag,
-                data: bytes = data,
-            ) -> list[str]:
-                (bad / "bad.safetensors").write_bytes(data)
-                given = _put(verb, flag, base(verb, world, bad), str(bad / "bad.safetensors"))
-                if verb == "train":
-                    where = given.index("--weights")
-                    del given[where : where + 2]
-                return given
-
+            make = with_file(verb, flag, "bad.safetensors", containing(data))
+            make = _without_weights(make) if verb == "train" else make
             yield Case("weights: safetensors", f"{verb}: {kind}", make, ("bad.safetensors",))
-    makers: Mapping[str, Callable[[pathlib.Path], Any]] = {
-        "a call": lambda path: path.write_bytes(pickle.dumps(_Call())),
-        "nested deep": lambda path: path.write_bytes(_deep_pickle()),
+    makers: Mapping[str, Write] = {
+        "a call": containing(pickle.dumps(_Call())),
+        "nested deep": containing(_deep_pickle()),
         "a bomb of 4 GB": _torch_bomb,
         "a tensor that claims 2**38 numbers": _huge_storage,
-        "a list": lambda path: path.write_bytes(pickle.dumps([1, 2])),
-        "a pickle that recurses": lambda path: path.write_bytes(b"\x80\x02]q\x00h\x00a."),
-        "memo of 2**31": lambda path: path.write_bytes(b"\x80\x02Nr\xff\xff\xff\x7f."),
-        "a long of 2**31 bytes": lambda path: path.write_bytes(b"\x80\x02\x8b\xff\xff\xff\x7f."),
-        "numbers by text": lambda path: path.write_bytes(b"\x80\x02L" + b"9" * 10**6 + b"L\n."),
+        "a list": containing(pickle.dumps([1, 2])),
+        "a pickle that recurses": containing(b"\x80\x02]q\x00h\x00a."),
+        "memo of 2**31": containing(b"\x80\x02Nr\xff\xff\xff\x7f."),
+        "a long of 2**31 bytes": containing(b"\x80\x02\x8b\xff\xff\xff\x7f."),
+        "numbers by text": containing(b"\x80\x02L" + b"9" * 10**6 + b"L\n."),
     }
     for kind, maker in makers.items():
+        yield Case("weights: torch", kind, _converted(maker), ("bad.pth",), check=_not_run)
 
-        def torch_file(
-            world: World, bad: pathlib.Path, maker: Callable[[pathlib.Path], Any] = maker
-        ) -> list[str]:
-            maker(bad / "bad.pth")
-            return ["convert", str(bad / "bad.pth"), str(bad / "out" / "x.safetensors")]
 
-        yield Case("weights: torch", kind, torch_file, ("bad.pth",), check=_not_run)
+def _converted(write: Write) -> Make:
+    def make(world: World, bad: pathlib.Path) -> list[str]:
+        write(bad / "bad.pth")
+        return ["convert", str(bad / "bad.pth"), str(bad / "out" / "x.safetensors")]
+
+    return make
 
 
 def _not_run(done: Done, folder: pathlib.Path) -> str | None:
@@ -944,102 +956,68 @@ PICTURES: Mapping[str, Callable[[], bytes]] = {
 }
 
 
+def _linked(made: Sequence[tuple[str, str]]) -> Write:
+    """Make a folder of pictures with links, and one picture at which it ends at the latest."""
+
+    def write(folder: pathlib.Path) -> None:
+        for name, target in made:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).symlink_to(target)
+        (folder / "broken.jpg").write_bytes(b"broken")
+
+    return write
+
+
+def _printed(make: Make, more: Sequence[str]) -> Make:
+    """Let a query print its answers, or draw them."""
+
+    def made(world: World, bad: pathlib.Path) -> list[str]:
+        given = [*make(world, bad)[:2], "--map", str(world.path("map")), "--quiet"]
+        return [*given, *(each.replace("OUT", str(bad / "out")) for each in more)]
+
+    return made
+
+
 def pictures() -> Iterator[Case]:
     """Give pictures that are none, claim any size, or have names that terminals obey."""
     for kind, data in PICTURES.items():
         for verb, flag in (("extract", "--images"), ("index", "--images"), ("query", "IMAGE")):
-
-            def make(
-                world: World,
-                bad: pathlib.Path,
-                verb: str = verb,
-                flag: str = flag,
-                data: Callable[[], bytes] = data,
-            ) -> list[str]:
-                (bad / "pictures").mkdir()
-                (bad / "pictures" / "bad.png").write_bytes(data())
-                return _put(verb, flag, base(verb, world, bad), str(bad / "pictures"))
-
+            make = with_file(verb, flag, "pictures/bad.png", containing(data), "pictures")
             needs = _products_of(verb)
             yield Case("pictures", f"{verb}: {kind}", make, ("bad.png",), needs=needs)
-    links = {
+    # A link to the root would find pictures of all kinds.
+    for kind, made in {
         "a folder that links to itself": (("a/b", "../a"),),
         "two folders that link to each other": (("a/x", "../b"), ("b/y", "../a")),
-        "a link to the root": (("a/root", "/"),),
-    }
-    for kind, made in links.items():
-
-        def linked(
-            world: World, bad: pathlib.Path, made: Sequence[tuple[str, str]] = made
-        ) -> list[str]:
-            for name, target in made:
-                path = bad / "pictures" / name
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.symlink_to(target)
-            (bad / "pictures" / "broken.jpg").write_bytes(b"broken")
-            return _put("extract", "--images", base("extract", world, bad), str(bad / "pictures"))
-
-        if kind != "a link to the root":  # which finds pictures of all kinds
-            yield Case("pictures: links", kind, linked, ("broken.jpg", "pictures"))
+    }.items():
+        make = with_file("extract", "--images", "pictures", _linked(made))
+        yield Case("pictures: links", kind, make, ("broken.jpg", "pictures"))
     names = {
         "escapes": "a\x1b[31mb.jpg", "a line break": "a\nb.jpg", "no UTF-8": "caf\udce9.jpg",
         "a bell and a carriage return": "a\x07\rb.jpg", "right to left": "a\u202eb.jpg",
     }  # fmt: skip
+    attack, needs = "pictures: names", ("index",)
     for kind, name in names.items():
         for words, data in (("broken", b"broken"), ("whole", picture_bytes())):
-
-            def named(
-                world: World, bad: pathlib.Path, name: str = name, data: bytes = data
-            ) -> list[str]:
-                (bad / "pictures").mkdir()
-                (bad / "pictures" / name).write_bytes(data)
-                return _put(
-                    "extract", "--images", base("extract", world, bad), str(bad / "pictures")
-                )
-
-            def asked(
-                world: World, bad: pathlib.Path, name: str = name, data: bytes = data
-            ) -> list[str]:
-                (bad / "pictures").mkdir()
-                (bad / "pictures" / name).write_bytes(data)
-                return _put(
-                    "query", "IMAGE", base("query", world, bad), str(bad / "pictures" / name)
-                )
-
-            yield Case("pictures: names", f"extract: {kind}, {words}", named, fine=True)
-            yield Case(
-                "pictures: names", f"query: {kind}, {words}", asked, fine=True, needs=("index",)
-            )
+            path = f"pictures/{name}"
+            make = with_file("extract", "--images", path, containing(data), "pictures")
+            yield Case(attack, f"extract: {kind}, {words}", make, fine=True)
+            make = with_file("query", "IMAGE", path, containing(data))
+            yield Case(attack, f"query: {kind}, {words}", make, fine=True, needs=needs)
             for more in (["--json", "-"], ["--gallery", "OUT/g.png"], []):
-
-                def printed(
-                    world: World,
-                    bad: pathlib.Path,
-                    asked: Make = asked,
-                    more: list[str] = more,
-                ) -> list[str]:
-                    given = [*asked(world, bad)[:2], "--map", str(world.path("map")), "--quiet"]
-                    return [*given, *(each.replace("OUT", str(bad / "out")) for each in more)]
-
                 if words == "whole":
-                    yield Case(
-                        "pictures: names",
-                        f"query {more}: {kind}",
-                        printed,
-                        fine=True,
-                        needs=("index",),
-                    )
+                    made = _printed(make, more)
+                    yield Case(attack, f"query {more}: {kind}", made, fine=True, needs=needs)
 
-    def heic(world: World, bad: pathlib.Path) -> list[str]:
-        (bad / "pictures").mkdir()
+    def others(folder: pathlib.Path) -> None:
         for name in ("a.heic", "b.HEIC", "c.gif"):
-            (bad / "pictures" / name).write_bytes(b"other")
-        return _put("extract", "--images", base("extract", world, bad), str(bad / "pictures"))
+            containing(b"other")(folder / name)
 
     def told(done: Done, folder: pathlib.Path) -> str | None:
         return None if "heic" in done.err else "no word of the images that are not read"
 
-    yield Case("pictures", "none but .heic", heic, ("found no image",), check=told)
+    make = with_file("extract", "--images", "pictures", others)
+    yield Case("pictures", "none but .heic", make, ("found no image",), check=told)
 
 
 POSITIONS: Mapping[str, bytes] = {
@@ -1068,13 +1046,8 @@ POSITIONS: Mapping[str, bytes] = {
 def tables() -> Iterator[Case]:
     """Damage tables of CSV."""
     for kind, data in POSITIONS.items():
-
-        def make(world: World, bad: pathlib.Path, data: bytes = data) -> list[str]:
-            (bad / "bad.csv").write_bytes(data)
-            return with_flag(base("index", world, bad), "--positions", str(bad / "bad.csv"))
-
-        fine = kind == "a byte order mark"
-        yield Case("tables: positions", kind, make, ("bad.csv",), fine)
+        make = with_file("index", "--positions", "bad.csv", containing(data))
+        yield Case("tables: positions", kind, make, ("bad.csv",))
     head = b"place_id,year,month,northdeg,city_id,lat,lon,panoid\n"
     rows = {
         "a NUL": b"0,2020,5,0,Aston,1.5\x00,2.5,pano\n",
@@ -1092,19 +1065,20 @@ def tables() -> Iterator[Case]:
         "a folder": b"",
     }
     for kind, data in rows.items():
+        write = _table(None if kind == "a folder" else data if kind == "UTF-16" else head + data)
+        make = with_file("train", "--data", "places", write)
+        yield Case("tables: places", kind, make, ("Bad.csv",))
 
-        def places(
-            world: World, bad: pathlib.Path, data: bytes = data, kind: str = kind
-        ) -> list[str]:
-            (bad / "places" / "Dataframes").mkdir(parents=True)
-            table = bad / "places" / "Dataframes" / "Bad.csv"
-            if kind == "a folder":
-                table.mkdir()
-            else:
-                table.write_bytes(data if kind == "UTF-16" else head + data)
-            return with_flag(base("train", world, bad), "--data", str(bad / "places"))
 
-        yield Case("tables: places", kind, places, ("Bad.csv",))
+def _table(data: bytes | None) -> Write:
+    """Write a training set with this table; None is a folder of its name."""
+
+    def write(folder: pathlib.Path) -> None:
+        table = folder / "Dataframes" / "Bad.csv"
+        table.parent.mkdir(parents=True)
+        table.mkdir() if data is None else table.write_bytes(data)
+
+    return write
 
 
 # ---- Maps ----
@@ -1125,6 +1099,25 @@ def _sealed(path: pathlib.Path, change: Callable[[Any], Any]) -> None:
 
 def _setting(key: str, new: Any) -> Callable[[Any], Any]:
     return lambda value: value | {key: new}
+
+
+def _with_map(change: Callable[[pathlib.Path], Any]) -> Make:
+    """Change a copy of the map, and ask it."""
+
+    def make(world: World, bad: pathlib.Path) -> list[str]:
+        shutil.copytree(world.path("map"), bad / "map")
+        change(bad / "map")
+        return with_flag(base("query", world, bad), "--map", str(bad / "map"))
+
+    return make
+
+
+def _sealed_in(name: str, change: Callable[[Any], Any]) -> Write:
+    return lambda folder: _sealed(folder / name, change)
+
+
+def _written_in(name: str, data: bytes | str) -> Write:
+    return lambda folder: containing(data)(folder / name)
 
 
 def maps() -> Iterator[Case]:
@@ -1173,42 +1166,20 @@ def maps() -> Iterator[Case]:
     }
     for name, changes in (("segments/0000000000.json", records), ("map.json", descriptions)):
         for kind, change in changes.items():
-
-            def make(
-                world: World,
-                bad: pathlib.Path,
-                name: str = name,
-                change: Callable[[Any], Any] = change,
-            ) -> list[str]:
-                shutil.copytree(world.path("map"), bad / "map")
-                _sealed(bad / "map" / name, change)
-                return with_flag(base("query", world, bad), "--map", str(bad / "map"))
-
             # What a map says of its images, or of where it was made, may be anything of its type.
             fine = kind in ("names with escapes", "a grouping of words", "a collection outside")
             fine |= kind in ("names of numbers", "a digest of nothing", "positions of NaN")
             # Of wrong names or roots, the picture that is not there is told.
+            make = _with_map(_sealed_in(name, change))
             yield Case(f"maps: {name}", kind, make, ("map", "images/", ".jpg"), fine, ("index",))
     for kind, data in NPY.items():
-
-        def segment(world: World, bad: pathlib.Path, data: bytes = data) -> list[str]:
-            shutil.copytree(world.path("map"), bad / "map")
-            (bad / "map" / "segments" / "0000000000.npy").write_bytes(data)
-            return with_flag(base("query", world, bad), "--map", str(bad / "map"))
-
-        yield Case("maps: descriptors", kind, segment, ("0000000000",), needs=("index",))
+        make = _with_map(_written_in("segments/0000000000.npy", data))
+        yield Case("maps: descriptors", kind, make, ("0000000000",), needs=("index",))
     texts = {"deep": "[" * 200_000, "NaN": "NaN", "nothing": "", "a key twice": '{"a":1,"a":2}'}
     for name in ("segments/0000000000.json", "map.json"):
         for kind, text in texts.items():
-
-            def written(
-                world: World, bad: pathlib.Path, name: str = name, text: str = text
-            ) -> list[str]:
-                shutil.copytree(world.path("map"), bad / "map")
-                (bad / "map" / name).write_text(text)
-                return with_flag(base("query", world, bad), "--map", str(bad / "map"))
-
-            yield Case(f"maps: {name}", f"text: {kind}", written, ("map",), needs=("index",))
+            make = _with_map(_written_in(name, text))
+            yield Case(f"maps: {name}", f"text: {kind}", make, ("map",), needs=("index",))
 
 
 # ---- Layouts of evaluation sets ----
@@ -1271,18 +1242,16 @@ def layouts() -> Iterator[Case]:
     }
     for kind in ("netvlad", "salad", "msls"):
         for words, names in strange.items():
-
-            def make(
-                world: World,
-                bad: pathlib.Path,
-                kind: str = kind,
-                names: Sequence[str] = names,
-            ) -> list[str]:
-                path = _layout(bad, kind, names)
-                return with_flag(base("evaluate", world, bad), "--data", str(path))
-
             named = ("set", "outside.png", "/etc", "/dev", "png", "xxx")
-            yield Case("layouts: names", f"{kind}: {words}", make, named, fine=words == "outside")
+            fine = words == "outside"
+            yield Case("layouts: names", f"{kind}: {words}", _listed(kind, names), named, fine)
+
+
+def _listed(kind: str, names: Sequence[str]) -> Make:
+    def make(world: World, bad: pathlib.Path) -> list[str]:
+        return with_flag(base("evaluate", world, bad), "--data", str(_layout(bad, kind, names)))
+
+    return make
 
 
 # ---- Comparisons ----
@@ -1290,27 +1259,23 @@ def layouts() -> Iterator[Case]:
 
 def comparisons() -> Iterator[Case]:
     """Change what a finished comparison left."""
-    files: Mapping[str, dict[str, Callable[[Any], Any]]] = {
-        "crisalad+gem/seed-0/result.json": {
-            "no settings": _setting("settings", {}),
-            "other settings": _setting("settings", {"training": {"epochs": 99}}),
-        },
-    }
-    for name, changes in files.items():
-        for kind, change in changes.items():
+    name = "crisalad+gem/seed-0/result.json"
+    for kind, settings in {
+        "no settings": {},
+        "other settings": {"training": {"epochs": 99}},
+    }.items():
+        make = _with_comparison(_sealed_in(name, _setting("settings", settings)))
+        named = ("result.json", "comparison")
+        yield Case(f"comparisons: {name}", kind, make, named, needs=("compare",))
 
-            def make(
-                world: World,
-                bad: pathlib.Path,
-                name: str = name,
-                change: Callable[[Any], Any] = change,
-            ) -> list[str]:
-                shutil.copytree(world.path("comparison"), bad / "comparison")
-                _sealed(bad / "comparison" / name, change)
-                return with_flag(base("compare", world, bad), "--out", str(bad / "comparison"))
 
-            named = (pathlib.Path(name).name, "comparison")
-            yield Case(f"comparisons: {name}", kind, make, named, needs=("compare",))
+def _with_comparison(change: Write) -> Make:
+    def make(world: World, bad: pathlib.Path) -> list[str]:
+        shutil.copytree(world.path("comparison"), bad / "comparison")
+        change(bad / "comparison")
+        return with_flag(base("compare", world, bad), "--out", str(bad / "comparison"))
+
+    return make
 
 
 # ---- The rest ----
@@ -1336,15 +1301,9 @@ def processes() -> Iterator[Case]:
     }
     for kind, address in addresses.items():
         for index in ("0", "5", "-1"):
-
-            def make(
-                world: World, bad: pathlib.Path, address: str = address, index: str = index
-            ) -> list[str]:
-                given = [*base("train", world, bad), "--coordinator-address", address]
-                return [*given, "--num-processes", "1", "--process-id", index]
-
+            more = ("--coordinator-address", address, "--num-processes", "1", "--process-id", index)
             words = ("process", "coordinator")
-            yield Case("processes", f"{kind}, index {index}", make, words)
+            yield Case("processes", f"{kind}, index {index}", with_more("train", *more), words)
 
 
 held: list[socket.socket] = []
@@ -1352,26 +1311,11 @@ held: list[socket.socket] = []
 
 def memory() -> Iterator[Case]:
     """Limit the address space."""
-    for verb in (
-        "train",
-        "evaluate",
-        "extract",
-        "index",
-        "query",
-        "pca",
-        "convert",
-        "info",
-        "export",
-    ):
+    verbs = ("train", "evaluate", "extract", "index", "query", "pca", "convert", "info", "export")
+    for verb in verbs:
         for megabytes in (16, 64, 256, 1024):
-
-            def make(world: World, bad: pathlib.Path, verb: str = verb) -> list[str]:
-                return base(verb, world, bad)
-
-            words = f"{verb}: {megabytes} MB"
-            yield Case(
-                "memory", words, make, (), True, _products_of(verb), memory=megabytes * 2**20
-            )
+            words, needs, most = f"{verb}: {megabytes} MB", _products_of(verb), megabytes * 2**20
+            yield Case("memory", words, with_more(verb), (), True, needs, memory=most)
 
 
 MARKUP = "<script>alert(1)</script>"

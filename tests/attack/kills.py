@@ -161,8 +161,8 @@ def command(arguments: Sequence[str], marks: Marks, *settings: tuple[Any, str, A
     """Return the work of a child: a command, with its marks, and attributes set to other values."""
 
     def work() -> int:
+        from crisalad_jax.__main__ import keep_on_without_reader
         from crisalad_jax.cli import main
-        from crisalad_jax.utils.output import keep_on_without_reader
         from crisalad_jax.utils.signals import end_at_signals
 
         for holder, name, value in settings:

@@ -218,8 +218,8 @@ def run(arguments: Sequence[str], *, cwd: pathlib.Path, **options: object) -> Do
 
 def command(arguments: Sequence[str]) -> int:
     """Run a command in this process, as the program `crisalad` does; return its exit code."""
+    from crisalad_jax.__main__ import keep_on_without_reader
     from crisalad_jax.cli import main
-    from crisalad_jax.utils.output import keep_on_without_reader
     from crisalad_jax.utils.signals import end_at_signals
 
     end_at_signals()

@@ -21,7 +21,7 @@ import safetensors.numpy
 import torch
 
 import crisalad_jax as cj
-import crisalad_jax.utils.download
+import crisalad_jax.checkpoints.download
 from crisalad_jax.checkpoints import cache
 from crisalad_jax.checkpoints.cache import cached_weights, is_cached
 from crisalad_jax.checkpoints.formats import VOCABULARY, public_shapes
@@ -34,7 +34,6 @@ from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import parameter_shapes
-from crisalad_jax.utils.download import RetryPolicy
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import CACHE, user_cache
 from crisalad_jax.utils.output import Note
@@ -55,8 +54,6 @@ MIT, GPL = (
     Licence("GPL-3.0", True, "copyleft, which what you publish may inherit"),
 )
 NO_LICENCE = Licence("no licence file")
-# Long enough for loopback on a loaded machine where nothing stalls.
-QUICK = RetryPolicy(timeout=5.0, least=1, attempts=2, pause=0.01)
 
 
 def state_bytes(seed: int, config: ModelConfig = CONFIG) -> bytes:
@@ -88,7 +85,8 @@ def model(server: FileServer, tmp_path: pathlib.Path, monkeypatch: pytest.Monkey
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     # The stalls and pauses of the default would last for minutes.
-    monkeypatch.setattr(crisalad_jax.utils.download, "RetryPolicy", lambda: QUICK)
+    monkeypatch.setattr(crisalad_jax.checkpoints.download, "_ATTEMPTS", 2)
+    monkeypatch.setattr(crisalad_jax.checkpoints.download, "_PAUSE", 0.01)
     tiny = Published(
         name="tiny-model",
         format="huggingface",

@@ -32,7 +32,7 @@ from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.gem import CosPlaceConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.queries import BoqConfig
-from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.model import Crisalad, Model, describe, init_crisalad, self_mask
 from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.utils import compiler
@@ -45,6 +45,26 @@ from tests.conftest import BATCH, MODEL, write_picture
 
 pytestmark = pytest.mark.usefixtures("symbolic_shapes")
 
+NEWTON = dataclasses.replace(
+    MODEL.aggregator,
+    sinkhorn=SinkhornConfig(step="newton", tolerance=1e-4, iterations=20, gradient="stop"),
+)
+OTHERS = {
+    name: dataclasses.replace(MODEL, aggregator=aggregator)
+    for name, aggregator in {
+        "pyramid": "gem-pyramid",
+        "GeM": "gem",
+        "Conv-AP": ConvApConfig(channels=16),
+        "CosPlace": CosPlaceConfig(dim=16),
+        "MixVPR": MixVprConfig(16, 2, 2),
+        "BoQ": BoqConfig(16, 3, 2, 5),
+    }.items()
+}
+"""Models of other aggregators, for each format."""
+PLAIN = OTHERS | {
+    "bfloat16": dataclasses.replace(MODEL, compute_dtype="bfloat16"),
+    "newton": dataclasses.replace(MODEL, aggregator=NEWTON),
+}
 SCRIPT = pathlib.Path(__file__).parents[2] / "scripts" / "run_exported.py"
 # The same operations, which another order of the compiler's rounds otherwise: numbers of a unit
 # descriptor are below 1, and float32 keeps 1e-7 of them. test_cli has the same.
@@ -227,30 +247,10 @@ def test_a_script_refuses_a_file_that_was_changed(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "config",
-    [
-        dataclasses.replace(MODEL, compute_dtype="bfloat16"),
-        dataclasses.replace(MODEL, aggregator="gem-pyramid"),
-        dataclasses.replace(
-            MODEL,
-            aggregator=dataclasses.replace(
-                MODEL.aggregator,
-                sinkhorn=SinkhornConfig(
-                    step="newton", tolerance=1e-4, iterations=20, gradient="stop"
-                ),
-            ),
-        ),
-        dataclasses.replace(MODEL, aggregator="gem"),
-        dataclasses.replace(MODEL, aggregator=ConvApConfig(channels=16)),
-        dataclasses.replace(MODEL, aggregator=CosPlaceConfig(dim=16)),
-        dataclasses.replace(MODEL, aggregator=MixVprConfig(16, 2, 2)),
-        dataclasses.replace(MODEL, aggregator=BoqConfig(16, 3, 2, 5)),
-    ],
-    ids=["bfloat16", "pyramid", "newton", "GeM", "Conv-AP", "CosPlace", "MixVPR", "BoQ"],
-)
-def test_other_models_for_all_platforms(config: ModelConfig):
+@pytest.mark.parametrize("name", PLAIN)
+def test_other_models_for_all_platforms(name: str):
     """Newton's steps solve linear systems, by another library on every platform."""
+    config = PLAIN[name]
     params = init_crisalad(jax.random.key(0), config)
     exported = export_model(params, config, ExportConfig(platforms=("cpu", "cuda", "rocm", "tpu")))
     program = export.deserialize(exported.serialize(vjp_order=0))
@@ -285,7 +285,12 @@ def test_nothing_is_chosen_by_the_platform_that_exports(monkeypatch: pytest.Monk
     ("fields", "words"),
     [
         ({"platforms": ("cpu", "metal")}, "ExportConfig.platforms: found"),
-        ({"platforms": ()}, "platforms: found none, expected some of cpu, cuda, rocm, tpu"),
+        ({"platforms": ()}, "format: found stablehlo with grouping single, 0 platforms"),
+        ({"grouping": "any"}, "format: found stablehlo with grouping any"),
+        (
+            {"format": "openvino", "weights_inside": True},
+            "format: found openvino with grouping single, 2 platforms and weights inside True",
+        ),
         ({"batch_size": 0}, "batch size: found 0, expected at least 1"),
         (
             {"grouping": "shuffled"},

@@ -11,8 +11,7 @@ import scipy.io
 
 from crisalad_jax import describe
 from crisalad_jax.checkpoints.formats import infer, public_shapes, to_params
-from crisalad_jax.checkpoints.formats.cnn import vgg_numbers
-from crisalad_jax.checkpoints.matlab_io import read_matlab
+from crisalad_jax.checkpoints.matlab_io import CONVOLUTIONS, read_matlab
 from crisalad_jax.checkpoints.public import convert, read_checkpoint
 from crisalad_jax.nn.aggregators.vlad import NetVladConfig
 from crisalad_jax.nn.projection import ProjectionConfig
@@ -32,7 +31,7 @@ def write_matlab(path: pathlib.Path, hloc: State, average: np.ndarray) -> None:
         layers[number]["weights"] = np.empty(2, object)
         layers[number]["weights"][:] = arrays
 
-    for _, number in vgg_numbers():
+    for number in CONVOLUTIONS:
         kernel = hloc[f"backbone.{number}.weight"].transpose(2, 3, 1, 0)
         put(number, kernel, hloc[f"backbone.{number}.bias"])
     put(30, hloc["netvlad.score_proj.weight"][:, :, 0].T, -hloc["netvlad.centers"])

@@ -199,22 +199,13 @@ def parameters(config: ModelConfig) -> int:
     return sum(leaf.size for leaf in jax.tree.leaves(parameter_shapes(config)))
 
 
-@pytest.mark.parametrize("name", STORED)
+@pytest.mark.parametrize("name", [*STORED, *SIZED])
 def test_a_models_facts_are_those_of_its_file(name):
     model = published_model(name)
-    layout, config = stored(name)
-    found = (model.format, model.descriptor, model.parameters)
-    assert found == (layout, config.descriptor_dim, parameters(config))
-
-
-@pytest.mark.parametrize("name", SIZED)
-def test_another_size_has_its_own_facts(name):
-    model = published_model(name)
-    like, settings = SIZED[name]
+    like, settings = SIZED.get(name, (name, {}))
     layout, config = stored(like)
-    config = dataclasses.replace(
-        config, aggregator=dataclasses.replace(config.aggregator, **settings)
-    )
+    head = dataclasses.replace(config.aggregator, **settings)
+    config = dataclasses.replace(config, aggregator=head)
     found = (model.format, model.descriptor, model.parameters)
     assert found == (layout, config.descriptor_dim, parameters(config))
 

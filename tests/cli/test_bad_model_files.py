@@ -1,7 +1,6 @@
 """Files that are no whole model, at each door that takes one: one line, and nothing written."""
 
 import dataclasses
-import pathlib
 from collections.abc import Callable
 
 import numpy as np
@@ -20,7 +19,7 @@ from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.utils.errors import InputError
-from tests.cli.test_cli import Capture, fails, succeeds
+from tests.cli.test_cli import fails, succeeds
 from tests.random_checkpoints import random_state, save
 
 Tensors = dict[str, torch.Tensor]
@@ -104,9 +103,7 @@ STATES: dict[str, tuple[Callable[[], Tensors], str]] = {
 
 
 @pytest.mark.parametrize("name", STATES)
-def test_a_part_of_a_model_or_one_of_another_size(
-    capfd: Capture, tmp_path: pathlib.Path, name: str
-) -> None:
+def test_a_part_of_a_model_or_one_of_another_size(capfd, tmp_path, name):
     make, words = STATES[name]
     file = save(tmp_path / "file.pth", make())
     fails(capfd, "convert", file, tmp_path / "ours.safetensors", words=(f"{file}: {words}",))
@@ -118,9 +115,7 @@ def test_a_part_of_a_model_or_one_of_another_size(
 
 @pytest.mark.parametrize("suffix", [".pth", ".ckpt", ".safetensors", ".mat"])
 @pytest.mark.parametrize("kept", [0.0, 0.001, 0.5, 0.99])
-def test_a_file_that_is_cut_short(
-    capfd: Capture, tmp_path: pathlib.Path, suffix: str, kept: float
-) -> None:
+def test_a_file_that_is_cut_short(capfd, tmp_path, suffix, kept):
     file = tmp_path / f"file{suffix}"
     if suffix == ".mat":
         scipy.io.savemat(file, {"net": {"layers": np.zeros((64, 64))}})
@@ -135,13 +130,10 @@ def test_a_file_that_is_cut_short(
     assert [path.name for path in tmp_path.iterdir()] == [file.name]
 
 
-@pytest.mark.parametrize("verb", ["extract", "evaluate", "info"])
-def test_public_files_are_told_from_ours_where_weights_are_asked_for(
-    capfd: Capture, tmp_path: pathlib.Path, verb: str
-) -> None:
+@pytest.mark.parametrize("verb", ["extract", "info"])
+def test_public_files_are_told_from_ours_where_weights_are_asked_for(capfd, tmp_path, verb):
     more = {
         "extract": ("--images", tmp_path, "--out", tmp_path / "d.npy"),
-        "evaluate": ("--data", tmp_path),
         "info": (),
     }[verb]
     public, old, matlab = (tmp_path / name for name in ("p.ckpt", "o.pth", "m.mat"))
@@ -165,16 +157,16 @@ def test_public_files_are_told_from_ours_where_weights_are_asked_for(
     fails(capfd, "convert", page, tmp_path / "x.safetensors", words=words)
 
 
-def test_a_preset_beside_weights(capfd: Capture, tmp_path: pathlib.Path) -> None:
+def test_a_preset_beside_weights(capfd, tmp_path):
     ours = tmp_path / "ours.safetensors"
     succeeds(capfd, "convert", save(tmp_path / "p.ckpt", salad()), ours)
-    words = ("--preset: found beside --weights, expected only one of the two",)
+    words = ("--preset: found with --weights, expected only one of the two",)
     given = ("--weights", ours, "--preset", "l14")
     fails(capfd, "info", *given, words=words)
     fails(capfd, "evaluate", *given, "--data", tmp_path, words=words)
 
 
-def test_training_from_another_size_or_kind(capfd: Capture, tmp_path: pathlib.Path) -> None:
+def test_training_from_another_size_or_kind(capfd, tmp_path):
     ours, public = tmp_path / "ours.safetensors", save(tmp_path / "p.ckpt", salad())
     succeeds(capfd, "convert", public, ours)
     train = ("train", "--preset", "tiny", "--data", tmp_path, "--out", tmp_path / "run")
@@ -193,6 +185,6 @@ def test_training_from_another_size_or_kind(capfd: Capture, tmp_path: pathlib.Pa
     assert not (tmp_path / "run").exists()
 
 
-def test_a_published_name_is_no_file_to_convert(capfd: Capture, tmp_path: pathlib.Path) -> None:
+def test_a_published_name_is_no_file_to_convert(capfd, tmp_path):
     words = ("salad: found the name of a published model, expected a file; --weights salad",)
     fails(capfd, "convert", "salad", tmp_path / "x.safetensors", words=words)

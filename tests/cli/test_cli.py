@@ -10,7 +10,6 @@ import pathlib
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 
 import cv2
 import h5py
@@ -28,7 +27,6 @@ from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.checkpoints.weights import FORMAT, load_weights, save_weights
 from crisalad_jax.cli import main
 from crisalad_jax.config.io import read_config, to_plain
-from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import resize_image
@@ -122,18 +120,13 @@ def test_help_lists_every_command_and_flag(capfd):
     for command, summary in crisalad_jax.cli._COMMANDS.items():
         assert f"{command} {summary}" in out
         help_text = succeeds(capfd, command, "--help-all")
-        module = importlib.import_module(f"crisalad_jax.cli.{command.replace('-', '_')}")
-        arguments = "".join(word.capitalize() for word in command.split("-"))
-        for field in dataclasses.fields(getattr(module, arguments)):
+        module = importlib.import_module(f"crisalad_jax.cli.{command}")
+        for field in dataclasses.fields(getattr(module, command.capitalize())):
             if (command, field.name) in POSITIONAL:
                 assert POSITIONAL[command, field.name] in help_text
             elif field.name != "settings":
                 assert f"--{field.name.replace('_', '-')}" in help_text
-    for flag in (
-        "--model.backbone.adapter.kind",
-        "--optimiser.learning-rate",
-        "--places-per-batch",
-    ):
+    for flag in ("--model.backbone.adapter.kind", "--optimiser.learning-rate"):
         assert flag in succeeds(capfd, "train", "--help-all")
 
 
@@ -150,22 +143,14 @@ def test_no_command_prints_the_usage(capfd):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (
-            "tran --data d --out o",
-            r"found no command 'tran'; did you mean train\? \(see",
-        ),
+        ("tran --data d --out o", r"found no command 'tran'; did you mean train\? \(see"),
         ("querry a.jpg --map m", r"found no command 'querry'; did you mean query\? \("),
         ("help querry", r"found no command 'querry'; did you mean query\? \("),
         ("xyz", "found no command 'xyz'; expected demo, render, train, .*, completion"),
         ("info --preset b16", "preset: found 'b16', expected one of b14, g14, l14, s14, tiny"),
         ("train --data d --out o --preset b16", "preset: found 'b16'"),
         ("train --data d --out o --recipe dbow", "recipe: found 'dbow', expected one of anyloc"),
-        ("train --data d --out o --recipe salad --config c", "--recipe: found beside --config"),
-        ("train --data d --out o --micro-batch 5", "micro_batch: found 5, expected a divisor of"),
-        ("train --data d --out o --loss.kind fast-ap", "expected 'none': it ranks all images"),
-        ("evaluate --data d --preset b16", "preset: found 'b16'"),
-        ("train --data d --out o --recipe tiny", "recipe: found 'tiny', expected one of anyloc"),
-        ("info --preset boq", "preset: found 'boq', expected one of b14, g14"),
+        ("train --data d --out o --recipe salad --config c", "--recipe: found with --config"),
         ("info --colour red", "--colour"),
         ("train --data d --out o --epoch 3", "--epochs"),  # perhaps you meant
         ("train --data d", "--out"),
@@ -175,36 +160,21 @@ def test_no_command_prints_the_usage(capfd):
         ("query a --map m --fps slow", "--fps: found 'slow', expected a number"),
         (f"query a --map m --k {LONG}", f"--k: found '{LONG}', expected a whole number"),
         ("train --data d --out o --preset", "--preset: found none, expected a value"),
-        ("evaluate --data d --image-size 200", "--image-size: found '200', expected 2 whole numb"),
         ("evaluate --data d --image-size 1 x", "--image-size: found '1 x', expected 2 whole numb"),
-        (
-            "train --data d --out o --model.image-size 9",
-            "--model.image-size: found '9', expected 2",
-        ),
+        ("train --data d --out o --model.image-size 9", "--model.image-size: found '9', expected"),
         ("train --data d --out o --model.image-size 9 9 9", "found '9 9 9', expected 2 values"),
         ("query a --map m --runtime tvm", "--runtime: found 'tvm', expected one of jax, onnxrunt"),
-        (
-            "index --images a --out m --dtype int8",
-            r"--dtype: found 'int8', expected one of float\d\d, float\d\d \(see",
-        ),
+        ("index --images a --out m --dtype int8", "--dtype: found 'int8', expected one of float"),
         ("evaluate --data d --image-size 9 9 --image-size 200", "--image-size: found '200', exp"),
-        (
-            "index --images a b --out m",
-            r"--images: found 'a b', expected one value \(quote",
-        ),
+        ("index --images a b --out m", r"--images: found 'a b', expected one value \(quote"),
         ("extract --images a --out m --quiet no", "--quiet: found 'no', expected no value"),
         ("index --image a --out m", "--image: found no such flag; missing --images PATH"),
         ("query a --map m --kk 3", r"--kk: found no such flag; did you mean --k INT\?"),
         ("evaluate d", "found 'd' without a flag before it; missing --data PATH"),
         ("serve city.map", "found 'city.map' without a flag before it; missing --map PATH"),
         ("train --data d --out o --seed -1", "TrainConfig.seed: found -1"),
-        ("train --data d --out o --epochs 0", "TrainConfig.epochs: found 0"),
-        ("train --data d --out o --trainable half", "trainable: found 'half'"),
-        ("train --data d --out o --optimiser.learning-rate 0", "learning_rate: found 0"),
         ("train --data d --out o --model.image-size 100 98", "found 100 x 98, .*nearest: 98 x 98"),
-        ("train --data d --out o --image-size 100 98", "found 100 x 98"),
         ("train --data d --out o --model.backbone.ffn relu", "relu.*mlp.*swiglu"),
-        ("train --data d --out o --model.backbone.dim 100", "ViTConfig.dim: found 100"),
         ("train --data d --out o --on-bad-image ignore", "ignore.*stop.*skip"),
         ("evaluate --data d --grouping single,sorted", "grouping: found 'sorted', expected one of"),
         ("evaluate --data d --grouping a/b/c", "grouping: found 'a/b/c', .*QUERIES/DATABASE"),
@@ -213,7 +183,6 @@ def test_no_command_prints_the_usage(capfd):
         ("evaluate --data d --seed -1", "seed: found -1"),
         ("extract --weights w --images d --out f.txt", r"f\.txt: suffix.*\.h5, \.npy"),
         ("extract --weights w --images d --out f.npy --grouping all", "grouping: found 'all'"),
-        ("extract --weights w --images d --out f.npy --batch-size 0", "batch size: found 0"),
         ("info --image-size 112 98", "56 patches for 64 clusters"),
         ("info --image-size 112", "--image-size"),
         ("info --trainable last-13-blocks+head", "last 13 blocks, expected at most 12"),
@@ -241,8 +210,6 @@ def test_a_refusal_leaves_no_width_behind(capfd, monkeypatch):
         (None, "found no such file, expected a configuration"),
         ("{", "found no JSON"),
         ('{"epochs": 3, "colour": "red"}', "colour"),
-        ('{"epochs": "three"}', "expected a whole number"),
-        ('{"model": {"image_size": [100, 98]}}', "found 100 x 98"),
     ],
 )
 def test_a_bad_config_file(capfd, tmp_path, content, words):
@@ -390,14 +357,12 @@ def no_number(city: pathlib.Path) -> pathlib.Path:
         (without_column, "missing northdeg"),
         (without_file, "Brill_0000001_2020_05_001_1.5_2.5_pano.jpg"),
         (few_images, "found no place with at least 2 images; the largest has 1"),
-        (few_places, "found 2 places, expected at least places_per_batch 3"),
+        (few_places, "found 2 places, expected places_per_batch 3"),
         (no_tables, "found no CSV file"),
         (no_number, "MMXX"),
     ],
 )
-def test_bad_places(
-    capfd, tmp_path, shared, city, damage: Callable[[pathlib.Path], pathlib.Path], words
-):
+def test_bad_places(capfd, tmp_path, shared, city, damage, words):
     culprit = damage(city)
     fails(capfd, *train(shared, city, tmp_path / "run"), words=(f"crisalad: {culprit}: ", words))
     assert not (tmp_path / "run").exists()
@@ -439,11 +404,8 @@ def test_a_bad_training_image_stops_the_run_until_it_is_repaired(
 
 
 def test_bad_training_images_are_skipped_and_counted(capfd, tmp_path, shared, city):
-    for path, how in zip(
-        sorted((city / "Images").rglob("*_000000[01]_*.jpg")),
-        ["empty", "cut", "text"] * 4,
-        strict=True,
-    ):
+    paths = sorted((city / "Images").rglob("*_000000[01]_*.jpg"))
+    for path, how in zip(paths, ["empty", "cut", "text"] * 4, strict=True):
         spoil(path, how)
     arguments = train(shared, city, tmp_path / "run", "--on-bad-image", "skip")
     out = succeeds(capfd, *arguments)
@@ -453,8 +415,8 @@ def test_bad_training_images_are_skipped_and_counted(capfd, tmp_path, shared, ci
     assert f"{skipped} unreadable images skipped" in out
 
 
-def test_a_loss_that_is_not_finite_names_the_step_and_keeps_the_last_good_state(
-    capfd, tmp_path, shared, params: Crisalad
+def test_a_loss_that_is_not_finite_names_the_step_and_saves_the_state(
+    capfd, tmp_path, shared, params
 ):
     """Finite weights so large that the first loss overflows."""
     huge = jax.tree.map(lambda leaf: leaf * 1e30, params)
@@ -462,15 +424,8 @@ def test_a_loss_that_is_not_finite_names_the_step_and_keeps_the_last_good_state(
     arguments = train(shared, shared / "city", tmp_path / "run")
     position = arguments.index("--weights") + 1
     arguments = (*arguments[:position], tmp_path / "huge.safetensors", *arguments[position + 1 :])
-    fails(
-        capfd,
-        *arguments,
-        words=(
-            "nan",
-            "at step 1, expected finite",
-            "the state after step 0 is saved",
-        ),
-    )
+    words = ("nan", "at step 1, expected finite", "the state after step 0 is saved")
+    fails(capfd, *arguments, words=words)
     kept, _ = load_weights(tmp_path / "run" / "last.safetensors")
     for name, leaf in named_leaves(kept).items():
         np.testing.assert_array_equal(leaf, named_leaves(huge)[name])
@@ -551,16 +506,9 @@ def test_bad_weights_are_named_by_every_command(capfd, tmp_path, shared, kind):
     before = files_in(tmp_path)
     start = ("--weights", weights)
     town = shared / "town"
+    recipe, city = shared / "recipe.json", shared / "city"
     for arguments in (
-        (
-            "train",
-            "--config",
-            shared / "recipe.json",
-            "--data",
-            shared / "city",
-            "--out",
-            tmp_path / "r",
-        ),
+        ("train", "--config", recipe, "--data", city, "--out", tmp_path / "r"),
         ("evaluate", "--data", town, "--json", tmp_path / "table.json"),
         ("extract", "--images", town, "--out", tmp_path / "d.npy"),
         ("info",),
@@ -625,7 +573,7 @@ def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public):
     fails(
         capfd,
         *(*arguments, "--out", tmp_path / "r", "--weights", public),
-        words=("--backbone: found beside --weights",),
+        words=("--backbone: found with --weights",),
     )
     fails(
         capfd,
@@ -645,9 +593,7 @@ def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public):
 # evaluate
 
 
-def test_evaluate_prints_and_writes_the_table(
-    capfd, tmp_path, shared, params: Crisalad, benchmark: Benchmark
-):
+def test_evaluate_prints_and_writes_the_table(capfd, tmp_path, shared, params, benchmark):
     out = succeeds(
         capfd,
         *("evaluate", "--weights", shared / "weights.safetensors", "--data", shared / "town"),
@@ -660,13 +606,8 @@ def test_evaluate_prints_and_writes_the_table(
     assert "window = every image with those just before it in file order" in out
     assert "Shuffled: mean of 2 seeds ± their standard deviation" in out
     table = json.loads((tmp_path / "table.json").read_text())
-    expected = evaluate(
-        Model(params, MODEL),
-        benchmark,
-        seed=3,
-        seeds=2,
-        reading=Reading(batch_size=BATCH, quiet=True),
-    )
+    reading = Reading(batch_size=BATCH, quiet=True)
+    expected = evaluate(Model(params, MODEL), benchmark, seed=3, seeds=2, reading=reading)
     groupings = ["single", "shuffled", "sequential", "window/single"]
     assert [row["grouping"] for row in table["results"]] == groupings
     for row, result in zip(table["results"], expected, strict=True):
@@ -831,11 +772,8 @@ def write_odd_images(folder: pathlib.Path) -> None:
             plain.convert("RGB").save(folder / f"{name.split('.')[0]}.plain.png")
 
     grey = picture(0)[..., 0].copy()
-    save(
-        "deep.odd.png",
-        PIL.Image.fromarray((grey.astype(np.uint16) << 8) + 37),
-        plain=PIL.Image.fromarray(grey),
-    )
+    deep = PIL.Image.fromarray((grey.astype(np.uint16) << 8) + 37)
+    save("deep.odd.png", deep, plain=PIL.Image.fromarray(grey))
     save("grey.odd.png", PIL.Image.fromarray(picture(1)[..., 0].copy()))
     save("alpha.odd.png", PIL.Image.fromarray(picture(2, channels=4)))
     save("cmyk.odd.jpg", PIL.Image.fromarray(picture(3)).convert("CMYK"))

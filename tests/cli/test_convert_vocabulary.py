@@ -38,7 +38,7 @@ def files(tmp_path: pathlib.Path) -> tuple[pathlib.Path, pathlib.Path]:
     return words, save(tmp_path / "dinov2.pth", dict(state))
 
 
-def test_there_and_back_are_the_same_bytes(files, capfd, tmp_path: pathlib.Path) -> None:
+def test_there_and_back_are_the_same_bytes(files, capfd, tmp_path):
     words, backbone = files
     ours, back = tmp_path / "anyloc.safetensors", tmp_path / "back.pt"
     flags = ("--backbone", backbone, "--layer", 1, "--facet", "key")
@@ -58,7 +58,7 @@ def test_there_and_back_are_the_same_bytes(files, capfd, tmp_path: pathlib.Path)
     assert convert(ours, tmp_path / "whole.pth").target == "reference"
 
 
-def test_what_does_not_belong_together(files, capfd, tmp_path: pathlib.Path) -> None:
+def test_what_does_not_belong_together(files, capfd, tmp_path):
     words, backbone = files
     wide = tmp_path / "wide.pt"
     torch.save(torch.ones(3, 96), wide)
@@ -66,7 +66,7 @@ def test_what_does_not_belong_together(files, capfd, tmp_path: pathlib.Path) -> 
         read_vocabulary(wide, backbone)
     with pytest.raises(InputError, match=r"AnyLocConfig.layer: found 5, expected -2 to 1"):
         read_vocabulary(words, backbone, {"layer": 5})
-    with pytest.raises(InputError, match=r"dinov2.pth: found dict, expected one tensor"):
+    with pytest.raises(InputError, match=r"dinov2.pth: the content is no plain tensor"):
         read_vocabulary(backbone, backbone)
     with pytest.raises(InputError, match=r"one tensor by itself, of shape .3, 64. .*--backbone"):
         read_checkpoint(words)

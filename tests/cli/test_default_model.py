@@ -1,7 +1,6 @@
 """Commands without --weights: the model in the package, and one line that says so."""
 
 import json
-import pathlib
 import shutil
 
 import numpy as np
@@ -11,7 +10,7 @@ from crisalad_jax.checkpoints.load import load
 from crisalad_jax.cli import main
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.nn.model import Model, describe
+from crisalad_jax.nn.model import describe
 from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.map import Map
@@ -29,7 +28,7 @@ def said(capfd: Capture, *arguments: object) -> tuple[str, list[str]]:
     return " ".join(printed.out.split()), notes
 
 
-def test_extract_takes_it(shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture) -> None:
+def test_extract_takes_it(shared, tmp_path, capfd):
     given = ("extract", "--images", shared / "town", "--quiet")
     _, (note,) = said(capfd, *given, "--out", tmp_path / "default.npy")
     assert note.startswith(NOTE)
@@ -50,9 +49,7 @@ def test_extract_takes_it(shared: pathlib.Path, tmp_path: pathlib.Path, capfd: C
 
 @pytest.mark.usefixtures("symbolic_shapes")
 @pytest.mark.parametrize("runtime", ["jax", "onnxruntime"])
-def test_a_map_is_made_asked_and_grown_without_weights(
-    runtime: str, shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
-) -> None:
+def test_a_map_is_made_asked_and_grown_without_weights(runtime, shared, tmp_path, capfd):
     images, out = shared / "town" / "images" / "test" / "database", tmp_path / "map"
     flags = ("--out", out, "--runtime", runtime, "--quiet")
     _, notes = said(capfd, "index", "--images", images, *flags)
@@ -72,9 +69,7 @@ def test_a_map_is_made_asked_and_grown_without_weights(
     assert notes == []
 
 
-def test_a_map_grows_by_its_own_model(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
-) -> None:
+def test_a_map_grows_by_its_own_model(shared, tmp_path, capfd):
     images, out = shared / "town" / "images" / "test", tmp_path / "map"
     flags = ("--out", out, "--quiet")
     weights = ("--weights", shared / "weights.safetensors")
@@ -85,9 +80,7 @@ def test_a_map_grows_by_its_own_model(
     assert notes == []
 
 
-def test_a_map_whose_weights_have_gone_names_itself_and_the_flag(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
-) -> None:
+def test_a_map_whose_weights_have_gone_names_itself_and_the_flag(shared, tmp_path, capfd):
     images, out = shared / "town" / "images" / "test" / "database", tmp_path / "map"
     weights = tmp_path / "mine.safetensors"
     shutil.copy(shared / "weights.safetensors", weights)
@@ -97,66 +90,49 @@ def test_a_map_whose_weights_have_gone_names_itself_and_the_flag(
     fails(capfd, "index", "--images", images, "--out", out, "--quiet", words=words)
 
 
-def test_a_map_of_another_versions_model_says_so(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
-) -> None:
-    images, out = shared / "town" / "images" / "test" / "database", tmp_path / "map"
-    said(capfd, "index", "--images", images, "--out", out, "--quiet")
-    value = json.loads((out / "map.json").read_text())
+@pytest.fixture(scope="module")
+def starters(shared, tmp_path_factory):
+    """A map of the town's database, by the model in the package."""
+    out = tmp_path_factory.mktemp("starter") / "map"
+    database = shared / "town" / "images" / "test" / "database"
+    index(load("starter"), database, out, weights="starter", reading=Reading(quiet=True))
+    return out
+
+
+@pytest.fixture
+def own_map(starters, tmp_path):
+    return shutil.copytree(starters, tmp_path / "map")
+
+
+def test_a_map_of_another_versions_model_says_so(shared, own_map, capfd):
+    value = json.loads((own_map / "map.json").read_text())
     value["model"] = "0" * 64
     del value["checksum"]  # as who edits the file
-    (out / "map.json").write_text(json.dumps(value))
+    (own_map / "map.json").write_text(json.dumps(value))
     words = ("starter of another version of this package", "`crisalad index` into a new folder")
-    fails(capfd, "query", list_images(images)[0], "--map", out, words=words)
+    fails(capfd, "query", list_images(shared / "town")[0], "--map", own_map, words=words)
 
 
-def test_a_map_asked_with_another_model_blames_no_version(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
-) -> None:
-    images, out = shared / "town" / "images" / "test" / "database", tmp_path / "map"
-    said(capfd, "index", "--images", images, "--out", out, "--quiet")
-    weights = shared / "weights.safetensors"
-    code = main(
-        [str(a) for a in ("query", list_images(images)[0], "--map", out, "--weights", weights)]
-    )
-    (line,) = capfd.readouterr().err.splitlines()
-    assert code == 2
-    assert "(starter), but" in line
+def test_a_map_asked_with_another_model_blames_no_version(shared, starters, capfd):
+    given = ("--map", starters, "--weights", shared / "weights.safetensors")
+    line = fails(capfd, "query", list_images(shared / "town")[0], *given, words=("(starter), but",))
     assert "version" not in line
 
 
-def test_a_map_made_in_python_by_its_name_is_asked_without_weights(
-    shared: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
-    images = shared / "town" / "images" / "test" / "database"
-    params, config = load("starter")
-    index(
-        Model(params, config),
-        images,
-        tmp_path / "map",
-        weights="starter",
-        reading=Reading(quiet=True),
-    )
-    with Map.open(tmp_path / "map") as places:
+def test_a_map_made_in_python_by_its_name_is_asked_without_weights(starters):
+    with Map.open(starters) as places:
         assert places.metadata.weights == "starter"
         assert places.load_model() is not None
 
 
-def test_a_map_of_it_is_calibrated_without_weights(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
-) -> None:
-    town, out = shared / "town", tmp_path / "map"
-    database = town / "images" / "test" / "database"
-    said(capfd, "index", "--images", database, "--out", out, "--quiet")
-    flags = ("--map", out, "--data", town, "--precision", 0.01, "--quiet")
+def test_a_map_of_it_is_calibrated_without_weights(shared, own_map, capfd):
+    flags = ("--map", own_map, "--data", shared / "town", "--precision", 0.01, "--quiet")
     words, notes = said(capfd, "calibrate", *flags)
     assert "are unknown from now on" in words
     assert notes == []
 
 
-def test_damaged_weights_are_found_unless_told_not_to_look(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
-) -> None:
+def test_damaged_weights_are_found_unless_told_not_to_look(shared, tmp_path, capfd):
     data = bytearray((shared / "weights.safetensors").read_bytes())
     data[-1] ^= 1  # the last bit of a number
     (tmp_path / "damaged.safetensors").write_bytes(data)
@@ -167,9 +143,7 @@ def test_damaged_weights_are_found_unless_told_not_to_look(
     assert "7 images added" in words
 
 
-def test_evaluate_takes_it_and_a_preset_is_still_untrained(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
-) -> None:
+def test_evaluate_takes_it_and_a_preset_is_still_untrained(shared, tmp_path, capfd):
     given = ("evaluate", "--data", shared / "town", "--quiet")
     words, (note,) = said(capfd, *given, "--json", tmp_path / "said.json")
     assert note.startswith(NOTE)

@@ -1,18 +1,13 @@
 """`crisalad evaluate --report`: the page holds what the command found."""
 
 import json
-import pathlib
-
-import pytest
 
 from tests.cli.test_cli import fails, succeeds
 from tests.conftest import BATCH
 from tests.experiments.report.test_page import Page
 
 
-def test_the_page_holds_the_numbers_of_the_json(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
-):
+def test_the_page_holds_the_numbers_of_the_json(shared, tmp_path, capfd):
     said = succeeds(
         capfd,
         *("evaluate", "--data", shared / "town", "--weights", shared / "weights.safetensors"),
@@ -51,9 +46,7 @@ def test_the_page_holds_the_numbers_of_the_json(
     assert json.loads(page.all("pre")[0]["text"])["model"]["image_size"] == [42, 56]
 
 
-def test_a_folder_that_cannot_be_is_found_before_the_work(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
-):
+def test_a_folder_that_cannot_be_is_found_before_the_work(shared, tmp_path, capfd):
     (tmp_path / "file").write_text("")
     given = ("evaluate", "--data", shared / "town", "--weights", shared / "weights.safetensors")
     words = (f"{tmp_path}/file", "cannot be made")

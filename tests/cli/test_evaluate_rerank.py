@@ -65,10 +65,10 @@ def test_bad_input_is_named_before_any_work(capfd, shared, weights, monkeypatch)
     for given, words in (
         ((*nowhere, "--rerank", "transvpr"), ("found 'transvpr', expected NAME:TOPK",)),
         ((*nowhere, "--rerank", "glue:3"), ("found 'glue', expected one of patch-netvlad, ",)),
-        ((*nowhere, "--rerank", "transvpr:3"), ("aggregator salad", "--rerank-weights")),
+        ((*start, "--rerank", "transvpr:3"), ("aggregator salad", "--rerank-weights")),
         ((*nowhere, "--rerank-weights", weights), ("--rerank-weights: found without --rerank",)),
         (
-            (*nowhere, "--rerank", "patch-netvlad:3", "--rerank-weights", weights),
+            (*start, "--rerank", "patch-netvlad:3", "--rerank-weights", weights),
             ("found a model with aggregator transvpr and size rule fixed, expected netvlad",),
         ),
         (

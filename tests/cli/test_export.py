@@ -1,16 +1,13 @@
 """`crisalad export`: what it writes and says, and for every bad input one line."""
 
 import json
-import pathlib
 
 import pytest
 
 from tests.cli.test_cli import fails, succeeds
 
 
-def test_flags_become_the_manifest(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
-):
+def test_flags_become_the_manifest(shared, tmp_path, capfd):
     out = tmp_path / "export"
     said = succeeds(
         capfd,
@@ -48,21 +45,13 @@ def test_flags_become_the_manifest(
         (("--weights", "none.safetensors"), ("none.safetensors: found no such file",)),
     ],
 )
-def test_bad_input_is_one_line(
-    shared: pathlib.Path,
-    tmp_path: pathlib.Path,
-    capfd: pytest.CaptureFixture[str],
-    flags: tuple[str, ...],
-    words: tuple[str, ...],
-):
+def test_bad_input_is_one_line(shared, tmp_path, capfd, flags, words):
     weights = () if "--weights" in flags else ("--weights", shared / "weights.safetensors")
     fails(capfd, "export", *weights, "--out", tmp_path / "out", *flags, words=words)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_there_is_not_overwritten(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
-):
+def test_what_is_there_is_not_overwritten(shared, tmp_path, capfd):
     (tmp_path / "file").write_text("mine")
     weights = shared / "weights.safetensors"
     for out in (tmp_path, tmp_path / "file"):

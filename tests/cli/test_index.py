@@ -214,7 +214,7 @@ def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd):
     path.write_bytes(path.read_bytes()[:-1] + b"!")
     assert "verified" not in succeeds(capfd, "info", "--map", folder)
     both = "info", "--map", folder, "--batch-size", 4
-    fails(capfd, *both, words=("--batch-size: found beside --map",))
+    fails(capfd, *both, words=("--batch-size: found with --map",))
     fails(capfd, "info", "--map", folder, "--verify", words=("descriptors 0 to 6 have changed",))
 
 

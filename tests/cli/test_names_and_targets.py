@@ -58,8 +58,8 @@ def test_verify_needs_a_map(capfd):
     fails(capfd, "info", "--verify", words=("--verify: found without --map",))
 
 
-def test_an_export_does_not_take_the_place_of_the_folder_that_one_stands_in(
-    capfd, tmp_path, shared, monkeypatch: pytest.MonkeyPatch
+def test_an_export_does_not_take_the_place_of_the_working_folder(
+    capfd, tmp_path, shared, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     start = ("export", "--weights", shared / "weights.safetensors", "--out", ".")

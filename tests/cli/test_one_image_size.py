@@ -1,9 +1,6 @@
 """A model whose parameters are for one image size, asked for another: one line, no work done."""
 
 import dataclasses
-import pathlib
-
-import pytest
 
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
@@ -19,9 +16,7 @@ CONFIG = dataclasses.replace(
 )
 
 
-def test_every_command_that_describes_refuses_it(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_every_command_that_describes_refuses_it(shared, tmp_path, capfd):
     weights, out = tmp_path / "w.safetensors", tmp_path / "out.npy"
     save_weights(weights, Model(random_params(CONFIG), CONFIG))
     images = shared / "town" / "images" / "test" / "database"

@@ -63,11 +63,13 @@ def test_evaluate_ranks_shorter_descriptors(capfd, tmp_path, shared, benchmark):
     start = ("evaluate", "--data", town, "--weights", weights, "--grouping", "single", "--quiet")
     succeeds(capfd, *start, "--pca", components, "--json", tmp_path / "found.json")
     (result,) = json.loads((tmp_path / "found.json").read_text())["results"]
-    rows = dict(zip(names, fitted.apply(whole), strict=True))
-    database, queries = (
-        np.stack([rows[path.relative_to(town).as_posix()] for path in paths])
-        for paths in (benchmark.database, benchmark.queries)
-    )
+
+    def sides(fitted):
+        rows = dict(zip(names, fitted.apply(whole), strict=True))
+        for paths in (benchmark.database, benchmark.queries):
+            yield np.stack([rows[path.relative_to(town).as_posix()] for path in paths])
+
+    database, queries = sides(fitted)
     best = (queries @ database.T).argmax(axis=1)
     right = [index in wanted for index, wanted in zip(best, benchmark.positives, strict=True)]
     assert result["recalls"]["R@1"] == np.mean(right)
@@ -75,11 +77,7 @@ def test_evaluate_ranks_shorter_descriptors(capfd, tmp_path, shared, benchmark):
     # Of their own lengths, components rank by Euclidean distance, as in CricaVPR.
     plain = fit_pca(whole, 3, PcaConfig(renormalise=False))
     save_pca(components, plain)
-    rows = dict(zip(names, plain.apply(whole), strict=True))
-    database, queries = (
-        np.stack([rows[path.relative_to(town).as_posix()] for path in paths])
-        for paths in (benchmark.database, benchmark.queries)
-    )
+    database, queries = sides(plain)
     best = np.linalg.norm(queries[:, None] - database, axis=2).argmin(axis=1)
     right = [index in wanted for index, wanted in zip(best, benchmark.positives, strict=True)]
     # Alone, and as the last layer of a model.

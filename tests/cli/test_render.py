@@ -1,15 +1,14 @@
 """`crisalad render`: what it writes, says and refuses."""
 
 import json
-import pathlib
 
 from crisalad_jax.cli import main
-from tests.cli.test_cli import Capture, fails
+from tests.cli.test_cli import fails
 
 SMALL = ("--scenes", "3", "--stations", "2", "--test-scenes", "2", "--image-size", "30", "40")
 
 
-def test_it_says_what_it_wrote(tmp_path: pathlib.Path, capfd: Capture) -> None:
+def test_it_says_what_it_wrote(tmp_path, capfd):
     out = tmp_path / "world"
     given = ["render", "--out", str(out), *SMALL, "--quiet", "--json", str(tmp_path / "said.json")]
     assert main(given) == 0
@@ -23,9 +22,7 @@ def test_it_says_what_it_wrote(tmp_path: pathlib.Path, capfd: Capture) -> None:
     assert (told["places"], told["test_places"], told["seed"]) == (6, 4, 0)
 
 
-def test_a_world_that_is_there_stays_and_another_is_refused_by_what_differs(
-    tmp_path: pathlib.Path, capfd: Capture
-) -> None:
+def test_a_world_that_is_there_stays_and_another_is_refused_by_what_differs(tmp_path, capfd):
     given = ("render", "--out", tmp_path / "world", *SMALL)
     assert main([*map(str, given)]) == 0
     written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
@@ -40,7 +37,7 @@ def test_a_world_that_is_there_stays_and_another_is_refused_by_what_differs(
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == written
 
 
-def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: pathlib.Path, capfd: Capture) -> None:
+def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capfd):
     out = tmp_path / "world"
     for flag, value, words in (
         ("--scenes", "0", "WorldConfig.scenes: found 0, expected at least 1"),

@@ -1,10 +1,8 @@
 """The words of --resize at the verbs, and what these say of images."""
 
 import json
-import pathlib
 
 import numpy as np
-import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.reading import Reading
@@ -13,9 +11,7 @@ from crisalad_jax.retrieval.extract import extract
 from tests.cli.test_cli import fails, succeeds
 
 
-def test_words_change_what_is_extracted_and_are_told(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_words_change_what_is_extracted_and_are_told(shared, tmp_path, capfd):
     weights, out = shared / "weights.safetensors", tmp_path / "out.npy"
     images = shared / "town" / "images" / "test" / "database"
     said = succeeds(
@@ -35,9 +31,7 @@ def test_words_change_what_is_extracted_and_are_told(
     np.testing.assert_allclose(np.load(out), expected, atol=1e-6)
 
 
-def test_info_tells_how_images_are_resized(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_info_tells_how_images_are_resized(shared, tmp_path, capfd):
     weights, out = shared / "weights.safetensors", tmp_path / "info.json"
     words = "longer side at most 56, area, on bytes, rounded to multiples of 14"
     said = succeeds(
@@ -49,7 +43,7 @@ def test_info_tells_how_images_are_resized(
     assert told["preprocessing"]["size_rule"] == "longer-side"
 
 
-def test_wrong_words_are_one_line(shared: pathlib.Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_wrong_words_are_one_line(shared, capfd):
     info = ("info", "--weights", shared / "weights.safetensors", "--resize")
     fails(capfd, *info, "cubic", words=("--resize: found 'cubic', expected some of fixed",))
     fails(capfd, *info, "bytes", "floats", words=("expected one of bytes, floats",))

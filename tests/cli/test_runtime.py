@@ -39,13 +39,7 @@ def succeeds(capfd: Capture, *arguments: object) -> str:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("grouping", ["single", "sequential", "window"])
-def test_extract_gives_the_descriptors_of_jax(
-    engine: str,
-    grouping: str,
-    shared: pathlib.Path,
-    tmp_path: pathlib.Path,
-    capfd: Capture,
-):
+def test_extract_gives_the_descriptors_of_jax(engine, grouping, shared, tmp_path, capfd):
     flags = ("--images", shared / "town", "--grouping", grouping, "--batch-size", "4", "--quiet")
     weights = ("--weights", shared / "weights.safetensors")
     found = {}
@@ -57,9 +51,7 @@ def test_extract_gives_the_descriptors_of_jax(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_evaluate_recalls_as_jax_does(
-    engine: str, shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
-):
+def test_evaluate_recalls_as_jax_does(engine, shared, tmp_path, capfd):
     command = (
         *("evaluate", "--data", shared / "town", "--weights", shared / "weights.safetensors"),
         *("--batch-size", "4", "--seeds", "1", "--quiet"),
@@ -78,14 +70,9 @@ def test_evaluate_recalls_as_jax_does(
     assert found == expected
 
 
-def test_a_map_of_one_runtime_answers_another(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
-):
+def test_a_map_of_one_runtime_answers_another(shared, tmp_path, capfd):
     weights = shared / "weights.safetensors"
-    images, queries = (
-        town(shared) / "database",
-        town(shared) / "queries",
-    )
+    images, queries = town(shared) / "database", town(shared) / "queries"
     index = ("index", "--weights", weights, "--images", images, "--out", tmp_path / "map")
     succeeds(capfd, *index, "--runtime", "openvino", "--quiet")
     assert "7 were there already" in succeeds(capfd, *index, "--runtime", "onnxruntime", "--quiet")
@@ -109,18 +96,10 @@ def printed_by(program: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
-def test_a_kept_export_describes_without_jax(
-    shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
-):
+def test_a_kept_export_describes_without_jax(shared, tmp_path, capfd):
     weights = shared / "weights.safetensors"
     out = tmp_path / "d.npy"
-    extract = (
-        "extract",
-        "--weights",
-        weights,
-        "--images",
-        town(shared) / "queries",
-    )
+    extract = ("extract", "--weights", weights, "--images", town(shared) / "queries")
     succeeds(capfd, *extract, "--runtime", "onnxruntime", "--out", out, "--quiet")
     program = (
         "import sys, numpy as np\n"
@@ -139,9 +118,7 @@ def exported(params: Crisalad, tmp_path: pathlib.Path) -> pathlib.Path:
 
 
 @pytest.mark.parametrize("told", [True, False])
-def test_a_query_by_an_exported_folder_starts_without_jax(
-    exported: pathlib.Path, shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture, told: bool
-):
+def test_a_query_by_an_exported_folder_starts_without_jax(exported, shared, tmp_path, capfd, told):
     places, asked = tmp_path / "map", town(shared) / "queries"
     by = ("--weights", exported, "--runtime", "onnxruntime")
     succeeds(capfd, "index", "--images", asked, "--out", places, *by, "--quiet")
@@ -157,12 +134,7 @@ def test_a_query_by_an_exported_folder_starts_without_jax(
     assert printed_by(program).endswith("\nset()\n")
 
 
-def test_an_exported_folder_is_a_model(
-    exported: pathlib.Path,
-    shared: pathlib.Path,
-    tmp_path: pathlib.Path,
-    capfd: Capture,
-):
+def test_an_exported_folder_is_a_model(exported, shared, tmp_path, capfd):
     flags = ("--images", town(shared) / "queries", "--quiet")
     out = tmp_path / "d.npy"
     extract = ("extract", "--weights", exported, *flags, "--out", out)
@@ -173,28 +145,11 @@ def test_an_exported_folder_is_a_model(
     np.testing.assert_allclose(np.load(out), np.load(own), rtol=0, atol=TOLERANCE)
 
 
-def test_bad_input_is_one_line(
-    exported: pathlib.Path,
-    shared: pathlib.Path,
-    tmp_path: pathlib.Path,
-    capfd: Capture,
-    monkeypatch: pytest.MonkeyPatch,
-):
-    flags = (
-        "--images",
-        town(shared) / "queries",
-        "--out",
-        tmp_path / "d.npy",
-        "--quiet",
-    )
+def test_bad_input_is_one_line(exported, shared, tmp_path, capfd, monkeypatch):
+    flags = ("--images", town(shared) / "queries", "--out", tmp_path / "d.npy", "--quiet")
     extract = ("extract", "--weights", exported, *flags, "--runtime", "onnxruntime")
-    fails(
-        capfd,
-        *extract,
-        "--grouping",
-        "sequential",
-        words=("grouping single, expected any", "sequential"),
-    )
+    words = ("grouping single, expected any", "sequential")
+    fails(capfd, *extract, "--grouping", "sequential", words=words)
     fails(capfd, *extract, "--image-size", "56", "42", words=("42 x 56", "expected 56 x 42"))
     fails(capfd, *extract, "--compute-dtype", "bfloat16", words=("bfloat16 with onnxruntime",))
     fails(capfd, *extract[:-2], words=(exported,))  # JAX takes no folder
@@ -202,21 +157,12 @@ def test_bad_input_is_one_line(
     fails(capfd, *extract, words=("no module onnxruntime", "pip install 'crisalad-jax[onnx]'"))
     data = (exported / "describe.onnx.data").read_bytes()
     (exported / "describe.onnx.data").write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-    fails(
-        capfd,
-        *extract[:-1],
-        "openvino",
-        words=("describe.onnx.data: found other bytes than manifest.json says",),
-    )
+    words = ("describe.onnx.data: found other bytes than manifest.json says",)
+    fails(capfd, *extract[:-1], "openvino", words=words)
     assert not (tmp_path / "d.npy").exists()
 
 
-def test_a_program_of_other_weights_is_not_a_maps(
-    exported: pathlib.Path,
-    shared: pathlib.Path,
-    tmp_path: pathlib.Path,
-    capfd: Capture,
-):
+def test_a_program_of_other_weights_is_not_a_maps(exported, shared, tmp_path, capfd):
     other = tmp_path / "other.safetensors"
     save_weights(other, Model(init_crisalad(jax.random.key(0), MODEL), MODEL))
     images = town(shared) / "queries"
@@ -226,9 +172,7 @@ def test_a_program_of_other_weights_is_not_a_maps(
     fails(capfd, *query, "--runtime", "onnxruntime", words=(exported, "map"))
 
 
-def test_an_int8_program_is_a_model_of_its_own(
-    params: Crisalad, shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
-):
+def test_an_int8_program_is_a_model_of_its_own(params, shared, tmp_path, capfd):
     """It may ask a map of the weights that it was made of; nothing else may ask its maps."""
     photographs = town(shared) / "queries"
     calibration = np.stack(

@@ -241,10 +241,10 @@ def test_a_watch_ends_by_a_signal_with_its_summary(shared, folder, tmp_path, num
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (("--watch", "{map}", "a.jpg"), "--watch: found beside IMAGE, expected only one of the tw"),
-        (("--watch", "{map}", "--camera", "0"), "--watch: found beside --camera, expected only on"),
-        (("--watch", "{map}", "--fps", "2"), "--watch: found beside --fps, expected only one"),
-        (("--camera", "0", "--gallery", "a.png"), "--camera: found beside --gallery, expected onl"),
+        (("--watch", "{map}", "a.jpg"), "IMAGE: found with --watch, expected only one of the two"),
+        (("--watch", "{map}", "--camera", "0"), "--camera: found with --watch, expected only one"),
+        (("--watch", "{map}", "--fps", "2"), "--fps: found with --watch, expected only one of"),
+        (("--camera", "0", "--gallery", "a.png"), "--gallery: found with --camera, expected only"),
         (("--camera", "0", "--json", "a"), "--json: found a with --camera, expected -: answers go"),
         (("--camera", "x.avi"), "camera: found 'x.avi', expected a number from 0, a URL or a vid"),
         (("--watch", "{map}/none"), "none: found nothing, expected a folder to watch"),

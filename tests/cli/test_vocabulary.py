@@ -23,7 +23,7 @@ def quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(name, lambda _, config: random_params(config))
 
 
-def test_it_leaves_a_whole_model(capfd, shared, tmp_path) -> None:
+def test_it_leaves_a_whole_model(capfd, shared, tmp_path):
     fresh = random_params(ANYLOC)
     start, out = tmp_path / "start.safetensors", tmp_path / "new" / "w.safetensors"
     save_weights(start, Model(fresh, ANYLOC))
@@ -34,7 +34,7 @@ def test_it_leaves_a_whole_model(capfd, shared, tmp_path) -> None:
     found, config = load_weights(out)
     assert config == ANYLOC
     paths = list_images(shared / "town")
-    assert_equal(found, with_vocabulary(fresh, ANYLOC, paths, seed=3, batch_size=BATCH))
+    assert_equal(found, with_vocabulary(Model(fresh, ANYLOC), paths, seed=3, batch_size=BATCH))
     succeeds(
         capfd,
         *("extract", "--weights", out, "--images", shared / "town", "--quiet"),
@@ -46,7 +46,7 @@ def test_it_leaves_a_whole_model(capfd, shared, tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("quick_start")
-def test_a_preset_and_a_backbone(capfd, shared, tmp_path) -> None:
+def test_a_preset_and_a_backbone(capfd, shared, tmp_path):
     """NetVLAD's, on the backbone of a model of another aggregator."""
     config = recipe("tiny", "scratch").model
     params = random_params(config)
@@ -65,15 +65,15 @@ def test_a_preset_and_a_backbone(capfd, shared, tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("quick_start")
-def test_bad_input_is_one_line(capfd, shared, tmp_path) -> None:
+def test_bad_input_is_one_line(capfd, shared, tmp_path):
     out, weights = tmp_path / "w.safetensors", shared / "weights.safetensors"
     start = ("vocabulary", "--images", shared / "town", "--out")
     for more, words in (
         ((tmp_path / "w.npy",), "w.npy: found the suffix '.npy', expected .safetensors"),
         ((out, "--weights", weights), "aggregator: found salad, which has no vocabulary"),
-        ((out, "--weights", weights, "--backbone", weights), "--backbone: found beside --weights"),
-        ((out, "--weights", weights, "--preset", "b14"), "--preset: found beside --weights"),
-        ((out, "--weights", weights, "--layer", 1), "--layer: found beside --weights"),
+        ((out, "--weights", weights, "--backbone", weights), "--backbone: found with --weights"),
+        ((out, "--weights", weights, "--preset", "b14"), "--preset: found with --weights"),
+        ((out, "--weights", weights, "--layer", 1), "--layer: found with --weights"),
         ((out, "--preset", "tiny", "--layer", 4), "layer: found 4, expected -4 to 3"),
         (
             (out, "--preset", "tiny", "--aggregator", "netvlad", "--facet", "key"),
@@ -128,7 +128,7 @@ class BagOfWords(Aggregator):
 
 
 @pytest.mark.usefixtures("quick_start")
-def test_a_plug_ins_aggregator(capfd, shared, tmp_path, monkeypatch) -> None:
+def test_a_plug_ins_aggregator(capfd, shared, tmp_path, monkeypatch):
     """Flags set the fields that it has; `extract` finds it by --plugin."""
     for name in ("_parts", "_presets"):
         monkeypatch.setattr(AGGREGATORS, name, dict(getattr(AGGREGATORS, name)))
@@ -146,6 +146,6 @@ def test_a_plug_ins_aggregator(capfd, shared, tmp_path, monkeypatch) -> None:
     params, config = load_weights(out)
     assert (config.aggregator.clusters, config.aggregator.layer) == (5, 2)
     paths = list_images(shared / "town")
-    assert_equal(with_vocabulary(params, config, paths, batch_size=BATCH), params)
+    assert_equal(with_vocabulary(Model(params, config), paths, batch_size=BATCH), params)
     succeeds(capfd, "extract", "--weights", out, "--out", tmp_path / "d.npy", *images)
     assert np.load(tmp_path / "d.npy").shape == (12, 5)

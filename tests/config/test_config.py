@@ -53,19 +53,18 @@ ROOT = pathlib.Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize(
-    ("preset", "dim", "depth", "heads", "hidden"),
+    ("preset", "sizes"),
     # Oquab et al. 2023, table 17, and the public checkpoints' shapes: w12 of g14 is 2 x 4096.
     [
-        ("s14", 384, 12, 6, 1536),
-        ("b14", 768, 12, 12, 3072),
-        ("l14", 1024, 24, 16, 4096),
-        ("g14", 1536, 40, 24, 4096),
+        ("s14", (384, 12, 6, 1536)),
+        ("b14", (768, 12, 12, 3072)),
+        ("l14", (1024, 24, 16, 4096)),
+        ("g14", (1536, 40, 24, 4096)),
     ],
 )
-def test_presets_are_the_four_sizes_of_dinov2(preset, dim, depth, heads, hidden):
+def test_presets_are_the_four_sizes_of_dinov2(preset, sizes):
     backbone = PRESETS[preset].backbone
-    assert (backbone.dim, backbone.depth, backbone.heads) == (dim, depth, heads)
-    assert backbone.hidden == hidden
+    assert (backbone.dim, backbone.depth, backbone.heads, backbone.hidden) == sizes
     assert PRESETS[preset].descriptor_dim == 8448
 
 
@@ -80,12 +79,8 @@ def test_the_recipe_is_the_papers():
     assert (config.places_per_batch, config.images_per_place) == (48, 4)
     assert config.trainable == "adapters+head"
     assert config.model.image_size == (224, 224)
-    loss = config.loss
-    assert (loss.kind.part_name, loss.miner, loss.miner_margin) == (
-        "multi-similarity",
-        "multi-similarity",
-        0.1,
-    )
+    loss, similar = config.loss, "multi-similarity"
+    assert (loss.kind.part_name, loss.miner, loss.miner_margin) == (similar, similar, 0.1)
     assert (loss.kind.alpha, loss.kind.beta) == (1.0, 50.0)
     assert config.augmentation == RandAugmentConfig(operations=3)
 
@@ -97,12 +92,13 @@ def test_the_recipes_are_their_papers():
     assert (salad.trainable, salad.monitor) == ("last-4-blocks+head", "R@1")
     assert (salad.model.backbone.adapter.kind, salad.model.cross_image.layers) == ("none", 0)
     optimiser = salad.optimiser
-    assert (optimiser.kind, optimiser.learning_rate) == ("adamw", 6e-5)
-    assert optimiser.weight_decay == 9.5e-9
-    assert (optimiser.schedule, optimiser.end_lr_fraction, optimiser.decay_steps) == (
-        "linear",
-        0.2,
-        4000,
+    assert optimiser == OptimiserConfig(
+        kind="adamw",
+        learning_rate=6e-5,
+        schedule="linear",
+        end_lr_fraction=0.2,
+        decay_steps=4000,
+        weight_decay=9.5e-9,
     )
     cricavpr = recipe("b14", "cricavpr")
     assert (cricavpr.places_per_batch, cricavpr.images_per_place) == (72, 4)
@@ -226,15 +222,6 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
     buff, salad = recipe("b14", "vlad-buff"), recipe("b14", "salad")
     assert buff.model.aggregator == VladBuffConfig(clusters=64, reduced=192)
     assert dataclasses.replace(buff, model=salad.model) == salad
-    assert (buff.places_per_batch, buff.epochs, buff.monitor) == (60, 4, "R@1")
-    assert buff.trainable == "last-4-blocks+head"
-    assert buff.optimiser == OptimiserConfig(
-        kind="adamw",
-        learning_rate=6e-5,
-        end_lr_fraction=0.2,
-        decay_steps=4000,
-        weight_decay=9.5e-9,
-    )
     for config in (mix, image, buff):
         assert config.model.compute_dtype == "bfloat16"
     for config in (boq, mix, vlad, image, buff):
@@ -282,10 +269,8 @@ def test_the_recipes_over_resnet_are_as_published():
     assert (classes.kind, classes.groups, cosplace.min_images) == ("cells", 8, 10)
     eigenplaces = recipe("b14", "eigenplaces-turns")
     # Its code trains in mixed precision, CosPlace's only where --use_amp16 asks for it.
-    assert (cosplace.model.compute_dtype, eigenplaces.model.compute_dtype) == (
-        "float32",
-        "bfloat16",
-    )
+    assert cosplace.model.compute_dtype == "float32"
+    assert eigenplaces.model.compute_dtype == "bfloat16"
     edtformer = recipe("b14", "edtformer")
     assert edtformer.model.descriptor_dim == 4096
     assert edtformer.model.backbone.adapter_dim == 4
@@ -316,7 +301,7 @@ def test_a_classification_needs_no_second_image_of_a_place():
     # The published descriptors of b14: BoQ's, and 4,096 of MixVPR and Conv-AP.
     [("gem", 768), ("conv-ap", 4096), ("mixvpr", 4096), ("boq", 12_288)],
 )
-def test_methods_to_compare_differ_in_the_aggregator_alone(name: str, width: int):
+def test_methods_to_compare_differ_in_the_aggregator_alone(name, width):
     found, paper = recipe("b14", f"crisalad+{name}"), recipe("b14")
     assert found.model.aggregator == AGGREGATORS.find(name)()
     assert found.model.descriptor_dim == width
@@ -331,7 +316,7 @@ def test_methods_to_compare_differ_in_the_aggregator_alone(name: str, width: int
 @pytest.mark.parametrize(
     "name", [*RECIPES, *(f"crisalad+aggregator:{name}" for name in AGGREGATORS)]
 )
-def test_every_recipe_fits_every_preset(preset: str, name: str):
+def test_every_recipe_fits_every_preset(preset, name):
     found = recipe(preset, name)
     assert from_scratch(found).trainable == "all"
     if isinstance(found.model.backbone, ViTConfig):
@@ -370,23 +355,20 @@ def test_augmentation_is_the_one_named():
     assert TrainConfig(augmentation="none").augmentation == NoAugmentation()
 
 
-def test_equal_configurations_name_one_program():
-    assert hash(recipe("tiny")) == hash(recipe("tiny"))
-    assert recipe("tiny").model == PRESETS["tiny"]
-
-
 def test_an_unknown_name_lists_the_known():
     with pytest.raises(InputError, match=r"^preset: found 'b16', expected one of b14, g14, l14"):
         recipe("b16")
-    words = (
-        r"^recipe: found 'dbow', expected one of anyloc, boq, .*crisalad, .*scratch.*, "
-        r"or a registered part as NAME or KIND:NAME, with a kind of aggregator, .* \(is a plug-in "
-        r"missing\?"
-    )
+    words = r"^recipe: found 'dbow', .* anyloc, .*scratch.*, or a registered .* \(is a plug-in mis"
     with pytest.raises(InputError, match=words):
         recipe("b14", "dbow")
     with pytest.raises(InputError, match=r"^colour: found '', expected one of blue, red$"):
         choose("colour", "", {"red": 1, "blue": 2})
+
+
+NARROW = {
+    **{"dim": 96, "heads": 2},
+    "adapter": AdapterConfig(kind="multi-resolution", bottleneck=0.25),
+}
 
 
 def of_clusters(clusters: int) -> ModelConfig:
@@ -430,104 +412,60 @@ def test_one_patch_more_than_clusters_is_enough():
         (ViTConfig, {"heads": 7}, "ViTConfig.dim: found 768, expected a multiple of the 7 heads"),
         (ViTConfig, {"depth": 0}, "ViTConfig.depth: found 0, expected more than 0"),
         (ViTConfig, {"registers": -1}, "ViTConfig.registers: found -1, expected at least 0"),
-        (ViTConfig, {"ffn": "glu"}, "ViTConfig.ffn: found 'glu'"),
         (
             ViTConfig,
             {"dim": 6, "heads": 1, "position_init": "sincos"},
-            "ViTConfig.dim: found 6, expected a multiple of 4",
+            "dim: found 6, .* of 4",
         ),
         (
             ViTConfig,
-            {
-                "dim": 96,
-                "heads": 2,
-                "adapter": AdapterConfig(kind="multi-resolution", bottleneck=0.25),
-            },
-            "bottleneck: found 0.25, which is a width of 24 for dim 96; expected a multiple of 16",
+            NARROW,
+            "found 0.25, expected a width for dim 96, 24, .* of 16",
         ),
         (ModelConfig, {"aggregator": "vlad"}, "^ModelConfig.aggregator: found 'vlad'"),
-        (
-            ModelConfig,
-            {"aggregator": "gem-pyramid", "image_size": (28, 56)},
-            "found 28 x 56, expected at least 42 x 42, a patch for every region",
-        ),
+        (ModelConfig, {"aggregator": "gem-pyramid", "image_size": (28, 56)}, "at least 42 x 42, a"),
         (
             ModelConfig,
             {"aggregator": "gem-pyramid", "cross_image": CrossImageConfig(heads=5)},
             "CrossImageConfig.heads: found 5, expected a divisor of the 768 numbers of a token",
         ),
         (ModelConfig, {"aggregator": "class-token", "image_size": (28, 57)}, "found 28 x 57"),
+        (ModelConfig, {"aggregator": AnyLocConfig(layer=12)}, "found 12, expected -12 to 11 for a"),
+        (ModelConfig, {"aggregator": AnyLocConfig(layer=-13)}, "found -13, expected -12 to 11"),
+        (ModelConfig, {"aggregator": "anyloc"}, "found 2 for aggregator anyloc, with which noth"),
+        (ModelConfig, {"aggregator": ConvApConfig(side=3), "image_size": (28, 56)}, "42 x 42, a p"),
+        (ModelConfig, {"image_size": (224, 225)}, "image size: found 224 x 225"),
+        (ModelConfig, {"image_size": (112, 112)}, "64 patches for 64 clusters"),
+        (ModelConfig, {"cross_image": CrossImageConfig(heads=12)}, "found 12, .* of the 128 num"),
+        (
+            ModelConfig,
+            {"aggregator": SaladConfig(token_dim=200)},
+            "global_token: found True, expected False",
+        ),
         (NetVladConfig, {"clusters": 1}, "NetVladConfig.clusters: found 1, expected at least 2"),
-        (AnyLocConfig, {"facet": "values"}, "AnyLocConfig.facet: found 'values', expected one of"),
-        (
-            ModelConfig,
-            {"aggregator": AnyLocConfig(layer=12)},
-            "AnyLocConfig.layer: found 12, expected -12 to 11 for a backbone of 12 blocks",
-        ),
-        (
-            ModelConfig,
-            {"aggregator": AnyLocConfig(layer=-13)},
-            "AnyLocConfig.layer: found -13, expected -12 to 11",
-        ),
-        (
-            ModelConfig,
-            {"aggregator": "anyloc"},
-            "CrossImageConfig.layers: found 2 for aggregator anyloc, with which nothing trains",
-        ),
-        (
-            ModelConfig,
-            {"aggregator": ConvApConfig(side=3), "image_size": (28, 56)},
-            "found 28 x 56, expected at least 42 x 42, a patch for every region",
-        ),
-        (
-            BoqConfig,
-            {"channels": 200},
-            "BoqConfig.channels: found 200, expected a multiple of its heads, 3: one for every 64",
-        ),
+        (BoqConfig, {"channels": 200}, "found 200, expected a multiple of its 3 heads, one for"),
         (MixVprConfig, {"rows": 0}, "MixVprConfig.rows: found 0"),
-        (ConvApConfig, {"side": 0}, "ConvApConfig.side: found 0"),
         (CosPlaceConfig, {"dim": -1}, "CosPlaceConfig.dim: found -1"),
         (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),
         (SaladConfig, {"epsilon": -1.0}, "SaladConfig.epsilon: found -1.0"),
         (SaladConfig, {"epsilon": float("nan")}, "SaladConfig.epsilon: found nan"),
         (SaladConfig, {"dropout": 1.0}, "SaladConfig.dropout: found 1.0, expected .* less than 1"),
-        (SaladConfig, {"clusters": 0}, "SaladConfig.clusters: found 0"),
-        (CrossImageConfig, {"layers": -1}, "CrossImageConfig.layers: found -1"),
         (CrossImageConfig, {"dropout": float("nan")}, "CrossImageConfig.dropout: found nan"),
-        (ModelConfig, {"compute_dtype": "float16"}, "ModelConfig.compute_dtype: found 'float16'"),
-        (PreprocessingConfig, {"filter": "box"}, "PreprocessingConfig.filter: found 'box', expec"),
-        (PreprocessingConfig, {"deviation": (1.0, 0.0, 1.0)}, "deviation: found .* numbers above"),
-        (PreprocessingConfig, {"mean": (0.0, 0.0, float("nan"))}, "mean: found .* finite numbers"),
         (
             PreprocessingConfig,
-            {"mean": (0.5, 0.5)},
-            "Config.mean: found .* tuple of 3",
+            {"deviation": (1.0, 0.0, 1.0)},
+            "found mean .*, and deviations above",
         ),
+        (PreprocessingConfig, {"mean": (0.0, 0.0, float("nan"))}, "found mean .* finite numbers"),
+        (PreprocessingConfig, {"mean": (0.5, 0.5)}, "Config.mean: found .* tuple of 3"),
         (
             PreprocessingConfig,
             {"normalisation": "local-contrast", "pixels": "floats"},
             "PreprocessingConfig.pixels: found floats with normalisation local-contrast",
         ),
-        (ModelConfig, {"image_size": (224, 225)}, "image size: found 224 x 225"),
-        (ModelConfig, {"image_size": (112, 112)}, "64 patches for 64 clusters"),
-        (
-            ModelConfig,
-            {"cross_image": CrossImageConfig(heads=12)},
-            "CrossImageConfig.heads: found 12, expected a divisor of the 128 numbers of a token",
-        ),
-        (
-            ModelConfig,
-            {"aggregator": SaladConfig(token_dim=200)},
-            "whose global token has 200 numbers, expected a multiple of a local one's 128",
-        ),
         (MultiSimilarityConfig, {"beta": 0.0}, "MultiSimilarityConfig.beta: found 0.0"),
         (LossConfig, {"miner_margin": -0.1}, "LossConfig.miner_margin: found -0.1"),
-        (
-            LossConfig,
-            {"kind": "softmax"},
-            "^LossConfig.kind: found 'softmax', expected one of circle",
-        ),
-        (LossConfig, {"miner": "hard"}, "LossConfig.miner: found 'hard'"),
+        (LossConfig, {"kind": "softmax"}, "^LossConfig.kind: found 'softmax', expected one of c"),
         (LossConfig, {"kind": "fast-ap"}, "expected 'none': it ranks all images"),
         (
             ContrastiveConfig,
@@ -538,40 +476,20 @@ def test_one_patch_more_than_clusters_is_enough():
         (CircleConfig, {"margin": 1.0}, "CircleConfig.margin: found 1.0"),
         (SupConConfig, {"temperature": 0.0}, "SupConConfig.temperature: found 0.0"),
         (FastAPConfig, {"bins": 0}, "FastAPConfig.bins: found 0"),
-        (
-            ClassesConfig,
-            {"kind": "cities"},
-            "ClassesConfig.kind: found 'cities', expected one of cells, places, view",
-        ),
         (LargeMarginCosineConfig, {"margin": 1.0}, "LargeMarginCosineConfig.margin: found 1.0"),
         (ClassesConfig, {"groups": 0}, "ClassesConfig.groups: found 0"),
         (ClassesConfig, {"steps": 0}, "ClassesConfig.steps: found 0"),
-        (
-            ClassesConfig,
-            {"sector": 50.0},
-            "ClassesConfig.sector: found 2 sectors of 50 degrees, expected a divisor of",
-        ),
+        (ClassesConfig, {"sector": 50.0}, "found 2 sectors of 50 degrees, expected a divisor of"),
         (RandAugmentConfig, {"magnitude": 31}, "RandAugmentConfig.magnitude: found 31"),
-        (RandAugmentConfig, {"operations": -1}, "RandAugmentConfig.operations: found -1"),
         (LightAugmentConfig, {"crop": 1.0}, "LightAugmentConfig.crop: found 1.0"),
         (LightAugmentConfig, {"grey": 1.1}, "LightAugmentConfig.grey: found 1.1"),
-        (LightAugmentConfig, {"blur": -1.0}, "LightAugmentConfig.blur: found -1.0"),
         (OptimiserConfig, {"learning_rate": 0.0}, "OptimiserConfig.learning_rate: found 0.0"),
-        (OptimiserConfig, {"weight_decay": -1.0}, "OptimiserConfig.weight_decay: found -1.0"),
         (OptimiserConfig, {"b2": 1.0}, "OptimiserConfig.b2: found 1.0"),
-        (OptimiserConfig, {"clip_norm": 0.0}, "OptimiserConfig.clip_norm: found 0.0"),
-        (
-            TrainConfig,
-            {"augmentation": "heavy"},
-            "^TrainConfig.augmentation: found 'heavy'",
-        ),
-        (TrainConfig, {"batch_order": "any"}, "TrainConfig.batch_order: found 'any'"),
-        (TrainConfig, {"epochs": 0}, "TrainConfig.epochs: found 0"),
+        (TrainConfig, {"augmentation": "heavy"}, "^TrainConfig.augmentation: found 'heavy'"),
         (TrainConfig, {"images_per_place": 1}, "TrainConfig.images_per_place: found 1"),
-        (TrainConfig, {"min_images": 3}, "TrainConfig.min_images: found 3, .*images_per_place .4"),
+        (TrainConfig, {"min_images": 3}, "TrainConfig.min_images: found 3, expected at least 4"),
         (TrainConfig, {"trainable": "tail"}, "TrainConfig.trainable: found 'tail', expected head"),
         (TrainConfig, {"trainable": "last--1-blocks+head"}, "TrainConfig.trainable"),
-        (TrainConfig, {"patience": 0}, "TrainConfig.patience: found 0"),
         (TrainConfig, {"validation_size": (320, 322)}, "image size: found 320 x 322, expected"),
         (TrainConfig, {"seed": -1}, "TrainConfig.seed: found -1"),
     ],
@@ -592,34 +510,18 @@ def test_what_does_not_fit_is_refused_in_one_line(kind, fields, words):
         (CrossImageConfig, {"dropout": None}, "None", "a number"),
         (CrossImageConfig, {"global_token": 1}, "1", "True or False"),
         (AdapterConfig, {"kind": None}, "None", "one of depthwise, mlp, multi-resolution, none"),
-        (AdapterConfig, {"alpha": "0.2"}, "'0.2'", "a number"),
-        (ViTConfig, {"dim": "384"}, "'384'", "a whole number"),
         (ViTConfig, {"adapter": "mlp"}, "'mlp'", "AdapterConfig"),
-        (SaladConfig, {"clusters": 8.0}, "8.0", "a whole number"),
         (SaladConfig, {"sinkhorn": 3}, "3", "SinkhornConfig"),
-        (AnyLocConfig, {"layer": 31.0}, "31.0", "a whole number"),
-        (SinkhornConfig, {"throw": 1}, "1", "True or False"),
         (SinkhornConfig, {"tolerance": "1e-3"}, "'1e-3'", "a number, or None"),
         (ModelConfig, {"image_size": 224}, "224", "a tuple of 2, each a whole number"),
         (ModelConfig, {"image_size": [224, 224]}, "[224, 224]", "a tuple of 2, each a whole num"),
         (ModelConfig, {"image_size": (224, 2.5)}, "(224, 2.5)", "a tuple of 2, each a whole num"),
-        (ModelConfig, {"cross_image": 2}, "2", "CrossImageConfig"),
         (ModelConfig, {"remat": ["dots"]}, "['dots']", "one of dots, full, none"),
-        (ModelConfig, {"precision": "float32"}, "'float32'", "one of default, high, highest"),
-        (LossConfig, {"miner_margin": "0.1"}, "'0.1'", "a number"),
-        (TripletConfig, {"margin": "0.1"}, "'0.1'", "a number"),
-        (ClassesConfig, {"groups": 2.5}, "2.5", "a whole number"),
-        (OptimiserConfig, {"learning_rate": "1e-3"}, "'1e-3'", "a number"),
         (OptimiserConfig, {"decay_steps": 10.5}, "10.5", "a whole number, or None"),
-        (OptimiserConfig, {"warmup_steps": 0.1}, "0.1", "a whole number"),
-        (TrainConfig, {"model": "tiny"}, "'tiny'", "ModelConfig"),
-        (TrainConfig, {"loss": "triplet"}, "'triplet'", "LossConfig"),
         (TrainConfig, {"trainable": None}, "None", "text"),
-        (TrainConfig, {"seed": None}, "None", "a whole number"),
         (TrainConfig, {"cities": "Bath"}, "'Bath'", "a tuple, each text, or None"),
         (TrainConfig, {"cities": ("Bath", 3)}, "('Bath', 3)", "a tuple, each text, or None"),
         (LightAugmentConfig, {"blur": "1"}, "'1'", "a number"),
-        (ExportConfig, {"batch_size": 1.5}, "1.5", "a whole number, or None"),
         (ExportConfig, {"platforms": "cpu"}, "'cpu'", "a tuple, each one of cpu"),
         (PcaConfig, {"whiten": "no"}, "'no'", "True or False"),
         (DemoConfig, {"epochs": 1.5}, "1.5", "a whole number"),
@@ -663,7 +565,8 @@ def test_numpys_numbers_and_whole_numbers_for_floats_are_taken():
 
 def test_anylocs_layer_is_its_papers_of_vit_g():
     """31 of 40 blocks, by Keetha et al., whether from the front or from the end."""
-    assert AnyLocConfig().block(40) == AnyLocConfig(layer=31).block(40) == 31
+    for part in (AnyLocConfig(), AnyLocConfig(layer=31)):
+        assert part.features(40).levels == (32,)  # counted from 1
     assert recipe("g14", "anyloc").model.descriptor_dim == 32 * 1536  # 49,152, as published
 
 

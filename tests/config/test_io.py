@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import pathlib
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from crisalad_jax.utils.files import write_json
 CHANGED = dataclasses.replace(
     recipe("tiny"), cities=("Aston", "Brill"), patience=4, augmentation=recipe("b14").augmentation
 )
+VIT = {"name": "vit"}
 RECIPES_OF_PRESETS = {
     f"{preset} {name}": recipe(preset, name)
     for preset in PRESETS
@@ -28,7 +28,7 @@ RECIPES_OF_PRESETS = {
 
 
 @pytest.mark.parametrize("config", [*map(recipe, PRESETS), CHANGED], ids=[*PRESETS, "changed"])
-def test_every_recipe_survives_a_file(tmp_path: pathlib.Path, config: TrainConfig):
+def test_every_recipe_survives_a_file(tmp_path, config):
     write_json(tmp_path / "config.json", to_plain(config))
     found = read_config(TrainConfig, tmp_path / "config.json")
     assert found == config
@@ -36,7 +36,7 @@ def test_every_recipe_survives_a_file(tmp_path: pathlib.Path, config: TrainConfi
 
 
 @pytest.mark.parametrize("config", RECIPES_OF_PRESETS.values(), ids=RECIPES_OF_PRESETS)
-def test_every_recipe_of_every_preset_survives_json(config: TrainConfig):
+def test_every_recipe_of_every_preset_survives_json(config):
     plain = to_plain(config)
     assert json.loads(json.dumps(plain)) == plain
     found = from_plain(TrainConfig, plain, source="here")
@@ -45,13 +45,6 @@ def test_every_recipe_of_every_preset_survives_json(config: TrainConfig):
     assert to_plain(found) == plain
     model = from_plain(ModelConfig, plain["model"], source="here")
     assert model == config.model
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_every_preset_survives_json(preset: str):
-    found = from_plain(ModelConfig, to_plain(PRESETS[preset]), source="here")
-    assert found == PRESETS[preset]
-    assert hash(found) == hash(PRESETS[preset])
 
 
 def test_plain_values_are_json_and_complete():
@@ -80,13 +73,10 @@ def test_fields_left_out_take_their_defaults():
         ({"model": {"image_size": [100, 98]}}, ["found 100 x 98", "nearest: 98 x 98"]),
         ({"model": {"image_size": [98]}}, ["config.model.image_size"]),
         (
-            {"model": {"backbone": {"name": "vit", "dim": "32"}}},
-            ["'32'", "expected a whole number", "config.model.backbone.dim"],
+            {"model": {"backbone": VIT | {"dim": "32"}}},
+            ["'32'", "expected a whole", "backbone.dim"],
         ),
-        (
-            {"model": {"backbone": {"name": "vit", "ffn": "relu"}}},
-            ["relu", "swiglu", "config.model.backbone.ffn"],
-        ),
+        ({"model": {"backbone": VIT | {"ffn": "relu"}}}, ["relu", "swiglu", "model.backbone.ffn"]),
         ({"model": {"backbone": {"dim": 32}}}, ["None", "config.model.backbone"]),
         ({"model": 3}, ["config.model"]),
         ({"model": None}, ["config.model"]),
@@ -95,26 +85,21 @@ def test_fields_left_out_take_their_defaults():
         ({"seed": True}, ["True", "expected a whole number", "config.seed"]),
         ({"patience": "x"}, ["'x'", "config.patience"]),
         ({"cities": "Rome"}, ["'Rome'", "tuple, each text", "config.cities"]),
-        (
-            {"loss": {"pml_compat": "no"}},
-            ["'no'", "True or False", "loss.pml_compat"],
-        ),
+        ({"loss": {"pml_compat": "no"}}, ["'no'", "True or False", "loss.pml_compat"]),
         ({"model": {"aggregator": ["gem"]}}, ["['gem']", "config.model.aggregator"]),
         ({"model": {"aggregator": {"name": ["gem"]}}}, ["['gem']", "config.model.aggregator"]),
         ({"model": {"aggregator": {"clusters": 32}}}, ["None", "config.model.aggregator"]),
         ({"model": {"aggregator": {"name": "gem", "clusters": 2}}}, ["found clusters"]),
         ({"model": {"aggregator": {"name": "gem"}, "gem": {}}}, ["found gem", "config.model"]),
         ({"model": {"remat": []}}, ["found []", "config.model.remat"]),
-        ({"model": {"remat": "some"}}, ["'some'", "dots", "config.model.remat"]),
         ({"augmentation": 3}, ["found 3", "config.augmentation"]),
         ({"augmentation": ["light"]}, ["['light']", "config.augmentation"]),
-        ({"epochs": 0.5}, ["config.epochs"]),
         ([], ["found []", "an object"]),
         (None, ["found None", "an object"]),
         ("b14", ["found 'b14'", "an object"]),
     ],
 )
-def test_what_does_not_fit_is_named_in_one_line(value: Any, words: list[str]):
+def test_what_does_not_fit_is_named_in_one_line(value, words):
     with pytest.raises(InputError) as caught:
         from_plain(TrainConfig, value, source="some/config.json")
     message = str(caught.value)
@@ -125,7 +110,7 @@ def test_what_does_not_fit_is_named_in_one_line(value: Any, words: list[str]):
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe\x00", b"[]", b'{"model": {'])
-def test_a_file_that_is_no_configuration_is_named(tmp_path: pathlib.Path, content: bytes):
+def test_a_file_that_is_no_configuration_is_named(tmp_path, content):
     path = tmp_path / "config.json"
     path.write_bytes(content)
     with pytest.raises(InputError, match=f"^{path}: ") as caught:
@@ -133,13 +118,13 @@ def test_a_file_that_is_no_configuration_is_named(tmp_path: pathlib.Path, conten
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_named(tmp_path: pathlib.Path):
+def test_a_missing_file_is_named(tmp_path):
     for path, found in ((tmp_path / "none.json", "no such file"), (tmp_path, "a folder")):
         with pytest.raises(InputError, match=f"^{path}: found {found}, expected a configuration"):
             read_config(ModelConfig, path)
 
 
-def test_a_written_configuration_that_was_changed_is_refused(tmp_path: pathlib.Path):
+def test_a_written_configuration_that_was_changed_is_refused(tmp_path):
     path = tmp_path / "config.json"
     write_json(path, to_plain(recipe("tiny")))
     text = path.read_text()
@@ -149,7 +134,7 @@ def test_a_written_configuration_that_was_changed_is_refused(tmp_path: pathlib.P
         read_config(TrainConfig, path)
 
 
-def test_a_configuration_that_a_user_wrote_is_read(tmp_path: pathlib.Path):
+def test_a_configuration_that_a_user_wrote_is_read(tmp_path):
     path = tmp_path / "config.json"
     path.write_text('{"seed": 7}')
     assert read_config(TrainConfig, path) == TrainConfig(seed=7)
@@ -164,38 +149,18 @@ def test_a_configuration_that_a_user_wrote_is_read(tmp_path: pathlib.Path):
             "model.backbone",
         ),
         (
-            {"model": {"aggregator": {"name": "x", "size": 3}}},
-            "aggregator: found 'x', expected one of a",
-            "model.aggregator",
-        ),
-        (
-            {"model": {"aggregator": {"name": "salad", "dustbin": "x"}}},
-            "dustbin: found 'x', expected one of column, mass, ",
-            "model.aggregator.dustbin",
-        ),
-        (
             {"model": {"aggregator": {"name": "salad", "sinkhorn": {"step": {"name": "x"}}}}},
             "step: found 'x', expected one of dual-softmax, newton, ",
             "model.aggregator.sinkhorn.step",
-        ),
-        (
-            {"model": {"aggregator": {"name": "salad", "sinkhorn": {"gradient": "x"}}}},
-            "gradient: found 'x', expected one of implicit, optimistix, ",
-            "model.aggregator.sinkhorn.gradient",
         ),
         (
             {"loss": {"kind": {"name": "x", "size": 3}}},
             "loss: found 'x', expected one of circle, ",
             "loss.kind",
         ),
-        (
-            {"augmentation": {"name": "x"}},
-            "augmentation: found 'x', expected one of camera, colour-crop, light, none, ",
-            "augmentation",
-        ),
     ],
 )
-def test_an_unknown_part_is_named_and_may_be_a_plug_ins(value: Any, words: str, place: str):
+def test_an_unknown_part_is_named_and_may_be_a_plug_ins(value, words, place):
     with pytest.raises(InputError) as caught:
         from_plain(TrainConfig, value, source="some/config.json")
     message = str(caught.value)
@@ -208,13 +173,8 @@ def test_an_unknown_part_is_named_and_may_be_a_plug_ins(value: Any, words: str, 
 
 def test_differences_name_the_fields_in_full():
     b14 = recipe("b14")
-    other = dataclasses.replace(
-        b14,
-        seed=3,
-        model=dataclasses.replace(
-            b14.model, aggregator=dataclasses.replace(b14.model.aggregator, clusters=32)
-        ),
-    )
+    head = dataclasses.replace(b14.model.aggregator, clusters=32)
+    other = dataclasses.replace(b14, seed=3, model=dataclasses.replace(b14.model, aggregator=head))
     assert differences(b14, b14) == []
     assert differences(other, b14) == [
         "model.aggregator.clusters: found 32, expected 64",
@@ -222,7 +182,7 @@ def test_differences_name_the_fields_in_full():
     ]
 
 
-def test_a_number_of_numpy_is_a_number_and_other_objects_are_refused() -> None:
+def test_a_number_of_numpy_is_a_number_and_other_objects_are_refused():
     @dataclasses.dataclass(frozen=True)
     class Some:
         value: Any

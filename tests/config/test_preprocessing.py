@@ -29,12 +29,12 @@ from tests.conftest import MODEL
         ("longer-side", (1024, 1024), (1, 9000), (1, 1024)),
     ],
 )
-def test_the_size_of_an_image(rule, image_size, size, expected) -> None:
+def test_the_size_of_an_image(rule, image_size, size, expected):
     how = PreprocessingConfig(size_rule=rule)
     assert how.target_size(size, image_size) == expected
 
 
-def test_sides_are_rounded_to_the_nearest_multiple_and_halves_to_the_even_one() -> None:
+def test_sides_are_rounded_to_the_nearest_multiple_and_halves_to_the_even_one():
     sides = {240: 238, 320: 322, 35: 28, 49: 56, 6: 14, 322: 322}
     native, fixed = PreprocessingConfig(size_rule="native"), PreprocessingConfig()
     for side, expected in sides.items():
@@ -45,7 +45,7 @@ def test_sides_are_rounded_to_the_nearest_multiple_and_halves_to_the_even_one() 
         assert native.rounded_size((side, side), 1) == (side, side)
 
 
-def test_words_set_fields() -> None:
+def test_words_set_fields():
     how = PreprocessingConfig(mean=(0.0, 0.0, 0.0))
     words = ("shorter-side", "bicubic", "no-antialias", "floats", "round")
     assert how.changed_by(words) == dataclasses.replace(
@@ -68,7 +68,7 @@ def test_words_set_fields() -> None:
             of.changed_by(words)
 
 
-def test_a_model_rounds_where_its_backbone_needs_it() -> None:
+def test_a_model_rounds_where_its_backbone_needs_it():
     """And a size that is fixed only where that is asked for."""
     native = MODEL.resized((60, 80), ["native"])
     assert (native.image_size, native.input_size, native.grid) == ((60, 80), (56, 84), (4, 6))
@@ -82,7 +82,7 @@ def test_a_model_rounds_where_its_backbone_needs_it() -> None:
         MODEL.resized((60, 80))
 
 
-def test_a_backbone_of_any_size_is_not_rounded() -> None:
+def test_a_backbone_of_any_size_is_not_rounded():
     @dataclasses.dataclass(frozen=True)
     class AnySize(ViTConfig):
         any_size = True
@@ -102,7 +102,7 @@ def test_a_backbone_of_any_size_is_not_rounded() -> None:
         config.resized(None, ["round"])
 
 
-def test_a_size_beside_a_native_rule_is_told() -> None:
+def test_a_size_beside_a_native_rule_is_told():
     """Unless the same call names a rule."""
     native = MODEL.resized(None, ["native"])
     for words in ([], ["bicubic"]):
@@ -113,7 +113,7 @@ def test_a_size_beside_a_native_rule_is_told() -> None:
     assert native.resized((56, 84), ["native"]).image_size == (56, 84)
 
 
-def test_parameters_for_every_patch_need_a_fixed_size() -> None:
+def test_parameters_for_every_patch_need_a_fixed_size():
     config = dataclasses.replace(
         MODEL,
         aggregator=MixVprConfig(channels=8, rows=2, depth=1),

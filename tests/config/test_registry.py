@@ -92,7 +92,7 @@ def birds(monkeypatch: pytest.MonkeyPatch) -> Registry[Bird]:
     return registry
 
 
-def test_a_part_is_found_and_made_by_its_name(birds: Registry[Bird]):
+def test_a_part_is_found_and_made_by_its_name(birds):
     assert birds.register("goose")(Goose) is Goose
     assert birds.names() == list(birds) == ["duck", "goose"]
     assert "goose" in birds
@@ -105,24 +105,18 @@ def test_a_part_is_found_and_made_by_its_name(birds: Registry[Bird]):
     assert birds.make("duck", "loud", volume=2) == Duck(volume=2)
 
 
-@pytest.mark.parametrize("name", ["duck", "goose"])
-def test_a_name_that_is_taken_is_refused(birds: Registry[Bird], name: str):
-    birds.register("goose")(Goose)
-    other = Goose if name == "duck" else Duck
-    there = birds.find(name)
+def test_a_name_that_is_taken_is_refused(birds):
     words = (
-        f"^register_bird '{name}': found the name taken by {__name__}.{there.__qualname__}, "
-        f"expected another name for {other.__qualname__}$"
+        f"^register_bird 'duck': found the name taken by {__name__}.Duck, expected another name "
+        "for Goose$"
     )
     with pytest.raises(InputError, match=words):
-        birds.register(name)(other)
-    assert birds.find(name) is there
-    assert there.part_name == name
-    assert (Duck.part_name, Goose.part_name) == ("duck", "goose")
+        birds.register("duck")(Goose)
+    assert birds.find("duck") is Duck
     assert birds.make("duck", "loud") == Duck(volume=3)
 
 
-def test_a_class_has_one_name(birds: Registry[Bird]):
+def test_a_class_has_one_name(birds):
     """Files would name the other one."""
     with pytest.raises(
         InputError, match=r"^register_bird 'drake': found Duck registered as 'duck'"
@@ -132,7 +126,7 @@ def test_a_class_has_one_name(birds: Registry[Bird]):
     assert birds.make("duck").part_name == "duck"
 
 
-def test_a_cell_that_runs_again_brings_the_same_part(birds: Registry[Bird]):
+def test_a_cell_that_runs_again_brings_the_same_part(birds):
     again = dataclasses.make_dataclass(
         "Duck",
         [("volume", int, 5)],
@@ -147,21 +141,21 @@ def test_a_cell_that_runs_again_brings_the_same_part(birds: Registry[Bird]):
 @pytest.mark.parametrize(
     ("part", "words"),
     [
-        (Thawed, "found Thawed, which is no frozen dataclass, expected @dataclasses.dataclass\\("),
-        (Plain, "found Plain, which is no frozen dataclass, expected @dataclasses.dataclass\\("),
-        (int, "found int, which is no frozen dataclass, expected @dataclasses.dataclass\\("),
-        (Stone, "found Stone, expected a subclass of Bird$"),
+        *(
+            (part, f"found {name}, expected a subclass of Bird with @dataclasses.dataclass\\(froz")
+            for part, name in (
+                *((each, each.__name__) for each in (Thawed, Plain, int, Stone, chirp)),
+                *((3, "int"), (Duck(), "Duck")),
+            )
+        ),
         (Named, "found a field 'name', which has another meaning here$"),
         (Plugged, "found a field 'plugin', which has another meaning here$"),
-        (Needy, ".* missing 1 required keyword-only argument: 'weight'; expected a default for"),
-        (Listed, "unhashable type: 'list'; expected a default for every field, and values that"),
-        (Mute, "found no method call, expected it$"),
-        (chirp, "found function, expected a frozen dataclass that inherits from Bird$"),
-        (3, "found int, expected a frozen dataclass that inherits from Bird$"),
-        (Duck(), "found Duck, expected a frozen dataclass that inherits from Bird$"),
+        (Needy, ".* missing 1 required keyword-only argument: 'weight'; expected all methods, a"),
+        (Listed, "unhashable type: 'list'; expected all methods, a default for every field"),
+        (Mute, ".* abstract class Mute with abstract method call; expected all methods"),
     ],
 )
-def test_what_is_no_part_is_refused_in_one_line(birds: Registry[Bird], part: Any, words: str):
+def test_what_is_no_part_is_refused_in_one_line(birds, part, words):
     with pytest.raises(InputError, match=f"^register_bird 'new': {words}") as caught:
         birds.register("new")(part)
     assert "\n" not in str(caught.value)
@@ -169,18 +163,18 @@ def test_what_is_no_part_is_refused_in_one_line(birds: Registry[Bird], part: Any
     assert not hasattr(part, "part_name") or part.part_name == "duck"
 
 
-def test_a_function_is_a_part_where_the_kind_says_so(monkeypatch: pytest.MonkeyPatch):
+def test_a_function_is_a_part_where_the_kind_says_so(monkeypatch):
     monkeypatch.setitem(REGISTRIES, "bird", None)
     birds = Registry("bird", Bird, of_function=lambda f: {"call": lambda self: f()})
     assert birds.register("chirp")(chirp) is chirp
     assert birds.make("chirp").call() == "chirp"
     assert birds.make("chirp") == birds.make("chirp")
-    with pytest.raises(InputError, match=r"^register_bird 'three': found int, expected a frozen"):
+    with pytest.raises(InputError, match=r"^register_bird 'three': found int, expected a subclass"):
         birds.register("three")(3)  # type: ignore[type-var]
 
 
 @pytest.mark.parametrize("name", ["swan", "", None, ["duck"], {}])
-def test_an_unknown_name_lists_the_known_and_tells_of_plug_ins(birds: Registry[Bird], name: Any):
+def test_an_unknown_name_lists_the_known_and_tells_of_plug_ins(birds, name):
     with pytest.raises(InputError) as caught:
         birds.find(name)
     assert str(caught.value) == (
@@ -191,7 +185,7 @@ def test_an_unknown_name_lists_the_known_and_tells_of_plug_ins(birds: Registry[B
         birds.make(name)
 
 
-def test_a_field_takes_a_part_or_its_name(birds: Registry[Bird]):
+def test_a_field_takes_a_part_or_its_name(birds):
     @dataclasses.dataclass(frozen=True)
     class Pond:
         bird: Any = part_field(birds, "duck")
@@ -208,7 +202,7 @@ def test_a_field_takes_a_part_or_its_name(birds: Registry[Bird]):
             Pond(bird=other)
 
 
-def test_an_unregistered_subclass_is_refused_where_a_part_is_expected(birds: Registry[Bird]):
+def test_an_unregistered_subclass_is_refused_where_a_part_is_expected(birds):
     """A file would keep it under its parent's name, and load the parent."""
     birds.register("duck")(Duck)
 
@@ -223,7 +217,9 @@ def test_an_unregistered_subclass_is_refused_where_a_part_is_expected(birds: Reg
     class Loud(Duck):
         pass
 
-    with pytest.raises(InputError, match=r"^Pond.bird: found .*Loud, which is not registered, exp"):
+    with pytest.raises(
+        InputError, match=r"^Pond.bird: found .*Loud.*, which is not registered, exp"
+    ):
         Pond(Loud())
 
 
@@ -241,20 +237,20 @@ def test_an_unregistered_subclass_is_refused_where_a_part_is_expected(birds: Reg
         (functools.partial(lambda a, b, c, scale: 0, scale=2), 3),
     ],
 )
-def test_a_function_is_given_what_it_requires_and_keeps_its_defaults(function: Any, count: int):
+def test_a_function_is_given_what_it_requires_and_keeps_its_defaults(function, count):
     assert count_arguments(function, "descriptors", "labels", "valid") == count
 
 
 @pytest.mark.parametrize(
     "function", [lambda a, b, c, scale: 0, lambda a, *, scale: 0], ids=["fourth", "by name"]
 )
-def test_a_function_that_requires_more_is_refused(function: Any):
+def test_a_function_that_requires_more_is_refused(function):
     words = r"found the arguments scale, expected at most descriptors, labels, valid$"
     with pytest.raises(InputError, match=words):
         count_arguments(function, "descriptors", "labels", "valid")
 
 
-def test_fields_of_a_plug_ins_part_are_checked_before_its_own_check(birds: Registry[Bird]):
+def test_fields_of_a_plug_ins_part_are_checked_before_its_own_check(birds):
     @birds.register("goose")
     @dataclasses.dataclass(frozen=True)
     class Goose(Bird):

@@ -12,8 +12,8 @@ from PIL.TiffImagePlugin import IFDRational
 
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.live import Camera
-from crisalad_jax.data.loader import image_batches
 from crisalad_jax.data.positions import Positions, exif_position, read_positions
+from crisalad_jax.data.reading import image_batches
 from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import file_of, frame_time, list_frames
 from crisalad_jax.utils.errors import InputError
@@ -137,35 +137,30 @@ def test_a_table_of_positions_has_the_same_forms(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
-        (
-            "none",
-            None,
-            "none: found nothing, expected a folder of images, an image, a video, a p",
-        ),
-        ("none.jpg", None, "none.jpg: found no such file, expected an image file"),
+        ("none", None, "none: found no such file, expected a folder of images, an image, a video"),
+        ("none.jpg", None, "none.jpg: found no such file, expected a folder of images, an image"),
         ("*.gif", None, r"\*.gif: found no image, expected files that end in .jpg"),
         ("run/*.md", None, "found no image among 1 file"),
-        ("a.txt", "\n\n", "a.txt: found no image, expected a path a line"),
-        ("a.txt", "b.png\n", "a.txt: line 1: .*b.png: found no such file, expected an image file"),
-        ("a.txt", "\n{run}/left/0.png\n{run}/right/../left/0.png", "line 3: .*on line 2 too, exp"),
-        ("a.txt", "{run}\n", "a.txt: line 1: .*run: found a folder, expected an image file"),
+        ("a.txt", "\n\n", "a.txt: found no image, expected images"),
+        ("a.txt", "b.png\n", "a.txt: .*b.png: found no such file, expected an image file"),
+        (
+            "a.txt",
+            "\n{run}/left/0.png\n{run}/right/../left/0.png",
+            "a.txt: found .*0.png' twice, exp",
+        ),
+        ("a.txt", "{run}\n", "a.txt: .*run: found a folder, expected an image file"),
         ("a.csv", "", "a.csv: found columns none; missing name"),
         ("a.csv", "file,lat,lon\n", "found columns file, lat, lon; missing name"),
-        ("a.csv", "name\n", "a.csv: found no image, expected a path a line"),
-        ("a.csv", "name,year\n,1\n", "line 2: found no name, expected an image's"),
+        ("a.csv", "name\n", "a.csv: found no image, expected images"),
+        ("a.csv", "name,year\n,1\n", "line 2: found no name, expected one"),
         ("a.csv", "name,lat,lon\n{run}/left/0.png,1,5,2,5\n", "line 2: found 5 fields, expected 3"),
         ("a.csv", "name;lat;lon\n{run}/left/0.png;1.000,5;2\n", "lat: found '1.000,5', expected"),
+        ("a.csv", "name,lat,lon\n{run}/left/0.png,1,\n", "line 2: lon: found '', expected"),
+        ("a.csv", "name,x,x,y\n", "found the column x twice, expected it once"),
         (
             "a.csv",
-            "name,lat,lon\n{run}/left/0.png,1,\n",
-            "line 2: lon: found '', expected",
-        ),
-        ("a.csv", "name,x,x,y\n", "found the column x twice, expected it once"),
-        ("a.csv", "name,x,y\n{run}/walk.avi,1,2\n", "found a video, expected an image file, or a"),
-        (
-            "a.npz",
-            "text",
-            "a.npz: found arrays of NumPy, expected a folder of images, .*`descr",
+            "name,x,y\n{run}/walk.avi,1,2\n",
+            "found the video .*walk.avi, expected images",
         ),
         ("a.mp4", "text", "a.mp4: found a file that does not decode, expected a video"),
         ("a.mp4#t=1.000", None, "a.mp4: found no such file"),
@@ -229,9 +224,7 @@ def test_a_frame_has_one_name_however_it_is_written(root, tmp_path):
     assert open_source(f"{video}#t=9").names == ["walk.avi#t=9.000"]  # is told where it is read
     work = pathlib.Path(shutil.copytree(root / "run", tmp_path / "run"))
     (work / "list.txt").write_text("walk.avi#t=1.2\nwalk.avi#t=1.15\n")
-    with pytest.raises(
-        InputError, match=r"line 2: found 'walk\.avi#t=1\.15', which is on line 1 too"
-    ):
+    with pytest.raises(InputError, match=r"found 'walk\.avi#t=1\.200' twice, expected it once"):
         open_source(work / "list.txt")
     (work / "table.csv").write_text("name,x,y\nwalk.avi#t=0.15,1,2\n")
     named = Positions(("x", "y"), {"walk.avi#t=0.200": (1, 2)})
@@ -337,7 +330,7 @@ def test_missing_files_are_listed_to_be_skipped(root, tmp_path):
     there = root / "run" / "right" / "2.jpg"
     lines = [*missing, str(there)]
     (root / "some.txt").write_text("\n".join(lines))
-    with pytest.raises(InputError, match=r"some.txt: line 1: .*gone.jpg: found no such file"):
+    with pytest.raises(InputError, match=r"some.txt: .*gone.jpg: found no such file"):
         open_source(root / "some.txt")
     source = open_source(root / "some.txt", on_bad_image="skip")
     assert source.names == [*missing, "run/right/2.jpg"]

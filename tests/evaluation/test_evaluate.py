@@ -1,7 +1,6 @@
 """Groupings against `describe` on the very images, and recalls against brute force."""
 
 import dataclasses
-import pathlib
 import re
 
 import faiss
@@ -211,7 +210,7 @@ def test_without_an_encoder_no_descriptor_depends_on_its_batch(benchmark):
     assert (result.query_share, result.database_share, dict(result.by_seed)) == (None, None, {})
 
 
-def test_an_image_that_cannot_be_read_stops_an_evaluation(params, town: pathlib.Path):
+def test_an_image_that_cannot_be_read_stops_an_evaluation(params, town):
     benchmark = open_benchmark(town)
     benchmark.queries[2].write_bytes(benchmark.queries[2].read_bytes()[:200])
     with pytest.raises(InputError, match=f"^{benchmark.queries[2]}: .*cut short"):
@@ -354,9 +353,7 @@ def test_recalls_are_those_of_a_flat_faiss_index_on_the_same_descriptors(params,
         assert recall == np.mean(right)
 
 
-def test_an_observer_sees_the_descriptors_of_each_grouping(
-    benchmark: Benchmark, params, images: np.ndarray
-):
+def test_an_observer_sees_the_descriptors_of_each_grouping(benchmark, params, images):
     seen = {}
 
     def observe(grouping: str, database: np.ndarray, queries: np.ndarray) -> None:

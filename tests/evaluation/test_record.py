@@ -44,8 +44,10 @@ def test_settings_are_what_was_asked(settings, benchmark):
 
 def test_results_are_written_with_them(settings, benchmark, tmp_path):
     results = [result("single"), result("single", "transvpr:3")]
-    found = json.loads(json.dumps(results_json(results, settings, model_name="mine")))
+    found = results_json(results, settings, model_name="mine", benchmark=benchmark)
+    found = json.loads(json.dumps(found))
     rows = found.pop("results")
+    assert found.pop("skipped") == {"queries": [], "database": []}
     assert found == settings
     names = {"benchmark": benchmark.name, "model": "mine"}
     assert rows == [names | json.loads(json.dumps(to_json(each))) for each in results]

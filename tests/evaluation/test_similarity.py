@@ -14,7 +14,7 @@ def random_unit(seed: int, count: int, length: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("most", [400, 5, 3, 1])
-def test_every_cell_is_the_largest_of_its_images(most: int, monkeypatch: pytest.MonkeyPatch):
+def test_every_cell_is_the_largest_of_its_images(most, monkeypatch):
     """Blocks smaller than the sets, whose last ones are not full."""
     monkeypatch.setattr(similarity, "_QUERY_CHUNK", 4)
     monkeypatch.setattr(similarity, "_DATABASE_CHUNK", 6)

@@ -75,12 +75,18 @@ def test_cricavprs_adapter_has_its_parameter_count() -> None:
     assert sum(counted) == 761_472
 
 
-@pytest.mark.parametrize("kind", ["depthwise", "multi-resolution", "mlp", "side"])
+@pytest.mark.parametrize(
+    "kind", ["depthwise", "multi-resolution", "mlp", "side", "serial-parallel"]
+)
 def test_an_untrained_adapter_adds_nothing(kind: str) -> None:
-    config = ViTConfig(dim=32, heads=2, adapter=AdapterConfig(kind=kind))
-    params = init_adapter(jax.random.key(0), config.dim, config.adapter)
+    params = init_adapter(jax.random.key(0), 32, AdapterConfig(kind=kind))
     tokens = jax.random.normal(jax.random.key(2), (16, 32))
-    np.testing.assert_array_equal(adapter(params, tokens, GRID)[0], jnp.zeros((16, 32)))
+    parts = [params]
+    if isinstance(params, SerialParallelAdapter):
+        parts = [params.serial, params.parallel]
+        assert (params.serial.down.weight != params.parallel.down.weight).any()
+    for each in parts:
+        np.testing.assert_array_equal(adapter(each, tokens, GRID)[0], jnp.zeros((16, 32)))
 
 
 def test_cricavprs_convolutions_start_at_1e_5() -> None:
@@ -96,16 +102,6 @@ def test_cricavprs_convolutions_start_at_1e_5() -> None:
     assert params.keys() - starts.keys() == {"down.weight", "down.bias"}
     for name, value in starts.items():
         np.testing.assert_array_equal(params[name], value, err_msg=name)
-
-
-def test_serial_and_parallel_adapters_add_nothing_untrained() -> None:
-    config = AdapterConfig(kind="serial-parallel")
-    params = init_adapter(jax.random.key(0), 32, config)
-    assert isinstance(params, SerialParallelAdapter)
-    tokens = jax.random.normal(jax.random.key(2), (16, 32))
-    for each in (params.serial, params.parallel):
-        np.testing.assert_array_equal(adapter(each, tokens, GRID)[0], jnp.zeros((16, 32)))
-    assert (params.serial.down.weight != params.parallel.down.weight).any()
 
 
 def test_no_adapter_is_none() -> None:

@@ -1,4 +1,4 @@
-"""Costs against the paper's Table 3, counts by hand, and a second count of the program.
+"""Costs against the paper's Table 3, and counts by hand.
 
 `part_costs` counts in the program itself; here are the formulas.
 """
@@ -30,7 +30,7 @@ from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.costs import adapter_macs, count_macs, paper_adapter_macs, part_costs
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import describe, parameter_shapes, self_mask
+from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.sinkhorn import SinkhornConfig
 
 
@@ -66,26 +66,6 @@ def test_parameters_of_the_public_backbone() -> None:
     """dinov2_vitb14's checkpoint holds 86,580,480 numbers, of them 768 of a mask token."""
     costs = {cost.part: cost.parameters for cost in part_costs(PRESETS["b14"])}
     assert costs["backbone blocks"] + costs["backbone embedding, norm"] == 86_580_480 - 768
-
-
-def _products(jaxpr: Any, times: int = 1) -> int:
-    """Multiply-accumulates of every dot_general, scans multiplied out."""
-    total = 0
-    for equation in jaxpr.eqns:
-        inner = (
-            times * equation.params.get("length", 1) if equation.primitive.name == "scan" else times
-        )
-        for value in equation.params.values():
-            if hasattr(value, "jaxpr"):
-                total += _products(value.jaxpr, inner)
-            elif hasattr(value, "eqns"):
-                total += _products(value, inner)
-        if equation.primitive.name == "dot_general":
-            (contracted, _), _ = equation.params["dimension_numbers"]
-            left = equation.invars[0].aval.shape
-            out = equation.outvars[0].aval.shape
-            total += times * math.prod(out) * math.prod(left[i] for i in contracted)
-    return total
 
 
 ROWS, COLUMNS, DIM = 6, 9, 32
@@ -303,63 +283,3 @@ def test_what_a_program_counts() -> None:
         return jax.lax.conv_general_dilated(image, kernel, (1, 1), "SAME", dimension_numbers=names)
 
     assert count_macs(convolved, image, kernel) == 5 * 6 * 9 * 3 * 7
-
-
-@pytest.mark.parametrize(
-    "config",
-    [
-        SMALL,
-        dataclasses.replace(
-            SMALL,
-            backbone=dataclasses.replace(
-                SMALL.backbone, ffn="swiglu", registers=4, adapter=AdapterConfig(kind="none")
-            ),
-            cross_image=CrossImageConfig(layers=0),
-        ),
-        dataclasses.replace(
-            SMALL,
-            aggregator=GemPyramidConfig(),
-            backbone=dataclasses.replace(SMALL.backbone, adapter=AdapterConfig(kind="mlp")),
-        ),
-        dataclasses.replace(PLAIN, aggregator=NetVladConfig()),
-        dataclasses.replace(PLAIN, aggregator=AnyLocConfig(7, -1, "value")),
-        dataclasses.replace(PLAIN, aggregator=AnyLocConfig(7, 1, "token")),
-        dataclasses.replace(PLAIN, aggregator=TransVprConfig(levels=3, dim=24)),
-        *(
-            dataclasses.replace(PLAIN, aggregator=AGGREGATORS[name][0])
-            for name in ("gem", "conv-ap", "cosplace", "mixvpr", "boq")
-        ),
-    ],
-    ids=[
-        *("adapters, encoder", "swiglu, registers, neither", "pyramid, mlp"),
-        *("netvlad", "anyloc, values", "anyloc, tokens", "transvpr"),
-        *("gem", "conv-ap", "cosplace", "mixvpr", "boq"),
-    ],
-)
-def test_count_equals_the_programs_products(config: ModelConfig) -> None:
-    images = 3
-    params = parameter_shapes(config)
-    pixels = jax.ShapeDtypeStruct((images, *config.image_size, 3), jnp.float32)
-    program = jax.make_jaxpr(lambda p, x: describe(p, x, config, mask=self_mask(images)))(
-        params, pixels
-    )
-    # Branches apart, which have no products.
-    counted = _products(program.jaxpr)
-    # Position interpolation is products too, once a batch; depthwise taps are not dot_generals.
-    rows, columns = (side // 14 for side in config.image_size)
-    grid, dim = config.backbone.position_grid, config.backbone.dim
-    orders = {
-        columns * grid * grid * dim + rows * grid * columns * dim,
-        rows * grid * grid * dim + rows * grid * columns * dim,
-    }
-    taps = 0
-    if config.backbone.adapter.kind == "depthwise":
-        taps = config.backbone.depth * rows * columns * 9 * config.backbone.adapter_dim
-    once = convolution = 0
-    if isinstance(config.aggregator, BoqConfig):
-        # Of each block's 7 queries: inputs and outputs, scores and sums, and questions. Like
-        # positions they do not depend on the image. And the 3 x 3 convolution is no dot_general.
-        once = 2 * (5 * 7 * 128**2 + 2 * 7**2 * 128)
-        convolution = rows * columns * 9 * dim * 128
-    each = sum(cost.macs for cost in part_costs(config, images=images))
-    assert counted - once - images * (each - taps - convolution) in orders

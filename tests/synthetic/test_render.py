@@ -27,20 +27,9 @@ def test_pictures_depend_on_place_and_view_alone(scenery):
     assert first.dtype == np.uint8
     np.testing.assert_array_equal(render(7, view, size, scenery), first)
     assert (render(8, view, size, scenery) != first).mean() > 0.3
-    changes = {
-        "lateral": 0.3,
-        "forward": 1.0,
-        "heading": 4.0,
-        "height": 1.0,
-        "pitch": 3.0,
-        "field": 60.0,
-        "repaint": 0.3,
-        "occluders": None,
-        "time": "night",
-        "exposure": 0.5,
-        "noise": 4.0,
-        "seed": 1,
-    }
+    changes = {"lateral": 0.3, "forward": 1.0, "heading": 4.0, "height": 1.0, "pitch": 3.0}
+    changes |= {"field": 60.0, "repaint": 0.3, "occluders": None, "time": "night"}
+    changes |= {"exposure": 0.5, "noise": 4.0, "seed": 1}
     # Indoors neither season nor weather is seen.
     unseen = {"season": "autumn", "weather": "haze"}
     for name, value in (changes | unseen).items():
@@ -73,9 +62,7 @@ def test_seasons_colour_the_city():
 
 def test_winter_covers_the_country():
     """Snow is brighter than grass; means of twelve places, half of the smallest gap."""
-    summer, winter = (
-        mean_colour(View(season=season), "country").mean() for season in ("summer", "winter")
-    )
+    summer, winter = (mean_colour(View(season=s), "country").mean() for s in ("summer", "winter"))
     assert winter > summer + 15
 
 

@@ -14,7 +14,7 @@ import pytest
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.places import read_places
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.model import describe, init_crisalad, tokens_and_statistics
+from crisalad_jax.nn.model import init_crisalad, tokens_and_statistics
 from crisalad_jax.training import run_files
 from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.training.loop import fit
@@ -116,15 +116,6 @@ def test_micro_batches_are_forward_passes_in_turn() -> None:
     assert_close(found, second)
     _, whole = tokens_of(PARAMS, images, valid=valid, config=MODEL)
     assert any(not np.allclose(statistics(whole)[n], x) for n, x in statistics(found).items())
-
-
-@pytest.mark.slow
-def test_a_description_owes_nothing_to_its_batch() -> None:
-    params, _ = stepped()
-    images, alone = pictures(6), jnp.eye(6, dtype=bool)
-    together = describe(params, images, MODEL, mask=alone)
-    # The same sums in batches of another size: some roundings of 6e-8.
-    np.testing.assert_allclose(describe(params, images[:1], MODEL), together[:1], atol=2e-6)
 
 
 @pytest.mark.slow

@@ -36,7 +36,7 @@ from crisalad_jax.training.run_files import (
     RunFiles,
     RunRecord,
     RunState,
-    acquire_run,
+    check_run,
     checksum,
     checksum_of_places,
 )
@@ -90,7 +90,7 @@ def save_steps(config, places, out, params, steps: tuple[int, ...] = (0,)) -> No
     files = RunFiles(out, config, record)
     state = files.load(RunState(state, None))
     for files.record.step in steps:
-        files.save(state, lambda: params)
+        files.save(state, params)
     files.close()
 
 
@@ -447,44 +447,26 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(
     assert fit(config, places, tmp_path, initial=params, quiet=True).steps == STEPS
 
 
-def test_a_step_is_started_before_the_one_before_is_read(tmp_path, places, params, monkeypatch):
-    """Or the devices would wait while its numbers are fetched and logged."""
-    events = []
-
-    def step(*args):
-        events.append("step")
-        return train_step(*args)
-
-    def log(self, values, *, of=""):
-        events.append(f"line {values['step']}")
-
-    monkeypatch.setattr(trainer, "train_step", step)
-    monkeypatch.setattr(RunFiles, "log", log)
-    fit(RECIPE, places, tmp_path, initial=params, quiet=True)
-    assert events[:4] == ["step", "step", "line 1", "line 2"]  # an epoch has two
-
-
-def test_a_step_costs_one_fetch_from_the_devices(tmp_path, places, params, monkeypatch):
-    """All metrics in one call, which starts every copy before it waits for the first."""
+def test_a_step_is_started_before_the_one_before_is_read_in_one_fetch(
+    tmp_path, places, params, monkeypatch
+):
+    """Or the devices would wait while its numbers are fetched, one by one, and logged."""
     config, events = dataclasses.replace(RECIPE, epochs=1), []
-    real = jax.device_get
 
-    def step(*args):
-        events.append("step")
-        return train_step(*args)
+    def recorded(name, function=lambda *args, **options: None):
+        def call(*args, **options):
+            events.append(name)
+            return function(*args, **options)
 
-    def device_get(tree):
-        events.append("fetch")
-        return real(tree)
+        return call
 
-    def save(self, *args):
-        events.append("save")
-
-    monkeypatch.setattr(trainer, "train_step", step)
-    monkeypatch.setattr(trainer.jax, "device_get", device_get)
-    monkeypatch.setattr(RunFiles, "save", save)
+    monkeypatch.setattr(trainer, "train_step", recorded("step", train_step))
+    monkeypatch.setattr(trainer.jax, "device_get", recorded("fetch", jax.device_get))
+    monkeypatch.setattr(RunFiles, "log", recorded("line"))
+    monkeypatch.setattr(RunFiles, "save", recorded("save"))
     fit(config, places, tmp_path, initial=params, quiet=True)
-    assert events[events.index("step") :] == ["step", "step", "fetch", "fetch", "save"]
+    found = events[events.index("step") :]
+    assert found == ["step", "step", "fetch", "line", "fetch", "line", "save"]
 
 
 def test_an_error_of_the_system_that_is_none_of_writing_is_not_told_as_one(
@@ -610,42 +592,33 @@ def test_a_damaged_state_is_one_line_that_names_it_and_the_way_back(tmp_path, pl
     assert "\n" not in str(error.value)
 
 
-def test_a_folder_belongs_to_one_configuration(tmp_path):
-    acquire_run(tmp_path / "new" / "run", RECIPE)
-    acquire_run(tmp_path / "new" / "run", RECIPE)
+def test_a_folder_belongs_to_one_configuration(run):
+    check_run(run, ENDLESS)
     with pytest.raises(InputError, match=r"seed: found 6, expected 5.*another folder"):
-        acquire_run(tmp_path / "new" / "run", dataclasses.replace(RECIPE, seed=6))
+        check_run(run, dataclasses.replace(ENDLESS, seed=6))
 
 
-def test_a_folder_of_other_files_is_left_alone(tmp_path):
-    (tmp_path / "thesis.tex").write_text("words")
+@pytest.mark.parametrize("name", ["thesis.tex", ".bashrc", ".git"])
+def test_a_folder_of_other_files_is_left_alone(tmp_path, name):
+    """A home folder may hold hidden files alone."""
+    (tmp_path / name).write_text("words")
     with pytest.raises(InputError, match=f"{tmp_path}: found files but no run"):
-        acquire_run(tmp_path, RECIPE)
-    with pytest.raises(
-        InputError, match=r"thesis\.tex: found a file, expected the folder of a run"
-    ):
-        acquire_run(tmp_path / "thesis.tex", RECIPE)
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+        check_run(tmp_path, RECIPE)
+    with pytest.raises(InputError, match=f"{re.escape(name)}: found a file, expected a run or"):
+        check_run(tmp_path / name, RECIPE)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_hidden_files_of_the_user_outlive_a_run(tmp_path, places, params):
     """A run once removed every hidden file of its folder."""
     hidden = {".env": "secret", ".gitignore": "*", ".bashrc": "alias"}
     run = tmp_path / "run"
-    acquire_run(run, RECIPE)
+    save_steps(RECIPE, places, run, params)
     cut_off = temporary_beside(run / "last.safetensors")
     for name, text in (hidden | {cut_off.name: "cut off"}).items():
         (run / name).write_text(text)
-    save_steps(RECIPE, places, run, params)
+    save_steps(RECIPE, places, run, params, (1,))
     assert {p.name: p.read_text() for p in run.glob(".*")} == hidden
-
-
-@pytest.mark.parametrize("name", [".bashrc", ".git"])
-def test_a_folder_of_hidden_files_is_no_empty_folder(tmp_path, name):
-    """A home folder may hold nothing else."""
-    (tmp_path / name).write_text("words")
-    with pytest.raises(InputError, match=f"{tmp_path}: found files but no run"):
-        acquire_run(tmp_path, RECIPE)
 
 
 def test_the_log_drops_what_will_be_repeated_and_a_line_cut_off(tmp_path):

@@ -14,9 +14,9 @@ import torch
 from crisalad_jax import recipe
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.augmentations import NoAugmentation
-from crisalad_jax.data.loader import image_batches
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.query_set import QuerySet, read_query_set
+from crisalad_jax.data.reading import image_batches
 from crisalad_jax.experiments.train import train
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.model import describe
@@ -152,7 +152,7 @@ def test_a_loss_of_tuples_refuses_places_and_models_without_local_features():
     descriptors, labels = batch(0)
     config = LossConfig(kind=SelaVprLoss(), miner="none")
     arrays = jnp.asarray(descriptors), jnp.asarray(labels)
-    with pytest.raises(InputError, match="loss selavpr: found places, expected the pairs of mined"):
+    with pytest.raises(InputError, match="loss selavpr: found no tuples, expected the pairs"):
         metric_loss(*arrays, config)
     with pytest.raises(InputError, match="loss selavpr: found no local features"):
         metric_loss(*arrays, config, pairs=tuple_pairs(arrays[1]))
@@ -402,9 +402,9 @@ def test_query_sets_are_read_by_positions(street):
     wide = read_query_set(street, positive_radius=3.5, negative_radius=97)
     assert wide.near[1].tolist() == [1, 2, 3, 4]
     assert wide.positives[1].tolist() == [2, 3]
-    with pytest.raises(InputError, match="found no query of 10 with a database image within 2 m"):
+    with pytest.raises(InputError, match="found 0 of 10 queries with a database image within 2 m"):
         read_query_set(street, positive_radius=2)
-    with pytest.raises(InputError, match="found all 20 database images within 5000 m of e"):
+    with pytest.raises(InputError, match="and none of them with one farther than 5000 m"):
         read_query_set(street, negative_radius=5000)
 
 
@@ -597,15 +597,15 @@ def test_an_older_state_has_its_own_tuples(street, whole, tmp_path, monkeypatch)
 def test_the_wrong_kind_of_set_is_refused(street, shared, tmp_path):
     out = tmp_path / "run"
     city = read_places(shared / "city", min_images=2)
-    with pytest.raises(InputError, match="places: found places with mining 'whole', expected a Q"):
+    with pytest.raises(InputError, match="places: found Places with mining 'whole', expected Q"):
         fit(CONFIG, city, out, quiet=True)
-    with pytest.raises(InputError, match="places: found a QuerySet with mining 'none', expected"):
+    with pytest.raises(InputError, match="places: found QuerySet with mining 'none', expected P"):
         fit(RECIPE, read_query_set(street), out, quiet=True)
-    with pytest.raises(InputError, match="found places, expected quer"):
+    with pytest.raises(InputError, match="expected images/"):
         train(CONFIG, shared / "city", out, quiet=True)
-    with pytest.raises(InputError, match="--data-images: found for places"):
+    with pytest.raises(InputError, match="--data-images: found for a recipe"):
         train(RECIPE, shared / "city", out, images=tmp_path, quiet=True)
-    with pytest.raises(InputError, match="--data-images: found with the folder"):
+    with pytest.raises(InputError, match=r"images: found .* but"):
         train(CONFIG, street, out, images=tmp_path, quiet=True)
     assert not out.exists()
 
@@ -614,7 +614,7 @@ def test_a_set_without_positions_goes_by_its_ground_truth(tmp_path):
     for side in ("database", "queries"):
         for number in range(3):
             write_picture(tmp_path / side / f"{number}.jpg", number)
-    with pytest.raises(InputError, match="found neither positions nor ground truth, expected one"):
+    with pytest.raises(InputError, match="no ground truth, nothing to score"):
         read_query_set(tmp_path)
     table = "query,database\n0.jpg,1.jpg\n0.jpg,2.jpg\n1.jpg,\n2.jpg,0.jpg\n"
     (tmp_path / "ground_truth.csv").write_text(table)

@@ -145,14 +145,6 @@ SCHEDULES = {
         OptimiserConfig(learning_rate=1e-4, schedule="step"),
         lambda each: torch.optim.lr_scheduler.StepLR(each, 3 * EPOCH, 0.5),
     ),
-    "EDTformer": lambda: stepped(
-        OptimiserConfig(learning_rate=1e-4, schedule="step", step_gamma=0.7),
-        lambda each: torch.optim.lr_scheduler.LambdaLR(each, lambda n: 0.7 ** (n // (3 * EPOCH))),
-    ),
-    "ImAge": lambda: stepped(
-        recipe("b14", "image").optimiser,
-        lambda each: torch.optim.lr_scheduler.StepLR(each, 3 * EPOCH, 0.5),
-    ),
     "VLAD-BuFF": lambda: stepped(
         recipe("b14", "vlad-buff").optimiser,
         lambda each: torch.optim.lr_scheduler.LinearLR(each, 1.0, 0.2, total_iters=4000),
@@ -214,16 +206,6 @@ def test_a_warm_up_of_shared_steps_is_told_and_shortened_in_steps(params) -> Non
     epochs = OptimiserConfig(warmup_epochs=10, accumulate=4)
     (note,) = told(params, epochs, 20 * 7, 7)
     assert "found 10, which are 20 steps, for a run of 40 steps" in note
-
-
-def test_a_warm_up_in_epochs_is_one_in_steps() -> None:
-    for schedule in ("linear", "step", "milestones"):
-        options = {"schedule": schedule, "milestones": (10, 20)}
-        in_steps = learning_rate_schedule(OptimiserConfig(warmup_steps=70, **options), 300, 7)
-        in_epochs = learning_rate_schedule(OptimiserConfig(warmup_epochs=10, **options), 300, 7)
-        assert [in_steps(step) for step in (0, 69, 70, 299)] == [
-            in_epochs(step) for step in (0, 69, 70, 299)
-        ]
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,7 @@ def paths(shared: pathlib.Path) -> list[pathlib.Path]:
 
 @pytest.fixture(scope="module")
 def built(fresh: Crisalad, paths: list[pathlib.Path]) -> Crisalad:
-    return with_vocabulary(fresh, ANYLOC, paths, seed=3, batch_size=BATCH)
+    return with_vocabulary(Model(fresh, ANYLOC), paths, seed=3, batch_size=BATCH)
 
 
 def centroids_of(params: Crisalad) -> np.ndarray:
@@ -76,7 +76,7 @@ def centroids_of(params: Crisalad) -> np.ndarray:
 def test_a_centroid_is_the_mean_of_the_features_nearest_to_it(config, paths) -> None:
     """Of all features of all images: with 12 patches an image, none are left out."""
     fresh = random_params(config)
-    centroids = centroids_of(with_vocabulary(fresh, config, paths, seed=3, batch_size=BATCH))
+    centroids = centroids_of(with_vocabulary(Model(fresh, config), paths, seed=3, batch_size=BATCH))
     images = np.stack([resize_image(read_image(path), config.image_size) for path in paths])
     batches = images.reshape(-1, BATCH, *images.shape[1:])
     found = [np.asarray(unit_features(fresh, jnp.asarray(batch), config)) for batch in batches]
@@ -96,8 +96,8 @@ def test_a_centroid_is_the_mean_of_the_features_nearest_to_it(config, paths) -> 
 def test_other_starts_are_of_the_same_features(config, paths) -> None:
     """ImAge's are those of its backbone without tokens, VLAD-BuFF's centroids of components."""
     fresh = random_params(config)
-    found = with_vocabulary(fresh, config, paths, seed=3, batch_size=BATCH).aggregator
-    again = with_vocabulary(fresh, config, paths, seed=3, batch_size=BATCH).aggregator
+    found = with_vocabulary(Model(fresh, config), paths, seed=3, batch_size=BATCH).aggregator
+    again = with_vocabulary(Model(fresh, config), paths, seed=3, batch_size=BATCH).aggregator
     assert_equal(found, again)
 
     alone = dataclasses.replace(config, aggregator=NetVladConfig(clusters=4))
@@ -111,7 +111,7 @@ def test_other_starts_are_of_the_same_features(config, paths) -> None:
         centroids = np.asarray(found.centroids)
     else:
         # Directions are all that is left of them.
-        expected = with_vocabulary(params, alone, paths, seed=3, batch_size=BATCH)
+        expected = with_vocabulary(Model(params, alone), paths, seed=3, batch_size=BATCH)
         centroids = centroids_of(expected)
         weight = expected.aggregator.conv.weight  # pyright: ignore
         # The same features but for the order of the compiled program's float32 sums.
@@ -122,10 +122,10 @@ def test_other_starts_are_of_the_same_features(config, paths) -> None:
 
 
 def test_a_seed_draws_images_and_centroids(fresh, paths, built) -> None:
-    again = with_vocabulary(fresh, ANYLOC, paths, seed=3, batch_size=BATCH)
+    again = with_vocabulary(Model(fresh, ANYLOC), paths, seed=3, batch_size=BATCH)
     assert_equal(again, built)
-    fewer = with_vocabulary(fresh, ANYLOC, paths, images=5, seed=3, batch_size=BATCH)
-    others = with_vocabulary(fresh, ANYLOC, paths, images=5, seed=4, batch_size=BATCH)
+    fewer = with_vocabulary(Model(fresh, ANYLOC), paths, images=5, seed=3, batch_size=BATCH)
+    others = with_vocabulary(Model(fresh, ANYLOC), paths, images=5, seed=4, batch_size=BATCH)
     some = [centroids_of(params) for params in (built, fewer, others)]
     for i, j in ((0, 1), (0, 2), (1, 2)):
         assert not np.array_equal(some[i], some[j])
@@ -149,29 +149,28 @@ def test_what_does_not_fit_is_said_before_images_are_read(fresh, tmp_path) -> No
         (ANYLOC, {"batch_size": 0}, "batch size: found 0"),
     ):
         with pytest.raises(InputError, match=words):
-            with_vocabulary(fresh, config, nowhere, **{"batch_size": BATCH} | options)
+            with_vocabulary(Model(fresh, config), nowhere, **{"batch_size": BATCH} | options)
 
 
 def test_unreadable_images_stop_or_are_left_out(fresh, paths, built, tmp_path) -> None:
     bad = tmp_path / "bad.jpg"
     bad.write_bytes(b"no image")
     with pytest.raises(InputError, match=f"{bad}: found 8 bytes that do not decode"):
-        with_vocabulary(fresh, ANYLOC, [*paths, bad], batch_size=BATCH)
+        with_vocabulary(Model(fresh, ANYLOC), [*paths, bad], batch_size=BATCH)
     options = {"seed": 3, "batch_size": BATCH, "on_bad_image": "skip"}
     with pytest.warns(Note, match=f"images: 1 unreadable left out, {bad} the first"):
-        assert_equal(with_vocabulary(fresh, ANYLOC, [*paths, bad], **options), built)
+        assert_equal(with_vocabulary(Model(fresh, ANYLOC), [*paths, bad], **options), built)
     with pytest.raises(InputError, match="found 0 features in those that can be read, expected at"):
-        with_vocabulary(fresh, ANYLOC, [bad], **options)
+        with_vocabulary(Model(fresh, ANYLOC), [bad], **options)
 
 
 def test_features_that_are_not_finite_are_refused(fresh, paths) -> None:
     spoilt = dataclasses.replace(fresh.backbone, cls_token=jnp.full(32, jnp.nan))
     broken = dataclasses.replace(fresh, backbone=spoilt)
     token = AnyLocConfig(clusters=4, layer=-1, facet="token")
-    with pytest.raises(InputError, match="features: found NaN or infinity"):
-        with_vocabulary(
-            broken, dataclasses.replace(ANYLOC, aggregator=token), paths[:BATCH], batch_size=BATCH
-        )
+    model = Model(broken, dataclasses.replace(ANYLOC, aggregator=token))
+    with pytest.raises(InputError, match=r"^images: found .* without NaN or infinity"):
+        with_vocabulary(model, paths[:BATCH], batch_size=BATCH)
 
 
 # Whose it is
@@ -236,7 +235,7 @@ def test_training_netvlad_starts_from_the_training_images(
         fails(capfd, *begin, words=("far enough",))
     places = read_places(shared / "city", min_images=2)
     images = [places.path(image) for image in range(len(places.files))]
-    expected = with_vocabulary(starts[0], NETVLAD, images, seed=config.seed)
+    expected = with_vocabulary(Model(starts[0], NETVLAD), images, seed=config.seed)
     assert_equal(starts[0], expected)
     assert_equal(starts[1], expected)
     assert_equal(starts[0].backbone, load_weights(weights)[0].backbone)

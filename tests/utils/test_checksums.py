@@ -5,7 +5,6 @@ import hashlib
 import json
 import random
 import re
-import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,7 +16,6 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
 
 CHANGED = "found other bytes than were written, expected those of its checksum"
-NONE = "found no checksum"
 ZEROS = "0" * 64
 # Zeros as those that stand for the digest while it is computed, a name that is not ASCII.
 VALUE = {"zeros": ZEROS, "numbers": [1, 2.5, None, True], "Straße": {"of": "Zürich"}, "none": {}}
@@ -41,27 +39,18 @@ def flips(data: bytes, count: int) -> Iterator[tuple[int, bytes]]:
         yield place, data[:place] + bytes([data[place] ^ other]) + data[place + 1 :]
 
 
-def with_checksum(value: object) -> bytes:
-    """JSON whose checksum is this value."""
-    return (json.dumps({"checksum": value} | VALUE) + "\n").encode()
-
-
 # As they are written
 
 
 @pytest.mark.parametrize("indent", [None, 2])
 def test_json_holds_the_digest_of_its_own_bytes(tmp_path, indent):
-    data = checksummed_json(VALUE, indent)
+    data = checksummed_json(VALUE | {"checksum": "of another file"}, indent)
     found, expected = by_hashlib(data)
     assert found == expected != ZEROS
-    value = json.loads(data)
-    assert list(value) == ["checksum", *VALUE]
-    assert value == {"checksum": found} | VALUE
+    assert list(json.loads(data).items()) == [("checksum", found), *VALUE.items()]
     path = tmp_path / "x.json"
     path.write_bytes(data)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert read_json(path, "some values") == VALUE
+    assert read_json(path, "some values") == VALUE
 
 
 def test_the_same_is_written_with_the_same_checksum_and_another_with_another(tmp_path):
@@ -96,37 +85,15 @@ def test_one_other_byte_of_json_is_refused(tmp_path):
         assert message.startswith(f"{path}: found "), place
         assert "\n" not in message
         try:
-            found = json.loads(data).get("checksum", "")
+            has_one = "checksum" in json.loads(data)
         except ValueError:
-            found = ""  # no JSON
-        still = re.fullmatch("[0-9a-f]{64}", found) is not None
-        assert (CHANGED in message) == still, (place, message)
-        refused[still] += 1
+            has_one = False
+        assert (CHANGED in message) == has_one, (place, message)
+        refused[has_one] += 1
     assert refused.total() == 100
     assert min(refused[True], refused[False]) > 20
     path.write_bytes(whole)
     assert read_json(path, "some values") == VALUE
-
-
-def test_json_that_may_lack_a_checksum_is_taken_for_an_old_file_only_if_the_key_has_changed(
-    tmp_path,
-):
-    path = tmp_path / "x.json"
-    write_json(path, VALUE)
-    whole, passed = path.read_bytes(), set()
-    key = whole.index(b"checksum")
-    for place in range(len(whole)):
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-        with warnings.catch_warnings(record=True) as told:
-            warnings.simplefilter("always")
-            try:
-                value = read_json(path, "some values")
-            except InputError:
-                continue
-        assert [NONE in str(one.message) for one in told] == [True]
-        assert {name: value[name] for name in VALUE} == VALUE
-        passed.add(place)
-    assert passed <= set(range(key, key + len("checksum")))
 
 
 def test_files_that_are_cut_or_longer_are_refused(tmp_path):
@@ -140,25 +107,12 @@ def test_files_that_are_cut_or_longer_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("digest", "words"),
-    [
-        (ZEROS, CHANGED),
-        ("f" * 64, CHANGED),
-        ("F" * 64, "found checksum 'F+', expected 64 hexadecimal digits"),
-        (f" {ZEROS[1:]}", "expected 64 hexadecimal digits"),
-        ("0" * 63, "expected 64 hexadecimal digits"),
-        ("0" * 65, "expected 64 hexadecimal digits"),
-        ("", "found checksum '', expected 64 hexadecimal digits"),
-        ("٣" * 64, "expected 64 hexadecimal digits"),
-        (None, "found checksum None, expected 64 hexadecimal digits"),
-        (64 * 1.0, r"found checksum 64\.0, expected 64 hexadecimal digits"),
-        ([ZEROS], "expected 64 hexadecimal digits"),
-    ],
+    "digest", [ZEROS, "f" * 64, f" {ZEROS[1:]}", "0" * 63, "", "٣" * 64, "\ud800", None, [ZEROS]]
 )
-def test_a_checksum_that_is_none_is_refused(tmp_path, digest, words):
+def test_a_wrong_checksum_is_refused(tmp_path, digest):
     path = tmp_path / "x.json"
-    path.write_bytes(with_checksum(digest))
-    with pytest.raises(InputError, match=rf"x\.json: .*{words}"):
+    path.write_bytes((json.dumps({"checksum": digest} | VALUE) + "\n").encode())
+    with pytest.raises(InputError, match=rf"x\.json: {CHANGED}"):
         read_json(path, "some values")
 
 
@@ -169,7 +123,7 @@ def test_the_right_digest_in_uppercase_is_refused(tmp_path):
     digest = by_hashlib(data)[0]
     assert digest != digest.upper()
     path.write_bytes(data.replace(digest.encode(), digest.upper().encode()))
-    with pytest.raises(InputError, match="expected 64 hexadecimal digits"):
+    with pytest.raises(InputError, match=CHANGED):
         read_json(path, "some values")
 
 
@@ -183,6 +137,4 @@ def test_json_without_a_checksum_is_refused_unless_anybody_may_write_it(tmp_path
         path.write_text(json.dumps(value))
         with pytest.raises(InputError, match=r"x\.json: found no checksum, expected some values"):
             read_json(path, "some values")
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            assert read_json(path, "some values", sealed=False) == value
+        assert read_json(path, "some values", sealed=False) == value

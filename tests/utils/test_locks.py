@@ -115,17 +115,13 @@ def test_a_second_process_is_refused_and_told_of_the_first(tmp_path):
         assert is_free(folder)
 
 
-def test_a_process_is_refused_its_own_folder(tmp_path):
-    with lock(tmp_path):
+def test_a_process_is_refused_its_own_folder_and_two_have_two_locks(tmp_path):
+    with lock(tmp_path), lock(tmp_path / "b"), lock(tmp_path / "b" / "c"):
         with pytest.raises(InputError, match=rf"{REFUSED} \(process {os.getpid()} on "):
             lock(tmp_path).__enter__()
         assert (tmp_path / LOCK).exists()
-    assert is_free(tmp_path)
-
-
-def test_two_folders_have_two_locks(tmp_path):
-    with lock(tmp_path / "a"), lock(tmp_path / "b"), lock(tmp_path / "a" / "c"):
         assert not is_free(tmp_path / "b")
+    assert is_free(tmp_path)
 
 
 def test_the_lock_of_a_killed_process_is_free(tmp_path):
@@ -148,14 +144,10 @@ def test_an_error_frees_the_lock_and_removes_what_was_made_for_it(tmp_path):
     fails_in(folder, lambda: (folder / "work").write_text("half"))
     assert contents(tmp_path) == {"new/deep/work": b"half"}
     assert is_free(folder)
-
-
-def test_a_folder_that_was_there_stays(tmp_path):
-    folder = tmp_path / "empty"
-    folder.mkdir()
-    fails_in(folder)
-    assert os.listdir(tmp_path) == ["empty"]
-    assert os.listdir(folder) == []
+    empty = tmp_path / "empty"  # a folder that was there stays
+    empty.mkdir()
+    fails_in(empty)
+    assert os.listdir(empty) == []
 
 
 def test_a_users_files_are_untouched(tmp_path):

@@ -1,129 +1,62 @@
-"""All formats of public checkpoints, by name.
+"""All formats of public checkpoints, by name: what formats.toml says, and what it cannot.
 
-Names and shapes are those of each family's public code, and of the torch reference in `parity/`,
-which can hold any model of this package over DINOv2 or a CNN.
+Names and shapes are those of each family's public code, and of the torch reference in `parity/`.
 """
 
 import dataclasses
+import functools
+import pathlib
+import tomllib
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from crisalad_jax.checkpoints.formats import cnn, heads, vit
-from crisalad_jax.checkpoints.formats.cnn import CnnNames
-from crisalad_jax.checkpoints.formats.format import (
-    Format,
-    Head,
-    Images,
-    Reader,
-    State,
-    encoder_lines,
-)
-from crisalad_jax.checkpoints.formats.forms import LINEAR, POINTWISE, Extra, Lines, affine
+from crisalad_jax.checkpoints.formats.format import BackboneNames, Format, Head, parts_of
+from crisalad_jax.checkpoints.formats.rows import SAME, Extra, Row, Rows, read_table, read_tables
+from crisalad_jax.checkpoints.formats.sizes import Reader, State, square_side
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.aggregators import Aggregator
-from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
+from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
-from crisalad_jax.nn.backbones.base import Backbone
-from crisalad_jax.nn.backbones.resnet import ResNetConfig
-from crisalad_jax.nn.backbones.vgg import VggConfig
-from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.aggregators.vlad import SuperVladConfig
+from crisalad_jax.nn.backbones import BACKBONES
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import parameter_shapes
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.pytree import named_leaves
 
 VOCABULARY = "anyloc-words"
 """Name of the format of AnyLoc's vocabularies (Keetha et al., RA-L 2023): the words alone."""
 REFERENCE = "reference"
 """Name of the format of our torch reference."""
-
-
-_NATIVE = PreprocessingConfig(size_rule="native")
-# Tensors at a torchvision that does not antialias them unasked: before 0.17.
-_PLAIN = PreprocessingConfig(antialias=False, pixels="floats")
-_ROUNDED = PreprocessingConfig(pixels="floats", round_to_patch=True)
-_BICUBIC = PreprocessingConfig(filter="bicubic", pixels="floats")
-
-
-_BICUBIC_322, _ROUNDED_322 = (Images((322, 322), chain) for chain in (_BICUBIC, _ROUNDED))
-_PLAIN_224, _PLAIN_504 = (Images((side, side), _PLAIN) for side in (224, 504))
-# Sides of at most 1,024, and pixels of 0 to 255 less the mean of VGG-16 of MatConvNet, from which
-# NetVLAD starts.
-_HLOC = PreprocessingConfig(
-    size_rule="longer-side",
-    filter="area",
-    pixels="floats",
-    mean=(123.68 / 255, 116.779 / 255, 103.939 / 255),
-    deviation=(1 / 255, 1 / 255, 1 / 255),
-)
-_NATIVE_512 = Images((512, 512), _NATIVE)
-
-
-_VIT = vit.DINOV2.under("backbone.")
-_MODEL_VIT = vit.DINOV2.under("backbone.model.")
-_RESNET, _VGG = (ResNetConfig,), (VggConfig,)
-_NUMBERED = CnnNames("backbone.", True, (ResNetConfig, VggConfig))
-_LU_FENG: dict[str, Any] = {"module": "module.", "under": "model_state_dict"}
-"""Where CricaVPR's files, and those of code that began from it, have the state."""
-
-
-class _ReferenceNames(NamedTuple):
-    """The names of any backbone in our torch reference."""
-
-    kinds: tuple[type[Backbone], ...] = (ViTConfig, *_NUMBERED.kinds)
-    marks: tuple[str, ...] = _VIT.marks
-
-    def lines(self, config: Any) -> Lines:
-        """Yield the table, in the public order."""
-        names = _VIT if isinstance(config, ViTConfig) else _NUMBERED
-        yield from names.lines(config)
-
-    def infer(self, state: State) -> Backbone:
-        """Infer a transformer; of another backbone our files have the configuration."""
-        return _VIT.infer(state)
-
-
-class _Reference(Format):
-    """The format of our torch reference, for any head. Our files have their configuration."""
-
-    def accepts(self, config: ModelConfig) -> bool:
-        """Return whether it has the backbone."""
-        return isinstance(config.backbone, self.backbone.kinds)
-
-    def lines(self, config: ModelConfig) -> Lines:
-        """Yield the table, in the public order."""
-        yield from self.backbone.lines(config.backbone)
-        yield from heads.head_lines(config)
-        yield from encoder_lines(config.cross_image)
-        if config.projection.dim:
-            yield from affine("projection", "projection", LINEAR)
-
-
-def _infer_reference_head(read: Reader) -> Aggregator:
-    """Infer SALAD or a class token; of another head our files have the configuration."""
-    salad = heads.SALAD
-    return salad.infer(read) if read.has(str(salad.mark)) else ClassTokenConfig()
-
-
-class _NoBackbone(NamedTuple):
-    """A backbone that is in another file."""
-
-    kinds: tuple[type[Backbone], ...] = (Backbone,)
-    marks: tuple[str, ...] = ()
-
-    def lines(self, config: Backbone) -> Lines:
-        """Yield nothing."""
-        return iter(())
-
-    def infer(self, state: State) -> Backbone:
-        """Refuse: no file is detected as one."""
-        raise NotImplementedError
+_CHAINS = {
+    "pillow": PreprocessingConfig(),
+    "native": PreprocessingConfig(size_rule="native"),
+    # Tensors at a torchvision that does not antialias them unasked: before 0.17.
+    "plain": PreprocessingConfig(antialias=False, pixels="floats"),
+    "rounded": PreprocessingConfig(pixels="floats", round_to_patch=True),
+    "bicubic": PreprocessingConfig(filter="bicubic", pixels="floats"),
+    # Sides of at most 1,024, and pixels of 0 to 255 less the mean of VGG-16 of MatConvNet, from
+    # which NetVLAD starts.
+    "hloc": PreprocessingConfig(
+        size_rule="longer-side",
+        filter="area",
+        pixels="floats",
+        mean=(123.68 / 255, 116.779 / 255, 103.939 / 255),
+        deviation=(1 / 255, 1 / 255, 1 / 255),
+    ),
+}
+"""How images are prepared, by the name in formats.toml."""
 
 
 def _with_squares(state: State, config: ModelConfig) -> ModelConfig:
     """Set MixVPR's image size, whose patches are as many as its rows' numbers."""
     name = "aggregator.row_proj.weight"
-    size = cnn.square_image(state, name, config.backbone.patch_size)
-    return dataclasses.replace(config, image_size=size)
+    positions = Reader(state).size(name, 1)
+    otherwise = f"{name} found for {positions} positions, expected a square number"
+    side = square_side(positions, otherwise) * config.backbone.patch_size
+    return dataclasses.replace(config, image_size=(side, side))
 
 
 def _conv_ap_filter(state: State, config: ModelConfig) -> ModelConfig:
@@ -133,235 +66,134 @@ def _conv_ap_filter(state: State, config: ModelConfig) -> ModelConfig:
     return dataclasses.replace(config, preprocessing=PreprocessingConfig(filter=name))
 
 
-def _all_stages(state: State, config: ModelConfig) -> ModelConfig:
-    """Set that torchvision's ResNets have all their stages."""
-    return dataclasses.replace(config, backbone=dataclasses.replace(config.backbone, stages=4))
+def _with_ghosts(state: State, config: ModelConfig) -> ModelConfig:
+    """Tell the clusters of the published files from their ghosts, which no shape does."""
+    name = "aggregation.conv.weight"
+    count = Reader(state).size(name, 0)
+    if count not in (3, 5):
+        raise InputError(f"{name} found of {count} clusters, expected 5 (1 ghost) or 3 (2 ghosts)")
+    ghosts = 1 if count == 5 else 2
+    if ghosts == 2:
+        warn(
+            f"{name}: found 3 clusters, read as 1 and 2 ghosts, as in 1-clusterVLAD.pth; "
+            "one of 2 and a ghost (--supervlad_clusters=2) has the same shape, and cannot be read"
+        )
+    return dataclasses.replace(config, aggregator=SuperVladConfig(count - ghosts, ghosts))
 
 
-def _classifier(layers: Mapping[str, tuple[int, int | None]]) -> Callable[[ModelConfig], Lines]:
-    """Return a function that yields torchvision's classifier, whose first layer takes features."""
-
-    def lines(config: ModelConfig) -> Lines:
-        for name, (outputs, inputs) in layers.items():
-            shape = (outputs, inputs or config.backbone.dim)
-            yield Extra(f"classifier.{name}.weight", f"{name}.weight", shape, np.float32)
-            yield Extra(f"classifier.{name}.bias", f"{name}.bias", shape[:1], np.float32)
-
-    return lines
+_ADJUST: dict[str, Callable[[State, ModelConfig], ModelConfig]] = {
+    "conv-ap": _conv_ap_filter,
+    "mixvpr": _with_squares,
+    "supervlad": _with_ghosts,
+}
 
 
-def _affine(name: str) -> tuple[str, str]:
-    return f"{name}.weight", f"{name}.bias"
+class _Reference(Format):
+    """The format of our torch reference, for any head. Our files have their configuration."""
+
+    def parts(self) -> dict[str, list[str]]:
+        """Return that it is any over DINOv2 or a CNN."""
+        parts = {part: ["any"] for part in super().parts()}
+        return parts | {"backbone": ["vit", "resnet", "vgg"]}
+
+    def backbone_of(self, config: ModelConfig) -> BackboneNames:
+        """Return the names of any such backbone."""
+        found = parts_of(config)
+        names = {"vit": "dinov2", "resnet": "resnet-numbers", "vgg": "vgg-numbers"}
+        name = "dinov2-side" if found["adapter"] == "side" else names[found["backbone"]]
+        return _BACKBONES[name]._replace(prefix="backbone.")
+
+    def head_of(self, config: ModelConfig) -> Head:
+        """Return the names of any head: our own where no public checkpoint has others."""
+        head = HEADS.get(config.aggregator.part_name)
+        if head is not None:
+            return head
+        leaves = named_leaves(parameter_shapes(config))
+        own = (
+            name.removeprefix("aggregator.") for name in leaves if name.startswith("aggregator.")
+        )
+        return self.head._replace(rows=tuple(Row((name,), (name,), SAME) for name in own))
+
+    def infer(self, state: State) -> ModelConfig:
+        """Make the configuration of a state with SALAD or a class token."""
+        head = self.head if super().has_head(state) else HEADS["class-token"]
+        return Format.infer(dataclasses.replace(self, head=head, projection=None), state)
+
+    def has_head(self, state: State) -> bool:
+        """Return that it has any."""
+        return True
 
 
-# Before DINOv2 comes DINOv3, which has some of its names.
-_FORMATS = (
-    Format(
-        VOCABULARY,
-        "AnyLoc c_centers.pt",
-        _NoBackbone(),
-        heads.ANYLOC,
-        adapter=None,
-        encoder=None,
-        bare=True,
-    ),
-    Format(
-        "boq-dinov2", "BoQ-DINOv2 .pth", vit.DINOV2.under("backbone.dino."), heads.BOQ, _BICUBIC_322
-    ),
-    Format(
-        "boq-resnet50",
-        "BoQ-ResNet50 .pth",
-        CnnNames("backbone.net.", True, _RESNET),
-        heads.BOQ,
-        Images((384, 384), _BICUBIC),
-    ),
-    Format(
-        "conv-ap",
-        "Conv-AP .ckpt",
-        CnnNames("backbone.model.", False, _RESNET),
-        heads.CONV_AP,
-        Images((320, 320)),
-        adjust=_conv_ap_filter,
-    ),
-    Format("cosplace", "CosPlace and EigenPlaces .pth", _NUMBERED, heads.COSPLACE, _NATIVE_512),
-    Format(
-        "cricavpr",
-        "CricaVPR .pth",
-        _VIT,
-        heads.GEM_PYRAMID,
-        _PLAIN_224,
-        adapter="multi-resolution",
-        encoder=True,
-        **_LU_FENG,
-    ),
-    Format(
-        "mixvpr",
-        "MixVPR .ckpt",
-        CnnNames("backbone.model.", False, _RESNET),
-        heads.MIXVPR,
-        adjust=_with_squares,
-    ),
-    # The chain of its evaluation. Its training validates on Pillow's images.
-    Format(
-        "dino-mix",
-        "DINO-Mix .ckpt",
-        vit.DINOV2.under("backbone.dino_model.", norm=None),
-        heads.DINO_MIX,
-        _PLAIN_224,
-        under="state_dict",
-    ),
-    Format("dino-salad", "DINO-SALAD .ckpt", _MODEL_VIT, heads.SALAD, Images((322, 322))),
-    Format("dinov3", "DINOv3 .pth", vit.DINOV3, heads.CLASS_TOKEN),
-    Format("dinov2", "DINOv2 .pth", vit.DINOV2, heads.CLASS_TOKEN),
-    Format(
-        "huggingface-dinov3",
-        "Hugging Face DINOv3 .safetensors",
-        vit.HUGGING_FACE_DINOV3,
-        heads.CLASS_TOKEN,
-        stored="safetensors",
-    ),
-    Format(
-        "huggingface",
-        "Hugging Face Dinov2 .safetensors",
-        vit.HUGGING_FACE,
-        heads.CLASS_TOKEN,
-        stored="safetensors",
-    ),
-    Format(
-        "edtformer",
-        "EDTformer .pth",
-        _VIT,
-        heads.EDTFORMER,
-        _ROUNDED_322,
-        first=1,
-        adapter="side",
-        **_LU_FENG,
-    ),
-    Format("fol", "FoL .pth", _MODEL_VIT, heads.PUBLISHED_FOL, _PLAIN_504, **_LU_FENG),
-    Format(
-        "image",
-        "ImAge .pth",
-        vit.DINOV2.under("backbone.", fields={"position_resize": "plain"}),
-        heads.AGGREGATION_TOKENS,
-        _ROUNDED_322,
-        first=1,
-        **_LU_FENG,
-    ),
-    # Indoor-VPR's files are those of SALAD and EigenPlaces within a module `model`; SALAD's images
-    # are prepared in another way.
-    Format(
-        "salad-indoor",
-        "SALAD-indoor .pth",
-        vit.DINOV2.under("model.backbone.model."),
-        heads.SALAD,
-        _ROUNDED_322,
-        prefix="model.aggregator.",
-    ),
-    Format(
-        "megaloc",
-        "MegaLoc model.safetensors",
-        vit.DINOV2.under("backbone.", mask_token=False),
-        heads.SALAD,
-        _ROUNDED_322,
-        prefix="aggregator.agg.",
-        projection=_affine("aggregator.linear"),
-        stored="safetensors",
-    ),
-    Format(
-        "megaloc-v1",
-        "MegaLoc v1 .torch",
-        _MODEL_VIT,
-        heads.SALAD,
-        _ROUNDED_322,
-        prefix="aggregator.agg.",
-        projection=_affine("aggregator.linear"),
-    ),
-    Format(
-        "netvlad",
-        "pytorch-NetVlad .pth.tar",
-        CnnNames("encoder.", True, _VGG),
-        heads.NETVLAD,
-        Images((480, 640), _NATIVE),
-        prefix="pool.",
-        under="state_dict",
-    ),
-    Format(
-        "netvlad-hloc",
-        "NetVLAD .mat, or hloc's .pth",
-        CnnNames("backbone.", True, _VGG),
-        heads.NETVLAD_HLOC,
-        Images((768, 1024), _HLOC),
-        projection=_affine("whiten"),
-        projection_form=heads.HLOC_WHITENING,
-    ),
-    Format(
-        "patch-netvlad",
-        "Patch-NetVLAD WPCA .pth.tar",
-        CnnNames("encoder.", True, _VGG),
-        heads.NETVLAD,
-        Images((480, 640)),
-        prefix="pool.",
-        projection=_affine("WPCA.0"),
-        projection_form=POINTWISE,
-        under="state_dict",
-    ),
-    _Reference(
-        REFERENCE,
-        "our torch reference",
-        _ReferenceNames(),
-        Head("any", heads.SALAD.lines, _infer_reference_head, None),
-        adapter=None,
-        encoder=None,
-        under="state_dict",
-    ),
-    Format(
-        "selavpr",
-        "SelaVPR .pth",
-        _VIT,
-        heads.SELAVPR,
-        _PLAIN_224,
-        adapter="serial-parallel",
-        **_LU_FENG,
-    ),
-    Format(
-        "supervlad", "SuperVLAD .pth", _VIT, heads.SUPERVLAD, _ROUNDED_322, encoder=None, **_LU_FENG
-    ),
-    # From torchvision's ImageNet weights training starts. As a model they are described by the
-    # generalised mean of their last features.
-    Format(
-        "torchvision-resnet",
-        "torchvision's ResNet .pth",
-        CnnNames("", False, _RESNET),
-        heads.WITHOUT_EXPONENT._replace(mark="fc.weight"),
-        extras=_classifier({"fc": (1000, None)}),
-        adjust=_all_stages,
-    ),
-    Format(
-        "torchvision-vgg",
-        "torchvision's VGG-16 .pth",
-        CnnNames("features.", True, _VGG),
-        heads.WITHOUT_EXPONENT._replace(mark="classifier.0.weight"),
-        extras=_classifier(
-            {
-                "classifier.0": (4096, 512 * 7 * 7),
-                "classifier.3": (4096, 4096),
-                "classifier.6": (1000, 4096),
-            }
-        ),
-    ),
-    Format(
-        "transvpr", "TransVPR .pth", cnn.TransVprNames(), heads.TRANSVPR, Images((480, 640), _PLAIN)
-    ),
-    Format(
-        "vlad-buff",
-        "VLAD-BuFF .ckpt",
-        _MODEL_VIT,
-        heads.VLAD_BUFF,
-        Images((322, 322)),
-        projection=_affine("WPCA_{dim}.0"),
-        projection_form=POINTWISE,
-        under="state_dict",
-    ),
-)
-FORMATS: dict[str, Format] = {each.name: each for each in _FORMATS}
+_FACTS = tomllib.loads(pathlib.Path(__file__).with_name("formats.toml").read_text(encoding="utf-8"))
+TABLES = read_tables(_FACTS["tables"])
+"""Tables of layers by name."""
+_BACKBONES = {
+    name: BackboneNames(
+        tuple(BACKBONES.find(kind) for kind in facts["kinds"]),
+        read_table(facts["rows"], TABLES),
+        tuple(facts["marks"]),
+    )
+    for name, facts in _FACTS["backbones"].items()
+}
+HEADS = {
+    name: Head(
+        AGGREGATORS.find(facts.get("aggregator", name)),
+        read_table(facts["rows"], TABLES),
+        facts.get("sizes", {}),
+        facts.get("mark"),
+        facts.get("prefix", "aggregator."),
+    )
+    for name, facts in _FACTS["heads"].items()
+}
+"""Heads by name: the aggregator's, where it has names of its own in the reference."""
+
+
+def _backbone(text: str) -> BackboneNames:
+    """Return the names of one of some backbones, after a prefix."""
+    names, _, prefix = text.partition(" ")
+    first, *others = (_BACKBONES[name] for name in names.split(","))
+    for other in others:
+        kinds, rows = first.kinds + other.kinds, first.rows + other.rows
+        first = BackboneNames(kinds, rows, first.marks + other.marks)
+    return first._replace(prefix=prefix)
+
+
+def _classifier(layers: Mapping[str, tuple[int, int]]) -> Rows:
+    """Return the rows of torchvision's classifier; 0 stands for the width of features."""
+
+    def blank(shape: tuple[int, ...], config: ModelConfig) -> np.ndarray:
+        return np.zeros([size or config.backbone.dim for size in shape], np.float32)
+
+    return tuple(
+        Row((f"classifier.{name}",), (name,), Extra(functools.partial(blank, shape)))
+        for layer, (outputs, inputs) in layers.items()
+        for name, shape in {
+            f"{layer}.weight": (outputs, inputs),
+            f"{layer}.bias": (outputs,),
+        }.items()
+    )
+
+
+def _format(name: str, facts: dict[str, Any]) -> Format:
+    chain, *size = facts.pop("images", "pillow 224 224").split()
+    head, _, prefix = facts.pop("head").partition(" ")
+    projection = facts.pop("projection", None)
+    if projection is not None:
+        theirs, table = projection.split()
+        facts["projection"] = Row(("projection",), (theirs,), TABLES[table])
+    names = HEADS[head]
+    return (_Reference if name == REFERENCE else Format)(
+        name=name,
+        backbone=_backbone(facts.pop("backbone")),
+        head=names._replace(prefix=prefix or names.prefix),
+        image_size=(int(size[0]), int(size[1])),
+        preprocessing=_CHAINS[chain],
+        encoder_rows=TABLES["encoder"],
+        extras=_classifier(facts.pop("extras", {})),
+        adjust=_ADJUST.get(name, Format.adjust),
+        **facts,
+    )
+
+
+FORMATS = {name: _format(name, facts) for name, facts in _FACTS["formats"].items()}
 """Formats by name, in the order in which they try to detect a state."""

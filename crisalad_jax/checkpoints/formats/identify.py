@@ -10,7 +10,7 @@ from collections.abc import Iterator, Set
 from typing import NamedTuple
 
 from crisalad_jax.checkpoints.formats.families import FORMATS
-from crisalad_jax.checkpoints.formats.format import State
+from crisalad_jax.checkpoints.formats.sizes import State
 from crisalad_jax.checkpoints.formats.table import public_shapes
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.utils.errors import InputError
@@ -60,7 +60,7 @@ def identify(state: State, *, source: str) -> Inferred:
     problems: list[str] = []
     for reading in _readings(state):
         for each in FORMATS.values():
-            if each.detects(reading.state):
+            if each.has_backbone(reading.state) and each.has_head(reading.state):
                 try:
                     config = each.infer(reading.state)
                     names = public_shapes(config, each.name).keys()
@@ -135,7 +135,7 @@ def _check_halves(state: State, source: str) -> None:
 
     Families share the names of their parts: the message has all that it may be of.
     """
-    formats = [each for each in FORMATS.values() if each.head.mark is not None]
+    formats = [each for each in FORMATS.values() if not each.has_head({})]
     heads = [each.holds for each in formats if each.has_head(state)]
     backbones = [each.holds for each in formats if each.has_backbone(state)]
     for here, families, missing in (("head", heads, "backbone"), ("backbone", backbones, "head")):

@@ -9,8 +9,8 @@ import jax
 import numpy as np
 
 from crisalad_jax.checkpoints.formats.families import FORMATS, REFERENCE, VOCABULARY
-from crisalad_jax.checkpoints.formats.format import State, parts_in_words
-from crisalad_jax.checkpoints.formats.forms import Absent, Entry, Extra
+from crisalad_jax.checkpoints.formats.rows import Absent, Extra, Form, Row
+from crisalad_jax.checkpoints.formats.sizes import State
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.io import differences
 from crisalad_jax.config.part import with_non_semantic_fields_of
@@ -22,19 +22,24 @@ from crisalad_jax.utils.errors import InputError, few
 from crisalad_jax.utils.pytree import named_leaves
 
 
-def table(config: ModelConfig, name: str) -> list[Entry | Extra | Absent]:
+def table(config: ModelConfig, name: str) -> list[Row]:
     """Return a format's table for a model, in the public order, without the prefix `module.`.
 
     Raises:
         InputError: no such format, or the model has parts that it cannot hold.
     """
     form = choose("format", name, FORMATS)
-    if not form.accepts(config):
-        raise InputError(
-            f"format {name}: found a model of {parts_in_words(config)}, expected "
-            f"{form.expected()} (format {REFERENCE} holds any)"
-        )
-    return list(form.lines(config))
+    form.check_parts(config)
+    return list(form.lines(config, _numbered(_blank(config))))
+
+
+def _blank(config: ModelConfig) -> dict[str, np.ndarray]:
+    """Return arrays of a model's shapes by name, which take no memory; empty ones are left out."""
+    return {
+        name: np.broadcast_to(np.zeros((), leaf.dtype), leaf.shape)
+        for name, leaf in named_leaves(parameter_shapes(config)).items()
+        if leaf.size
+    }
 
 
 def check_holds(config: ModelConfig, name: str) -> ModelConfig:
@@ -47,7 +52,7 @@ def check_holds(config: ModelConfig, name: str) -> ModelConfig:
         InputError: what `table` raises; or a setting that no shape tells and that differs from the
             published one, which reading would take for it.
     """
-    state = _initial_state(config, name)
+    state = _theirs(_blank(config), table(config, name), config, {})
     if name in (REFERENCE, VOCABULARY):  # which have the configuration, or no model
         return config
     read_back = FORMATS[name].infer(state)
@@ -82,15 +87,8 @@ def public_shapes(config: ModelConfig, name: str) -> dict[str, tuple[int, ...]]:
     Raises:
         InputError: what `table` raises.
     """
-    return {theirs: array.shape for theirs, array in _initial_state(config, name).items()}
-
-
-def _initial_state(config: ModelConfig, name: str) -> dict[str, np.ndarray]:
-    """Return a state of zeros and of the extras' initial values; its arrays take no memory."""
-    zeros = jax.tree.map(
-        lambda leaf: np.broadcast_to(np.zeros((), leaf.dtype), leaf.shape), parameter_shapes(config)
-    )
-    return _theirs(zeros, config, name, {})
+    state = _theirs(_blank(config), table(config, name), config, {})
+    return {theirs: array.shape for theirs, array in state.items()}
 
 
 def to_params(
@@ -104,12 +102,10 @@ def to_params(
     Raises:
         InputError: naming `source` and the first names that are missing, unknown or misshaped.
     """
-    lines = table(config, name)
-    shapes = public_shapes(config, name)
-    for line in lines:
-        if isinstance(line, Extra) and line.theirs not in state:
-            del shapes[line.theirs]
-    problems = [f"{theirs} missing" for theirs in shapes.keys() - state.keys()]
+    lines, blank = table(config, name), _blank(config)
+    shapes = {name: array.shape for name, array in _theirs(blank, lines, config, {}).items()}
+    extras = {row.theirs[0] for row in lines if isinstance(row.form, Extra)}
+    problems = [f"{theirs} missing" for theirs in shapes.keys() - state.keys() - extras]
     problems += [f"{theirs} unknown" for theirs in state.keys() - shapes.keys()]
     problems += [
         f"{theirs} found {state[theirs].shape}, expected {shape}"
@@ -121,19 +117,16 @@ def to_params(
             f"{source}: does not fit the format {name} of width {config.backbone.dim} and "
             f"{config.backbone.depth} blocks: {few(sorted(problems, key=_natural))}"
         )
-    template = named_leaves(parameter_shapes(config))
-    ours: dict[str, np.ndarray] = {}
-    extras: dict[str, np.ndarray] = {}
-    for line in lines:
-        if isinstance(line, Extra):
-            if line.theirs in state:
-                (extras[line.name],) = line.form.ours(state[line.theirs])
-        elif isinstance(line, Absent):
-            ours[line.ours] = np.full(template[line.ours].shape, line.value, np.float32)
-        else:
-            arrays = line.form.ours(*(state[theirs] for theirs in line.theirs))
-            ours |= zip(line.ours, arrays, strict=True)
-    return _from_numbered(ours, config), extras
+    ours, read = {}, {}
+    for row in lines:
+        arrays = [state[name] for name in row.theirs if name in state]
+        if isinstance(row.form, Form):
+            ours |= zip(row.ours, row.form.ours(*arrays), strict=True)
+        elif isinstance(row.form, Absent):
+            ours[row.ours[0]] = np.full(blank[row.ours[0]].shape, row.form.value, np.float32)
+        elif isinstance(row.form, Extra) and arrays:
+            (read[row.ours[0]],) = row.form.form.ours(*arrays)
+    return _from_numbered(ours, config), read
 
 
 def to_state(
@@ -144,21 +137,22 @@ def to_state(
     Raises:
         InputError: the format has no place for a part of this model.
     """
-    state = _theirs(jax.tree.map(np.asarray, params), config, name, extras)
+    leaves = {leaf: np.asarray(array) for leaf, array in named_leaves(params).items()}
+    state = _theirs(leaves, table(config, name), config, extras)
     return {theirs: np.ascontiguousarray(x).reshape(x.shape) for theirs, x in state.items()}
 
 
 def _theirs(
-    params: Crisalad, config: ModelConfig, name: str, extras: State
+    leaves: State, lines: list[Row], config: ModelConfig, extras: State
 ) -> dict[str, np.ndarray]:
-    ours = _numbered(named_leaves(params))
-    state: dict[str, np.ndarray] = {}
-    for line in table(config, name):
-        if isinstance(line, Extra):
-            state[line.theirs] = line.stored(extras)
-        elif isinstance(line, Entry):
-            arrays = line.form.theirs(*(ours[each] for each in line.ours))
-            state |= zip(line.theirs, arrays, strict=True)
+    ours, state = _numbered(leaves), {}
+    for row in lines:
+        if isinstance(row.form, Form):
+            state |= zip(row.theirs, row.form.theirs(*map(ours.get, row.ours)), strict=True)
+        elif isinstance(row.form, Extra):
+            extra = extras.get(row.ours[0])
+            array = row.form.initial(config) if extra is None else extra
+            (state[row.theirs[0]],) = row.form.form.theirs(array)
     return state
 
 

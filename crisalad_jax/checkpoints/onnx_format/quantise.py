@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import pathlib
+import shutil
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -25,25 +26,29 @@ class _Images(quantization.CalibrationDataReader):
 
 def quantise(
     program: pathlib.Path,
-    out: pathlib.Path,
     images: np.ndarray,
     nodes: Sequence[str],
     *,
     per_channel: bool,
 ) -> None:
-    """Quantise a program of images.
+    """Quantise a program of images in its place.
 
     Args:
-        program: the file in float32, for any number of images.
-        out: the file in int8; its weights lie beside it, with .data appended.
+        program: the file in float32, for any number of images; its weights lie beside it, with
+            .data appended.
         images: prepared images of the kind that will be described.
         nodes: names of the products to quantise.
         per_channel: whether each column of weights has a scale of its own, which is more exact.
     """
+    # It finds its weights by their name, so they keep it.
+    whole = program.parent / "float32"
+    whole.mkdir()
+    for each in (program, program.with_name(f"{program.name}.data")):
+        each.rename(whole / each.name)
     with _quiet():
         quantization.quantize_static(
+            whole / program.name,
             program,
-            out,
             _Images(images),
             quant_format=quantization.QuantFormat.QDQ,
             op_types_to_quantize=_OPERATORS,
@@ -58,6 +63,7 @@ def quantise(
                 "OpTypesToExcludeOutputQuantization": _OPERATORS,
             },
         )
+    shutil.rmtree(whole)
 
 
 @contextlib.contextmanager

@@ -2,7 +2,7 @@
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders import read_folders
-from crisalad_jax.data.benchmarks.msls import read_msls, read_msls_subtask
+from crisalad_jax.data.benchmarks.msls import read_msls
 from crisalad_jax.data.benchmarks.netvlad import read_netvlad
 from crisalad_jax.data.benchmarks.npy_lists import read_salad_lists, read_vpr_bench
 from crisalad_jax.data.benchmarks.open import LAYOUTS, open_benchmark
@@ -14,7 +14,6 @@ __all__ = [
     "open_benchmark",
     "read_folders",
     "read_msls",
-    "read_msls_subtask",
     "read_netvlad",
     "read_salad_lists",
     "read_utm",

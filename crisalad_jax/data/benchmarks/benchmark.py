@@ -65,10 +65,10 @@ class Benchmark:
         """
         if queries.all() and database.all():
             return self
-        for name, readable in (("queries", queries), ("database", database)):
+        for side, readable in (("queries", queries), ("database", database)):
             if not readable.any():
                 raise InputError(
-                    f"{self.root}: {name}: found {len(readable)} images, none of them readable, "
+                    f"{self.root}: {side}: found {len(readable)} images, none of them readable, "
                     "expected at least one"
                 )
         asked, number = np.flatnonzero(queries), np.cumsum(database) - 1
@@ -118,22 +118,18 @@ DEFAULT_RADIUS = 25.0
 """Radius in metres of the common rule (Arandjelovic et al. 2016)."""
 
 
-def check_radius(radius: float) -> None:
-    """Check a distance in metres.
-
-    Raises:
-        InputError: it is negative, infinite or no number.
-    """
-    if not 0 <= radius < math.inf:
-        raise InputError(f"radius: found {radius}, expected finite metres from 0")
-
-
 def within(
     database: Float64[np.ndarray, "images axis"],
     queries: Float64[np.ndarray, "q axis"],
     radius: float,
 ) -> tuple[Int64[np.ndarray, " _"], ...]:
-    """Find the database images at most `radius` away from each query, as ascending indices."""
+    """Find the database images at most `radius` away from each query, as ascending indices.
+
+    Raises:
+        InputError: the radius is negative, infinite or not a number.
+    """
+    if not 0 <= radius < math.inf:
+        raise InputError(f"radius: found {radius}, expected finite metres from 0")
     import scipy.spatial  # takes a fifth of a second, which reading images does not need
 
     near = scipy.spatial.KDTree(database).query_ball_point(queries, radius, return_sorted=True)

@@ -6,16 +6,15 @@ import re
 
 import numpy as np
 
-from crisalad_jax.data.benchmarks.benchmark import DEFAULT_RADIUS, Benchmark, check_radius, within
+from crisalad_jax.data.benchmarks.benchmark import DEFAULT_RADIUS, Benchmark, within
 from crisalad_jax.data.benchmarks.on_disk import find_split, list_part
 from crisalad_jax.data.metres import comparable
-from crisalad_jax.data.positions import AXES, read_positions
+from crisalad_jax.data.positions import AXES, positions_of
 from crisalad_jax.data.tables import matched, read_table
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float64, Int64
 
 TRUTH = "ground_truth.csv"
-_POSITIONS = "positions.csv"
 _HEADER = ["query", "database"]
 _NO_MATCH = -1
 _Paths = tuple[pathlib.Path, ...]
@@ -59,21 +58,18 @@ def read_folders(
     folder, name = find_split(root, split)
     database, queries = (list_part(folder / part) for part in ("database", "queries"))
     table = folder / TRUTH
-    if frames is not None:
-        if radius is not None or table.exists():
-            given = "a radius" if radius is not None else table
-            raise InputError(f"frames: found {frames} and {given}, expected one of the two")
-        return _by_frames(root, name, database, queries, frames)
     places, asked = _read_positions(folder, database, queries)
-    if radius is not None and (table.exists() or places is None):
-        has = table if table.exists() else f"{root}, which has no positions ({_POSITIONS})"
+    given = {"--frames": frames is not None, TRUTH: table.exists(), "--radius": radius is not None}
+    if sum(given.values()) > 1 or (radius is not None and places is None):
         raise InputError(
-            f"radius: found {radius:g} with {has}, expected it where positions are the ground truth"
+            f"{root}: found {' and '.join(each for each, is_given in given.items() if is_given)}, "
+            f"expected one of --frames, {TRUTH}, and --radius with positions (positions.csv)"
         )
+    if frames is not None:
+        return _by_frames(root, name, database, queries, frames)
     radius = DEFAULT_RADIUS if radius is None else radius
-    check_radius(radius)
     if table.exists():
-        positives = _by_table(table, _numbers(folder, database), _numbers(folder, queries))
+        positives = _by_table(folder, database, queries)
         truth, rule = TRUTH, f"the database images that {TRUTH} lists"
     elif places is not None and asked is not None:
         positives = within(places, asked, radius)
@@ -87,12 +83,11 @@ def read_folders(
 def _by_frames(
     root: pathlib.Path, name: str, database: _Paths, queries: _Paths, frames: int
 ) -> Benchmark:
-    if frames < 0:
-        raise InputError(f"frames: found {frames}, expected a number from 0")
-    if len(database) != len(queries):
+    if frames < 0 or len(database) != len(queries):
         raise InputError(
-            f"frames: found {len(database)} database images and {len(queries)} queries in {root}, "
-            "expected as many: a frame matches those of the same moment"
+            f"{root}: found {frames} frames, {len(database)} database images and {len(queries)} "
+            "queries, expected at least 0 frames, and as many images in both folders: a frame "
+            "matches those of the same moment"
         )
     count = len(queries)
     title, rule = f"{name} (two folders", f"at most {frames} frames apart"
@@ -117,75 +112,68 @@ def _in_numbers(path: pathlib.Path) -> list[str | int]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)]
 
 
-def _numbers(folder: pathlib.Path, paths: _Paths) -> dict[str, int]:
-    """Number the images by their path below `database/` or `queries/`."""
-    depth = len(folder.parts) + 1
-    return {"/".join(path.parts[depth:]): number for number, path in enumerate(paths)}
+def _names(folder: pathlib.Path, paths: _Paths) -> list[str]:
+    return [path.relative_to(folder).as_posix() for path in paths]
 
 
 def _by_table(
-    path: pathlib.Path, database: dict[str, int], queries: dict[str, int]
+    folder: pathlib.Path, database: _Paths, queries: _Paths
 ) -> tuple[Int64[np.ndarray, " _"], ...]:
+    """Read the matches of each query from a table, which may have a header."""
+    path = folder / TRUTH
     table = read_table(path)
+    if len(table.columns) != 2:
+        found = ", ".join(table.columns) or "nothing"
+        raise InputError(f"{path}: found {found} in the first line, expected query,database")
     rows = [] if table.columns == _HEADER else [(1, table.columns)]
     rows += [(line, [field.strip() for field in fields]) for line, fields in table.lines]
-    lines = rows if len(table.columns) == 2 else []
-    asked = matched((query for _, (query, _) in lines), queries)
-    there = matched((match for _, (_, match) in lines), database)
-    matches: dict[str, set[int]] = {}
-    for line, (query, match) in lines:
-        for side, name, known in (("queries", query, asked), ("database", match, there)):
-            if name not in known and (name or side == "queries"):
-                raise InputError(
-                    f"{path}: line {line}: found {name!r}, expected the path of an image below "
-                    f"{path.parent / side}"
-                )
-        found = matches.setdefault(asked[query], set())
-        found.add(database[there[match]] if match else _NO_MATCH)
-        if _NO_MATCH in found and len(found) > 1:
+    number = {name: image for image, name in enumerate(_names(folder / "database", database))}
+    number[""] = _NO_MATCH
+    matches: dict[str, set[int]] = {name: set() for name in _names(folder / "queries", queries)}
+    asked = matched((query for _, (query, _) in rows), matches)
+    there = matched((match for _, (_, match) in rows), number)
+    for line, (query, match) in rows:
+        if query not in asked or match not in there:
             raise InputError(
-                f"{path}: line {line}: found {query!r} with a match and without, expected either"
+                f"{path}: line {line}: found {query!r},{match!r}, expected the paths of images "
+                "below queries/ and database/"
             )
-    missing = queries.keys() - matches.keys()
-    if missing:
+        matches[asked[query]].add(number[there[match]])
+    wrong = [name for name, of in matches.items() if not of or (_NO_MATCH in of and len(of) > 1)]
+    if wrong:
         raise InputError(
-            f"{path}: found {len(missing)} of {len(queries)} queries without a line query,database"
-            f", expected all ('{min(missing)},' where there is no match)"
+            f"{path}: found {len(wrong)} of {len(matches)} queries without a line, or with a match "
+            f"and without, expected either; the first is {wrong[0]} ('{wrong[0]},' has no match)"
         )
-    return tuple(np.array(sorted(matches[query] - {_NO_MATCH}), np.int64) for query in queries)
+    return tuple(np.array(sorted(of - {_NO_MATCH}), np.int64) for of in matches.values())
 
 
 def _read_positions(
     folder: pathlib.Path, database: _Paths, queries: _Paths
 ) -> tuple[Float64[np.ndarray, "images axis"], Float64[np.ndarray, "q axis"]] | tuple[None, None]:
     """Read where the images of two folders were taken, as points whose distances are metres."""
-    both, sides = folder / _POSITIONS, [folder / "database.csv", folder / "queries.csv"]
-    there = [table for table in (both, *sides) if table.exists()]
-    if not there:
+    both = folder / "positions.csv"
+    tables = [folder / "database.csv", folder / "queries.csv"]
+    if both.exists():
+        tables = [both, both]
+    elif not any(table.exists() for table in tables):
         return None, None
-    if there not in ([both], sides):
-        raise InputError(
-            f"{folder}: found {', '.join(table.name for table in there)}, expected {_POSITIONS}, "
-            "or database.csv and queries.csv"
-        )
-    tables = [read_positions(table) for table in there]
-    if len({table.axes for table in tables}) > 1:
-        raise InputError(
-            f"{there[0]}: found lat,lon in one table and east,north in the other, expected the same"
-        )
-    found = []
-    for number, images in enumerate((database, queries)):
-        table, root = (number, folder / sides[number].stem) if there == sides else (0, folder)
-        names = ["/".join(image.parts[len(root.parts) :]) for image in images]
-        of = tables[table].of
-        lines = matched(names, of)
-        missing = [name for name in names if name not in lines]
+    axes, points = [], []
+    for table, images in zip(tables, (database, queries), strict=True):
+        names = _names(folder if table == both else folder / table.stem, images)
+        found = positions_of(table, names, folder)
+        missing = [name for name in names if name not in found.of]
         if missing:
             raise InputError(
-                f"{there[table]}: found {len(missing)} of {len(names)} images of "
-                f"{sides[number].stem} without a line, expected all; the first is {missing[0]}"
+                f"{table}: found {len(missing)} of {len(names)} images without a line, expected "
+                f"all; the first is {missing[0]}"
             )
-        found.append(np.array([of[lines[name]] for name in names], np.float64))
-    if tables[0].axes == AXES[1]:
-        found = np.split(comparable(*np.concatenate(found).T), [len(found[0])])
-    return found[0], found[1]
+        axes.append(found.axes)
+        points.append(np.array([found.of[name] for name in names], np.float64))
+    if axes[0] != axes[1]:
+        raise InputError(
+            f"{tables[0]}: found columns {axes[0]}, expected {axes[1]} as in the other"
+        )
+    if axes[0] == AXES[1]:
+        points = np.split(comparable(*np.concatenate(points).T), [len(database)])
+    return points[0], points[1]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crisalad_jax.data.benchmarks.benchmark import DEFAULT_RADIUS, Benchmark, check_radius, within
+from crisalad_jax.data.benchmarks.benchmark import DEFAULT_RADIUS, Benchmark, within
 from crisalad_jax.data.benchmarks.on_disk import find_images, listing, shown
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.metres import on_ellipsoid
@@ -46,11 +46,17 @@ def read_msls(
     radius: float = DEFAULT_RADIUS,
     *,
     max_heading_difference: float | None = None,
+    subtask: bool = False,
     on_bad_image: OnBadImage = "stop",
 ) -> Benchmark:
     """Read raw MSLS: all images but panoramas. A query without a match counts as a miss.
 
     VPR-datasets-downloader takes the same images: about 11,000 queries of val.
+
+    With `subtask` it is what the official code reads for val, with its list of 740 queries: images
+    that `subtask_index.csv` marks as `all`. Queries need a database image within `radius`, by
+    distance alone; a `max_heading_difference` leaves the queries the same, and those that it leaves
+    without a match count as misses.
 
     Args:
         root: the folder with `train_val/`, or that one.
@@ -58,6 +64,7 @@ def read_msls(
         radius: in metres, inclusive. Images of different cities never match.
         max_heading_difference: largest difference of two compass angles in degrees, inclusive, for
             a match (the CriSALAD paper says 40); None lets any match, as the official code does.
+        subtask: whether to read the subtask `all` alone.
         on_bad_image: "skip" lets images be missing, for whoever reads them to leave out.
 
     Raises:
@@ -65,52 +72,7 @@ def read_msls(
             field that is no number, images that are missing, a negative radius, an angle that is
             not from 0 to 180.
     """
-    return _read(root, split, radius, max_heading_difference, on_bad_image, subtask=False)
-
-
-def read_msls_subtask(
-    root: str | os.PathLike[str],
-    split: str | None = None,
-    radius: float = DEFAULT_RADIUS,
-    *,
-    max_heading_difference: float | None = None,
-    on_bad_image: OnBadImage = "stop",
-) -> Benchmark:
-    """Read raw MSLS as the official code does for val: the list of 740 queries.
-
-    Images are those that `subtask_index.csv` marks as `all`, without panoramas. Queries need a
-    database image within `radius`, by distance alone. A `max_heading_difference` leaves the queries
-    the same, and those that it leaves without a match count as misses.
-
-    Arguments and errors are those of `read_msls`.
-    """
-    return _read(root, split, radius, max_heading_difference, on_bad_image, subtask=True)
-
-
-class _Side(NamedTuple):
-    """The database or the queries of a city."""
-
-    images: tuple[pathlib.Path, ...]
-    metres: Float64[np.ndarray, "images 2"]
-    """East and north in the city's zone."""
-    degrees: Float64[np.ndarray, "images 2"]
-    """Latitude and longitude."""
-    headings: Float64[np.ndarray, " images"]
-    """Compass angles in degrees; 0 where nothing asks for them."""
-
-
-def _read(
-    root: str | os.PathLike[str],
-    split: str | None,
-    radius: float,
-    max_heading_difference: float | None,
-    on_bad_image: OnBadImage,
-    *,
-    subtask: bool,
-) -> Benchmark:
-    root = pathlib.Path(root)
-    check_radius(radius)
-    limit = max_heading_difference
+    root, limit = pathlib.Path(root), max_heading_difference
     if limit is not None and not 0 <= limit <= 180:
         raise InputError(f"max heading difference: found {limit}, expected degrees from 0 to 180")
     folders = _city_folders(root, split or "val")
@@ -124,17 +86,13 @@ def _read(
             for part in ("database", "query")
         )
         near = within(there.metres, asked.metres, radius)
-        if subtask:
-            chosen = [query for query, matches in enumerate(near) if matches.size]
-            images = tuple(asked.images[query] for query in chosen)
-            asked = _Side(images, *(part[chosen] for part in asked[1:]))
-            near = tuple(near[query] for query in chosen)
-        if limit is not None:
-            near = tuple(
-                matches[heading_difference(there.headings[matches], heading) <= limit]
-                for matches, heading in zip(near, asked.headings, strict=True)
-            )
-        positives += [matches + start for matches in near]
+        chosen = [query for query, matches in enumerate(near) if matches.size or not subtask]
+        asked = _Side(*(part[chosen] for part in asked))
+        for query, heading in zip(chosen, asked.headings, strict=True):
+            matches = near[query]
+            if limit is not None:
+                matches = matches[heading_difference(there.headings[matches], heading) <= limit]
+            positives.append(matches + start)
         database.append(there)
         queries.append(asked)
         start += len(there.images)
@@ -160,6 +118,19 @@ def _read(
         query_positions=_positions(queries),
         radius=radius,
     )
+
+
+class _Side(NamedTuple):
+    """The database or the queries of a city."""
+
+    images: np.ndarray
+    """Paths."""
+    metres: Float64[np.ndarray, "images 2"]
+    """East and north in the city's zone."""
+    degrees: Float64[np.ndarray, "images 2"]
+    """Latitude and longitude."""
+    headings: Float64[np.ndarray, " images"]
+    """Compass angles in degrees; 0 where nothing asks for them."""
 
 
 def _positions(sides: list[_Side]) -> Float64[np.ndarray, "images axis"]:
@@ -202,14 +173,14 @@ def _read_side(
     folder: pathlib.Path, on_bad_image: OnBadImage, *, headings: bool, subtask: bool
 ) -> _Side:
     """Read a folder's images that are not panoramas, in the order of the tables."""
-    angles = ("ca",) * headings
-    raw = _read_rows(folder / "raw.csv", "key", "pano", "lat", "lon", *angles)
-    placed = _read_rows(folder / "postprocessed.csv", "key", "easting", "northing")
-    marked = _read_rows(folder / "subtask_index.csv", "all") if subtask else raw
-    expected = [row.fields["key"] for row in raw]
+    columns = ("lat", "lon", *["ca"] * headings)
+    raw = list(read_table(folder / "raw.csv", "key", "pano", *columns).rows())
+    placed = list(read_table(folder / "postprocessed.csv", "key", "easting", "northing").rows())
+    marked = list(read_table(folder / "subtask_index.csv", "all").rows()) if subtask else raw
+    keys = [row.fields["key"] for row in raw]
     for name, rows in {"postprocessed.csv": placed, "subtask_index.csv": marked}.items():
-        keys = [row.fields.get("key", key) for row, key in zip(rows, expected, strict=False)]
-        if keys != expected or len(rows) != len(raw):
+        same = [row.fields.get("key", key) for row, key in zip(rows, keys, strict=False)] == keys
+        if not same or len(rows) != len(keys):
             raise InputError(
                 f"{folder / name}: found {len(rows)} rows, expected the same {len(raw)} images as "
                 "in raw.csv, in the same order"
@@ -221,22 +192,14 @@ def _read_side(
     ]
     if not chosen:
         raise InputError(f"{folder}: found {len(raw)} images, expected some that are no panoramas")
-
-    def numbers(rows: list[Row], *columns: str) -> Float64[np.ndarray, "images column"]:
-        values = [[rows[number].number(column) for column in columns] for number in chosen]
-        return np.array(values).reshape(len(chosen), -1)
-
-    names = [f"{expected[number]}.jpg" for number in chosen]
-    return _Side(
-        images=find_images(folder / "raw.csv", folder / "images", names, on_bad_image=on_bad_image),
-        metres=numbers(placed, "easting", "northing"),
-        degrees=numbers(raw, "lat", "lon"),
-        headings=numbers(raw, "ca")[:, 0] if headings else np.zeros(len(chosen)),
+    names = [f"{keys[number]}.jpg" for number in chosen]
+    images = find_images(folder / "raw.csv", names, [folder / "images"], on_bad_image)
+    metres, numbers = (
+        np.array([[rows[number].number(column) for column in wanted] for number in chosen])
+        for rows, wanted in ((placed, ("easting", "northing")), (raw, columns))
     )
-
-
-def _read_rows(path: pathlib.Path, *columns: str) -> list[Row]:
-    return list(read_table(path, *columns).rows())
+    angles = numbers[:, 2] if headings else np.zeros(len(chosen))
+    return _Side(np.array(images, object), metres, numbers[:, :2], angles)
 
 
 def _truth(row: Row, column: str) -> bool:

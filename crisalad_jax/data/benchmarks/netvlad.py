@@ -6,17 +6,15 @@ posDistThr, and others that are not needed here.
 
 import os
 import pathlib
-from typing import Any
 
 import numpy as np
 
-from crisalad_jax.data.benchmarks.benchmark import Benchmark, check_radius, within
-from crisalad_jax.data.benchmarks.on_disk import find_image_root, find_images
+from crisalad_jax.data.benchmarks.benchmark import Benchmark, within
+from crisalad_jax.data.benchmarks.on_disk import find_images, image_roots
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.mat_files import load_mat
 
-_FIELDS = ("whichSet", "dbImage", "utmDb", "qImage", "utmQ", "numDb", "numQ", "posDistThr")
 _SIDES = (
     ("dbImage", "utmDb", "numDb", (".", "images")),
     # Look in the queries' folders first: a query may have the same name as a database image.
@@ -47,66 +45,30 @@ def read_netvlad(
             are missing, a negative radius.
     """
     path = pathlib.Path(path)
-    struct = _read_struct(path)
-    radius = float(_numbers(path, struct, "posDistThr").item()) if radius is None else radius
-    check_radius(radius)
-    found = []
-    for field, utm, count, folders in _SIDES:
-        names = _names(path, struct, field)
-        expected = _numbers(path, struct, count).item()
-        if len(names) != expected or not names:
-            raise InputError(
-                f"{path}: {field}: found {len(names)} images, expected {count}, {expected:g}, and "
-                "at least one"
-            )
-        positions = np.ascontiguousarray(_numbers(path, struct, utm, len(names)).T, np.float64)
-        root = find_image_root(path, images, names, folders, on_bad_image=on_bad_image)
-        found.append((find_images(path, root, names, on_bad_image=on_bad_image), positions))
-    (database, places), (queries, asked) = found
-    which = " ".join(map(str, struct["whichSet"].reshape(-1)[:1]))
-    return Benchmark(
-        name=f"{path.stem} (NetVLAD .mat, {which} set, {radius:g} m)",
-        root=path,
-        database=database,
-        queries=queries,
-        positives=within(places, asked, radius),
-        rule=f"UTM distance of at most {radius:g} m",
-        database_positions=places,
-        query_positions=asked,
-        radius=radius,
-    )
-
-
-def _read_struct(path: pathlib.Path) -> np.void:
     contents = load_mat(path, "a .mat file with dbStruct", damaged="cannot be read as a .mat file")
-    struct = contents.get("dbStruct")
-    if struct is None or struct.size != 1 or struct.dtype.names is None:
-        variables = ", ".join(name for name in contents if not name.startswith("__"))
-        raise InputError(f"{path}: found {variables or 'nothing'}, expected a struct dbStruct")
-    missing = [name for name in _FIELDS if name not in struct.dtype.names]
-    if missing:
-        raise InputError(f"{path}: dbStruct: found no {', '.join(missing)}")
-    return struct.reshape(-1)[0]
-
-
-def _numbers(
-    path: pathlib.Path, struct: np.void, field: str, images: int | None = None
-) -> np.ndarray:
-    """Return a field that holds one number, or two for each image."""
-    value = struct[field]
-    right = value.size == 1 if images is None else value.shape == (2, images)
-    if not right or value.dtype.kind not in "iuf" or not np.isfinite(value).all():
-        expected = "a finite number" if images is None else f"2 x {images} numbers"
-        raise InputError(f"{path}: {field}: found {_found(value)}, expected {expected}")
-    return value
-
-
-def _names(path: pathlib.Path, struct: np.void, field: str) -> list[str]:
-    cells = struct[field].reshape(-1)
-    if any(getattr(cell, "dtype", cells.dtype).kind != "U" or cell.size != 1 for cell in cells):
-        raise InputError(f"{path}: {field}: found {_found(cells)}, expected names of images")
-    return [str(cell.item()) for cell in cells]
-
-
-def _found(value: Any) -> str:
-    return str(value.item()) if value.size == 1 else f"an array of {value.shape} of {value.dtype}"
+    found, sides = [], []
+    try:
+        struct = contents["dbStruct"].reshape(-1)[0]
+        which = str(struct["whichSet"].item())
+        radius = float(struct["posDistThr"].item()) if radius is None else radius
+        for field, utm, count, folders in _SIDES:
+            names = [str(cell.item()) for cell in struct[field].reshape(-1)]
+            positions = np.ascontiguousarray(struct[utm].T, np.float64)
+            found.append((names, positions, float(struct[count].item()), folders))
+    except (KeyError, IndexError, ValueError, TypeError) as error:
+        raise InputError(
+            f"{path}: found {', '.join(contents)} ({error}), expected a struct dbStruct of NetVLAD"
+        ) from error
+    for names, positions, count, folders in found:
+        right = positions.shape == (len(names), 2) and np.isfinite(positions).all()
+        if not right or not names or len(names) != count:
+            raise InputError(
+                f"{path}: found {len(names)} names, a count of {count:g} and positions of shape "
+                f"{positions.T.shape}, expected the same number of each, and finite positions"
+            )
+        sides.append(find_images(path, names, image_roots(path, images, folders), on_bad_image))
+    (database, queries), (places, asked) = sides, (positions for _, positions, _, _ in found)
+    name = f"{path.stem} (NetVLAD .mat, {which} set, {radius:g} m)"
+    rule = f"UTM distance of at most {radius:g} m"
+    positives = within(places, asked, radius)
+    return Benchmark(name, path, database, queries, positives, rule, places, asked, radius)

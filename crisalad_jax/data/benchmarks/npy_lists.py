@@ -7,6 +7,7 @@ The lists: `pitts30k_test_dbImages.npy`, `..._qImages.npy` and `..._gt.npy`. MSL
 `gt`.
 """
 
+import collections
 import os
 import pathlib
 import re
@@ -17,7 +18,7 @@ import numpy as np
 
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.msls import msls_title
-from crisalad_jax.data.benchmarks.on_disk import find_image_root, find_images, list_part, listing
+from crisalad_jax.data.benchmarks.on_disk import find_images, image_roots, list_part
 from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
@@ -32,6 +33,7 @@ _MSLS_IMAGE = re.compile(r"train_val/([^/]+)/(?:database|query)/images/[^/]+")
 _FOLDERS = {"dbImages": (".",), "qImages": ("queries_real", ".")}
 _NORDLAND_RULE = ", which are 10i - 1, 10i and 10i + 1 for query i: by that it is Nordland*"
 
+_MOST = 2**62
 _Lists = dict[str, pathlib.Path]
 """The files of a set, by their kind."""
 _Matches = tuple[Int64[np.ndarray, " _"], ...]
@@ -61,12 +63,7 @@ def read_vpr_bench(root: str | os.PathLike[str]) -> Benchmark:
             f"{path}: found shape {rows.shape}, expected ({len(queries)}, 2): one row for each "
             "query"
         )
-    asked = [index for row in _rows(path, rows[:, 0]) for index in row.tolist()]
-    if sorted(asked) != [*range(len(queries))]:
-        raise InputError(
-            f"{path}: found queries {asked[:8]}..., expected each from 0 to {len(queries) - 1} in "
-            "one row"
-        )
+    asked = _chosen(path, rows[:, 0], len(queries))
     truth = _read_matches(path, rows[:, 1], len(database), windows=True)
     positives = tuple(truth[row] for row in np.argsort(asked))
     name = f"{real_path(root).name} (VPR-Bench)"
@@ -117,25 +114,24 @@ def read_salad_lists(
     names = {kind: _names(files[kind]) for kind in _FOLDERS}
     count = len(names["dbImages"])
     if "qIdx" in files:
-        chosen = _chosen(files["qIdx"], len(names["qImages"]))
+        chosen = _chosen(files["qIdx"], read_npy(files["qIdx"]), len(names["qImages"]))
         names["qImages"] = [names["qImages"][query] for query in chosen]
     asked = len(names["qImages"])
     truth = files.get("gt", files.get("pIdx"))
     positives, rule = None, "none: there is no ground truth beside the lists"
     if truth is not None:
-        rows = read_npy(truth)
-        if rows.ndim == 0 or len(rows) != asked:
+        rows = np.atleast_1d(read_npy(truth))
+        if len(rows) != asked:
             raise InputError(
                 f"{truth}: found shape {rows.shape}, expected a row for each of {asked} queries"
             )
         positives = _read_matches(truth, rows, count)
         rule = f"the database images that {truth.name} lists"
-    found = []
+    sides = []
     for kind, folders in _FOLDERS.items():
-        folder = find_image_root(
-            files[kind], images, names[kind], folders, on_bad_image=on_bad_image
-        )
-        found.append(find_images(files[kind], folder, names[kind], on_bad_image=on_bad_image))
+        roots = image_roots(files[kind], images, folders)
+        sides.append(find_images(files[kind], names[kind], roots, on_bad_image))
+    database, queries = sides
     cities = [_MSLS_IMAGE.fullmatch(name) for kind in names for name in names[kind]]
     if positives is not None and _is_nordland_star(positives, count):
         name = "Nordland*, winter database, summer queries (SALAD's lists)"
@@ -145,57 +141,41 @@ def read_salad_lists(
         name = f"{name}, {asked} queries (SALAD's list)"
     else:
         name = f"{prefix.strip('_') or real_path(files['dbImages']).parent.name} (SALAD's lists)"
-    database, queries = found
     return Benchmark(name, root, database, queries, positives, rule)
 
 
-def is_list(path: pathlib.Path) -> bool:
-    """Return whether a file has the name of one of the lists."""
-    return path.is_file() and _FILE.fullmatch(path.name) is not None
+def find_lists(root: pathlib.Path) -> dict[str, _Lists]:
+    """Find the lists of each set in a folder, or of the set that one of its files is of.
 
-
-def has_lists(folder: pathlib.Path) -> bool:
-    """Return whether a folder holds the lists of any set."""
-    return folder.is_dir() and bool(_find(folder))
-
-
-def _find(folder: pathlib.Path) -> dict[str, _Lists]:
-    """Find the files of every set that lists a database, by the prefix of their names."""
-    sets: dict[str, _Lists] = {}
-    for path in sorted(folder.glob("*.npy")):
+    Returns:
+        Prefix of the files' names -> the files. Sets that list no database are left out.
+    """
+    one = _FILE.fullmatch(root.name) if root.is_file() else None
+    sets: dict[str, _Lists] = collections.defaultdict(dict)
+    for path in sorted((root.parent if one else root).glob("*.npy")):
         parts = _FILE.fullmatch(path.name)
-        if parts is not None:
-            sets.setdefault(parts["prefix"], {})[parts["kind"]] = path
+        if parts is not None and (one is None or one["prefix"] == parts["prefix"]):
+            sets[parts["prefix"]][parts["kind"]] = path
     return {prefix: files for prefix, files in sets.items() if "dbImages" in files}
 
 
 def _choose(root: pathlib.Path, split: str | None) -> tuple[str, _Lists]:
     """Find the lists of the one set that a file or a split names."""
-    parts = _FILE.fullmatch(root.name) if root.is_file() else None
-    folder = root if parts is None else root.parent
-    if not folder.is_dir():
-        raise InputError(f"{root}: found {listing(root)}, expected a folder with ..._dbImages.npy")
-    there = _find(folder)
-    sets = {
-        prefix: files
-        for prefix, files in there.items()
-        if (parts is None or prefix == parts["prefix"])
-        and (split is None or split in prefix.split("_"))
-    }
-    if len(sets) != 1:
+    there = find_lists(root)
+    chosen = [prefix for prefix in there if split is None or split in prefix.split("_")]
+    if len(chosen) != 1:
         names = ", ".join(prefix.strip("_") or "dbImages.npy" for prefix in there) or "no set"
-        asked = "" if split is None else f" and split {split!r}"
         raise InputError(
-            f"{root}: found lists of {names}{asked}, expected those of one: name a "
-            "..._dbImages.npy, or a split that one of them has in its name"
+            f"{root}: found lists of {names}, expected those of one: name a ..._dbImages.npy, or a "
+            f"split that one of them has in its name{'' if split is None else f', unlike {split}'}"
         )
-    ((prefix, files),) = sets.items()
+    files = there[chosen[0]]
     if "qImages" not in files or {"gt", "pIdx"} <= files.keys():
         raise InputError(
-            f"{folder}: found {', '.join(path.name for path in files.values())}, expected "
-            f"{prefix}qImages.npy, and one of {prefix}gt.npy and {prefix}pIdx.npy"
+            f"{root}: found {', '.join(path.name for path in files.values())}, expected "
+            f"{chosen[0]}qImages.npy, and one of {chosen[0]}gt.npy and {chosen[0]}pIdx.npy"
         )
-    return prefix, files
+    return chosen[0], files
 
 
 def _names(path: pathlib.Path) -> list[str]:
@@ -208,50 +188,36 @@ def _names(path: pathlib.Path) -> list[str]:
     return names
 
 
-def _chosen(path: pathlib.Path, queries: int) -> Int64[np.ndarray, " _"]:
-    """Read the indices of the queries that are evaluated."""
-    (chosen,) = _rows(path, [read_npy(path)])
-    unlike = len(np.unique(chosen)) == len(chosen) > 0
-    if not unlike or not 0 <= chosen.min() <= chosen.max() < queries:
+def _chosen(path: pathlib.Path, rows: np.ndarray, queries: int) -> Int64[np.ndarray, " _"]:
+    """Return the indices of queries in some rows, of which each may be there once."""
+    indices = [index for row in _rows(path, np.atleast_1d(rows)) for index in row.tolist()]
+    if not indices or len({*indices} & {*range(queries)}) < len(indices):
         raise InputError(
-            f"{path}: found {len(chosen)} indices, expected some from 0 to {queries - 1}, each once"
+            f"{path}: found queries {indices[:8]}..., expected some from 0 to {queries - 1}, each "
+            "once"
         )
-    return chosen
+    return np.array(indices, np.int64)
 
 
 def _rows(path: pathlib.Path, rows: Iterable[Any]) -> _Matches:
-    """Convert the rows of a file to indices.
-
-    Raises:
-        InputError: a row is no number, flat list or array of integers.
-    """
-    found = []
-    for number, row in enumerate(rows):
-        try:
-            found.append(_indices(row))
-        except (TypeError, OverflowError) as error:
-            raise InputError(
-                f"{path}: row {number}: found {error}, expected whole numbers"
-            ) from error
-    return tuple(found)
-
-
-def _indices(value: Any) -> Int64[np.ndarray, " _"]:
-    """Convert a number, flat list or integer array to indices.
+    """Convert the rows of a file, which are numbers, flat lists or integer arrays, to indices.
 
     Nested lists are refused, not flattened: a pickle of a few hundred bytes can hold nested lists
     of any size.
     """
-    if isinstance(value, np.ndarray) and value.dtype != object:
-        if value.size and value.dtype.kind not in "iu":
-            raise TypeError(f"values of type {value.dtype}")
-        return np.asarray(value).reshape(-1).astype(np.int64)
-    items = value.reshape(-1) if isinstance(value, np.ndarray) else value
-    items = items if isinstance(items, list | tuple | np.ndarray) else (items,)
-    for item in items:
-        if isinstance(item, bool | np.bool_) or not isinstance(item, int | np.integer):
-            raise TypeError(f"values of type {type(item).__name__}")
-    return np.array([int(item) for item in items], np.int64)
+    found = []
+    for number, row in enumerate(rows):
+        items = row.reshape(-1).tolist() if isinstance(row, np.ndarray) else row
+        items = items if isinstance(items, list | tuple) else [items]
+        for item in items:
+            whole = isinstance(item, int | np.integer) and not isinstance(item, bool)
+            if not whole or not -_MOST < item < _MOST:
+                raise InputError(
+                    f"{path}: row {number}: found values of type {type(item).__name__}, expected "
+                    "whole numbers of 64 bits"
+                )
+        found.append(np.array(items, np.int64))
+    return tuple(found)
 
 
 def _read_matches(

@@ -39,7 +39,7 @@ def list_part(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
 def listing(folder: pathlib.Path) -> str:
     """Describe in a message what a folder holds."""
     if not folder.is_dir():
-        return "no such folder"
+        return "a file" if folder.exists() else "no such folder"
     return shown(path.name + "/" * path.is_dir() for path in folder.iterdir())
 
 
@@ -81,65 +81,46 @@ def find_split(root: pathlib.Path, split: str | None) -> tuple[pathlib.Path, str
     return root / "images" / split, f"{resolved.name}/{split}"
 
 
-def find_image_root(
-    named_by: pathlib.Path,
-    images: str | os.PathLike[str] | None,
-    names: Sequence[str],
-    folders: Sequence[str] = (".",),
-    *,
-    on_bad_image: OnBadImage = "stop",
-) -> pathlib.Path:
-    """Find the folder that a file's image names are relative to, by the first of them.
+def image_roots(
+    named_by: pathlib.Path, images: str | os.PathLike[str] | None, folders: Sequence[str] = (".",)
+) -> list[pathlib.Path]:
+    """List where the images that a file names may be.
 
     Args:
-        named_by: the file that names images, or the folder of it.
-        images: where they are; None looks beside that file, and one folder further up.
-        names: their names.
-        folders: folders there that may hold them.
-        on_bad_image: "skip" finds it by any of them.
-
-    Raises:
-        InputError: there is no such image.
+        named_by: the file.
+        images: the folder that holds them; None is that of the file, and the one above.
+        folders: folders in it that names may be relative to.
     """
-    if images is None:
-        beside = named_by if named_by.is_dir() else named_by.parent
-        roots = (beside, beside.absolute().parent)
-    else:
-        roots = (pathlib.Path(images),)
-    disk = Disk()
-    candidates = [root / folder for root in roots for folder in folders]
-    sought = names if on_bad_image == "skip" else names[:1]
-    for candidate in candidates:
-        if any(disk.find(candidate, name) is not None for name in sought):
-            return candidate
-    raise InputError(
-        f"{named_by}: found no image {names[0]} in {', '.join(map(str, candidates))}; expected its "
-        "folder as images (--images)"
-    )
+    near = (named_by.parent, named_by.parent.absolute().parent)
+    roots = near if images is None else (pathlib.Path(images),)
+    return [root / folder for root in roots for folder in folders]
 
 
 def find_images(
     named_by: pathlib.Path,
-    root: pathlib.Path,
-    names: Iterable[str],
-    *,
-    on_bad_image: OnBadImage = "stop",
+    names: Sequence[str],
+    roots: Sequence[pathlib.Path],
+    on_bad_image: OnBadImage,
 ) -> tuple[pathlib.Path, ...]:
-    """Return the paths of all images that a file names relative to `root`; see `names.Disk`.
+    """Return the paths of all images that a file names; see `tables.Disk`.
 
-    Under "skip" they may be missing, and whoever reads them leaves them out.
+    Args:
+        named_by: the file.
+        names: the images'.
+        roots: folders that names may be relative to, of which the first that has any is taken.
+        on_bad_image: under "skip" some may be missing, and whoever reads them leaves them out.
 
     Raises:
         InputError: some are missing; how many, and which is the first.
     """
-    disk, names = Disk(), list(names)
+    disk = Disk()
+    found = (root for root in roots if any(disk.find(root, name) is not None for name in names))
+    root = next(found, roots[0])
     paths = [disk.find(root, name) for name in names]
-    if on_bad_image == "skip":
-        return tuple(path or root / name for name, path in zip(names, paths, strict=True))
-    missing = [root / name for name, path in zip(names, paths, strict=True) if path is None]
-    if missing:
+    missing = [name for name, path in zip(names, paths, strict=True) if path is None]
+    if missing and (on_bad_image == "stop" or len(missing) == len(names)):
         raise InputError(
-            f"{named_by}: found {len(missing)} of {len(paths)} images missing, expected all; the "
-            f"first is {missing[0]}"
+            f"{named_by}: found {len(missing)} of {len(names)} images missing, expected all in one "
+            f"of {', '.join(map(str, roots))} (--images); the first is {missing[0]}"
         )
-    return tuple(path for path in paths if path is not None)
+    return tuple(path or root / name for name, path in zip(names, paths, strict=True))

@@ -1,6 +1,6 @@
 """Find the layout of an evaluation set, and read it with the layout's options."""
 
-import inspect
+import functools
 import os
 import pathlib
 from collections.abc import Callable
@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 from crisalad_jax.config.checks import PATH, choose, takes
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.folders import TRUTH, read_folders
-from crisalad_jax.data.benchmarks.msls import is_msls, read_msls, read_msls_subtask
+from crisalad_jax.data.benchmarks.msls import is_msls, read_msls
 from crisalad_jax.data.benchmarks.netvlad import read_netvlad
 from crisalad_jax.data.benchmarks.npy_lists import (
     VPR_BENCH_TRUTH,
-    has_lists,
-    is_list,
+    find_lists,
     read_salad_lists,
     read_vpr_bench,
 )
@@ -22,7 +21,6 @@ from crisalad_jax.data.benchmarks.on_disk import find_split, has_sides, has_spli
 from crisalad_jax.data.benchmarks.utm import QUERIES, has_utm_names, read_utm
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_one_array
 
 
 class Layout(NamedTuple):
@@ -30,28 +28,26 @@ class Layout(NamedTuple):
 
     words: str
     read: Callable[..., Benchmark]
-
-    @property
-    def options(self) -> list[str]:
-        """Names of the options that the reader takes after the path."""
-        _, *options = inspect.signature(self.read).parameters
-        return [name for name in options if name != _ON_BAD_IMAGE]
-
-    @property
-    def names_images(self) -> bool:
-        """Whether files name images, which may be missing."""
-        return _ON_BAD_IMAGE in inspect.signature(self.read).parameters
+    options: tuple[str, ...] = ()
+    """Names of the options that the reader takes after the path."""
+    names_images: bool = False
+    """Whether files name images, which may be missing."""
 
 
-_ON_BAD_IMAGE = "on_bad_image"
+_ALL = ("split", "radius")
+_MSLS = (*_ALL, "max_heading_difference")
 LAYOUTS = {
-    "utm": Layout("a folder of @UTM names", read_utm),
+    "utm": Layout("a folder of @UTM names", read_utm, (*_ALL, "queries", "ignore_zones")),
     "vpr-bench": Layout("a VPR-Bench folder", read_vpr_bench),
-    "netvlad": Layout("a .mat file of NetVLAD", read_netvlad),
-    "salad": Layout(".npy lists of GSV-Cities or SALAD", read_salad_lists),
-    "msls": Layout("raw MSLS", read_msls),
-    "msls-subtask": Layout("raw MSLS, subtask all", read_msls_subtask),
-    "folders": Layout("two plain folders", read_folders),
+    "netvlad": Layout("a .mat file of NetVLAD", read_netvlad, ("radius", "images"), True),
+    "salad": Layout(
+        ".npy lists of GSV-Cities or SALAD", read_salad_lists, ("split", "images"), True
+    ),
+    "msls": Layout("raw MSLS", read_msls, _MSLS, True),
+    "msls-subtask": Layout(
+        "raw MSLS, subtask all", functools.partial(read_msls, subtask=True), _MSLS, True
+    ),
+    "folders": Layout("two plain folders", read_folders, (*_ALL, "frames")),
 }
 """Layouts by the name that `open_benchmark` takes."""
 
@@ -73,8 +69,7 @@ def open_benchmark(
     """Read an evaluation set of the given `layout`, or of the layout that its files show.
 
     An option that is None takes the default of the layout's reader: `read_utm`,
-    `read_vpr_bench`, `read_netvlad`, `read_salad_lists`, `read_msls`, `read_msls_subtask`,
-    `read_folders`.
+    `read_vpr_bench`, `read_netvlad`, `read_salad_lists`, `read_msls` or `read_folders`.
 
     Args:
         root: a folder, or a file of NetVLAD's or SALAD's.
@@ -104,9 +99,8 @@ def open_benchmark(
         4
     """
     root = pathlib.Path(root)
-    chosen = choose(
-        "layout", _find_layout(root, split, queries) if layout is None else layout, LAYOUTS
-    )
+    layout = _find_layout(root, split, queries) if layout is None else layout
+    chosen = choose("layout", layout, LAYOUTS)
     options = {
         "split": split,
         "radius": radius,
@@ -117,40 +111,32 @@ def open_benchmark(
         "ignore_zones": ignore_zones or None,
     }
     given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
-    for name, value in given.items():
-        if name not in chosen.options:
-            known = ", ".join(chosen.options).replace("_", " ") or "no option"
-            raise InputError(
-                f"{name.replace('_', ' ')}: found {str(value)!r}, but {root} is {chosen.words}, "
-                f"which takes {known}"
-            )
+    if unknown := given.keys() - {*chosen.options}:
+        known = ", ".join(chosen.options) or "no option"
+        raise InputError(
+            f"{root}: found {', '.join(sorted(unknown))} for {chosen.words}, which takes {known}"
+        )
     if chosen.names_images:
-        given[_ON_BAD_IMAGE] = on_bad_image
+        given["on_bad_image"] = on_bad_image
     return chosen.read(root, **given)
 
 
 def _find_layout(root: pathlib.Path, split: str | None, queries: str | None) -> str:
-    if root.is_file():
-        if root.suffix == ".mat":
-            return "netvlad"
-        if is_list(root):
-            return "salad"
-        check_one_array(root)
-        raise InputError(
-            f"{root}: found a file, expected a folder, a .mat file of NetVLAD or a list of SALAD "
-            "that ends in dbImages.npy"
-        )
+    if root.is_file() and root.suffix == ".mat":
+        return "netvlad"
     if is_msls(root):
         return "msls"
     if has_split(root) or has_sides(root):
         folder, _ = find_split(root, split)
         plain = (folder / TRUTH).exists() or not has_utm_names(folder, queries or QUERIES)
         return "folders" if plain else "utm"
-    if (root / "ref").is_dir() and (root / "query").is_dir():
-        has_truth = (root / VPR_BENCH_TRUTH).exists() or not has_lists(root)
-        return "vpr-bench" if has_truth else "salad"
-    if has_lists(root):
+    is_bench = (root / "ref").is_dir() and (root / "query").is_dir()
+    if is_bench and (root / VPR_BENCH_TRUTH).exists():
+        return "vpr-bench"
+    if find_lists(root):
         return "salad"
+    if is_bench:
+        return "vpr-bench"
     raise InputError(
         f"{root}: found {listing(root)}; expected images/{{test,val,train}}/, or database/ and "
         "queries/, or ref/, query/ and ground_truth_new.npy, or train_val/ (MSLS), or "

@@ -11,15 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from crisalad_jax.data.benchmarks.benchmark import DEFAULT_RADIUS, Benchmark, check_radius, within
+from crisalad_jax.data.benchmarks.benchmark import DEFAULT_RADIUS, Benchmark, within
 from crisalad_jax.data.benchmarks.msls import msls_title
-from crisalad_jax.data.benchmarks.on_disk import (
-    find_database,
-    find_split,
-    list_part,
-    listing,
-    shown,
-)
+from crisalad_jax.data.benchmarks.on_disk import find_database, find_split, list_part, shown
 from crisalad_jax.data.metres import Zone, on_ellipsoid
 from crisalad_jax.data.positions import utm_degrees, utm_position, utm_zones
 from crisalad_jax.utils.errors import InputError
@@ -37,6 +31,8 @@ _NORDLANDS = {
 """Versions of Nordland by the metres between two frames."""
 # Names have one decimal, truncated.
 _NAME_METRES = 0.1
+_Points = Float64[np.ndarray, "images axis"]
+_Matches = tuple[Int64[np.ndarray, " _"], ...]
 _MSLS_NOTE = re.compile(r"(?:day|night)_[a-z]+_([a-z]+)")
 
 
@@ -72,9 +68,10 @@ def read_utm(
             or without a zone where others are of several, a negative radius.
     """
     root = pathlib.Path(root)
-    check_radius(radius)
+    if not queries.startswith(QUERIES):
+        raise InputError(f"queries: found {queries!r}, expected the name of a folder {QUERIES}...")
     folder, name = find_split(root, split)
-    database, asking = list_part(find_database(folder)), _list_queries(folder, queries)
+    database, asking = list_part(find_database(folder)), list_part(folder / queries)
     places, asked = _coordinates(database), _coordinates(asking)
     which = "" if queries == QUERIES else f", {queries}"
 
@@ -123,14 +120,10 @@ def read_utm(
 def _across_zones(
     names: Sequence[str],
     zones: Sequence[Zone | None],
-    places: Float64[np.ndarray, "images 2"],
-    asked: Float64[np.ndarray, "q 2"],
+    places: _Points,
+    asked: _Points,
     radius: float,
-) -> tuple[
-    tuple[Int64[np.ndarray, " _"], ...],
-    Float64[np.ndarray, "images 3"],
-    Float64[np.ndarray, "q 3"],
-]:
+) -> tuple[_Matches, _Points, _Points]:
     """Find the positives of a set of several zones, and both sides' points on the ellipsoid.
 
     Images of one zone match by its metres, so that published sets such as MSLS, with a city a
@@ -154,20 +147,11 @@ def _across_zones(
 
 def has_utm_names(folder: pathlib.Path, queries: str = QUERIES) -> bool:
     """Return whether any image of the database or the queries has a name that begins with @."""
-    paths = list_part(find_database(folder)) + _list_queries(folder, queries)
+    paths = list_part(find_database(folder)) + list_part(folder / queries)
     return any(path.name.startswith("@") for path in paths)
 
 
-def _list_queries(folder: pathlib.Path, queries: str) -> tuple[pathlib.Path, ...]:
-    """List the images of one of the queries' folders."""
-    there = [path.name for path in folder.glob(f"{QUERIES}*") if path.is_dir()]
-    if queries not in there:
-        others = shown(f"{name}/" for name in there) if there else listing(folder)
-        raise InputError(f"{folder}: found {others}, expected a folder {queries}")
-    return list_part(folder / queries)
-
-
-def _coordinates(paths: tuple[pathlib.Path, ...]) -> Float64[np.ndarray, "images 2"]:
+def _coordinates(paths: tuple[pathlib.Path, ...]) -> _Points:
     """Read each image's east and north in metres from its name."""
     coordinates = [utm_position(path.name) for path in paths]
     if None in coordinates:
@@ -176,9 +160,7 @@ def _coordinates(paths: tuple[pathlib.Path, ...]) -> Float64[np.ndarray, "images
     return np.array(coordinates, np.float64)
 
 
-def _nordland(
-    database: Float64[np.ndarray, "images 2"], queries: Float64[np.ndarray, "q 2"]
-) -> tuple[float, Float64[np.ndarray, "images 2"], Float64[np.ndarray, "q 2"]] | None:
+def _nordland(database: _Points, queries: _Points) -> tuple[float, _Points, _Points] | None:
     """Return the Nordland spacing and (0, frame) for every image; None for other sets."""
     for metres in _NORDLANDS:
         sides = [np.round(side / metres) for side in (database, queries)]
@@ -193,9 +175,7 @@ def _nordland(
     return None
 
 
-def _are_placeholders(
-    database: Float64[np.ndarray, "images 2"], queries: Float64[np.ndarray, "q 2"]
-) -> bool:
+def _are_placeholders(database: _Points, queries: _Points) -> bool:
     """Return whether all eastings are 0 and northings whole kilometres, unique in the database."""
     both = np.concatenate([database, queries])
     whole = not both[:, 0].any() and not (both[:, 1] % _PLACE_METRES).any()

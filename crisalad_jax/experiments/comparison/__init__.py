@@ -1,46 +1,20 @@
 """Methods side by side: trained or loaded, evaluated alike, tabled as the paper's Tables 1 to 3."""
 
-from crisalad_jax.experiments.comparison.costs import AdapterCost, adapter_costs
-from crisalad_jax.experiments.comparison.methods import (
-    ABLATIONS,
-    METHODS,
-    AblationRow,
-    ComparedMethod,
-    parse_row,
-)
-from crisalad_jax.experiments.comparison.plan import (
-    ComparisonConfig,
-    Prepared,
-    names_to_compare,
-    prepare,
-)
-from crisalad_jax.experiments.comparison.results import (
-    Difference,
-    Recall,
-    Row,
-    Summary,
-    paired_difference,
-    summarise,
-)
-from crisalad_jax.experiments.comparison.runner import compare
-
-__all__ = [
-    "ABLATIONS",
-    "METHODS",
-    "AblationRow",
-    "AdapterCost",
-    "ComparedMethod",
-    "ComparisonConfig",
-    "Difference",
-    "Prepared",
-    "Recall",
-    "Row",
-    "Summary",
-    "adapter_costs",
-    "compare",
-    "names_to_compare",
-    "paired_difference",
-    "parse_row",
-    "prepare",
-    "summarise",
-]
+from crisalad_jax.experiments.comparison.costs import AdapterCost as AdapterCost
+from crisalad_jax.experiments.comparison.costs import adapter_costs as adapter_costs
+from crisalad_jax.experiments.comparison.methods import ABLATIONS as ABLATIONS
+from crisalad_jax.experiments.comparison.methods import METHODS as METHODS
+from crisalad_jax.experiments.comparison.methods import AblationRow as AblationRow
+from crisalad_jax.experiments.comparison.methods import ComparedMethod as ComparedMethod
+from crisalad_jax.experiments.comparison.methods import parse_row as parse_row
+from crisalad_jax.experiments.comparison.plan import ComparisonConfig as ComparisonConfig
+from crisalad_jax.experiments.comparison.plan import Prepared as Prepared
+from crisalad_jax.experiments.comparison.plan import names_to_compare as names_to_compare
+from crisalad_jax.experiments.comparison.plan import prepare as prepare
+from crisalad_jax.experiments.comparison.results import Difference as Difference
+from crisalad_jax.experiments.comparison.results import Recall as Recall
+from crisalad_jax.experiments.comparison.results import Row as Row
+from crisalad_jax.experiments.comparison.results import Summary as Summary
+from crisalad_jax.experiments.comparison.results import paired_difference as paired_difference
+from crisalad_jax.experiments.comparison.results import summarise as summarise
+from crisalad_jax.experiments.comparison.runner import compare as compare

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -27,7 +27,6 @@ from crisalad_jax.utils.compiler import jit
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.progress import progress_bar
-from crisalad_jax.utils.pytree import named_leaves
 
 _CALLS = 3
 """Number of calls of each in a round; their median counts."""
@@ -35,19 +34,17 @@ _LONG = 3.0
 """Seconds of a call that is made once in a round: a few of it vary less than many short ones."""
 
 
-class Race(NamedTuple):
-    """Seconds of a call by name, the median of each round."""
+class Spread(NamedTuple):
+    """What repeats of a measurement range over."""
 
-    rounds: Mapping[str, list[float]]
+    median: float
+    least: float
+    most: float
 
-    def slower(self, name: str, than: str) -> tuple[float, float, float]:
-        """Compare the time of two calls: median, least and most of the rounds' ratios.
-
-        Both times of a ratio are of one round, under the same load.
-        """
-        pairs = zip(self.rounds[name], self.rounds[than], strict=True)
-        ratios = [ours / theirs for ours, theirs in pairs]
-        return statistics.median(ratios), min(ratios), max(ratios)
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "Spread | None":
+        """Summarise values; None of none."""
+        return cls(statistics.median(values), min(values), max(values)) if values else None
 
 
 def race(
@@ -55,13 +52,16 @@ def race(
     rounds: int,
     *,
     quiet: bool = True,
-) -> Race:
+) -> dict[str, list[float]]:
     """Time calls in turns; each call does all of its work and waits for it.
 
     The first call of each, which compiles, does not count, nor does the first of each turn. A call
     of `_LONG` and longer is then made once, any other `_CALLS` times. A contender makes its call
     for a turn and drops it: one model is in memory at a time. A progress bar counts the turns,
     unless `quiet`.
+
+    Returns:
+        Seconds of a call by name, the median of each round.
     """
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     with progress_bar("speed", (1 + rounds) * len(contenders), "turns", quiet=quiet) as bar:
@@ -75,7 +75,13 @@ def race(
                 times = [_seconds(call) for _ in range(calls)]
                 seconds[name].append(statistics.median(times))
                 bar.advance(1)
-    return Race(seconds)
+    return seconds
+
+
+def ratios(rounds: Mapping[str, Sequence[float]], name: str, than: str) -> list[float]:
+    """Compare the times of two calls: a ratio of each round, both times under the same load."""
+    pairs = zip(rounds[name], rounds[than], strict=True)
+    return [ours / theirs for ours, theirs in pairs]
 
 
 def _seconds(call: Callable[[], Any]) -> float:
@@ -129,8 +135,8 @@ class AdapterCost(NamedTuple):
     paper_macs: int
     macs: int
     """Multiply-accumulates that an image really takes."""
-    time: tuple[float, float, float] | None
-    """Time over the depthwise adapter's: median, least and most of the rounds."""
+    time: Spread | None
+    """Time over the depthwise adapter's, over the rounds; None where it was not measured."""
 
 
 NOTES = (
@@ -149,29 +155,26 @@ def adapter_costs(*, measure: bool = True, rounds: int = 5, images: int = 4) -> 
     """
     kinds: tuple[AdapterKind, ...] = ("mlp", "multi-resolution", "depthwise")
     calls = {kind: functools.partial(_adapter_call, kind, images) for kind in kinds}
-    raced = race(calls, rounds) if measure else None
-    return [_adapter_cost(kind, raced) for kind in kinds]
+    seconds = race(calls, rounds) if measure else {}
+    return [_adapter_cost(kind, seconds) for kind in kinds]
 
 
-def _adapter_cost(kind: AdapterKind, raced: Race | None) -> AdapterCost:
+_PAPER_PARAMETERS = {"mlp": 590_976, "multi-resolution": 761_472, "depthwise": 741_504}
+"""By the count that docs/comparison.md explains."""
+
+
+def _adapter_cost(kind: AdapterKind, seconds: Mapping[str, Sequence[float]]) -> AdapterCost:
     config = AdapterConfig(kind=kind)
     backbone = ViTConfig(adapter=config)
     model = dataclasses.replace(PRESETS["b14"], backbone=backbone)
     make = functools.partial(init_adapter, dim=backbone.dim, config=config)
-    shapes = named_leaves(jax.eval_shape(make, jax.random.key(0)))
-    sizes = {name: leaf.size for name, leaf in shapes.items()}
-    total = parameters = sum(sizes.values())
+    leaves = jax.tree.leaves(jax.eval_shape(make, jax.random.key(0)))
     macs = paper_adapter_macs(model)
-    if kind == "multi-resolution":
-        parameters = sum(
-            size
-            for name, size in sizes.items()
-            if name.startswith(("down.", "up.")) or name.endswith("conv.weight")
-        )
-    if kind == "mlp":
-        macs = 2 * macs + sum(size for name, size in sizes.items() if name.endswith("bias"))
-    time = None if raced is None else raced.slower(kind, "depthwise")
-    return AdapterCost(kind, parameters, total, macs, adapter_macs(model), time)
+    if kind == "mlp":  # the paper counts each weight twice here, and the biases
+        macs = 2 * macs + backbone.dim // 2 + backbone.dim
+    time = Spread.of(ratios(seconds, kind, "depthwise")) if seconds else None
+    parameters = sum(leaf.size for leaf in leaves)
+    return AdapterCost(kind, _PAPER_PARAMETERS[kind], parameters, macs, adapter_macs(model), time)
 
 
 def _adapter_call(kind: AdapterKind, images: int) -> Callable[[], Any]:

@@ -1,14 +1,13 @@
 """What is compared: the methods of the paper's Table 1, the rows of its Table 2, custom rows."""
 
 import dataclasses
-import functools
+import itertools
 import re
 import shlex
 from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
 from crisalad_jax.config.flags import parse_changes
-from crisalad_jax.config.part import Part
 from crisalad_jax.data.augmentations import Augmentation
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -20,7 +19,6 @@ from crisalad_jax.training.recipes import (
     mines_tuples,
     recipe,
     split_name,
-    with_part,
 )
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
@@ -61,51 +59,6 @@ METHODS: Mapping[str, ComparedMethod] = {
 """Methods in the order of Table 1. Those with a + have the head of a method whose own backbone is
 another, on CriSALAD's backbone and with its training. Other names are recipes or parts, without a
 second stage."""
-
-
-class Line(NamedTuple):
-    """What a name stands for."""
-
-    title: str
-    changed: str
-    """What an ablation changes with it, in words."""
-    run: str
-    """Name of the run that makes its model."""
-    training: TrainConfig
-    rerank: str | None = None
-
-
-def find_line(name: str, preset: str, *, from_nothing: bool, what: str = "--methods") -> Line:
-    """Look up a line of a table by its name.
-
-    Args:
-        name: of `METHODS` or `ABLATIONS`, or what `method_of` looks up.
-        preset: the size of the models.
-        from_nothing: whether training starts from random weights, as `from_scratch` has it.
-        what: what messages call the name.
-
-    Returns:
-        The line; Table 2's CriSALAD itself has its settings in place of what it changes.
-
-    Raises:
-        InputError: there is no such method, row, recipe or part, or it does not fit.
-
-    Example:
-        >>> find_line("no-encoder-step", "b14", from_nothing=False).changed
-        'cross-image encoder no, scheduler step'
-    """
-    if name not in ABLATIONS:
-        method = method_of(name, preset, what)
-        training = method_training(method.recipe, preset, from_nothing=from_nothing)
-        return Line(method.title, method.title, method.recipe, training, method.rerank)
-    training = ABLATIONS[name].training(preset, from_nothing=from_nothing)
-    settings = _settings(training)
-    base = _settings(ABLATIONS["crisalad"].training(preset, from_nothing=from_nothing))
-    changed = {each: word for each, word in settings.items() if word != base[each]} or settings
-    title = METHODS[name].title if name in METHODS else name
-    return Line(
-        title, ", ".join(f"{each} {word}" for each, word in changed.items()), name, training
-    )
 
 
 def method_of(name: str, preset: str, what: str = "--methods") -> ComparedMethod:
@@ -158,11 +111,11 @@ def is_method(name: str) -> bool:
     return (named and not mines_tuples(name)) or "+" in name or ":" in name
 
 
-def method_training(recipe_name: str, preset: str, *, from_nothing: bool) -> TrainConfig:
+def method_training(name: str, preset: str, *, from_nothing: bool) -> TrainConfig:
     """Look up how a method is trained in a comparison.
 
     Args:
-        recipe_name: what `recipe` looks up.
+        name: what `recipe` looks up.
         preset: the size of the model.
         from_nothing: whether training starts from random weights, as `from_scratch` has it.
 
@@ -171,42 +124,19 @@ def method_training(recipe_name: str, preset: str, *, from_nothing: bool) -> Tra
 
     Raises:
         InputError: what `recipe` raises.
-    """
-    if recipe_name in RECIPES:
-        config = recipe(preset, recipe_name)
-        return from_scratch(config) if from_nothing else config
-    base, part = split_name(recipe_name)
-    found = find_part(part, preset)
-    return training_with(found, preset, from_nothing=from_nothing, base=base or "crisalad")
-
-
-def training_with(
-    part: Part, preset: str, *, from_nothing: bool, base: str = "crisalad"
-) -> TrainConfig:
-    """Make a recipe with one part replaced by another of its kind.
-
-    Args:
-        part: the part.
-        preset: the size of the model.
-        from_nothing: whether training starts from random weights, as `from_scratch` has it.
-        base: name of the recipe.
-
-    Returns:
-        The configuration.
-
-    Raises:
-        InputError: what `with_part` raises.
 
     Example:
-        >>> training_with(find_part("light", "b14"), "b14", from_nothing=False).augmentation
+        >>> method_training("crisalad+light", "b14", from_nothing=True).augmentation
         LightAugmentConfig(...)
     """
-    config = with_part(recipe(preset, base), part)
+    config = recipe(preset, name)
     if not from_nothing:
         return config
-    config = from_scratch(config)
+    scratch = from_scratch(config)
+    if name in RECIPES or not isinstance(find_part(split_name(name)[1], preset), Augmentation):
+        return scratch
     # `from_scratch` sets its own augmentation, which would replace the one that is compared.
-    return with_part(config, part) if isinstance(part, Augmentation) else config
+    return dataclasses.replace(scratch, augmentation=config.augmentation)
 
 
 class Ablation(NamedTuple):
@@ -239,6 +169,18 @@ class Ablation(NamedTuple):
         )
         return dataclasses.replace(config, optimiser=optimiser)
 
+    def words(self, training: TrainConfig) -> str:
+        """Say what the row changes, of CriSALAD itself its settings; `training` is its recipe."""
+        settings = {
+            "adapter": self.adapter,
+            "cross-image encoder": "yes" if self.encoder else "no",
+            "learning rate": f"{training.optimiser.learning_rate:.2g}",
+            "scheduler": self.schedule,
+        }
+        words = [f"{name} {setting}" for name, setting in settings.items()]
+        changed = [own != usual for own, usual in zip(self, Ablation(), strict=True)]
+        return ", ".join(itertools.compress(words, changed) if any(changed) else words)
+
 
 ABLATIONS: Mapping[str, Ablation] = {
     "crisalad": Ablation(),
@@ -254,26 +196,15 @@ ABLATIONS: Mapping[str, Ablation] = {
 the step schedule, is also here with the linear one, which changes a single part."""
 
 
-def _settings(training: TrainConfig) -> dict[str, str]:
-    """Describe what Table 2 varies."""
-    return {
-        "adapter": adapter_kind(training.model),
-        "cross-image encoder": "yes" if training.model.cross_image.layers else "no",
-        "learning rate": f"{training.optimiser.learning_rate:.2g}",
-        "scheduler": training.optimiser.schedule,
-    }
-
-
 def adapter_kind(model: ModelConfig) -> str:
     """Return the kind of a model's adapters; "none" where its backbone has no such setting."""
     return getattr(model.backbone, "adapter", AdapterConfig(kind="none")).kind
 
 
-_SHAPE = "NAME: flag=value, flag=value"
-_ITEM = re.compile(r"""(?:[^,"']|"[^"]*"|'[^']*'|["'])+""")
-"""Text up to a comma that is in no quotes."""
-_LARGEST = 2**40
-"""Largest whole number, as of the command line's flags."""
+_FLAG = re.compile(
+    r"""\s*(?:--)?([\w.-]+)\s*=\s*(?=[^\s,])((?:[^,"']|"[^"]*"|'[^']*')+?)\s*(?:,|$)"""
+)
+"""A flag with its value, up to a comma that is in no quotes."""
 _FIXED = (
     *("seed", "preset", "mining.kind", "patience", "validate-every", "validation-size"),
     *("monitor", "save-top-k"),
@@ -306,34 +237,14 @@ class AblationRow(NamedTuple):
         Raises:
             InputError: no such recipe, flag or part, or a value that does not fit.
         """
-        try:
-            config = method_training(self.recipe, preset, from_nothing=from_nothing)
-        except InputError as error:
-            raise InputError(f"--row {self.name}: {error}") from error
-        config = self.changed(config, preset)
-        if config.mines:
-            raise InputError(
-                f"--row {self.name}: found recipe {self.recipe}, which mines tuples, expected one "
-                f"that trains on places, such as crisalad+{self.recipe}"
-            )
-        return config
+        found = method_of(self.recipe, preset, f"--row {self.name}: recipe").recipe
+        return self.changed(method_training(found, preset, from_nothing=from_nothing), preset)
 
     def changed(self, config: TrainConfig, preset: str) -> TrainConfig:
         """Put the row's changes into a configuration; raises as `training`."""
-        return _changed(self, config, preset)
-
-
-@functools.lru_cache(64)  # a comparison asks several times, and a parser takes half a second
-def _changed(row: AblationRow, config: TrainConfig, preset: str) -> TrainConfig:
-    arguments = []
-    for flag, value in row.flags:
-        try:
-            arguments += [f"--{flag}", *shlex.split(value)]
-        except ValueError as error:
-            raise InputError(
-                f"--row {row.name}: {flag}: found {value}, expected closed quotes"
-            ) from error
-    return parse_changes(config, arguments, preset, f"--row {row.name}")
+        pairs = ((f"--{flag}", *shlex.split(value)) for flag, value in self.flags)
+        arguments = [word for words in pairs for word in words]
+        return parse_changes(config, arguments, preset, f"--row {self.name}")
 
 
 def parse_row(text: str) -> AblationRow:
@@ -350,32 +261,26 @@ def parse_row(text: str) -> AblationRow:
         The row; flags and values are checked where its configuration is made.
 
     Raises:
-        InputError: the text has another shape.
+        InputError: the text has another shape, or a flag that is the same for all rows.
 
     Example:
         >>> parse_row("flat: recipe=salad, optimiser.learning_rate=1e-5, image_size=224 224").words
         'recipe=salad, optimiser.learning-rate=1e-5, model.image-size=224 224'
     """
-    name, colon, rest = (part.strip() for part in text.partition(":"))
-    items = [item for item in map(str.strip, _ITEM.findall(rest)) if item]
-    if not name or not colon or not items or set(name) & set("=,"):
-        raise InputError(f"--row: found {text!r}, expected {_SHAPE}")
-    flags: dict[str, str] = {}
-    for item in items:
-        flag, _, value = (part.strip() for part in item.partition("="))
-        flag = flag.removeprefix("--").replace("_", "-")
-        # As `train` has it, for the size is wanted often.
-        flag = "model.image-size" if flag == "image-size" else flag
-        if not flag or not value or flag in flags:
-            raise InputError(f"--row {name}: found {item!r}, expected flag=value, each flag once")
-        if flag in _FIXED:
-            raise InputError(
-                f"--row {name}: found {item!r}, expected another flag: all rows of a comparison "
-                f"have the same {flag}"
-            )
-        numbers = [word.lstrip("+-") for word in value.split()]
-        if any(word.isdecimal() and int(word) > _LARGEST for word in numbers):
-            raise InputError(f"--row {name}: {flag}: found {value}, expected at most 2**40")
-        flags[flag] = value
-    recipe = flags.pop("recipe", "crisalad")
-    return AblationRow(name, recipe, tuple(flags.items()))
+    name, _, rest = (part.strip() for part in text.partition(":"))
+    found = list(_FLAG.finditer(rest))
+    flags = {match[1].replace("_", "-"): match[2] for match in found}
+    is_whole = "".join(match.group() for match in found) == rest and len(flags) == len(found) > 0
+    if not is_whole or not re.fullmatch("[^=,]+", name):
+        raise InputError(
+            f"--row: found {text!r}, expected NAME: flag=value, flag=value, each flag once"
+        )
+    if fixed := [flag for flag in flags if flag in _FIXED]:
+        raise InputError(
+            f"--row {name}: found {', '.join(fixed)}, expected another flag: it is the same for "
+            "all rows of a comparison"
+        )
+    base = flags.pop("recipe", "crisalad")
+    # As `train` has it, for the size is wanted often.
+    short = {"image-size": "model.image-size"}
+    return AblationRow(name, base, tuple((short.get(flag, flag), flags[flag]) for flag in flags))

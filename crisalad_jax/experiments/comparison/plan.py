@@ -5,6 +5,7 @@ import functools
 import pathlib
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -27,8 +28,9 @@ from crisalad_jax.experiments.comparison.methods import (
     METHODS,
     AblationRow,
     adapter_kind,
-    find_line,
     is_method,
+    method_of,
+    method_training,
     parse_row,
 )
 from crisalad_jax.nn.config import ModelConfig
@@ -36,7 +38,6 @@ from crisalad_jax.retrieval.grouping import parse_groupings
 from crisalad_jax.retrieval.reranking import parse_reranking
 from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
-from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.optimiser import count_steps, warmup_length, with_short_warmup
 from crisalad_jax.training.run_files import checksum_of_places
 from crisalad_jax.training.trainable import count_trainable
@@ -57,7 +58,8 @@ class ComparisonConfig:
 
     kind: Literal["compare", "ablate"]
     names: tuple[str, ...]
-    """Names that `find_line` looks up, of `rows`, and any others that `weights` has."""
+    """Names of `METHODS`, `ABLATIONS`, recipes, parts and `rows`, and any others that `weights`
+    has."""
     test: tuple[str, ...]
     """Evaluation sets, of any layout that `open_benchmark` knows."""
     train: str | None = None
@@ -96,19 +98,14 @@ class ComparisonConfig:
         object.__setattr__(self, "names", names)
         check_count("batch size", self.batch_size)
         check_count("seeds", self.seeds)
+        if self.epochs is not None:
+            check_count("--epochs", self.epochs)
         parse_groupings(self.grouping.split(","))
-        if own and self.kind != "ablate":
-            raise InputError("--row: found rows with methods, expected them in an ablation alone")
-        _check_distinct("--row", (*ABLATIONS, *own), (*ABLATIONS, *own))
-        _check_distinct(self.flag, names, map(file_name, names))
-        _check_distinct("--test", self.test, self.test)
+        _check_distinct("--row", (*ABLATIONS, *own), str)
+        _check_distinct(self.flag, names, file_name)
+        _check_distinct("--test", self.test, str)
         for name in names:
-            if name not in self.models:
-                _draft(self, name)  # which raises for an unknown name
-        # A single retrieval cannot be re-ranked.
-        for flag, value, least in (("--epochs", self.epochs, 1), ("--rerank", self.rerank, 2)):
-            if value is not None and value < least:
-                raise InputError(f"{flag}: found {value}, expected at least {least}")
+            _draft(self, name)  # which raises for an unknown name
         if self.reference not in (None, *names):
             raise InputError(
                 f"--reference: found {self.reference}, expected one of those compared, "
@@ -131,18 +128,15 @@ class ComparisonConfig:
         return models_of(self.weights)
 
 
-def _check_distinct(flag: str, values: Sequence[str], folders: Iterable[str]) -> None:
-    """Check that no two values are for the same folder."""
-    first: dict[str, str] = {}
-    for value, folder in zip(values, folders, strict=True):
-        if folder in first:
-            raise InputError(
-                f"{flag}: found {first[folder]} and {value}, expected each once, under names that "
-                "differ in letters or digits"
-            )
-        first[folder] = value
-    if not first:
-        raise InputError(f"{flag}: found none, expected at least one")
+def _check_distinct(flag: str, values: Sequence[str], key: Callable[[str], str]) -> None:
+    """Check that there are values, and that no two are for the same folder."""
+    keys = list(map(key, values))
+    twice = [value for value in values if keys.count(key(value)) > 1]
+    if twice or not values:
+        raise InputError(
+            f"{flag}: found {' and '.join(twice) or 'none'}, expected at least one, and each once, "
+            "under names that differ in letters or digits"
+        )
 
 
 def file_name(name: str) -> str:
@@ -259,9 +253,18 @@ def prepare(
     benchmarks = [open_benchmark(path, on_bad_image=on_bad_image) for path in config.test]
     for benchmark in benchmarks:
         benchmark.ground_truth()
-    left_out: list[str] = []
+    left_out = []
     if on_bad_image == "skip":
-        benchmarks = [_readable(each, left_out, quiet) for each in benchmarks]
+        readable = [leave_out_unreadable(each, quiet=quiet) for each in benchmarks]
+        for was, now in zip(benchmarks, readable, strict=True):
+            queries = len(was.queries) - len(now.queries)
+            database = len(was.database) - len(now.database)
+            if queries or database:
+                left_out.append(
+                    f"{was.name}: unreadable and left out: {queries} queries and {database} "
+                    "database images."
+                )
+        benchmarks = readable
     variants = [_draft(config, name, files) for name in config.names]
     smallest = min(len(benchmark.database) for benchmark in benchmarks)
     for variant in variants:
@@ -278,58 +281,41 @@ def prepare(
     return Prepared(config, variants, benchmarks, on_bad_image, left_out)
 
 
-def _readable(benchmark: Benchmark, left_out: list[str], quiet: bool) -> Benchmark:
-    """Leave unreadable images out of a set, and say how many there were."""
-    readable = leave_out_unreadable(benchmark, quiet=quiet)
-    queries = len(benchmark.queries) - len(readable.queries)
-    database = len(benchmark.database) - len(readable.database)
-    if queries or database:
-        left_out.append(
-            f"{benchmark.name}: unreadable and left out: {queries} queries and {database} "
-            "database images."
-        )
-    return readable
-
-
 def _weights(config: ComparisonConfig) -> dict[str, pathlib.Path]:
-    """Map the names of runs to the files of weights that replace them."""
+    """Map names to the files of weights of their models."""
     files: dict[str, pathlib.Path] = {}
     for text in config.weights:
         name, separator, file = text.partition("=")
-        if not name or (separator and not file):
+        if name not in config.names or name in files or (separator and not file):
             raise InputError(
-                f"--weights: found {text!r}, expected NAME=FILE, or the NAME of a published model"
+                f"--weights: found {text!r}, expected NAME=FILE or the NAME of a published model, "
+                f"each once, of one of those compared, {', '.join(config.names)}"
             )
-        if name not in config.names:
-            raise InputError(
-                f"--weights: found {name!r}, expected one of those compared, "
-                f"{', '.join(config.names)}"
-            )
-        run = name if name in config.models else _draft(config, name).run
-        path = find_weights(file or name)
-        if files.setdefault(run, path) != path:
-            raise InputError(
-                f"--weights: found {files[run]} and {path} for {run}, expected one file: methods "
-                "of one recipe share their model"
-            )
+        files[name] = find_weights(file or name)
     return files
 
 
 def _draft(
-    config: ComparisonConfig, name: str, files: Mapping[str, pathlib.Path] | None = None
+    config: ComparisonConfig, name: str, files: Mapping[str, pathlib.Path] = MappingProxyType({})
 ) -> Variant:
     """Make a variant as its recipe defines it, or as its file holds it."""
-    rerank, row = None, next((row for row in map(parse_row, config.rows) if row.name == name), None)
+    size = {"preset": config.preset, "from_nothing": config.from_nothing}
+    row = next((row for row in map(parse_row, config.rows) if row.name == name), None)
+    rerank, title, changed, run = None, name, "", name
     if name in config.models:
-        title, changed, run, training = name, "", name, TrainConfig(trainable="head")
+        training = TrainConfig(trainable="head")
     elif row is not None:
-        title, changed, run = name, row.words, name
-        training = row.training(config.preset, from_nothing=config.from_nothing)
+        changed, training = row.words, row.training(**size)
+    elif name in ABLATIONS:
+        title = METHODS[name].title if name in METHODS else name
+        training = ABLATIONS[name].training(**size)
+        changed = ABLATIONS[name].words(training)
     else:
-        title, changed, run, training, rerank = find_line(
-            name, config.preset, from_nothing=config.from_nothing, what=config.flag
-        )
-    model, file = training.model, (files or {}).get(run)
+        title, run, rerank = method_of(name, config.preset, config.flag)
+        changed, training = title, method_training(run, **size)
+    model = training.model
+    # Methods of one recipe share its model, and its file unless they have their own.
+    file, run = (files[name], name) if name in files else (files.get(run), run)
     if file is not None:
         _, found = load_weights(file)
         if name not in config.models:
@@ -386,18 +372,15 @@ def _fitted(
     typical = int(np.clip(np.median(read(2, None).image_counts), 2, _VIEWS))
 
     def fit(variant: Variant) -> Variant:
-        recipe, row = variant.training, variant.row
-        views, epochs, warms_up = typical, config.epochs, True
-        if row is not None:
-            views = recipe.images_per_place if row.sets("images-per-place") else views
-            epochs = recipe.epochs if row.sets("epochs") else epochs
-            warms_up = not row.sets("optimiser.warmup-")
-        count = len(read(views, recipe.cities).place_id)
-        training = _of_size(recipe, count, views, epochs, from_nothing=config.from_nothing)
+        training, row = variant.training, variant.row
+        sets = row.sets if row is not None else lambda flag: False
+        views = training.images_per_place if sets("images-per-place") else typical
+        places = len(read(views, training.cities).place_id)
+        training = _of_size(config, training, places, views)
         if row is not None:
             training = row.changed(training, config.preset)
         places = read(training.min_images_of_place, training.cities)
-        if warms_up:
+        if not sets("optimiser.warmup-"):
             training = _with_short_warmup(variant, training, places)
         return dataclasses.replace(variant, training=training, places=places)
 
@@ -405,24 +388,29 @@ def _fitted(
 
 
 def _of_size(
-    training: TrainConfig, places: int, views: int, epochs: int | None, *, from_nothing: bool
+    config: ComparisonConfig, training: TrainConfig, places: int, views: int
 ) -> TrainConfig:
     """Fit a recipe to a training set of that many places, so that it can fill its batches.
 
-    From random weights all methods have the same number of images in a batch, and of steps.
+    From random weights all methods have the same number of images in a batch, and of steps, and a
+    classification loss takes a small set's places as classes, all in one group.
     """
-    grouping = training.loss.kind.grouping
-    changes: dict[str, Any] = {"patience": None, "epochs": epochs or training.epochs}
-    if from_nothing:
+    loss, grouping = training.loss, training.loss.kind.grouping
+    changes: dict[str, Any] = {"patience": None}
+    if config.from_nothing:
+        if grouping is not None:
+            classes = dataclasses.replace(grouping, kind="places", groups=1, steps=None)
+            loss = dataclasses.replace(loss, kind=loss.kind.with_grouping(classes))
         size = training.places_per_batch * training.images_per_place // views
         changes |= {
-            "epochs": epochs or EPOCHS,
-            "loss": _own_places(training.loss),
+            "epochs": config.epochs or EPOCHS,
+            "loss": loss,
             "places_per_batch": min(size, places),
             "images_per_place": views,
             "min_images": views,
         }
     else:
+        changes["epochs"] = config.epochs or training.epochs
         changes["places_per_batch"] = min(training.places_per_batch, places)
         changes["micro_batch"] = None
         if grouping is None:
@@ -432,20 +420,9 @@ def _of_size(
     return dataclasses.replace(training, **changes)
 
 
-def _own_places(loss: LossConfig) -> LossConfig:
-    """Make a classification loss take a small set's places as classes, all in one group."""
-    if loss.kind.grouping is None:
-        return loss
-    classes = dataclasses.replace(loss.kind.grouping, kind="places", groups=1, steps=None)
-    return dataclasses.replace(loss, kind=loss.kind.with_grouping(classes))
-
-
 def _with_short_warmup(variant: Variant, training: TrainConfig, places: Places) -> TrainConfig:
     """Shorten the warm-up of a short run, and say so."""
-    try:
-        per_epoch = PlaceBatches(training, places).steps_per_epoch
-    except InputError as error:
-        raise InputError(f"{variant.name}: {error}") from error
+    per_epoch = PlaceBatches(training, places).steps_per_epoch
     steps = per_epoch * training.epochs
     optimiser = with_short_warmup(training.optimiser, steps, per_epoch)
     if optimiser != training.optimiser and variant.trains:

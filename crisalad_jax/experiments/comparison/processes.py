@@ -70,12 +70,11 @@ def run_jobs(work: Callable[..., Any], jobs: int, say: Callable[[str], None]) ->
                 writer.close()
                 processes[reader] = process
             _pass_on(processes, stop.check, say)
-        except BaseException:  # they save their work; a second signal does not wait for it
+        finally:  # after an error they save their work; a second signal does not wait for it
             for process in processes.values():
                 process.terminate()
             for process in processes.values():
                 process.join()
-            raise
 
 
 def shares_of(platform: str, count: int, jobs: int, visible: str | None) -> list[Share]:
@@ -148,10 +147,9 @@ def _pass_on(
                 process.join()
                 del running[reader]
                 if process.exitcode:
-                    others = "the others go on" if running else "what is left is done here"
                     warn(
                         f"--jobs: found process {process.name} ended with code "
-                        f"{process.exitcode}; {others}"
+                        f"{process.exitcode}; its runs are left to the others"
                     )
                 continue
             if kind == "error":

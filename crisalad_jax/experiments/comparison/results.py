@@ -3,7 +3,7 @@
 import dataclasses
 import pathlib
 import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -14,13 +14,14 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
-from crisalad_jax.experiments.comparison.costs import NOTES, AdapterCost, Race
+from crisalad_jax.experiments.comparison.costs import NOTES, AdapterCost, Spread, ratios
 from crisalad_jax.experiments.comparison.plan import (
     Prepared,
     Variant,
     file_name,
     short_names,
 )
+from crisalad_jax.experiments.report.page import render
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.training.run_files import checksum_of_benchmark
 from crisalad_jax.training.trainable import count_trainable
@@ -45,15 +46,6 @@ def read_result(path: pathlib.Path) -> dict[str, Any]:
         raise InputError(f"{error}; delete it, and the same command makes it again") from error
 
 
-class Evaluation(NamedTuple):
-    """One of the evaluations of a run."""
-
-    variant: Variant
-    benchmark: Benchmark
-    key: str
-    """Everything that its result depends on besides the run's model."""
-
-
 @dataclasses.dataclass
 class RunResult:
     """All that a run has come to: `result.json` in its folder."""
@@ -70,6 +62,15 @@ class RunResult:
     def write(self, folder: pathlib.Path) -> None:
         """Write it into the run's folder, whole or not at all."""
         write_json(folder / "result.json", dataclasses.asdict(self))
+
+
+class Evaluation(NamedTuple):
+    """One of the evaluations of a run."""
+
+    key: str
+    """All that its result depends on besides the run's model."""
+    variant: Variant
+    benchmark: Benchmark
 
 
 class Run(NamedTuple):
@@ -118,15 +119,15 @@ def runs_of(prepared: Prepared, out: pathlib.Path) -> list[Run]:
     for variant in prepared.variants:
         sharing.setdefault(variant.run, []).append(variant)
     sets = [
-        (each, f"{each.name} {checksum_of_benchmark(each):08x}") for each in prepared.benchmarks
+        (f"{each.name} {checksum_of_benchmark(each):08x}", each) for each in prepared.benchmarks
     ]
     how = f"{config.grouping}, batches of {config.batch_size}"
     runs = []
     for name, variants in sharing.items():
         evaluations = [
-            Evaluation(variant, benchmark, f"{variant.rerank or 'one stage'}, {words}, {how}")
+            Evaluation(f"{variant.rerank or 'one stage'}, {words}, {how}", variant, benchmark)
             for variant in variants
-            for benchmark, words in sets
+            for words, benchmark in sets
         ]
         for seed in range(1 if variants[0].weights is not None else config.seeds):
             folder = out / file_name(name) / f"seed-{seed}"
@@ -235,14 +236,6 @@ class Recall(NamedTuple):
     """Difference to the reference; None of the reference itself."""
 
 
-class Spread(NamedTuple):
-    """What repeats of a measurement range over."""
-
-    median: float
-    least: float
-    most: float
-
-
 @brief
 class Row(NamedTuple):
     """A line of the table: a method under one grouping."""
@@ -285,15 +278,15 @@ class Summary(NamedTuple):
 
 def summarise(
     prepared: Prepared,
-    out: pathlib.Path,
+    runs: Sequence[Run],
     speed: Mapping[str, Any],
     adapters: Sequence[AdapterCost] = (),
 ) -> Summary:
     """Read the results of all runs, and summarise them by row.
 
     Args:
-        prepared: the comparison, whose runs are done.
-        out: its folder.
+        prepared: the comparison.
+        runs: its runs, which are done.
         speed: the times of all models: "rounds", "batch_size", "device", and whether seconds are
             "absolute".
         adapters: Table 3, for an ablation.
@@ -308,11 +301,13 @@ def summarise(
     sets = dict(zip(short_names(prepared.benchmarks), prepared.benchmarks, strict=True))
     variants = {variant.name: variant for variant in prepared.variants}
     reference = variants.get(config.reference or "crisalad", prepared.variants[0])
-    runs: dict[str, list[Run]] = {}
-    for run in runs_of(prepared, out):
-        runs.setdefault(run.variant.run, []).append(run)
+    results: dict[str, list[tuple[Run, RunResult]]] = {}
+    for run in runs:
+        results.setdefault(run.variant.run, []).append((run, run.read()))
     rows = [
-        row for variant in prepared.variants for row in _rows(variant, reference, sets, runs, speed)
+        row
+        for variant in prepared.variants
+        for row in _rows(variant, reference, sets, results, speed)
     ]
     notes = [*_notes(prepared, reference, speed), *(NOTES if adapters else ())]
     return Summary(
@@ -331,15 +326,16 @@ def _rows(
     variant: Variant,
     reference: Variant,
     sets: Mapping[str, Benchmark],
-    runs: Mapping[str, Sequence[Run]],
+    results: Mapping[str, Sequence[tuple[Run, RunResult]]],
     speed: Mapping[str, Any],
 ) -> Iterator[Row]:
     """Yield a variant's row under each grouping."""
-    raced = Race(speed["rounds"])
-    batch = statistics.median(raced.rounds[variant.run])
-    ours, others = (_training_seconds(runs[each.run]) for each in (variant, reference))
-    theirs = _ranks(reference, sets, runs[reference.run])
-    for grouping, ranks in _ranks(variant, sets, runs[variant.run]).items():
+    rounds = speed["rounds"]
+    batch = statistics.median(rounds[variant.run])
+    relative = statistics.median(ratios(rounds, variant.run, reference.run))
+    ours, others = (_training_seconds(results[each.run]) for each in (variant, reference))
+    theirs = _ranks(reference, sets, results[reference.run])
+    for grouping, ranks in _ranks(variant, sets, results[variant.run]).items():
         # A grouping that the reference lacks is compared with its first.
         other = theirs.get(grouping, next(iter(theirs.values())))
         recalls = {
@@ -355,29 +351,28 @@ def _rows(
             grouping,
             variant.model.descriptor_dim,
             recalls,
-            1 / raced.slower(variant.run, reference.run)[0],
+            1 / relative,
             speed["batch_size"] / batch if speed["absolute"] else None,
             *_parameters(variant),
             # Runs are not interleaved: one of the same seed met no more of the same load.
-            _spread([each / other for each in ours for other in others]),
-            _spread(ours),
+            Spread.of([each / other for each in ours for other in others]),
+            Spread.of(ours),
         )
 
 
 def _ranks(
-    variant: Variant, sets: Mapping[str, Benchmark], runs: Sequence[Run]
+    variant: Variant, sets: Mapping[str, Benchmark], results: Sequence[tuple[Run, RunResult]]
 ) -> dict[str, dict[str, np.ndarray]]:
     """Collect a variant's (seed, query) ranks of first right retrievals, by grouping and set."""
-    ranks: dict[str, dict[str, list[list[int]]]] = {}
-    for run in runs:
-        result = run.read()
-        own = [each.key for each in run.evaluations if each.variant is variant]
-        for name, key in zip(sets, own, strict=True):
-            for grouping, of_seed in result.ranks[key].items():
-                ranks.setdefault(grouping, {}).setdefault(name, []).append(of_seed)
+    run = results[0][0]
+    own = [each.key for each in run.evaluations if each.variant is variant]
+    groupings = results[0][1].ranks[own[0]]
     return {
-        grouping: {name: np.array(of_seeds) for name, of_seeds in of_sets.items()}
-        for grouping, of_sets in ranks.items()
+        grouping: {
+            name: np.array([result.ranks[key][grouping] for _, result in results])
+            for name, key in zip(sets, own, strict=True)
+        }
+        for grouping in groupings
     }
 
 
@@ -401,74 +396,43 @@ def recall_of(ranks: np.ndarray, k: int, reference: np.ndarray | None = None) ->
     )
 
 
-def _training_seconds(runs: Sequence[Run]) -> list[float]:
+def _training_seconds(results: Sequence[tuple[Run, RunResult]]) -> list[float]:
     """Return the seconds of the runs that had their device to themselves, if at least two had."""
-    records = [record for record in (run.read().training for run in runs) if record is not None]
+    records = [result.training for _, result in results if result.training is not None]
     alone = [each["steps"] * each["step_seconds"] for each in records if not each["beside"]]
     return alone if len(alone) > 1 else []
 
 
-def _spread(values: Sequence[float]) -> Spread | None:
-    return Spread(statistics.median(values), min(values), max(values)) if values else None
-
-
 def _parameters(variant: Variant) -> tuple[int, int | None]:
-    """Count all parameters, and those that were trained."""
+    """Count all parameters, and those that were trained; None for a model from a file."""
     total = sum(leaf.size for leaf in jax.tree.leaves(parameter_shapes(variant.model)))
     if variant.weights is not None:
         return total, None
-    if not variant.trains:
-        return total, 0
-    return total, count_trainable(variant.model, variant.training.trainable)
+    trains = variant.trains
+    return total, count_trainable(variant.model, variant.training.trainable) if trains else 0
 
 
 def _notes(prepared: Prepared, reference: Variant, speed: Mapping[str, Any]) -> list[str]:
     """Say how the numbers came about; docs/comparison.md says more."""
-    config, variants = prepared.config, prepared.variants
-    trained = [variant for variant in variants if variant.trains]
-    unlearnt = [v for v in variants if v.weights is None and not v.trains]
-    reranked = [variant for variant in variants if variant.rerank is not None]
-    over = "" if speed["absolute"] else f", over {reference.labels[0]}'s"
-    seeds = f"Seeds of all but models from files: {config.seeds}; weights after the last step."
-    notes = [
-        "Recalls in percent of all queries: the mean over the seeds ± their standard deviation, "
-        "and in brackets 95 % by bootstrap over the queries, as if they were independent. "
-        + (seeds if trained or unlearnt else "All models are from files."),
-        f"Images/s: describing batches of {speed['batch_size']}, each image alone, all models in "
-        f"turns, on {speed['device']}{over}." + (" Re-ranking comes on top." if reranked else ""),
-    ]
-    if len(variants) > 1:
-        notes.append(
-            f"Δ: recall less {reference.labels[0]}'s in points, with 95 % by a paired bootstrap "
-            f"over queries and seeds, {RESAMPLES:,} resamples. Better or worse: the interval "
-            "excludes 0."
-        )
-    if trained:
-        start = "nothing, by the recipe scratch" if config.from_nothing else "a given backbone"
-        sizes = {
-            variant.labels[0]: f"{variant.training.epochs} epochs, batches of "
-            f"{variant.training.places_per_batch} places x {variant.training.images_per_place}"
-            for variant in trained
-        }
-        same = len(set(sizes.values())) == 1
-        words = [sizes[trained[0].labels[0]]] if same else [f"{t}: {s}" for t, s in sizes.items()]
-        notes += [
-            f"Training time: steps x the median time of a step{over}, without compiling, of runs "
-            "that had their device to themselves, at least two: median and range.",
-            f"Trained from {start} on {pathlib.Path(config.train or '').name}. {'; '.join(words)}.",
-        ]
-    if config.grouping != "single":
-        notes.append(
-            f"A grouping other than single lets the {config.batch_size} images of a batch attend "
-            "to each other."
-        )
-    if reranked:
-        notes.append(f"Re-ranked, the first {config.rerank} retrievals: {_titles(reranked)}.")
-    if unlearnt:
-        start = ", here of random features" if config.from_nothing else ""
-        notes.append(f"Never trained, a vocabulary of features alone{start}: {_titles(unlearnt)}.")
-    return [*notes, *prepared.left_out]
+    variants, sizes = prepared.variants, {}
+    for variant in variants:
+        training = variant.training
+        size = training.epochs, training.places_per_batch, training.images_per_place
+        if variant.trains:
+            sizes.setdefault(size, {})[variant.labels[0]] = None
+    context = {
+        "config": prepared.config,
+        "variants": variants,
+        "reference": reference.labels[0],
+        "speed": speed,
+        "resamples": RESAMPLES,
+        "train": pathlib.Path(prepared.config.train or "").name,
+        "sizes": sizes,
+        "reranked": _titles(variant for variant in variants if variant.rerank is not None),
+        "unlearnt": _titles(v for v in variants if v.weights is None and not v.trains),
+    }
+    return [*render("notes.txt", context).splitlines(), *prepared.left_out]
 
 
-def _titles(variants: Sequence[Variant]) -> str:
-    return ", ".join(dict.fromkeys(variant.labels[0] for variant in variants))
+def _titles(variants: Iterable[Variant]) -> list[str]:
+    return list(dict.fromkeys(variant.labels[0] for variant in variants))

@@ -7,6 +7,7 @@ OUT/NAME/seed-S/start.safetensors     what it starts from, where a vocabulary wa
 OUT/speed.json, adapters.json         the timing of all models, and of the paper's adapters
 """
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -28,6 +29,7 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.comparison.costs import (
     AdapterCost,
+    Spread,
     adapter_costs,
     describing,
     machine,
@@ -36,7 +38,6 @@ from crisalad_jax.experiments.comparison.costs import (
 from crisalad_jax.experiments.comparison.plan import ComparisonConfig, Prepared, prepare
 from crisalad_jax.experiments.comparison.processes import run_jobs
 from crisalad_jax.experiments.comparison.results import (
-    Evaluation,
     Run,
     Summary,
     read_result,
@@ -48,9 +49,11 @@ from crisalad_jax.experiments.report.gallery import first_right_ranks
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.reranking import parse_reranking
+from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
-from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
+from crisalad_jax.training.start import with_vocabulary_of
+from crisalad_jax.training.vocabulary import needs_vocabulary
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target, real_path, split_markers, write_json
 from crisalad_jax.utils.locks import POLL, BusyFolderError, lock
@@ -115,12 +118,12 @@ def compare(
         if jobs > 1:
             run_jobs(functools.partial(work, quiet=True), jobs, say)
             warnings.simplefilter("ignore", Note)  # the processes have told them
-        prepared = work(say=say, quiet=quiet)
+        prepared, runs = work(say=say, quiet=quiet)
     with lock(out, wait=True):
-        speed = _speed(prepared, out, say, quiet)
+        speed = _speed(prepared, runs, out, say, quiet)
         # Table 3 belongs to the paper's rows.
         papers = config.kind == "ablate" and not config.rows
-        summary = summarise(prepared, out, speed, _adapter_costs(out) if papers else [])
+        summary = summarise(prepared, runs, speed, _adapter_costs(out) if papers else [])
         write_tables(summary, out)
     if page is not None:
         put_in_page(pathlib.Path(page), name, markdown(summary))
@@ -136,8 +139,8 @@ def carry_out(
     quiet: bool,
     jobs: int = 1,
     beside: bool = False,
-) -> Prepared:
-    """Prepare a comparison, make `out` its folder, and take its runs.
+) -> tuple[Prepared, list[Run]]:
+    """Prepare a comparison, make `out` its folder, and take all runs that nobody is at.
 
     Args:
         config: what to compare.
@@ -147,9 +150,6 @@ def carry_out(
         quiet: no progress bars.
         jobs: number of processes that do the same, for the time that is left.
         beside: whether they share this process's device.
-
-    Returns:
-        The comparison, all of whose runs are done.
 
     Raises:
         InputError: what `compare` raises.
@@ -163,53 +163,24 @@ def carry_out(
         )
     with lock(out, wait=True, quiet=quiet):
         write_json(path, to_plain(config))
-    take_runs(prepared, out, say=say, quiet=quiet, jobs=jobs, beside=beside)
-    return prepared
-
-
-def take_runs(
-    prepared: Prepared,
-    out: pathlib.Path,
-    *,
-    say: Say,
-    quiet: bool = False,
-    jobs: int = 1,
-    beside: bool = False,
-) -> None:
-    """Take runs that no other process is at, until all are done, by whomever.
-
-    Args:
-        prepared: the comparison, whose folder was claimed.
-        out: the folder.
-        say: is given a line before each run.
-        quiet: no progress bars.
-        jobs: number of processes that share the runs, for the time that is left.
-        beside: whether others share this process's device.
-
-    Raises:
-        InputError: what `fit` and `evaluate` raise, or a run was made with other settings.
-        Interrupted: what `fit` raises; the same call resumes.
-    """
-    runs, waits = runs_of(prepared, out), False
-    left = runs
-    start = prepared.config.backbone or "nothing"
+    runs = runs_of(prepared, out)
+    start = config.backbone or "nothing"
     say(f"{len(runs)} runs to compare; what is trained starts from {start}")
-    while left := [run for run in left if not run.is_done]:
+    waits = False
+    while left := [run for run in runs if not run.is_done]:
         began = False
         for run in left:
-            try:
-                with lock(run.folder):
-                    if not run.is_done:  # by another, a moment ago
-                        say(progress_words(run, runs, jobs))
-                        _complete(prepared, run, quiet, beside)
-                        began = True
-            except BusyFolderError:
-                continue
+            with contextlib.suppress(BusyFolderError), lock(run.folder):
+                if not run.is_done:  # by another, a moment ago
+                    say(progress_words(run, runs, jobs))
+                    _complete(prepared, run, quiet, beside)
+                    began = True
         if not began:
             if not waits:
                 say("waiting for the runs of other processes")
             waits = True
             time.sleep(POLL)
+    return prepared, runs
 
 
 def progress_words(run: Run, runs: Sequence[Run], jobs: int) -> str:
@@ -238,37 +209,28 @@ def progress_words(run: Run, runs: Sequence[Run], jobs: int) -> str:
 def _complete(prepared: Prepared, run: Run, quiet: bool, beside: bool) -> None:
     """Train a run's model and evaluate its variants, as far as results are missing."""
     remove_temporaries(run.folder)
-    params = _model(prepared, run, quiet, beside)
+    params, config = _model(prepared, run, quiet, beside), prepared.config
     result = run.read()
-    for evaluation in run.evaluations:
-        if evaluation.key not in result.ranks:
-            started = time.monotonic()
-            ranks = _ranks(prepared.config, evaluation, params, run.seed)
-            result.ranks[evaluation.key] = ranks
-            result.seconds += time.monotonic() - started
-            result.write(run.folder)
-
-
-def _ranks(
-    config: ComparisonConfig, evaluation: Evaluation, params: Crisalad, seed: int
-) -> dict[str, list[int]]:
-    """Evaluate a variant: for each grouping the rank of each query's first right retrieval."""
-    variant, benchmark = evaluation.variant, evaluation.benchmark
-    rerank = None if variant.rerank is None else parse_reranking(variant.rerank)
-    results = evaluate(
-        Model(params, variant.model),
-        benchmark,
-        groupings=config.grouping.split(","),
-        seed=seed,
-        seeds=1,
-        rerank=rerank,
-        reading=Reading(batch_size=config.batch_size, quiet=True),
-    )
-    return {
-        each.grouping: first_right_ranks(each.neighbours, benchmark.ground_truth()).tolist()
-        for each in results
-        if (each.rerank is None) == (rerank is None)
-    }
+    for key, variant, benchmark in run.evaluations:
+        if key in result.ranks:
+            continue
+        started = time.monotonic()
+        results = evaluate(
+            Model(params, variant.model),
+            benchmark,
+            groupings=config.grouping.split(","),
+            seed=run.seed,
+            seeds=1,
+            rerank=None if variant.rerank is None else parse_reranking(variant.rerank),
+            reading=Reading(batch_size=config.batch_size, quiet=True),
+        )
+        # Of a grouping with and without a second stage, the last is the one with it.
+        result.ranks[key] = {
+            each.grouping: first_right_ranks(each.neighbours, benchmark.ground_truth()).tolist()
+            for each in results
+        }
+        result.seconds += time.monotonic() - started
+        result.write(run.folder)
 
 
 def _model(prepared: Prepared, run: Run, quiet: bool, beside: bool = False) -> Crisalad:
@@ -278,13 +240,14 @@ def _model(prepared: Prepared, run: Run, quiet: bool, beside: bool = False) -> C
         return load_weights(variant.weights)[0]
     if result.training is not None:
         return load_weights(folder / "last.safetensors", expected=variant.model)[0]
-    start = _start(prepared, run, quiet)
+    training = dataclasses.replace(variant.training, seed=run.seed)
+    start = _start(prepared, run, training, quiet)
     result.write(run.folder)  # the settings, which a resumed training is checked by
     if not variant.trains:
         return start
     assert variant.places is not None
     fitted = fit(
-        dataclasses.replace(variant.training, seed=run.seed),
+        training,
         variant.places,
         folder,
         initial=start,
@@ -292,7 +255,7 @@ def _model(prepared: Prepared, run: Run, quiet: bool, beside: bool = False) -> C
         quiet=quiet,
     )
     # Repeated steps of a resumed run count once.
-    images = variant.training.places_per_batch * variant.training.images_per_place
+    images = training.places_per_batch * training.images_per_place
     records = read_metrics(folder / "metrics.jsonl")
     seconds = [images / r["images_per_second"] for r in records if "images_per_second" in r]
     result.training = {
@@ -306,9 +269,9 @@ def _model(prepared: Prepared, run: Run, quiet: bool, beside: bool = False) -> C
     return fitted.params
 
 
-def _start(prepared: Prepared, run: Run, quiet: bool) -> Crisalad:
+def _start(prepared: Prepared, run: Run, training: TrainConfig, quiet: bool) -> Crisalad:
     """Make the parameters that a run starts from, always the same for its seed."""
-    path, model = run.folder / "start.safetensors", run.variant.model
+    path, model = run.folder / "start.safetensors", training.model
     if path.exists():
         return load_weights(path, expected=model)[0]
     # The same split of the seed's key as in `fit`, so that both draw the same parameters.
@@ -316,26 +279,23 @@ def _start(prepared: Prepared, run: Run, quiet: bool) -> Crisalad:
     params = init_crisalad(key, model)
     if prepared.config.backbone is not None:
         params = with_backbone_of(params, model, prepared.config.backbone)
-    if needs_vocabulary(model):
-        places = run.variant.places
-        assert places is not None
-        params = with_vocabulary(
-            params,
-            model,
-            [places.path(image) for image in range(len(places.files))],
-            images=model.aggregator.centroid_images,
-            seed=run.seed,
-            on_bad_image=prepared.on_bad_image,
-            quiet=quiet,
-        )
-        save_weights(path, Model(params, model))
-    return params
+    if not needs_vocabulary(model):
+        return params
+    places = run.variant.places
+    assert places is not None
+    how = {"on_bad_image": prepared.on_bad_image, "quiet": quiet}
+    built = with_vocabulary_of(params, training, places, **how)
+    assert built is not None
+    save_weights(path, Model(built, model))
+    return built
 
 
-def _speed(prepared: Prepared, out: pathlib.Path, say: Say, quiet: bool) -> dict[str, Any]:
+def _speed(
+    prepared: Prepared, runs: Sequence[Run], out: pathlib.Path, say: Say, quiet: bool
+) -> dict[str, Any]:
     """Time a batch of every model in turns, unless that was done; variants of a run count once."""
     path, size = out / "speed.json", prepared.config.batch_size
-    models = {run.variant.run: run for run in runs_of(prepared, out) if run.seed == 0}
+    models = {run.variant.run: run for run in runs if run.seed == 0}
     if path.exists():
         record = read_result(path)
         if models.keys() <= record["rounds"].keys() and record["batch_size"] == size:
@@ -354,7 +314,7 @@ def _speed(prepared: Prepared, out: pathlib.Path, say: Say, quiet: bool) -> dict
         # A CPU's times depend on other load.
         "absolute": target().platform != "cpu",
         "batch_size": size,
-        "rounds": race(calls, _ROUNDS, quiet=quiet).rounds,
+        "rounds": race(calls, _ROUNDS, quiet=quiet),
     }
     write_json(path, record)
     return record
@@ -365,4 +325,6 @@ def _adapter_costs(out: pathlib.Path) -> list[AdapterCost]:
     path = out / "adapters.json"
     if not path.exists():
         write_json(path, {"costs": [cost._asdict() for cost in adapter_costs()]})
-    return [AdapterCost(**cost) for cost in read_result(path)["costs"]]
+    return [
+        AdapterCost(**cost | {"time": Spread(*cost["time"])}) for cost in read_result(path)["costs"]
+    ]

@@ -9,17 +9,16 @@ from typing import Any
 
 from crisalad_jax.evaluation.results import percent
 from crisalad_jax.experiments.comparison.costs import AdapterCost
-from crisalad_jax.experiments.comparison.results import KS, Recall, Row, Summary
+from crisalad_jax.experiments.comparison.results import KS, Difference, Recall, Row, Summary
 from crisalad_jax.experiments.report.page import PAGE, render
 from crisalad_jax.experiments.report.style import (
     COLOURS,
     GREY,
     INK,
     Drawing,
-    drawing,
+    chart,
     label_axes,
     new_figure,
-    save,
 )
 from crisalad_jax.experiments.report.tables import NOTHING, Cell, Table, no_formula, write_text
 from crisalad_jax.utils.files import split_markers, write_json
@@ -35,15 +34,7 @@ def write_tables(summary: Summary, out: pathlib.Path) -> None:
     charts = [_chart(summary, name, out, number) for number, name in enumerate(summary.sets)]
     context = {
         "title": _PAGE_TITLES[summary.kind],
-        "sets": list(summary.sets),
-        "facts": [
-            (
-                name,
-                f"{len(each.queries):,} queries, {len(each.database):,} database images, positive: "
-                f"{each.rule}",
-            )
-            for name, each in summary.sets.items()
-        ],
+        "sets": summary.sets,
         "reference": summary.reference,
         "charts": charts,
         "tables": tables_of(summary),
@@ -69,8 +60,6 @@ def tables_of(summary: Summary) -> dict[str, Table]:
     """Make the tables of a comparison by name; those without a row are left out."""
     first, *described = summary.headers
     columns = [(name, k) for name in summary.sets for k in KS]
-    # A model's costs do not depend on the grouping.
-    one_of_each = list({row.name: row for row in reversed(summary.rows)}.values())[::-1]
     recalls = [
         [
             Cell(_title(row, summary.rows)),
@@ -80,27 +69,32 @@ def tables_of(summary: Summary) -> dict[str, Table]:
         for row in summary.rows
     ]
     differences = [
-        [
-            Cell(_title(row, summary.rows)),
-            *(_difference(row.recalls[name][k]) for name, k in columns),
-        ]
+        [Cell(_title(row, summary.rows))]
+        + [_difference(row.recalls[name][k].difference) for name, k in columns]
         for row in summary.rows
-        if any(recall.difference for by_k in row.recalls.values() for recall in by_k.values())
+        if any(row.recalls[name][k].difference for name, k in columns)
     ]
-    costs = [[row.labels[0], *costs_of(row)] for row in one_of_each]
-    at_k = [f"{name} R@{k}" for name, k in columns]
+    # A model's costs do not depend on the grouping.
+    of_each = {row.name: row for row in reversed(summary.rows)}.values()
     tables = {
-        "recall": Table([first, *described, *at_k], recalls, labels=len(summary.headers)),
+        "recall": Table(
+            [first, *described, *(f"{name} R@{k}" for name, k in columns)],
+            recalls,
+            labels=len(summary.headers),
+        ),
         "differences": Table(
             [f"{first}, less {summary.reference}", *(f"{name} Δ R@{k}" for name, k in columns)],
             differences,
         ),
-        "costs": Table([first, *_COSTS], [list(map(Cell, cells)) for cells in costs]),
-        "adapters": Table(
-            _ADAPTERS, [list(map(Cell, adapter_cells(cost))) for cost in summary.adapters]
-        ),
+        "costs": _table_of([{first: row.labels[0]} | costs_of(row) for row in reversed(of_each)]),
+        "adapters": _table_of(list(map(adapter_cells, summary.adapters))),
     }
     return {name: table for name, table in tables.items() if table.rows}
+
+
+def _table_of(rows: Sequence[Mapping[str, str]]) -> Table:
+    """Make a table whose headers are the names of the rows' texts."""
+    return Table(list(rows[0]) if rows else [], [list(map(Cell, row.values())) for row in rows])
 
 
 def _title(row: Row, rows: Sequence[Row]) -> str:
@@ -117,10 +111,10 @@ def _recall(recall: Recall, name: str, k: int, rows: Sequence[Row]) -> Cell:
     return Cell(percent(recall.mean), note, "best" if recall.mean == best else "")
 
 
-def _difference(recall: Recall) -> Cell:
-    if recall.difference is None:
+def _difference(difference: Difference | None) -> Cell:
+    if difference is None:
         return Cell(NOTHING)
-    mean, (low, high), verdict = recall.difference
+    mean, (low, high), verdict = difference
     kind = {"better": "right", "worse": "wrong"}.get(verdict, "")
     return Cell(_points(mean), f"({_points(low)} to {_points(high)})\n{verdict}", kind)
 
@@ -131,23 +125,23 @@ def _points(fraction: float) -> str:
     return f"{round(100 * fraction, 1) + 0:+.1f}"
 
 
-_COSTS = ("dimension", "images/s", "parameters", "trained", "training time")
-
-
-def costs_of(row: Row) -> list[str]:
-    """Format a row's costs, in the columns of `_COSTS`: times over the reference's on a CPU."""
-    training = NOTHING
+def costs_of(row: Row) -> dict[str, str]:
+    """Format a row's costs by their headers: times over the reference's on a CPU."""
     if row.images_per_second is None:
         speed = f"{row.speed:.2f} x"
-        if row.training is not None:
-            training = _ratios(row.training)
+        training = NOTHING if row.training is None else _ratios(row.training)
     else:
-        speed = f"{row.images_per_second:.0f}"
+        speed, training = f"{row.images_per_second:.0f}", NOTHING
         if row.training_seconds is not None:
             minutes = (seconds / 60 for seconds in row.training_seconds)
             training = "{:.1f} min ({:.1f} to {:.1f})".format(*minutes)
-    trained = NOTHING if row.trained is None else f"{row.trained:,}"
-    return [f"{row.dimension:,}", speed, f"{row.parameters:,}", trained, training]
+    return {
+        "dimension": f"{row.dimension:,}",
+        "images/s": speed,
+        "parameters": f"{row.parameters:,}",
+        "trained": NOTHING if row.trained is None else f"{row.trained:,}",
+        "training time": training,
+    }
 
 
 def _ratios(times: Sequence[float]) -> str:
@@ -155,30 +149,19 @@ def _ratios(times: Sequence[float]) -> str:
     return "{:.2f} x ({:.2f} to {:.2f})".format(*times)
 
 
-_ADAPTERS = (
-    "adapter",
-    "parameters, paper",
-    "parameters here",
-    "MACs, paper (M)",
-    "FLOPs, paper (M)",
-    "true MACs (M)",
-    "time",
-)
-
-
-def adapter_cells(cost: AdapterCost) -> list[str]:
-    """Format the cost of an adapter, in the columns of `_ADAPTERS`."""
+def adapter_cells(cost: AdapterCost) -> dict[str, str]:
+    """Format the cost of an adapter by its headers."""
     # The only figure of the paper that no way of counting gives.
     printed = " (printed: 2,356,080)" if cost.adapter == "mlp" else ""
-    return [
-        cost.adapter,
-        f"{cost.paper_parameters:,}{printed}",
-        f"{cost.parameters:,}",
-        f"{cost.paper_macs / 1e6:.3f}",
-        f"{2 * cost.paper_macs / 1e6:.3f}",
-        f"{cost.macs / 1e6:.1f}",
-        NOTHING if cost.time is None else _ratios(cost.time),
-    ]
+    return {
+        "adapter": cost.adapter,
+        "parameters, paper": f"{cost.paper_parameters:,}{printed}",
+        "parameters here": f"{cost.parameters:,}",
+        "MACs, paper (M)": f"{cost.paper_macs / 1e6:.3f}",
+        "FLOPs, paper (M)": f"{2 * cost.paper_macs / 1e6:.3f}",
+        "true MACs (M)": f"{cost.macs / 1e6:.1f}",
+        "time": NOTHING if cost.time is None else _ratios(cost.time),
+    }
 
 
 def as_json(summary: Summary) -> dict[str, Any]:
@@ -236,18 +219,16 @@ def _chart(summary: Summary, name: str, out: pathlib.Path, number: int) -> Drawi
         colour = COLOURS[0] if row.labels[0] == summary.reference else INK
         low, high = (100 * end for end in recall.interval)
         axes.plot((low, high), (place, place), color=colour, linewidth=1.6, alpha=0.55)
-        seeds = [100 * value for value in recall.by_seed]
         ring = {"markersize": 4, "markerfacecolor": "none", "markeredgewidth": 0.8}
-        axes.plot(seeds, [place] * len(seeds), "o", color=GREY, clip_on=False, **ring)
+        for value in recall.by_seed:
+            axes.plot(100 * value, place, "o", color=GREY, clip_on=False, **ring)
         axes.plot(100 * recall.mean, place, "o", color=colour, markersize=6, clip_on=False)
     axes.set_yticks(range(len(titles)), titles, fontsize=9)
     axes.set_ylim(len(titles) - 0.5, -0.5)
     axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter("{x:g} %")
-    path = out / f"recall_{number}.png"
-    save(figure, path)
     means = "; ".join(
         f"{title} {percent(row.recalls[name][1].mean)} %"
         for title, row in zip(titles, summary.rows, strict=True)
     )
-    return drawing(path, f"R@1 on {name}: {means}")
+    return chart(figure, out / f"recall_{number}.png", f"R@1 on {name}: {means}")

@@ -1,52 +1,183 @@
-"""Pictures of a whole evaluation: a map of where images were taken, a matrix of similarities."""
+"""Charts: recall, precision and training curves, a map of positions, a matrix of similarities."""
 
-import os
-from collections.abc import Sequence
-from typing import NamedTuple
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap
 from matplotlib.ticker import MaxNLocator
 
+from crisalad_jax.evaluation.metrics import PrecisionRecall, right_retrievals
 from crisalad_jax.evaluation.similarity import cells_of
 from crisalad_jax.experiments.report.style import (
+    COLOURS,
     GREY,
     INK,
     PLAIN,
     RIGHT,
     UNMATCHED,
+    WIDE,
     WRONG,
+    Picture,
     label_axes,
     legend_above,
     new_figure,
-    save,
 )
+from crisalad_jax.experiments.report.tables import check_recalls
 from crisalad_jax.retrieval.neighbours import Neighbours
+from crisalad_jax.utils.errors import InputError
 
+OUTCOMES = ("wrong", "no positive", "right")
+"""What may become of a query: its first retrieval is wrong although another image is right, no
+database image is right, or it is right."""
+_DASHES = ("-", "--", ":")
+_RECALL = re.compile(r"R@(\d+)")
+# Key, title of the panel, and whether to smooth it because batches make it noisy.
+_LOSSES = (
+    ("loss", "loss", True),
+    ("easy_anchor_fraction", "share of anchors without a hard positive", True),
+    ("accuracy", "share of images nearest to their class", True),
+    ("learning_rate", "learning rate", False),
+)
 _TIMES, _LEAST = 10, 1000.0
 _SHARE, _COUNT = 0.02, 5
 _TRUTH = "#d55e00"
 
 
-class Verdicts(NamedTuple):
-    """Whether each query's first retrieval is right, and whether it could be."""
+def recall_curves(
+    curves: Mapping[str, Mapping[int, float]], title: str = "", *, wide: bool = False
+) -> Picture:
+    """Draw Recall@K in percent against K, one named line per curve.
 
-    right: Bool[np.ndarray, " q"]
-    matched: Bool[np.ndarray, " q"]
-    """Whether any database image is right for the query."""
+    Args:
+        curves: name -> K -> fraction of the queries, 0 to 1.
+        title: stands above the picture.
+        wide: whether it is for a page of its own, and not for one that telephones show too.
 
-    @property
-    def wrong(self) -> Bool[np.ndarray, " q"]:
-        """Mask of the queries whose first retrieval is wrong although another image is right."""
-        return self.matched & ~self.right
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: no curves, a curve without values, or a recall outside 0 to 1.
+    """
+    check_recalls("curves", curves)
+    figure = new_figure(4.5, title, **WIDE) if wide else new_figure(3.4, title)
+    axes = figure.add_subplot()
+    label_axes(axes, "K, database images retrieved", "Recall@K")
+    _draw_recalls(axes, curves)
+    axes.set_xticks(sorted({k for curve in curves.values() for k in curve}))
+    legend_above(figure)
+    return figure
 
 
-def judge(neighbours: Neighbours, positives: Sequence[Int[np.ndarray, " _"]]) -> Verdicts:
-    """Judge each query's first retrieval by the ground truth."""
-    first = neighbours.indices[:, 0]
-    right = [bool(np.isin(index, wanted)) for index, wanted in zip(first, positives, strict=True)]
-    return Verdicts(np.array(right, bool), np.array([np.size(p) > 0 for p in positives], bool))
+def precision_curves(curves: Mapping[str, PrecisionRecall]) -> Picture:
+    """Draw precision against recall in percent, one named line per curve."""
+    figure = new_figure(3.4)
+    axes = figure.add_subplot()
+    label_axes(axes, "recall", "precision")
+    for number, (name, curve) in enumerate(curves.items()):
+        _draw_line(axes, number, name, 100 * curve.recall, 100 * curve.precision)
+    axes.set(xlim=(0, 100), ylim=(0, 100))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter("{x:.0f} %")
+    legend_above(figure)
+    return figure
+
+
+def training_curves(records: Sequence[Mapping[str, int | float]], title: str = "") -> Picture:
+    """Draw a run: its losses, learning rate and validation recalls against the step.
+
+    A panel is drawn for each that the records hold. Long noisy series are pale under their running
+    mean.
+
+    Args:
+        records: the lines of metrics.jsonl, each with "step" and any of "loss",
+            "easy_anchor_fraction", "accuracy", "learning_rate", and "R@K" as a fraction of the
+            queries, 0 to 1.
+        title: stands above the picture.
+
+    Returns:
+        The figure.
+
+    Raises:
+        InputError: no record with a known value.
+    """
+    series = {
+        key: {int(record["step"]): record[key] for record in records if key in record}
+        for key in dict.fromkeys(key for record in records for key in record)
+    }
+    losses = [panel for panel in _LOSSES if panel[0] in series]
+    ks = sorted(int(match[1]) for match in map(_RECALL.fullmatch, series) if match)
+    recalls = {f"R@{k}": series[f"R@{k}"] for k in ks}
+    if not losses and not recalls:
+        raise InputError(
+            f"records: found {len(records)} without any of "
+            f"{', '.join(key for key, *_ in _LOSSES)} or R@K, expected at least one"
+        )
+    heights = [1.5] * len(losses) + [2.4] * bool(recalls)
+    figure = new_figure(sum(heights) + 0.45 * len(heights) + 0.6, title, **WIDE)
+    panels = figure.subplots(len(heights), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for axes, (key, label, noisy) in zip(panels, losses, strict=False):
+        label_axes(axes, "", "", title=label)
+        _draw_series(axes, series[key], noisy)
+    if recalls:
+        label_axes(panels[-1], "", "", title="validation Recall@K")
+        _draw_recalls(panels[-1], recalls)
+        panels[-1].legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1, 0.5))
+    panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+    panels[-1].set_xlabel("step", fontsize=10)
+    return figure
+
+
+def _draw_recalls(axes: Axes, curves: Mapping[str, Mapping[int, float]]) -> None:
+    """Draw fractions in percent; each line's name ends with its last value."""
+    for number, (name, curve) in enumerate(curves.items()):
+        at, values = zip(*sorted(curve.items()), strict=True)
+        percent = 100 * np.array(values)
+        _draw_line(axes, number, f"{name}  {percent[-1]:.1f}", at, percent, marker="o")
+    least = 100 * min(value for curve in curves.values() for value in curve.values())
+    # The scale starts at 0 unless the lines are high, where that would hide their differences.
+    axes.set_ylim(0 if least < 50 else None, None)
+    axes.yaxis.set_major_locator(MaxNLocator(6, integer=True, steps=(1, 2, 5, 10)))
+    axes.yaxis.set_major_formatter("{x:.0f} %")
+
+
+def _draw_line(axes: Axes, number: int, name: str, x: Any, y: Any, marker: str = "") -> None:
+    axes.plot(
+        x,
+        y,
+        color=COLOURS[number % len(COLOURS)],
+        linestyle=_DASHES[number // len(COLOURS) % len(_DASHES)],
+        linewidth=1.8,
+        marker=marker,
+        markersize=4.5,
+        label=name,
+        clip_on=False,  # markers at 100 % are not cut in half
+    )
+
+
+def _draw_series(axes: Axes, series: Mapping[int, float], noisy: bool) -> None:
+    steps, values = list(series), np.array(list(series.values()), float)
+    axes.yaxis.set_major_formatter("{x:g}")
+    window = len(values) // 20
+    if noisy and window >= 3:
+        axes.plot(steps, values, color=COLOURS[0], linewidth=0.7, alpha=0.3)
+        ones = np.ones(window)
+        counts = np.convolve(np.ones_like(values), ones, mode="same")
+        values = np.convolve(values, ones, mode="same") / counts
+    marker = "o" if len(values) == 1 else ""
+    axes.plot(steps, values, color=COLOURS[0], linewidth=1.8, marker=marker, markersize=4.5)
+
+
+def outcomes_of(neighbours: Neighbours, positives: Sequence[Int[np.ndarray, " _"]]) -> np.ndarray:
+    """Return what became of each query, one of `OUTCOMES`, by its first retrieval."""
+    right = right_retrievals(neighbours.indices[:, :1], positives)[:, 0]
+    matched = [len(wanted) > 0 for wanted in positives]
+    return np.where(right, "right", np.where(matched, "wrong", "no positive"))
 
 
 class Placed(NamedTuple):
@@ -80,25 +211,23 @@ def find_placed(
 
 
 def position_map(
-    path: str | os.PathLike[str],
     database: Float[np.ndarray, "n 2"],
     queries: Float[np.ndarray, "q 2"],
     first: Int[np.ndarray, " q"],
-    verdicts: Verdicts,
+    outcomes: np.ndarray,
     placed: Placed,
-) -> None:
-    """Write a PNG of a map in metres, with the same scale on both axes.
+) -> Picture:
+    """Draw a map in metres, with the same scale on both axes.
 
     The database is grey. A query is a green dot if its first retrieval is right, or a red cross,
     with a line to the retrieval, if it is wrong. It is a hollow triangle if no database image is
     right.
 
     Args:
-        path: the picture to write.
         database: positions in metres, east and north or any two axes.
         queries: those of the queries.
         first: the first retrieval of each query, an index of the database.
-        verdicts: whether it is right.
+        outcomes: what `outcomes_of` returns.
         placed: the images that are drawn.
     """
     points = np.concatenate([database[placed.database], queries[placed.queries]])
@@ -118,26 +247,26 @@ def position_map(
     size = float(np.clip(4000 / len(points), 2, 18))
     there = database[placed.database]
     axes.scatter(*there.T, s=2.5 * size, c=PLAIN, linewidths=0, label="database")
-    joined = verdicts.wrong & placed.queries & placed.database[first]
+    joined = (outcomes == "wrong") & placed.queries & placed.database[first]
     lines = np.stack([queries[joined], database[first[joined]]], axis=1)
     # Paler where there are many, so that what is below them shows.
     alpha = float(np.clip(60 / max(len(lines), 1), 0.05, 0.45))
     axes.add_collection(LineCollection(lines.tolist(), colors=WRONG, linewidths=0.6, alpha=alpha))
     hollow = {"facecolors": "none", "edgecolors": UNMATCHED, "marker": "^", "linewidths": 0.8}
-    for label, of_kind, marks in (
-        ("right", verdicts.right, {"c": RIGHT, "marker": "o", "linewidths": 0}),
-        ("wrong", verdicts.wrong, {"c": WRONG, "marker": "x", "linewidths": 1}),
-        ("no positive exists", ~verdicts.matched & ~verdicts.right, hollow),
+    for outcome, marks in (
+        ("right", {"c": RIGHT, "marker": "o", "linewidths": 0}),
+        ("wrong", {"c": WRONG, "marker": "x", "linewidths": 1}),
+        ("no positive", hollow),
     ):
-        mask = of_kind & placed.queries
+        mask = (outcomes == outcome) & placed.queries
         if mask.any():
-            axes.scatter(*queries[mask].T, s=1.4 * size, label=f"{label} ({mask.sum()})", **marks)
+            axes.scatter(*queries[mask].T, s=1.4 * size, label=f"{outcome} ({mask.sum()})", **marks)
     legend_above(figure)
-    save(figure, path)
+    return figure
 
 
 def truth_cells(
-    positives: Sequence[Int[np.ndarray, " _"]], database: int, shape: tuple[int, int]
+    positives: Sequence[Int[np.ndarray, " _"]], database: int, shape: tuple[int, ...]
 ) -> Bool[np.ndarray, "rows columns"]:
     """Mark the cells of a similarity map that hold a query and one of its positives.
 
@@ -154,55 +283,37 @@ def truth_cells(
 
 
 def similarity_matrix(
-    path: str | os.PathLike[str],
     similarities: Float[np.ndarray, "rows columns"],
     positives: Sequence[Int[np.ndarray, " _"]],
     first: Int[np.ndarray, " q"],
-    right: Bool[np.ndarray, " q"],
+    outcomes: np.ndarray,
     database: int,
-) -> None:
-    """Write a PNG of a similarity map, ground truth outlined, first retrievals as dots.
+) -> Picture:
+    """Draw a similarity map, ground truth tinted, first retrievals as dots.
 
     Args:
-        path: the picture to write.
         similarities: the map that `similarity.similarity_map` returns.
         positives: the database indices that are right for each of the q queries.
-        first: the first retrieval of each query; green where right, red where wrong.
-        right: whether it is right.
+        first: the first retrieval of each query; green where right, red where not.
+        outcomes: what `outcomes_of` returns.
         database: images in the database.
     """
     queries = len(positives)
-    rows, columns = similarities.shape
     # Cells are square, unless one side would be too narrow to read.
     ratio = min(max(queries / database, 0.3), 1.6)
     figure = new_figure(0.6 + 2.7 * ratio)
     axes = figure.add_subplot()
     label_axes(axes, "database image, in file order", "query, in file order")
     axes.grid(visible=False)
-    drawn = axes.imshow(
-        similarities,
-        cmap="Greys",
-        extent=(0, database, queries, 0),
-        aspect=ratio * database / queries,
-        interpolation="nearest",
-    )
-    outlines = _outlines(truth_cells(positives, database, (rows, columns)))
-    outlines *= (database / columns, queries / rows)
-    axes.add_collection(LineCollection(outlines.tolist(), colors=_TRUTH, linewidths=0.8))
+    where: Any = {"extent": (0, database, queries, 0), "aspect": ratio * database / queries}
+    drawn = axes.imshow(similarities, cmap="Greys", interpolation="nearest", **where)
+    truth = truth_cells(positives, database, similarities.shape)
+    tint = ListedColormap([_TRUTH])
+    axes.imshow(truth, tint, alpha=0.9 * truth, interpolation="nearest", **where)
     size = float(np.clip(600 / queries, 0.6, 30))
-    colours = np.where(right, RIGHT, WRONG).tolist()
+    colours = np.where(outcomes == "right", RIGHT, WRONG).tolist()
     axes.scatter(first + 0.5, np.arange(queries) + 0.5, s=size, c=colours, linewidths=0)
     bar = figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, pad=0.02)
     bar.set_label("similarity", fontsize=9, color=INK)
     bar.ax.tick_params(labelsize=8, labelcolor=INK, color=GREY)
-    save(figure, path)
-
-
-def _outlines(cells: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "line 2 2"]:
-    """Trace edges between marked and unmarked cells, as pairs of (x, y)."""
-    framed = np.pad(cells, 1)
-    y, x = np.nonzero(framed[1:] != framed[:-1])
-    across = np.stack([np.stack([x - 1, y], -1), np.stack([x, y], -1)], 1)
-    y, x = np.nonzero(framed[:, 1:] != framed[:, :-1])
-    down = np.stack([np.stack([x, y - 1], -1), np.stack([x, y], -1)], 1)
-    return np.concatenate([across, down]).astype(float)
+    return figure

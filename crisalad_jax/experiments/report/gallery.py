@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +16,15 @@ from crisalad_jax.data.images import read_image
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.evaluation.metrics import right_retrievals
 from crisalad_jax.evaluation.results import GroupingResult
-from crisalad_jax.experiments.report.style import GREY, INK, RIGHT, WRONG, Picture, fit_width, save
+from crisalad_jax.experiments.report.style import (
+    GREY,
+    INK,
+    RIGHT,
+    WRONG,
+    Picture,
+    new_figure,
+    save,
+)
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
@@ -24,8 +32,8 @@ from crisalad_jax.utils.locks import staged_folder
 from crisalad_jax.utils.output import counted, warn
 
 _DPI = 120
-_WIDTH, _GAP, _MARGIN = 1.7, 0.16, 0.25
-"""Inches of a picture, between pictures, and around all."""
+_WIDTH, _GAP = 1.7, 0.26
+"""Inches of a picture, and between pictures."""
 _BOX = 0xC4
 """Grey of a picture that is not there."""
 _NAME = 28
@@ -86,23 +94,22 @@ def show_retrievals(
             f"{'a result of evaluate' if is_result else 'answers of a map'}, expected it for "
             "results alone"
         )
-    indices = found.neighbours.indices[:, :columns]
-    if benchmark is None:
-        chosen = _evenly(np.arange(len(indices)), min(rows, len(indices)))
+    count = len(found.neighbours.indices)
+    if queries is not None:
+        chosen = list(queries)
+    elif benchmark is None:
+        chosen = evenly(np.arange(count), rows)
     else:
         right = first_right_ranks(found.neighbours, benchmark.ground_truth()) == 1
         chosen = _half_right(right, rows)
-    if queries is not None:
-        chosen = list(queries)
-        if not chosen or not all(0 <= query < len(indices) for query in chosen):
-            raise InputError(
-                f"queries: found {chosen}, expected numbers from 0 to {len(indices) - 1}"
-            )
-    tiles = [_row(found, benchmark, query, indices[query], root) for query in chosen]
-    legend = "query, then retrievals: rank, similarity"
-    if is_result:
-        legend += ", \N{CHECK MARK} right, \N{BALLOT X} wrong"
-    return _draw(tiles, title, legend, strict=is_result)
+    if not chosen or not all(0 <= query < count for query in chosen):
+        raise InputError(f"queries: found {chosen}, expected numbers from 0 to {count - 1}")
+    if isinstance(found, Answers):
+        tiles = [_answers(found, query, columns, root) for query in chosen]
+    else:
+        assert benchmark is not None
+        tiles = [_results(found, benchmark, query, columns) for query in chosen]
+    return _draw([list(row) for row in tiles], title, strict=is_result)
 
 
 def write_galleries(
@@ -153,18 +160,17 @@ def thumbnail(image: UInt8[np.ndarray, "h w 3"], side: int) -> UInt8[np.ndarray,
     return resize_image(image, (height, width))
 
 
+def evenly(queries: Int[np.ndarray, " n"], most: int) -> list[int]:
+    """Choose at most so many queries, evenly spaced from the first to the last."""
+    places = np.linspace(0, len(queries) - 1, min(most, len(queries))).round().astype(int)
+    return queries[places].tolist()
+
+
 def _half_right(right: Bool[np.ndarray, " q"], rows: int) -> list[int]:
     """Choose right queries, then wrong ones: half each, more of one kind if the other is short."""
     good, bad = np.flatnonzero(right), np.flatnonzero(~right)
     good_count = min(len(good), max(rows - rows // 2, rows - len(bad)))
-    bad_count = min(len(bad), rows - good_count)
-    return _evenly(good, good_count) + _evenly(bad, bad_count)
-
-
-def _evenly(queries: Int[np.ndarray, " n"], count: int) -> list[int]:
-    """Choose `count` queries, evenly spaced from the first to the last."""
-    places = np.linspace(0, len(queries) - 1, count).round().astype(int)
-    return queries[places].tolist()
+    return evenly(good, good_count) + evenly(bad, rows - good_count)
 
 
 class _Tile(NamedTuple):
@@ -177,65 +183,67 @@ class _Tile(NamedTuple):
     name: str = ""
 
 
-def _row(
-    found: Answers | GroupingResult,
-    benchmark: Benchmark | None,
-    query: int,
-    indices: Int[np.ndarray, " k"],
-    root: str | os.PathLike[str] | None,
-) -> list[_Tile]:
-    """List the tiles of a query and its retrievals."""
-    captions = [
-        f"{rank}   {similarity:.3f}"
-        for rank, similarity in enumerate(found.neighbours.similarities[query][: len(indices)], 1)
-    ]
-    if isinstance(found, Answers):
-        name = found.names[query] if found.known[query] else f"unknown: {found.names[query]}"
-        images = [found.images[index] for index in indices]
-        return [_Tile(found.queries[query], f"query {query}", name=name)] + [
-            _Tile(Path(image.root if root is None else root) / image.name, caption, name=image.name)
-            for image, caption in zip(images, captions, strict=True)
-        ]
-    assert benchmark is not None
+def _captions(found: Answers | GroupingResult, query: int, columns: int) -> Iterator[tuple]:
+    """Yield the number of each retrieval, and its rank and similarity."""
+    pairs = zip(*(each[query, :columns] for each in found.neighbours), strict=True)
+    for rank, (index, similarity) in enumerate(pairs, 1):
+        yield index, f"{rank}   {similarity:.3f}"
+
+
+def _answers(
+    found: Answers, query: int, columns: int, root: str | os.PathLike[str] | None
+) -> Iterator[_Tile]:
+    """Yield the tiles of a query and what a map answers."""
+    name = found.names[query] if found.known[query] else f"unknown: {found.names[query]}"
+    yield _Tile(found.queries[query], f"query {query}", name=name)
+    for index, caption in _captions(found, query, columns):
+        image = found.images[index]
+        file = Path(image.root if root is None else root) / image.name
+        yield _Tile(file, caption, name=image.name)
+
+
+def _results(
+    found: GroupingResult, benchmark: Benchmark, query: int, columns: int
+) -> Iterator[_Tile]:
+    """Yield the tiles of a query and its retrievals, right and wrong."""
     positives = benchmark.ground_truth()[query]
     note = "" if len(positives) else ", no positive exists"
-    # The sign is for readers who cannot tell green from red.
-    signs = {True: ("\N{CHECK MARK}", RIGHT), False: ("\N{BALLOT X}", WRONG)}
-    tiles = [_Tile(benchmark.queries[query], f"query {query}{note}")]
-    for index, caption in zip(indices, captions, strict=True):
-        sign, colour = signs[bool(index in positives)]
-        tiles.append(_Tile(benchmark.database[index], f"{caption}   {sign}", colour))
-    return tiles
+    yield _Tile(benchmark.queries[query], f"query {query}{note}")
+    for index, caption in _captions(found, query, columns):
+        # The sign is for readers who cannot tell green from red.
+        is_right = index in positives
+        sign, colour = ("\N{CHECK MARK}", RIGHT) if is_right else ("\N{BALLOT X}", WRONG)
+        yield _Tile(benchmark.database[index], f"{caption}   {sign}", colour)
 
 
-def _draw(rows: Sequence[Sequence[_Tile]], title: str, legend: str, *, strict: bool) -> Picture:
+def _draw(rows: Sequence[Sequence[_Tile]], title: str, *, strict: bool) -> Picture:
     """Draw tiles in rows; unless `strict`, a retrieval that cannot be read is a grey box."""
-    images = _read([tile.file for row in rows for tile in row[:1]], strict=True)
-    images |= _read([tile.file for row in rows for tile in row[1:]], strict=strict)
+    images = {row[0].file: _read(row[0].file) for row in rows}
+    lost = []
+    for file in dict.fromkeys(tile.file for row in rows for tile in row[1:]):
+        try:
+            images[file] = _read(file)
+        except InputError as error:
+            if strict:
+                raise
+            lost.append(error)
+            images[file] = np.full((round(90 * _WIDTH), round(_DPI * _WIDTH), 3), _BOX, np.uint8)
+    if lost:
+        warn(
+            f"{counted(len(lost), 'picture')} shown as a grey box, as of {lost[0]}; --map-images "
+            "(root=) says where else"
+        )
     aspect = float(np.median([image.shape[0] / image.shape[1] for image in images.values()]))
-    height, columns = _WIDTH * min(max(aspect, 0.5), 1.5), len(rows[0])
-    # In inches. Frames and captions are drawn into the gaps.
-    between = 0.48 if any(tile.name for row in rows for tile in row) else 0.34
-    head = 0.85 if title else 0.55
-    size = (
-        2 * _MARGIN + columns * _WIDTH + (columns - 1) * _GAP,
-        head + len(rows) * (height + between) + _MARGIN,
-    )
-    figure = Picture(figsize=size, dpi=_DPI)
-    left, top = _MARGIN / size[0], 1 - 0.2 / size[1]
-    if title:
-        fit_width(figure.text(left, top, title, fontsize=13, color=INK, va="top"), figure)
-        top -= 0.3 / size[1]
-    figure.text(left, top, legend, fontsize=9, color=GREY, va="top")
+    height = _WIDTH * min(max(aspect, 0.5), 1.5)
+    # Frames and captions are drawn between the rows.
+    below = 0.6 if any(tile.name for row in rows for tile in row) else 0.44
+    size = len(rows) * (height + below) + (0.65 if title else 0.35)
+    columns = len(rows[0])
+    figure = new_figure(size, title, width=columns * (_WIDTH + _GAP), dpi=_DPI)
+    legend = "query, then retrievals: rank, similarity"
+    legend += ", \N{CHECK MARK} right, \N{BALLOT X} wrong" if strict else ""
+    figure.supxlabel(legend, fontsize=9, color=GREY, x=0.02, ha="left")
     panels = figure.subplots(len(rows), columns, squeeze=False)
-    figure.subplots_adjust(
-        left=left,
-        right=1 - left,
-        top=1 - head / size[1],
-        bottom=(_MARGIN + between) / size[1],
-        wspace=_GAP / _WIDTH,
-        hspace=between / height,
-    )
     for row, of_row in zip(rows, panels, strict=True):
         for tile, axes in zip(row, of_row, strict=True):
             _draw_tile(axes, tile, images[tile.file])
@@ -248,42 +256,23 @@ def _draw_tile(axes: Axes, tile: _Tile, image: UInt8[np.ndarray, "h w 3"]) -> No
     axes.set_xlabel(tile.caption, fontsize=9, color=tile.colour, loc="left", labelpad=4)
     plain = tile.colour == INK
     axes.spines[:].set(color=GREY if plain else tile.colour, linewidth=0.5 if plain else 3)
-    axes.annotate(
-        shortened(tile.name, _NAME),
-        (0, 0),
-        xycoords="axes fraction",
-        xytext=(0, -18),
-        textcoords="offset points",
-        va="top",
-        fontsize=7,
-        family="monospace",
-        color=GREY,
-        parse_math=False,  # a dollar sign in a name starts no formula
-    )
-
-
-def _read(files: Sequence[Path], *, strict: bool) -> dict[Path, UInt8[np.ndarray, "h w 3"]]:
-    """Read pictures small; unless `strict`, those that cannot be read are grey boxes, with a note.
-
-    Raises:
-        InputError: a picture cannot be read, if `strict`.
-    """
-    side = round(_WIDTH * _DPI)
-    images, lost = {}, []
-    for file in dict.fromkeys(files):
-        try:
-            images[file] = thumbnail(read_image(file, bit_depth="contrast-stretch"), side)
-        except InputError as error:
-            if strict:
-                raise
-            lost.append(error)
-            images[file] = np.full((round(0.75 * side), side, 3), _BOX, np.uint8)
-    if lost:
-        warn(
-            f"{counted(len(lost), 'picture')} shown as a grey box, as of {lost[0]}; --map-images "
-            "(root=) says where else"
+    if tile.name:
+        axes.annotate(
+            shortened(tile.name, _NAME),
+            (0, 0),
+            xycoords="axes fraction",
+            xytext=(0, -18),
+            textcoords="offset points",
+            va="top",
+            fontsize=7,
+            family="monospace",
+            color=GREY,
+            parse_math=False,  # a dollar sign in a name starts no formula
         )
-    return images
+
+
+def _read(file: Path) -> UInt8[np.ndarray, "h w 3"]:
+    return thumbnail(read_image(file, bit_depth="contrast-stretch"), round(_DPI * _WIDTH))
 
 
 def shortened(text: str, most: int) -> str:

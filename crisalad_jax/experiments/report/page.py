@@ -6,7 +6,6 @@ import json
 import math
 import os
 import pathlib
-import posixpath
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -19,48 +18,38 @@ from crisalad_jax.data.metres import flattened
 from crisalad_jax.evaluation.operating_point import OperatingPoint, caveats
 from crisalad_jax.evaluation.results import ANY, GroupingResult, percent
 from crisalad_jax.experiments.report.charts import (
+    OUTCOMES,
     Placed,
-    Verdicts,
     find_placed,
-    judge,
+    outcomes_of,
     position_map,
+    precision_curves,
+    recall_curves,
     similarity_matrix,
 )
-from crisalad_jax.experiments.report.curves import precision_curves, recall_curves
-from crisalad_jax.experiments.report.gallery import first_right_ranks, thumbnail
-from crisalad_jax.experiments.report.style import Drawing, drawing, photograph
+from crisalad_jax.experiments.report.gallery import evenly, first_right_ranks, thumbnail
+from crisalad_jax.experiments.report.style import Drawing, chart, illustration, photograph
 from crisalad_jax.experiments.report.tables import (
     Cell,
     Table,
-    check_fractions,
+    check_recalls,
     no_formula,
     write_text,
 )
-from crisalad_jax.experiments.report.transport import (
-    CLUSTER_COLOURS,
-    draw_clusters,
-    draw_dustbin,
-    heat_gradient,
-    heat_range,
-    strongest_clusters,
-    transport_of,
-)
+from crisalad_jax.experiments.report.transport import draw_transport, transport_of
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.retrieval.grouping import GROUPINGS, Grouping
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import staged_folder
 from crisalad_jax.utils.output import printable
 
 PAGE = "index.html"
-OUTCOMES = ("wrong", "no positive", "right")
-"""What became of a query, in the order of the page's table."""
 _DASH = "\N{EN DASH}"
 _RETRIEVALS = 4
 """Number of retrievals shown for each query."""
 _SHOWN = 6
-"""Largest number of queries shown of each kind."""
+"""Largest number of queries shown of each outcome."""
 _THUMBNAIL = 320
 
 
@@ -94,45 +83,33 @@ def write_report(
         InputError: no groupings or ground truth, a recall outside 0 to 1, an image that cannot be
             read, or files that cannot be written: then none of them is.
     """
-    if not groupings:
-        raise InputError("groupings: found none, expected at least one")
-    for grouping in groupings:
-        check_fractions(grouping.label, grouping.recalls)
+    check_recalls("groupings", {grouping.label: grouping.recalls for grouping in groupings})
     main = groupings[0]
     subject = Subject.of(benchmark, main.neighbours)
-    placed, shown = subject.placed, subject.choose()
+    shown = subject.choose()
     with staged_folder(out) as folder:
         write_results(folder / "results.csv", subject, groupings)
         context = {
             "title": benchmark.name,
             "model_name": model_name,
-            "benchmark": benchmark,
+            "subject": subject,
             "config": config,
             "groupings": groupings,
             "main": main,
-            "unmatched": int((~subject.verdicts.matched).sum()),
             "table": _table(groupings),
-            "points": [
-                (g.label, f"{100 * g.operating_point.asked:g}", caveats(g.operating_point))
-                for g in groupings
-                if g.operating_point is not None
-            ],
+            "caveats": caveats,
             "meanings": _meanings(groupings),
             "depends": params.cross_image is not None,
             "curves": _curves(folder, groupings),
-            "galleries": list(_galleries(subject, shown)),
+            "galleries": {
+                outcome: [_photographs(subject, query) for query in chosen]
+                for outcome, chosen in shown.items()
+                if chosen
+            },
             "results": page_rows(subject, main),
             "outcomes": OUTCOMES,
-            "kept": main.neighbours.indices.shape[1],
-            "metres": placed is not None,
             "map": _map(folder, subject),
-            "lost": placed
-            and {
-                "queries": int((~placed.queries).sum()),
-                "database": int((~placed.database).sum()),
-                "limit": placed.limit,
-            },
-            "transport": _transport(subject, shown, params, config),
+            "transport": list(_transport(subject, shown, params, config)),
             "matrix": _matrix(folder, subject, similarities),
             "settings": json.dumps(settings, indent=2),
         }
@@ -141,12 +118,12 @@ def write_report(
 
 
 def render(template: str, context: Mapping[str, Any]) -> str:
-    """Render a page from a template; everything in the context is escaped, names of files too."""
+    """Render a template; in a page everything in the context is escaped, names of files too."""
     import jinja2
 
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("crisalad_jax.experiments.report"),
-        autoescape=True,
+        autoescape=jinja2.select_autoescape(),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -160,7 +137,8 @@ class Subject(NamedTuple):
 
     benchmark: Benchmark
     neighbours: Neighbours
-    verdicts: Verdicts
+    outcomes: np.ndarray
+    """What became of each query, one of `OUTCOMES`."""
     placed: Placed | None
     """Which images have a likely position; None where none has one."""
 
@@ -169,7 +147,7 @@ class Subject(NamedTuple):
         """Judge an evaluation's retrievals and positions."""
         places, asked = benchmark.database_positions, benchmark.query_positions
         placed = None if places is None or asked is None else find_placed(places, asked)
-        return cls(benchmark, neighbours, judge(neighbours, benchmark.ground_truth()), placed)
+        return cls(benchmark, neighbours, outcomes_of(neighbours, benchmark.ground_truth()), placed)
 
     def name(self, path: pathlib.Path) -> str:
         """Name a file of the benchmark by its path in the benchmark's folder."""
@@ -186,19 +164,19 @@ class Subject(NamedTuple):
         return math.dist(asked[query], places[index])
 
     def choose(self, most: int = _SHOWN) -> dict[str, list[int]]:
-        """Choose at most `most` queries of each kind, by similarity and then in file order.
+        """Choose at most `most` queries of each outcome, by similarity and then in file order.
 
         Wrong queries and those without a positive are the most confident ones, which would do the
         most harm. Right queries are spread evenly from the most to the least confident.
         """
         order = np.argsort(-self.neighbours.similarities[:, 0], kind="stable")
-        verdicts = self.verdicts
-        right = order[verdicts.right[order]]
-        spread = np.linspace(0, len(right) - 1, min(most, len(right))).round().astype(int)
+        right, wrong, unmatched = (
+            order[self.outcomes[order] == outcome] for outcome in ("right", "wrong", "no positive")
+        )
         return {
-            "right": right[spread].tolist(),
-            "wrong": order[verdicts.wrong[order]][:most].tolist(),
-            "unmatched": order[~verdicts.matched[order]][:most].tolist(),
+            "right": evenly(right, most),
+            "wrong": wrong[:most].tolist(),
+            "no positive": unmatched[:most].tolist(),
         }
 
 
@@ -258,129 +236,74 @@ def _meanings(groupings: Sequence[GroupingResult]) -> dict[str, str]:
 def _curves(folder: pathlib.Path, groupings: Sequence[GroupingResult]) -> list[Drawing]:
     """Draw recall by K and, where it is known, precision by recall: a line for each grouping."""
     best = "; ".join(f"{g.label} {percent(g.recalls[min(g.recalls)])} %" for g in groupings)
-    path = folder / "recall_curves.png"
-    recall_curves(path, {g.label: g.recalls for g in groupings})
-    drawings = [drawing(path, f"Recall at K against K. At K = 1: {best}")]
+    recall = recall_curves({g.label: g.recalls for g in groupings})
+    words = f"Recall at K against K. At K = 1: {best}"
+    drawings = [chart(recall, folder / "recall_curves.png", words)]
     known = {g.label: g.precision_recall for g in groupings if g.precision_recall is not None}
     if known:
-        path = folder / "precision_recall.png"
-        precision_curves(path, known)
-        drawings.append(drawing(path, f"Precision against recall: {', '.join(known)}"))
+        words = f"Precision against recall: {', '.join(known)}"
+        drawings.append(chart(precision_curves(known), folder / "precision_recall.png", words))
     return drawings
 
 
-class QueryResult(NamedTuple):
-    """What one query found under one grouping."""
+def query_results(subject: Subject, grouping: GroupingResult) -> Iterator[dict[str, Any]]:
+    """Yield what each query found under a grouping, in their order, as rows of results.csv.
 
-    query: str
-    """Its file, by the path in the set's folder."""
-    outcome: str
-    """One of `OUTCOMES`."""
-    rank: int | None
-    """Rank of the first right retrieval, from 1; None where none of those kept is right."""
-    retrieval: str
-    """File of the first retrieval."""
-    similarity: float
-    metres: float | None
-    """Metres from the query to the first retrieval; None without known positions of both."""
-
-
-def query_results(subject: Subject, grouping: GroupingResult) -> Iterator[QueryResult]:
-    """Yield the result of every query under a grouping, in the order of the queries."""
+    Files are named by their path in the set's folder, with control characters escaped.
+    """
     benchmark, neighbours = subject.benchmark, grouping.neighbours
-    positives = benchmark.ground_truth()
-    ranks = first_right_ranks(neighbours, positives).tolist()
-    for query, (path, rank) in enumerate(zip(benchmark.queries, ranks, strict=True)):
+    outcomes = outcomes_of(neighbours, benchmark.ground_truth()).tolist()
+    ranks = first_right_ranks(neighbours, benchmark.ground_truth()).tolist()
+    for query, path in enumerate(benchmark.queries):
         first = int(neighbours.indices[query, 0])
-        yield QueryResult(
-            printable(subject.name(path)),
-            "right" if rank == 1 else "wrong" if len(positives[query]) else "no positive",
-            rank or None,
-            printable(subject.name(benchmark.database[first])),
-            float(neighbours.similarities[query, 0]),
-            subject.metres(query, first),
-        )
+        metres = subject.metres(query, first)
+        yield {
+            "query": printable(subject.name(path)),
+            "grouping": grouping.grouping,
+            "rerank": grouping.rerank or "",
+            "outcome": outcomes[query],
+            "rank_of_first_positive": ranks[query] or None,
+            "first_retrieval": printable(subject.name(benchmark.database[first])),
+            "similarity": round(float(neighbours.similarities[query, 0]), 6),
+            "distance_m": None if metres is None else round(metres, 2),
+        }
 
 
 def write_results(
     path: pathlib.Path, subject: Subject, groupings: Sequence[GroupingResult]
 ) -> None:
-    """Write results.csv: a row for every query under every grouping, of the first seed.
-
-    Control characters in names are escaped, and no cell is a spreadsheet's formula.
-    """
+    """Write results.csv: a row for every query under every grouping, of the first seed."""
+    rows = [row for grouping in groupings for row in query_results(subject, grouping)]
     text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    writer.writerow(
-        (
-            *("query", "grouping", "rerank", "outcome", "rank_of_first_positive"),
-            *("first_retrieval", "similarity", "distance_m"),
-        )
-    )
-    for grouping in groupings:
-        for row in query_results(subject, grouping):
-            metres = "" if row.metres is None else f"{row.metres:.2f}"
-            names = no_formula(row.query), grouping.grouping, grouping.rerank or ""
-            found = no_formula(row.retrieval), f"{row.similarity:.6f}", metres
-            writer.writerow((*names, row.outcome, row.rank or "", *found))
+    writer = csv.DictWriter(text, list(rows[0]))
+    writer.writeheader()
+    for row in rows:
+        # No cell is a spreadsheet's formula.
+        names = {name: no_formula(row[name]) for name in ("query", "first_retrieval")}
+        writer.writerow(row | names)
     write_text(path, text.getvalue())
 
 
-def page_rows(subject: Subject, grouping: GroupingResult) -> list[list[Any]]:
-    """Return the rows of the page's table, as short as JSON allows; see queries.js.
+_SHOWN_COLUMNS = ("rank_of_first_positive", "first_retrieval", "similarity", "distance_m")
 
-    Names lack the folder that all of a side's images are in.
-    """
-    benchmark = subject.benchmark
-    asked, places = (_folder(subject, paths) for paths in (benchmark.queries, benchmark.database))
+
+def page_rows(subject: Subject, grouping: GroupingResult) -> list[list[Any]]:
+    """Return the rows of the page's table, as short as JSON allows; see queries.js."""
     return [
-        [
-            row.query.removeprefix(asked),
-            OUTCOMES.index(row.outcome),
-            row.rank,
-            row.retrieval.removeprefix(places),
-            round(row.similarity, 4),
-            None if row.metres is None else round(row.metres, 1),
-        ]
+        [row["query"], OUTCOMES.index(row["outcome"]), *(row[name] for name in _SHOWN_COLUMNS)]
         for row in query_results(subject, grouping)
     ]
 
 
-def _folder(subject: Subject, paths: Sequence[pathlib.Path]) -> str:
-    """Return the folder that all images are in, as it begins their names."""
-    folders = [posixpath.dirname(printable(subject.name(path))) for path in paths]
-    common = posixpath.commonpath(folders)
-    return f"{common}/" if common else ""
-
-
-class Photograph(NamedTuple):
-    """A small photograph in a gallery."""
-
-    drawing: Drawing
-    kind: str
-    """One of query, right, wrong and expected."""
-    lines: tuple[str, ...]
-
-
-def _galleries(subject: Subject, shown: Mapping[str, Sequence[int]]) -> Iterator[dict[str, Any]]:
-    """Yield the queries shown of each kind, with what was retrieved for them."""
-    verdicts, queries = subject.verdicts, subject.benchmark.queries
-    masks = {"right": verdicts.right, "wrong": verdicts.wrong, "unmatched": ~verdicts.matched}
-    for kind, chosen in shown.items():
-        if chosen:
-            found = [(subject.name(queries[each]), _photographs(subject, each)) for each in chosen]
-            yield {"kind": kind, "total": int(masks[kind].sum()), "retrievals": found}
-
-
-def _photographs(subject: Subject, query: int) -> list[Photograph]:
-    """Show a query and its first retrievals, and of a wrong one what should have come first."""
+def _photographs(subject: Subject, query: int) -> tuple[str, list[Drawing]]:
+    """Name a query, and show it and its first retrievals, and what should have come first."""
     benchmark = subject.benchmark
     positives = benchmark.ground_truth()[query]
     indices, similarities = (part[query] for part in subject.neighbours)
 
-    def show(path: pathlib.Path, kind: str, words: str, *lines: str) -> Photograph:
+    def show(path: pathlib.Path, kind: str, words: str, *lines: str) -> Drawing:
         image = thumbnail(read_image(path, bit_depth="contrast-stretch"), _THUMBNAIL)
-        return Photograph(photograph(image, f"{words}: {subject.name(path)}"), kind, lines)
+        return photograph(image, f"{words}: {subject.name(path)}", kind, lines)
 
     photographs = [show(benchmark.queries[query], "query", "query", "query")]
     for rank, index in enumerate(indices[:_RETRIEVALS], 1):
@@ -388,7 +311,7 @@ def _photographs(subject: Subject, query: int) -> list[Photograph]:
         lines = f"{rank}", f"{similarities[rank - 1]:.3f}", *_away(subject, query, index)
         path = benchmark.database[index]
         photographs.append(show(path, kind, f"retrieval {rank}, {kind}", *lines))
-    if subject.verdicts.wrong[query]:
+    if subject.outcomes[query] == "wrong":
         # The best retrieved positive, or else the nearest one.
         ranks = np.flatnonzero(np.isin(indices, positives))
         if ranks.size:
@@ -399,7 +322,7 @@ def _photographs(subject: Subject, query: int) -> list[Photograph]:
         lines = "would be right", rank, *_away(subject, query, index)
         words = f"right for the query, {rank}"
         photographs.append(show(benchmark.database[index], "expected", words, *lines))
-    return photographs
+    return subject.name(benchmark.queries[query]), photographs
 
 
 def _away(subject: Subject, query: int, index: int) -> tuple[str, ...]:
@@ -412,17 +335,17 @@ def _away(subject: Subject, query: int, index: int) -> tuple[str, ...]:
 def _map(folder: pathlib.Path, subject: Subject) -> Drawing | None:
     """Draw the map of all images; None without positions."""
     places, asked = subject.benchmark.database_positions, subject.benchmark.query_positions
-    placed, verdicts = subject.placed, subject.verdicts
+    placed, outcomes = subject.placed, subject.outcomes
     if places is None or asked is None or placed is None:
         return None
     places, asked = np.split(flattened(np.concatenate([places, asked])), [len(places)])
-    path = folder / "positions.png"
-    position_map(path, places, asked, subject.neighbours.indices[:, 0], verdicts, placed)
+    figure = position_map(places, asked, subject.neighbours.indices[:, 0], outcomes, placed)
+    right, wrong = ((outcomes == outcome).sum() for outcome in ("right", "wrong"))
     words = (
-        f"Map of {len(places)} database images and {len(asked)} queries, of which "
-        f"{verdicts.right.sum()} are right and {verdicts.wrong.sum()} wrong"
+        f"Map of {len(places)} database images and {len(asked)} queries, of which {right} are "
+        f"right and {wrong} wrong"
     )
-    return drawing(path, words)
+    return chart(figure, folder / "positions.png", words)
 
 
 def _matrix(
@@ -433,12 +356,11 @@ def _matrix(
     """Draw the similarities of all queries and the whole database; None where they are unknown."""
     if similarities is None:
         return None
-    path, benchmark = folder / "similarities.png", subject.benchmark
-    first, count = subject.neighbours.indices[:, 0], len(benchmark.database)
-    positives, right = benchmark.ground_truth(), subject.verdicts.right
-    similarity_matrix(path, similarities, positives, first, right, count)
+    benchmark, first = subject.benchmark, subject.neighbours.indices[:, 0]
+    positives, count = benchmark.ground_truth(), len(benchmark.database)
+    figure = similarity_matrix(similarities, positives, first, subject.outcomes, count)
     words = f"Similarities of {len(benchmark.queries)} queries (rows) and {count} database images"
-    return drawing(path, words)
+    return chart(figure, folder / "similarities.png", words)
 
 
 def _transport(
@@ -447,43 +369,25 @@ def _transport(
     params: Crisalad,
     config: ModelConfig,
     each: int = 2,
-) -> dict[str, Any] | None:
-    """Draw dustbin and clusters over `each` wrong and right queries and their retrievals.
+) -> Iterator[tuple[str, Drawing]]:
+    """Yield name and drawing of `each` wrong and right queries, with their first retrievals.
 
-    The result is None for a model without a transport.
+    A model without a transport has none.
     """
     if not config.aggregator.transports:
-        return None
+        return
     benchmark, first = subject.benchmark, subject.neighbours.indices[:, 0]
-    files = []
-    for query in shown["wrong"][:each] + shown["right"][:each] or shown["unmatched"][:each]:
-        word = "right" if subject.verdicts.right[query] else "wrong"
-        files += [
-            ("Query", benchmark.queries[query]),
-            (f"Retrieved for it, {word}", benchmark.database[first[query]]),
-        ]
-    bit_depth = config.preprocessing.bit_depth
-    pictures = [  # one by one, for their sizes may differ
-        transport_of(read_image(path, bit_depth=bit_depth), params, config) for _, path in files
-    ]
-    clusters = strongest_clusters(pictures)
-    limits = None if pictures[0].dustbin is None else heat_range(pictures)
-    panels = []
-    for (title, path), picture in zip(files, pictures, strict=True):
-        name, share = subject.name(path), picture.dustbin_share
-        drawings = [
-            photograph(
-                draw_clusters(picture, list(clusters)), f"The top cluster of each patch of {name}"
-            )
-        ]
-        if limits is not None:
-            words = f"The dustbin's share of each patch of {name}"
-            drawings.insert(0, photograph(draw_dustbin(picture, limits), words))
-        panels.append({"title": title, "file": name, "share": share, "drawings": drawings})
-    keys = zip(CLUSTER_COLOURS, clusters.items(), strict=False)
-    return {
-        "pictures": panels,
-        "heat": limits,
-        "gradient": heat_gradient(),
-        "clusters": [(colour, number, share) for colour, (number, share) in keys],
-    }
+    pairs = {}
+    for query in shown["wrong"][:each] + shown["right"][:each] or shown["no positive"][:each]:
+        word = "right" if subject.outcomes[query] == "right" else "wrong"
+        files = benchmark.queries[query], benchmark.database[first[query]]
+        # One by one, for their sizes may differ.
+        bit_depth = config.preprocessing.bit_depth
+        images = (read_image(path, bit_depth=bit_depth) for path in files)
+        transported = (transport_of(image, params, config) for image in images)
+        pairs[query] = dict(zip(("query", f"retrieved, {word}"), transported, strict=True))
+    among = [picture for pair in pairs.values() for picture in pair.values()]
+    for query, pair in pairs.items():
+        name = subject.name(benchmark.queries[query])
+        words = f"Dustbin and top clusters of each patch of {name} and of its first retrieval"
+        yield name, illustration(draw_transport(pair, among, photographs=False), words)

@@ -10,7 +10,7 @@ import os
 import pathlib
 import warnings
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -34,9 +34,8 @@ PLAIN = "#c4c4c4"
 # Okabe and Ito's colours, which the colour-blind can tell apart; without yellow, too light for
 # lines.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-_WIDE, _DPI = 7.0, 120
-_NARROW, _NARROW_DPI = 4.0, 200
-"""Width in inches, and dots an inch: letters of 9 points are then readable on a telephone."""
+WIDE = {"width": 7.0, "dpi": 120}
+"""Size of a figure that stands for itself."""
 _WEBP_QUALITY = 78
 
 
@@ -45,20 +44,24 @@ class Picture(Figure):
 
     def _repr_jpeg_(self) -> bytes:
         """Return the figure for IPython's display; photographs as a PNG fill a notebook."""
-        data = io.BytesIO()
-        with _any_names(self):
-            self.savefig(data, format="jpg", facecolor="white", pil_kwargs={"quality": 88})
-        return data.getvalue()
+        return _encode(self, "jpg", pil_kwargs={"quality": 88})
 
 
-def new_figure(height: float, title: str = "", *, wide: bool = False) -> Picture:
-    """Make a figure of this height in inches: for a page that telephones show too, or `wide`."""
+def new_figure(height: float, title: str = "", *, width: float = 4.0, dpi: int = 200) -> Picture:
+    """Make a figure of this size in inches.
+
+    By default letters of 9 points are readable in a page on a telephone.
+    """
     # Inches around everything, so that no name touches the edge.
     layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.1)
-    width, dpi = (_WIDE, _DPI) if wide else (_NARROW, _NARROW_DPI)
     figure = Picture(figsize=(width, height), dpi=dpi, layout=layout)
     if title:
-        fit_width(figure.suptitle(title, fontsize=12, color=INK, x=0.02, ha="left"), figure)
+        label = figure.suptitle(title, fontsize=12, color=INK, x=0.02, ha="left")
+        with _any_names(figure):
+            extent = label.get_window_extent()
+        # Its right margin is at least its left one.
+        room = figure.bbox.width - 2 * extent.x0
+        label.set_fontsize(float(label.get_fontsize()) * min(1, room / extent.width))
     return figure
 
 
@@ -85,14 +88,6 @@ def legend_above(figure: Figure) -> None:
     figure.legend(frameon=False, fontsize=9, labelcolor=INK, **where)
 
 
-def fit_width(label: Label, figure: Figure) -> None:
-    """Shrink a line of text so that its right margin is at least its left one."""
-    with _any_names(figure):
-        extent = label.get_window_extent()
-    room = figure.bbox.width - 2 * extent.x0
-    label.set_fontsize(float(label.get_fontsize()) * min(1, room / extent.width))
-
-
 @contextlib.contextmanager
 def _any_names(figure: Figure) -> Iterator[None]:
     """Let texts hold the name of any file while they are drawn.
@@ -101,18 +96,24 @@ def _any_names(figure: Figure) -> Iterator[None]:
     lacks are drawn as boxes, without the warning that would print them.
     """
     for label in figure.findobj(Label):
-        text = label.get_text()
-        if text != printable(text):
-            label.set_text(printable(text))
+        label.set_text(printable(label.get_text()))
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"Glyph .* missing", UserWarning)
         yield
 
 
+def _encode(figure: Figure, kind: str, **options: Any) -> bytes:
+    data = io.BytesIO()
+    with _any_names(figure):
+        figure.savefig(data, format=kind, facecolor="white", **options)
+    return data.getvalue()
+
+
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Write a figure as a PNG, whole or not at all."""
-    with atomic_path(path) as temporary, _any_names(figure):
-        figure.savefig(temporary, format="png", facecolor="white")
+    data = _encode(figure, "png")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
 
 
 class Drawing(NamedTuple):
@@ -122,20 +123,35 @@ class Drawing(NamedTuple):
     width: int
     height: int
     alt: str
+    kind: str = ""
+    """How the page frames it."""
+    lines: tuple[str, ...] = ()
+    """What is below it."""
 
 
-def drawing(path: pathlib.Path, alt: str) -> Drawing:
-    """Embed a PNG; its sides are in its first chunk (W3C PNG specification, 11.2.2)."""
-    data = path.read_bytes()
-    width, height = (int.from_bytes(data[at : at + 4], "big") for at in (16, 20))
-    return Drawing(_uri("png", data), width, height, alt)
+def chart(figure: Figure, path: pathlib.Path, alt: str) -> Drawing:
+    """Write a figure as a PNG, and embed that."""
+    save(figure, path)
+    return _embed(figure, "png", path.read_bytes(), alt)
 
 
-def photograph(image: UInt8[np.ndarray, "h w 3"], alt: str) -> Drawing:
+def illustration(figure: Figure, alt: str) -> Drawing:
+    """Embed a figure with photographs in it, as a WebP."""
+    data = _encode(figure, "webp", pil_kwargs={"quality": _WEBP_QUALITY})
+    return _embed(figure, "webp", data, alt)
+
+
+def _embed(figure: Figure, kind: str, data: bytes, alt: str) -> Drawing:
+    return Drawing(_uri(kind, data), int(figure.bbox.width), int(figure.bbox.height), alt)
+
+
+def photograph(
+    image: UInt8[np.ndarray, "h w 3"], alt: str, kind: str = "", lines: tuple[str, ...] = ()
+) -> Drawing:
     """Embed RGB pixels as a WebP of a few kilobytes."""
     _, data = cv2.imencode(".webp", image[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY])
     height, width = image.shape[:2]
-    return Drawing(_uri("webp", data.tobytes()), width, height, alt)
+    return Drawing(_uri("webp", data.tobytes()), width, height, alt, kind, lines)
 
 
 def _uri(kind: str, data: bytes) -> str:

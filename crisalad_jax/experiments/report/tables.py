@@ -49,9 +49,9 @@ class Table(NamedTuple):
     def markdown(self) -> str:
         """Write the table as Markdown, one line a row, ending in a newline."""
         rule = ["---"] * self.labels + ["---:"] * (len(self.headers) - self.labels)
-        body = [[_in_line(cell).replace("|", r"\|") for cell in cells] for cells in self.rows]
-        headers = [header.replace("|", r"\|") for header in self.headers]
-        return "".join(f"| {' | '.join(cells)} |\n" for cells in [headers, rule, *body])
+        rows = [self.headers, *(map(_in_line, cells) for cells in self.rows)]
+        head, *body = ([text.replace("|", r"\|") for text in row] for row in rows)
+        return "".join(f"| {' | '.join(cells)} |\n" for cells in [head, rule, *body])
 
 
 def _in_line(cell: Cell) -> str:
@@ -76,10 +76,7 @@ def recall_table(rows: Sequence[RecallRow], title: str = "") -> Table:
     Raises:
         InputError: no rows, or a recall outside 0 to 1.
     """
-    if not rows:
-        raise InputError("rows: found none, expected at least one row of recalls")
-    for row in rows:
-        check_fractions(f"{row.benchmark}, {row.model}", row.recalls)
+    check_recalls("rows", {", ".join(row[:3]): row.recalls for row in rows})
     ks = sorted({k for row in rows for k in row.recalls})
     body = [
         [row.benchmark, row.model, row.grouping]
@@ -90,17 +87,21 @@ def recall_table(rows: Sequence[RecallRow], title: str = "") -> Table:
     return Table(headers, [list(map(Cell, cells)) for cells in body], labels=3, title=title)
 
 
-def check_fractions(name: str, recalls: Mapping[int, float]) -> None:
-    """Check that there are recalls, and that all are within 0 to 1.
+def check_recalls(what: str, curves: Mapping[str, Mapping[int, float]]) -> None:
+    """Check that there are curves of recalls, and that all are within 0 to 1.
 
     Raises:
         InputError: there are none, or one is outside 0 to 1.
     """
-    if not recalls:
-        raise InputError(f"{name}: found no recalls, expected at least one")
-    for at, value in recalls.items():
-        if not 0 <= value <= 1:
-            raise InputError(f"{name}: found recall {value} at {at}, expected a fraction, 0 to 1")
+    wrong = [
+        f"{name}: {dict(recalls)}"
+        for name, recalls in curves.items()
+        if not recalls or not all(0 <= value <= 1 for value in recalls.values())
+    ]
+    if wrong or not curves:
+        raise InputError(
+            f"{what}: found {', '.join(wrong) or 'none'}, expected recalls as fractions, 0 to 1"
+        )
 
 
 def no_formula(text: str) -> str:

@@ -1,11 +1,10 @@
-"""The transport plan of a model drawn over a photograph: its clusters, and its dustbin."""
+"""The transport plan of a model drawn over photographs: its clusters, and its dustbin."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
-import matplotlib
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from matplotlib import colors
@@ -18,24 +17,20 @@ from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.prepare import as_rgb
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.experiments.report.gallery import thumbnail
-from crisalad_jax.experiments.report.style import GREY, INK, Picture
+from crisalad_jax.experiments.report.style import GREY, INK, Picture, new_figure
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, check_params, transport_masses
+from crisalad_jax.nn.model import Crisalad, Model, check_params, transport_masses
 from crisalad_jax.retrieval.describe import prepare_image
 
 CLUSTER_COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
 """Okabe and Ito's colours, which the colour-blind can tell apart, on a grey photograph."""
 _HEAT = "inferno"
 _OPACITY = 0.65
-_PANEL = 3.4
-"""Width of a panel in inches."""
 _PIXELS = 480
 
 
-@takes(params=Crisalad, config=ModelConfig)
-def show_transport(
-    image: str | os.PathLike[str] | Pixels, params: Crisalad, config: ModelConfig
-) -> Picture:
+@takes(model=Model)
+def show_transport(image: str | os.PathLike[str] | Pixels, model: Model) -> Picture:
     """Draw a picture, each patch's share in the dustbin, and the cluster that took most of it.
 
     The strongest seven clusters have colours; patches that others took stay grey. A colour's
@@ -44,8 +39,7 @@ def show_transport(
 
     Args:
         image: a file, or 8-bit RGB or grey, as `prepare_image` takes it.
-        params: the model's parameters.
-        config: the model.
+        model: the model, as `load` returns it.
 
     Returns:
         A figure that a notebook shows; `figure.savefig(path)` writes it.
@@ -58,57 +52,16 @@ def show_transport(
         >>> import jax
         >>> from crisalad_jax import PRESETS, init_crisalad
         >>> config = PRESETS["tiny"]
-        >>> params = init_crisalad(jax.random.key(0), config)
-        >>> figure = show_transport(pictures / "0.png", params, config)
+        >>> model = Model(init_crisalad(jax.random.key(0), config), config)
+        >>> figure = show_transport(pictures / "0.png", model)
         >>> [axes.get_title(loc="left").split(",")[0] for axes in figure.axes[:3]]
-        ['80 x 60 pixels', 'dustbin: 67 % of the mass', 'top clusters']
+        ['80 x 60 pixels', 'dustbin: 67 %', 'top clusters']
     """
+    params, config = model
     check_params(params, config)
     pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
     picture = transport_of(as_rgb(pixels, config.preprocessing.bit_depth), params, config)
-    clusters = strongest_clusters([picture])
-    height, width = picture.image.shape[:2]
-    rows, columns = picture.masses.shape[:2]
-    panels = 2 if picture.dustbin is None else 3
-    size = (panels * _PANEL, _PANEL * min(height / width, 2) + 0.9)
-    figure = Picture(figsize=size, layout="constrained")
-    first, *middle, last = figure.subplots(1, panels)
-    _panel(first, thumbnail(picture.image, _PIXELS), f"{width} x {height} pixels")
-    for axes in middle:
-        limits = heat_range([picture])
-        title = f"dustbin: {100 * (picture.dustbin_share or 0):.0f} % of the mass"
-        _panel(axes, draw_dustbin(picture, limits, _PIXELS), title)
-        scale = ScalarMappable(colors.Normalize(*limits), _HEAT)
-        below = axes.inset_axes((0.1, -0.1, 0.8, 0.04))
-        bar = figure.colorbar(scale, cax=below, orientation="horizontal")
-        bar.set_label("share of the patch in the dustbin", fontsize=8, color=INK)
-        bar.ax.tick_params(labelsize=8, colors=GREY, labelcolor=INK)
-        bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-    title = f"top clusters, {rows} x {columns} patches"
-    _panel(last, draw_clusters(picture, list(clusters), _PIXELS), title)
-    last.legend(
-        handles=[
-            Patch(color=colour, label=f"{number}: {100 * part:.0f} %")
-            for colour, (number, part) in zip(CLUSTER_COLOURS, clusters.items(), strict=False)
-        ],
-        title="cluster: share of what clusters took",
-        title_fontsize=8,
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.02),
-        ncols=4,
-        fontsize=8,
-        frameon=False,
-        handlelength=1,
-        columnspacing=1,
-    )
-    return figure
-
-
-def _panel(axes: Axes, pixels: Pixels, title: str) -> None:
-    axes.imshow(pixels)
-    axes.set_axis_off()
-    axes.set_anchor("N")
-    axes.set_title(title, loc="left", fontsize=9, color=INK)
+    return draw_transport({"": picture}, [picture], photographs=True)
 
 
 class Transported(NamedTuple):
@@ -130,13 +83,6 @@ class Transported(NamedTuple):
         if self.masses.shape[-1] == self.clusters:
             return None
         return self.masses[..., self.clusters] / self.masses.sum(axis=-1)
-
-    @property
-    def dustbin_share(self) -> float | None:
-        """Share of all mass in the dustbin; None without a dustbin."""
-        if self.dustbin is None:
-            return None
-        return float(self.masses[..., self.clusters].sum() / self.masses.sum())
 
     @property
     def top(self) -> Int[np.ndarray, "row column"]:
@@ -169,61 +115,85 @@ def strongest_clusters(
     return {int(cluster): float(mass[cluster] / total) for cluster in order if mass[cluster] > 0}
 
 
-def heat_range(pictures: Sequence[Transported]) -> tuple[float, float]:
-    """Find the smallest and largest share of a patch in the dustbin, as one scale for all."""
-    shares = [picture.dustbin for picture in pictures if picture.dustbin is not None]
-    values = np.concatenate(shares, axis=None)
-    return float(values.min()), float(values.max())
+def draw_transport(
+    pictures: Mapping[str, Transported], among: Sequence[Transported], *, photographs: bool
+) -> Picture:
+    """Draw pictures in rows: each patch's share in the dustbin, and its top cluster.
 
-
-def heat_gradient() -> str:
-    """Return the colours of the dustbin's scale as CSS."""
-    stops = matplotlib.colormaps[_HEAT](np.linspace(0, 1, 9))
-    return ", ".join(map(colors.to_hex, stops))
-
-
-def draw_dustbin(
-    picture: Transported, limits: tuple[float, float], width: int = 320
-) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Draw each patch's share in the dustbin over the grey photograph.
-
-    Patches are dark at the lower end of the scale and bright at the upper; `limits` are its ends.
+    Args:
+        pictures: what is drawn, by the name of its row.
+        among: the pictures that share one scale, and one choice of clusters.
+        photographs: whether each row begins with the photograph itself, in a larger figure.
     """
-    assert picture.dustbin is not None
-    low, high = limits
-    heat = 255 * matplotlib.colormaps[_HEAT]((picture.dustbin - low) / max(high - low, 1e-6))
-    return _over(picture.image, heat[..., :3], np.full(heat.shape[:2], _OPACITY), width)
+    clusters = strongest_clusters(among)
+    shares = [picture.dustbin for picture in among if picture.dustbin is not None]
+    columns = 1 + bool(shares) + photographs
+    panel, dpi = (3.4, 100) if photographs else (2.0, 200)
+    heights = [panel * min(each.image.shape[0] / each.image.shape[1], 2) for each in among]
+    height = len(pictures) * (max(heights) + 0.2) + 1.2
+    figure = new_figure(height, width=columns * panel, dpi=dpi)
+    panels = figure.subplots(len(pictures), columns, squeeze=False)
+    for (name, picture), (*first, last) in zip(pictures.items(), panels, strict=True):
+        height, width = picture.image.shape[:2]
+        image = thumbnail(picture.image, _PIXELS)
+        if photographs:
+            rows, across = picture.masses.shape[:2]
+            _panel(first[0], image, f"{width} x {height} pixels, {rows} x {across} patches")
+        if picture.dustbin is not None:
+            share = picture.masses[..., picture.clusters].sum() / picture.masses.sum()
+            _panel(first[-1], image, f"dustbin: {100 * share:.0f} %", picture.dustbin)
+            first[-1].images[-1].set_clim(np.min(shares), np.max(shares))
+        _panel(last, image, "top clusters", _cluster_colours(picture, list(clusters)))
+        (first or [last])[0].set_ylabel(name, fontsize=9, color=INK)
+    if shares:
+        scale = ScalarMappable(colors.Normalize(np.min(shares), np.max(shares)), _HEAT)
+        below = {"location": "bottom", "shrink": 0.5, "aspect": 25, "pad": 0.02}
+        bar = figure.colorbar(scale, ax=panels.ravel().tolist(), **below)
+        bar.set_label("share of the patch in the dustbin", fontsize=8, color=INK)
+        bar.ax.tick_params(labelsize=8, colors=GREY, labelcolor=INK)
+        bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    figure.legend(
+        handles=[
+            Patch(color=colour, label=f"{number}: {100 * part:.0f} %")
+            for colour, (number, part) in zip(CLUSTER_COLOURS, clusters.items(), strict=False)
+        ],
+        title="cluster: share of what clusters took",
+        title_fontsize=8,
+        loc="outside lower center",
+        ncols=4,
+        fontsize=8,
+        frameon=False,
+        handlelength=1,
+        columnspacing=1,
+    )
+    return figure
 
 
-def draw_clusters(
-    picture: Transported, chosen: Sequence[int], width: int = 320
-) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Draw each patch in the colour of its top cluster over the grey photograph.
+def _panel(axes: Axes, image: Pixels, title: str, over: np.ndarray | None = None) -> None:
+    """Draw a photograph, or over it in grey a value or a colour for each patch, which tile it."""
+    axes.set(xticks=[], yticks=[], anchor="N")
+    axes.spines[:].set_visible(False)
+    axes.set_title(title, loc="left", fontsize=9, color=INK)
+    if over is None:
+        axes.imshow(image)
+        return
+    axes.imshow(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), "gray", vmin=0, vmax=255)
+    alpha = _OPACITY if over.ndim == 2 else None
+    extent = (-0.5, image.shape[1] - 0.5, image.shape[0] - 0.5, -0.5)
+    axes.imshow(over, _HEAT, alpha=alpha, interpolation="nearest", extent=extent)
 
-    The colour's strength is the mass that clusters took of the patch, over the largest in the
-    picture. Patches whose top cluster is not `chosen` stay grey.
+
+def _cluster_colours(
+    picture: Transported, chosen: Sequence[int]
+) -> Float[np.ndarray, "row column 4"]:
+    """Colour each patch by its top cluster, as RGBA; those of clusters not `chosen` are clear.
+
+    The opacity is the mass that clusters took of the patch, over the largest in the picture.
     """
     taken = picture.taken.sum(axis=-1)
-    strength = np.where(np.isin(picture.top, chosen), taken / taken.max(), 0)
-    over = np.zeros((*taken.shape, 3))
+    shown = np.zeros((*taken.shape, 4))
     for cluster, colour in zip(chosen, CLUSTER_COLOURS, strict=False):
-        over[picture.top == cluster] = 255 * np.array(colors.to_rgb(colour))
-    return _over(picture.image, over, (0.25 + _OPACITY * strength) * (strength > 0), width)
-
-
-def _over(
-    image: UInt8[np.ndarray, "h w 3"],
-    over: Float[np.ndarray, "row column 3"],
-    opacity: Float[np.ndarray, "row column"],
-    width: int,
-) -> UInt8[np.ndarray, "h2 w2 3"]:
-    """Blend patches over a grey photograph of this width; they tile any aspect ratio."""
-    height = max(1, round(width * min(image.shape[0] / image.shape[1], 2)))
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA).astype(float)
-    rows, columns = opacity.shape
-    row = np.arange(height) * rows // height
-    column = np.arange(width) * columns // width
-    alpha = opacity[row][:, column, None]
-    mixed = (1 - alpha) * grey[..., None] + alpha * over[row][:, column]
-    return np.clip(np.round(mixed), 0, 255).astype(np.uint8)
+        patches = (picture.top == cluster) & (taken > 0)
+        shown[patches, :3] = colors.to_rgb(colour)
+        shown[patches, 3] = 0.25 + _OPACITY * taken[patches] / taken.max()
+    return shown

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.config.checks import require_positive, require_range
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import (
     AGGREGATORS,
@@ -76,11 +76,7 @@ class AggregationTokensConfig(Aggregator):
         Raises:
             InputError: there is no such block.
         """
-        require(
-            -depth <= self.insertion < depth,
-            f"AggregationTokensConfig.insertion: found {self.insertion}, expected {-depth} to "
-            f"{depth - 1} for a backbone of {depth} blocks",
-        )
+        require_range(self, -depth, depth - 1, "insertion")
         return FeatureSpec(insertion=self.insertion % depth)
 
     def token_shape(self, dim: int) -> TokenShape:

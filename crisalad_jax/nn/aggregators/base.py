@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
@@ -13,7 +13,7 @@ from crisalad_jax.config.checks import require
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.registry import Registry
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid
+from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
 from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.errors import InputError
@@ -22,6 +22,8 @@ from crisalad_jax.utils.pytree import expect_like
 Centroids = Float[Array, "cluster dim"]
 FeatureRows = Float[Array, "feature dim"]
 FlattenOrder = Literal["token-first", "dimension-first"]
+Cut = tuple[int, int]
+"""First row or column of a region, and the one after its last."""
 
 
 @brief
@@ -167,12 +169,13 @@ class Aggregator(Part, abc.ABC):
         """Return parameters with the metadata that a file stores with their arrays."""
         return params
 
-    def plan(self, params: Any, features: Features) -> Float[Array, "*batch patch column"] | None:
-        """Return the mass that a transport sends from each patch to each cluster; by default None.
+    def plan(self, params: Any, features: Features) -> Float[Array, "*batch patch column"]:
+        """Return the mass that a transport sends from each patch to each cluster.
 
-        A patch sends a mass of 1. If there is a dustbin, it is the last column.
+        A patch sends a mass of 1. If there is a dustbin, it is the last column. `transports` tells
+        whether an aggregator has this.
         """
-        return None
+        raise NotImplementedError
 
 
 def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int, ...]) -> None:
@@ -222,6 +225,17 @@ def require_side(name: str, grid: Grid, regions: int, patch_size: int) -> None:
         f"image size: found {height} x {width}, expected at least {side} x {side}, a patch for "
         f"every region of aggregator {name}",
     )
+
+
+def regions(
+    patches: Patches, grid: Grid, rows: Iterable[Cut], columns: Iterable[Cut]
+) -> list[Float[Array, "*batch _ _ dim"]]:
+    """Cut the patch grid into regions, in row order; each cut is (first, last + 1)."""
+    columns = list(columns)
+    cells = patches.reshape(*patches.shape[:-2], *grid, patches.shape[-1])
+    return [
+        cells[..., top:bottom, left:right, :] for top, bottom in rows for left, right in columns
+    ]
 
 
 def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:

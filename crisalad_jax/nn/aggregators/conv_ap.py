@@ -12,6 +12,7 @@ from crisalad_jax.nn.aggregators.base import (
     Aggregator,
     FlattenOrder,
     TokenShape,
+    regions,
     require_side,
 )
 from crisalad_jax.nn.backbones.base import Backbone, Features, Grid, Patches
@@ -72,14 +73,5 @@ def adaptive_means(patches: Patches, grid: Grid, side: int) -> Float[Array, "*ba
     Region i of a side of n patches goes from floor(i n / side) to ceil((i + 1) n / side): where
     `side` does not divide n, neighbours share a row or column.
     """
-    cells = patches.reshape(*patches.shape[:-2], *grid, patches.shape[-1])
-    means = [
-        cells[..., top:bottom, left:right, :].mean(axis=(-3, -2))
-        for top, bottom in _cuts(grid[0], side)
-        for left, right in _cuts(grid[1], side)
-    ]
-    return jnp.stack(means, axis=-2)
-
-
-def _cuts(length: int, side: int) -> list[tuple[int, int]]:
-    return [(i * length // side, -(-(i + 1) * length // side)) for i in range(side)]
+    cuts = ([(i * n // side, -(-(i + 1) * n // side)) for i in range(side)] for n in grid)
+    return jnp.stack([each.mean(axis=(-3, -2)) for each in regions(patches, grid, *cuts)], axis=-2)

@@ -10,7 +10,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_positive
 from crisalad_jax.nn import random_init
-from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape, require_side
+from crisalad_jax.nn.aggregators.base import (
+    AGGREGATORS,
+    Aggregator,
+    TokenShape,
+    regions,
+    require_side,
+)
 from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
 from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise, linear
 from crisalad_jax.nn.tokens import Tokens
@@ -149,17 +155,9 @@ def gem_pyramid(
     Regions come level by level in row order. A side of n patches is cut at round(i n / level). For
     CricaVPR's fixed 16 x 16 grid that gives its published cuts at 8, and at 5 and 11.
     """
-    cells = log_units(patches)
-    cells = cells.reshape(*cells.shape[:-2], *grid, cells.shape[-1])
-    means = [
-        generalised_mean(cells[..., top:bottom, left:right, :], p, axis=(-3, -2))
-        for level in PYRAMID_LEVELS
-        for top, bottom in _cuts(grid[0], level)
-        for left, right in _cuts(grid[1], level)
-    ]
+    logs, means = log_units(patches), []
+    for level in PYRAMID_LEVELS:
+        edges = ([round(i * n / level) for i in range(level + 1)] for n in grid)
+        cuts = map(itertools.pairwise, edges)
+        means += [generalised_mean(x, p, axis=(-3, -2)) for x in regions(logs, grid, *cuts)]
     return jnp.stack(means, axis=-2)
-
-
-def _cuts(side: int, level: int) -> list[tuple[int, int]]:
-    edges = [round(i * side / level) for i in range(level + 1)]
-    return list(itertools.pairwise(edges))

@@ -8,7 +8,7 @@ import math
 from typing import ClassVar
 
 import jax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from crisalad_jax.config.checks import require_positive
 from crisalad_jax.nn import random_init
@@ -97,7 +97,8 @@ class MixVprConfig(Aggregator):
         """Return a token of `channels` numbers for each row (paper Eqs. 1 to 4)."""
         maps = features.patches.swapaxes(-2, -1)
         for mixer in params.mix:
-            maps = feature_mixer(mixer, maps)
+            hidden = linear(mixer.fc1, layer_norm(mixer.norm, maps, epsilon=NORM_EPSILON))
+            maps = maps + linear(mixer.fc2, jax.nn.relu(hidden))
         channels = linear(params.channel_proj, maps.swapaxes(-2, -1)).swapaxes(-2, -1)
         return Tokens.of_local(at_least_float32(linear(params.row_proj, channels)).swapaxes(-2, -1))
 
@@ -106,11 +107,3 @@ def _init_mixer(key: PRNGKeyArray, patches: int) -> FeatureMixer:
     weights = random_init.normal(key, (2, patches, patches), scale=0.02)
     first, second = (Linear(weight, random_init.zeros(patches)) for weight in weights)
     return FeatureMixer(init_layer_norm(patches), first, second)
-
-
-def feature_mixer(
-    params: FeatureMixer, maps: Float[Array, "*batch channel patch"]
-) -> Float[Array, "*batch channel patch"]:
-    """Compute x + W2 relu(W1 norm(x)) along each channel's patches, in `maps`' type (Eq. 2)."""
-    hidden = linear(params.fc1, layer_norm(params.norm, maps, epsilon=NORM_EPSILON))
-    return maps + linear(params.fc2, jax.nn.relu(hidden))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.config.checks import require_field, require_positive
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, FlattenOrder, TokenShape
 from crisalad_jax.nn.attention import Attention, attention, cross_attention, init_torch_attention
@@ -81,11 +81,8 @@ class BoqConfig(Aggregator):
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_positive(self, "channels", "queries", "layers", "rows")
-        require(
-            self.channels % self.heads == 0,
-            f"BoqConfig.channels: found {self.channels}, expected a multiple of its heads, "
-            f"{self.heads}: one for every 64 channels",
-        )
+        words = f"a multiple of its {self.heads} heads, one for every 64 channels"
+        require_field(self, "channels", self.channels % self.heads == 0, words)
 
     @property
     def heads(self) -> int:
@@ -202,11 +199,8 @@ class EdtFormerConfig(Aggregator):
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_positive(self, "width", "heads", "layers", "queries", "channels", "rows")
-        require(
-            self.width % self.heads == 0,
-            f"EdtFormerConfig.width: found {self.width}, expected a multiple of the {self.heads} "
-            "heads",
-        )
+        fits = self.width % self.heads == 0
+        require_field(self, "width", fits, f"a multiple of the {self.heads} heads")
 
     def features(self, depth: int) -> FeatureSpec:
         """Request the last patches and the class token."""

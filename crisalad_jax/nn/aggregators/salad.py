@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_fraction, require_positive
+from crisalad_jax.config.checks import require, require_field, require_fraction, require_positive
 from crisalad_jax.config.part import OrName, non_semantic_field
 from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.nn import random_init
@@ -152,11 +152,7 @@ class SaladConfig(TransportAggregator):
         super().__post_init__()
         require_positive(self, "epsilon")
         for name in ("row_tau", "column_tau"):
-            value = getattr(self, name)
-            require(
-                0 < value <= 1,
-                f"SaladConfig.{name}: found {value}, expected more than 0 and at most 1",
-            )
+            require_field(self, name, 0 < getattr(self, name) <= 1, "more than 0 and at most 1")
 
     @property
     def scores(self) -> int:

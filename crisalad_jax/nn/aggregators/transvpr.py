@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.config.checks import require_positive, require_range
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
@@ -46,11 +46,7 @@ class TransVprConfig(Aggregator):
 
     def features(self, depth: int) -> FeatureSpec:
         """Request the patches after several numbers of blocks."""
-        require(
-            self.levels <= depth,
-            f"TransVprConfig.levels: found {self.levels}, expected at most {depth}, the backbone's "
-            "blocks",
-        )
+        require_range(self, 1, depth, "levels")
         return FeatureSpec(
             tuple(depth * (level + 1) // self.levels for level in range(self.levels))
         )

@@ -3,6 +3,7 @@
 All compute in float32 at least, at the highest precision.
 """
 
+import abc
 import dataclasses
 import hashlib
 import math
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.config.checks import require, require_field, require_positive, require_range
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import (
     AGGREGATORS,
@@ -44,15 +45,24 @@ class VladConfig(Aggregator):
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_positive(self, "clusters")
-        require(
-            self.count_centroids(0) > 1,
-            f"{type(self).__name__}.clusters: found {self.clusters}, expected at least 2 to choose "
-            "from",
-        )
+        require_field(self, "clusters", self.count_centroids(0) > 1, "at least 2 to choose from")
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of one sum for each cluster."""
         return TokenShape(0, self.clusters, dim)
+
+    @abc.abstractmethod
+    def sums(self, params: Any, patches: Patches) -> Float[Array, "*batch cluster dim"]:
+        """Return a sum for each cluster of unit patches in float32 at least.
+
+        All products are of the highest precision: a small difference of scores or distances can
+        move a patch to another cluster.
+        """
+
+    def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+        """Return the sum of each cluster, and no global token."""
+        patches = l2_normalise(at_least_float32(features.patches))
+        return Tokens.of_local(self.sums(params, patches))
 
 
 @pytree_dataclass
@@ -86,9 +96,9 @@ class NetVladConfig(VladConfig):
         """Make parameters as the authors do; see `scores_from_centroids`."""
         return NetVlad(scores_from_centroids(centroids, features), centroids)
 
-    def apply(self, params: NetVlad, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
-        """Return a sum of residuals for each cluster, of length 1; no global token."""
-        return Tokens.of_local(netvlad(params, features.patches))
+    def sums(self, params: NetVlad, patches: Patches) -> Float[Array, "*batch cluster dim"]:
+        """Sum residuals by Eq. 4, then intra-normalise (Arandjelovic, Zisserman 2013)."""
+        return l2_normalise(residual_sums(shares(params.conv, patches), patches, params.centroids))
 
 
 @pytree_dataclass
@@ -119,9 +129,7 @@ class SuperVladConfig(VladConfig):
     def __post_init__(self) -> None:
         """Check the ranges."""
         super().__post_init__()
-        require(
-            self.ghosts >= 0, f"SuperVladConfig.ghosts: found {self.ghosts}, expected at least 0"
-        )
+        require_range(self, 0, math.inf, "ghosts")
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> SuperVlad:
         """Draw the scores' layer as torch's convolution."""
@@ -135,11 +143,11 @@ class SuperVladConfig(VladConfig):
         """Return the number of all clusters, ghosts included."""
         return self.clusters + self.ghosts
 
-    def apply(
-        self, params: SuperVlad, features: Features, grid: Grid, *, key: Keys | None
-    ) -> Tokens:
-        """Return a sum of patches for each cluster, of the same length; together of length 1."""
-        return Tokens.of_local(supervlad(params, features.patches, self.clusters))
+    def sums(self, params: SuperVlad, patches: Patches) -> Float[Array, "*batch cluster dim"]:
+        """Sum patches by their shares in the clusters, then normalise each sum, then all."""
+        parts = shares(params.conv, patches)[..., : self.clusters]
+        sums = l2_normalise(jnp.einsum("...pk,...pd->...kd", parts, patches, precision="highest"))
+        return l2_normalise(sums.reshape(*sums.shape[:-2], -1)).reshape(sums.shape)
 
 
 @pytree_dataclass
@@ -180,9 +188,7 @@ class VladBuffConfig(VladConfig):
     def __post_init__(self) -> None:
         """Check the ranges."""
         super().__post_init__()
-        require(
-            self.reduced >= 0, f"VladBuffConfig.reduced: found {self.reduced}, expected at least 0"
-        )
+        require_range(self, 0, math.inf, "reduced")
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of one sum of residuals for each cluster."""
@@ -220,11 +226,12 @@ class VladBuffConfig(VladConfig):
         conv = scores_from_centroids(centroids, self.centroid_features(features))
         return VladBuff(reduction, conv, centroids, jnp.asarray(BURST))
 
-    def apply(
-        self, params: VladBuff, features: Features, grid: Grid, *, key: Keys | None
-    ) -> Tokens:
-        """Return a sum of residuals for each cluster, of length 1; no global token."""
-        return Tokens.of_local(vlad_buff(params, features.patches))
+    def sums(self, params: VladBuff, patches: Patches) -> Float[Array, "*batch cluster reduced"]:
+        """Reduce patches, and sum their residuals by shares over burst weights."""
+        if params.reduction is not None:
+            patches = l2_normalise(reduce_features(params.reduction, patches))
+        weighed = shares(params.conv, patches) / burst_weights(params.burst, patches)[..., None]
+        return l2_normalise(residual_sums(weighed, patches, params.centroids))
 
 
 @pytree_dataclass
@@ -254,22 +261,14 @@ class AnyLocConfig(VladConfig):
     """What the nearest word of a patch is nearest by. The public code takes the angle; so does the
     k-means that builds a vocabulary."""
 
-    def block(self, depth: int) -> int:
-        """Return the number of the facet's block among `depth` blocks, from 0.
+    def features(self, depth: int) -> FeatureSpec:
+        """Request the facet, without the last layer norm.
 
         Raises:
             InputError: there is no such block.
         """
-        require(
-            -depth <= self.layer < depth,
-            f"AnyLocConfig.layer: found {self.layer}, expected {-depth} to {depth - 1} for a "
-            f"backbone of {depth} blocks",
-        )
-        return self.layer % depth
-
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the facet, without the last layer norm."""
-        return FeatureSpec((self.block(depth) + 1,), self.facet, norm=False)
+        require_range(self, -depth, depth - 1, "layer")
+        return FeatureSpec((self.layer % depth + 1,), self.facet, norm=False)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> AnyLoc:
         """Draw random unit vectors as words, until a vocabulary is built."""
@@ -304,10 +303,15 @@ class AnyLocConfig(VladConfig):
         """Return the words with the backbone's digest."""
         return AnyLoc(params.words, metadata.get("backbone"))
 
-    def apply(self, params: AnyLoc, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
-        """Return a sum of residuals for each word, of length 1, or 0 where no patch is near."""
-        vlad = hard_vlad(params.words, features.patches, assignment=self.assignment)
-        return Tokens.of_local(vlad)
+    def sums(self, params: AnyLoc, patches: Patches) -> Float[Array, "*batch cluster dim"]:
+        """Compute VLAD (Jegou et al. 2010): residuals from the nearest word, intra-normalised.
+
+        Residuals are from the words as they are, whatever their lengths. A sum is 0 where no patch
+        is near.
+        """
+        nearest = nearest_words(params.words, patches, self.assignment)
+        one_hot = jax.nn.one_hot(nearest, len(params.words), dtype=patches.dtype)
+        return l2_normalise(residual_sums(one_hot, patches, params.words))
 
 
 def scores_from_centroids(centroids: Centroids, features: FeatureRows) -> Linear:
@@ -336,16 +340,6 @@ def scores_from_centroids(centroids: Centroids, features: FeatureRows) -> Linear
     return Linear(math.log(RATIO) / gap * directions.T, None)
 
 
-def netvlad(params: NetVlad, patches: Patches) -> Float[Array, "*batch cluster dim"]:
-    """Aggregate unit patches by Eq. 4, then intra-normalise (Arandjelovic, Zisserman 2013).
-
-    It computes in float32 at least, at the highest precision, because alpha multiplies the scores'
-    rounding error.
-    """
-    patches = l2_normalise(at_least_float32(patches))
-    return l2_normalise(residual_sums(shares(params.conv, patches), patches, params.centroids))
-
-
 def shares(conv: Linear, patches: Patches) -> Float[Array, "*batch patch cluster"]:
     """Assign unit patches softly: compute a softmax over the clusters (the paper's Eq. 3)."""
     scores = jnp.matmul(patches, conv.weight, precision="highest")
@@ -361,20 +355,6 @@ def residual_sums(
     """
     sums = jnp.einsum("...pk,...pd->...kd", shares, patches, precision="highest")
     return sums - shares.sum(axis=-2)[..., None] * centroids
-
-
-def supervlad(
-    params: SuperVlad, patches: Patches, clusters: int
-) -> Float[Array, "*batch cluster dim"]:
-    """Sum unit patches by their shares in the clusters, then normalise each sum, then all.
-
-    It computes in float32 at least, at the highest precision, as `netvlad` does.
-    """
-    patches = l2_normalise(at_least_float32(patches))
-    parts = shares(params.conv, patches)[..., :clusters]
-    sums = l2_normalise(jnp.einsum("...pk,...pd->...kd", parts, patches, precision="highest"))
-    flat = l2_normalise(sums.reshape(*sums.shape[:-2], -1))
-    return flat.reshape(sums.shape)
 
 
 def fit_reduction(features: FeatureRows, reduced: int) -> Reduction:
@@ -406,18 +386,6 @@ def reduce_features(
     return jnp.matmul(features - reduction.mean, reduction.rotation, precision="highest")
 
 
-def vlad_buff(params: VladBuff, patches: Patches) -> Float[Array, "*batch cluster reduced"]:
-    """Reduce unit patches to shorter ones, and sum their residuals by shares over burst weights.
-
-    It computes in float32 at least, at the highest precision, as `netvlad` does.
-    """
-    patches = l2_normalise(at_least_float32(patches))
-    if params.reduction is not None:
-        patches = l2_normalise(reduce_features(params.reduction, patches))
-    weighed = shares(params.conv, patches) / burst_weights(params.burst, patches)[..., None]
-    return l2_normalise(residual_sums(weighed, patches, params.centroids))
-
-
 def burst_weights(burst: Float[Array, "3"], patches: Patches) -> Float[Array, "*batch patch"]:
     """Count, softly, the patches that are like each: sigmoids of squared distances, summed.
 
@@ -437,20 +405,6 @@ def _digest(backbone: Any) -> str:
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(leaf).data)
     return digest.hexdigest()
-
-
-def hard_vlad(
-    words: Centroids, patches: Patches, *, assignment: Literal["cosine", "euclidean"]
-) -> Float[Array, "*batch cluster dim"]:
-    """Compute VLAD (Jegou et al. 2010) of unit patches, each at its nearest word, intra-normalised.
-
-    Residuals are from the words as they are, whatever their lengths. It computes in float32 at
-    least, at the highest precision: rounding would change words.
-    """
-    patches = l2_normalise(at_least_float32(patches))
-    nearest = nearest_words(words, patches, assignment)
-    shares = jax.nn.one_hot(nearest, len(words), dtype=patches.dtype)
-    return l2_normalise(residual_sums(shares, patches, words))
 
 
 def nearest_words(

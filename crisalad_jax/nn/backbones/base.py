@@ -57,6 +57,21 @@ class FeatureSpec:
     inserted: Float[Array, "inserted dim"] | None = None
     """Those tokens, the same for every image; `Aggregator.inserted` returns them."""
 
+    def levels_of(self, depth: int) -> tuple[int, ...]:
+        """Return the levels in a backbone of so many blocks.
+
+        Raises:
+            InputError: they are not in order, more than there are blocks, or several of a facet.
+        """
+        levels = (depth,) if self.levels is None else self.levels
+        in_order = list(levels) == sorted(set(levels)) and 0 < levels[0] <= levels[-1] <= depth
+        require(
+            in_order and (self.facet == "token" or len(levels) == 1),
+            f"levels: found {levels} of facet {self.facet}, expected numbers of blocks in order, 1 "
+            f"to {depth}, and one alone of a facet of attention",
+        )
+        return levels
+
 
 @dataclasses.dataclass(frozen=True)
 class Backbone(Part, abc.ABC):

@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require
+from crisalad_jax.config.checks import require_field
 from crisalad_jax.nn.attention import Attention, Rotation, without_key_bias
 from crisalad_jax.nn.backbones.base import BACKBONES, Grid, Patches
 from crisalad_jax.nn.backbones.vit import Block, VisionTransformer, ViT
@@ -44,11 +44,8 @@ class DinoV3Config(VisionTransformer):
     def __post_init__(self) -> None:
         """Check the ranges."""
         super().__post_init__()
-        require(
-            self.dim // self.heads % 4 == 0,
-            f"DinoV3Config.heads: found {self.heads} of width {self.dim // self.heads}, expected a "
-            "width that is a multiple of 4, for the angles of rows and columns",
-        )
+        fits = self.dim // self.heads % 4 == 0
+        require_field(self, "heads", fits, f"a divisor of a fourth of dim ({self.dim})")
 
     def init_positions(self, key: PRNGKeyArray) -> tuple[None, None]:
         """Return no parameters."""

@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from crisalad_jax.config.checks import require
+from crisalad_jax.config.checks import require, require_range
 from crisalad_jax.nn.backbones.base import (
     BACKBONES,
     Backbone,
@@ -43,10 +43,8 @@ class HogConfig(Backbone):
 
     def __post_init__(self) -> None:
         """Check that its sizes are the only ones."""
-        require(
-            (self.dim, self.depth) == (_DIM, 1),
-            f"HogConfig: found dim {self.dim} and depth {self.depth}, expected {_DIM} and 1",
-        )
+        require_range(self, _DIM, _DIM, "dim")
+        require_range(self, 1, 1, "depth")
 
     def grid(self, image_size: tuple[int, int]) -> Grid:
         """Return 1 x 1: the whole image is one patch."""

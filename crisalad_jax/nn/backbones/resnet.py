@@ -7,7 +7,7 @@ from typing import Any, Literal
 import jax
 from jaxtyping import PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.config.checks import require_positive, require_range
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.backbones.base import BACKBONES, Grid, Valid
 from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages
@@ -49,10 +49,7 @@ class ResNetConfig(StagedBackbone):
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require(
-            1 <= self.stages <= 4,
-            f"ResNetConfig.stages: found {self.stages}, expected 1 to 4",
-        )
+        require_range(self, 1, 4, "stages")
         require_positive(self, "width")
 
     @property

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.config.checks import require, require_field, require_positive
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.attention import Attention, attention
 from crisalad_jax.nn.backbones.base import (
@@ -82,12 +82,9 @@ class TransVprNetConfig(Backbone):
     def __post_init__(self) -> None:
         """Check the ranges."""
         require_positive(self, "dim", "depth", "heads", "hidden")
-        for name, divisor in (("heads", self.heads), ("maps", len(WIDTHS))):
-            require(
-                self.dim % divisor == 0,
-                f"TransVprNetConfig.dim: found {self.dim}, expected a multiple of the {divisor} "
-                f"{name}",
-            )
+        fits = self.dim % self.heads == self.dim % len(WIDTHS) == 0
+        words = f"a multiple of the {self.heads} heads and of the {len(WIDTHS)} maps"
+        require_field(self, "dim", fits, words)
 
     def init(self, key: PRNGKeyArray) -> TransVprNet:
         """Draw parameters: convolutions as He et al., linears normal of deviation 0.02."""
@@ -138,11 +135,7 @@ class TransVprNetConfig(Backbone):
         Raises:
             InputError: while tracing, for levels out of order, or a facet of attention.
         """
-        levels = (self.depth,) if request.levels is None else request.levels
-        require(
-            list(levels) == sorted(set(levels)) and levels[0] > 0 and levels[-1] <= self.depth,
-            f"levels: found {levels}, expected numbers of blocks in order, 1 to {self.depth}",
-        )
+        levels = request.levels_of(self.depth)
         require(
             request.facet == "token",
             f"features: found a request for facet {request.facet} of backbone {self.part_name}, "

@@ -24,16 +24,10 @@ class VggConfig(StagedBackbone):
 
     patch_size: ClassVar[int] = 16
     """Distance of two features in pixels."""
-
-    @property
-    def depth(self) -> int:
-        """Number of stages."""
-        return len(WIDTHS)
-
-    @property
-    def dim(self) -> int:
-        """Width of a feature."""
-        return WIDTHS[-1][-1]
+    depth: ClassVar[int] = len(WIDTHS)
+    """Number of stages."""
+    dim: ClassVar[int] = WIDTHS[-1][-1]
+    """Width of a feature."""
 
     def grid(self, image_size: tuple[int, int]) -> Grid:
         """Return the rows and columns of features: every halving rounds down."""

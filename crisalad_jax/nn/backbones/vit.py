@@ -19,7 +19,13 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from crisalad_jax.config.checks import choose, require, require_positive
+from crisalad_jax.config.checks import (
+    choose,
+    require,
+    require_field,
+    require_positive,
+    require_range,
+)
 from crisalad_jax.config.part import non_semantic_field
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.adapter import (
@@ -134,20 +140,11 @@ class VisionTransformer(Backbone):
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        name = type(self).__name__
         require_positive(self, "dim", "depth", "heads", "mlp_ratio")
-        require(
-            self.registers >= 0,
-            f"{name}.registers: found {self.registers}, expected at least 0",
-        )
-        require(
-            self.dim % self.heads == 0,
-            f"{name}.dim: found {self.dim}, expected a multiple of the {self.heads} heads",
-        )
-        require(
-            self.hidden >= 1,
-            f"{name}.mlp_ratio: found {self.mlp_ratio}, expected a hidden width of at least 1",
-        )
+        require_range(self, 0, math.inf, "registers")
+        fits = self.dim % self.heads == 0
+        require_field(self, "dim", fits, f"a multiple of the {self.heads} heads")
+        require_field(self, "mlp_ratio", self.hidden >= 1, "a hidden width of at least 1")
         self.adapter.width(self.dim)
 
     @property
@@ -265,10 +262,8 @@ class ViTConfig(VisionTransformer):
         """Check the ranges."""
         super().__post_init__()
         require_positive(self, "position_grid")
-        require(
-            self.position_init != "sincos" or self.dim % 4 == 0,
-            f"ViTConfig.dim: found {self.dim}, expected a multiple of 4 for a sin-cos start",
-        )
+        fits = self.position_init != "sincos" or self.dim % 4 == 0
+        require_field(self, "dim", fits, "a multiple of 4 for a sin-cos start")
 
     def init_positions(
         self, key: PRNGKeyArray
@@ -392,15 +387,7 @@ def vit(
 
 def _checked_levels(request: FeatureSpec, config: VisionTransformer) -> tuple[int, ...]:
     """Return the numbers of blocks after which features are taken."""
-    levels = (config.depth,) if request.levels is None else request.levels
-    require(
-        levels[0] > 0 and levels[-1] <= config.depth and list(levels) == sorted(set(levels)),
-        f"levels: found {levels}, expected numbers of blocks in order, 1 to {config.depth}",
-    )
-    require(
-        request.facet == "token" or len(levels) == 1,
-        f"levels: found {levels}, expected one for the facet {request.facet}",
-    )
+    levels = request.levels_of(config.depth)
     special = {
         "levels or a facet": levels != (config.depth,) or request.facet != "token",
         "inserted tokens": request.inserted is not None,

@@ -1,4 +1,4 @@
-"""Measure a plan's marginal errors, and check the inputs and steps of a problem."""
+"""Check a transport problem at the door, and what a custom step makes of it."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,46 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.nn.transport.config import SinkhornConfig, Solution
-from crisalad_jax.nn.transport.problem import LOG_ZERO, Matrix, Potentials, Problem
+from crisalad_jax.nn.transport.config import SinkhornConfig
+from crisalad_jax.nn.transport.problem import LOG_ZERO, Potentials, Problem
 from crisalad_jax.utils.pytree import expect_like
-
-
-def marginal_error(
-    log_plan: Matrix,
-    log_mu: Float[Array, "*#batch rows"],
-    log_nu: Float[Array, "*#batch columns"],
-) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """Compute the largest relative error of the row masses and of the column masses of a plan.
-
-    Args:
-        log_plan: logarithms of the masses.
-        log_mu: logarithms of the rows' marginals.
-        log_nu: logarithms of the columns' marginals.
-
-    Returns:
-        The largest |mass / marginal - 1| of the rows, and of the columns. Where a marginal is 0,
-        the error is 0 if the mass is, else infinite.
-
-    Example:
-        >>> import jax.numpy as jnp
-        >>> log_plan, log_nu = jnp.log(jnp.eye(2)), jnp.log(jnp.full(2, 0.5))
-        >>> rows, columns = marginal_error(log_plan, jnp.zeros(2), log_nu)
-        >>> float(rows), float(columns)
-        (0.0, 1.0)
-    """
-    rows = _relative_error(jax.nn.logsumexp(log_plan, axis=-1), log_mu)
-    columns = _relative_error(jax.nn.logsumexp(log_plan, axis=-2), log_nu)
-    return rows.max(axis=-1), columns.max(axis=-1)
-
-
-def _relative_error(log_mass: Array, log_marginal: Array) -> Array:
-    empty = log_marginal < LOG_ZERO
-    error = jnp.abs(jnp.expm1(log_mass - jnp.where(empty, 0, log_marginal)))
-    return jnp.where(empty, jnp.where(log_mass < LOG_ZERO, 0, jnp.inf), error)
 
 
 def wide_dtype(scores: Array) -> jnp.dtype:
@@ -55,7 +21,13 @@ def wide_dtype(scores: Array) -> jnp.dtype:
 
 
 def check_inputs(
-    scores: Array, log_mu: Array, log_nu: Array, epsilon: float | Array, *, equal_totals: bool
+    scores: Array,
+    log_mu: Array,
+    log_nu: Array,
+    epsilon: float | Array,
+    init: Potentials | None,
+    *,
+    equal_totals: bool,
 ) -> None:
     """Check the shapes of a problem, and its values where they are known (outside of `jit`).
 
@@ -63,76 +35,47 @@ def check_inputs(
         InputError: naming the argument, what was found and what was expected.
     """
     shape = scores.shape
-    for name, marginal, target, side in (
-        ("log_mu", log_mu, shape[:-1], "rows"),
-        ("log_nu", log_nu, (*shape[:-2], *shape[-1:]), "columns"),
-    ):
-        require(
-            len(shape) >= 2 and 0 not in shape[-2:] and _spreads(marginal.shape, target),
-            f"sinkhorn: found scores of shape {shape} and {name} of {marginal.shape}, expected "
-            f"(..., rows, columns) and (..., {side})",
-        )
+    rows, columns = shape[:-1], (*shape[:-2], *shape[-1:])
     require(
-        not jnp.ndim(epsilon),
-        f"sinkhorn: epsilon found of shape {jnp.shape(epsilon)}, expected a single number",
+        len(shape) >= 2
+        and 0 not in shape[-2:]
+        and not jnp.issubdtype(scores.dtype, jnp.complexfloating),
+        f"sinkhorn: found scores of {scores.dtype} and shape {shape}, expected real numbers of "
+        "shape (..., rows, columns)",
     )
-    for name, value in (("scores", scores), ("log_mu", log_mu), ("log_nu", log_nu)):
+    vectors = {"log_mu": (log_mu, rows), "log_nu": (log_nu, columns)}
+    if init is not None:
+        is_pair = isinstance(init, tuple) and len(init) == 2
+        row, column = init if is_pair else (init, init)
+        vectors |= {"init.row": (row, rows), "init.column": (column, columns)}
+    for name, (vector, target) in {**vectors, "epsilon": (epsilon, ())}.items():
         require(
-            not jnp.iscomplexobj(value),
-            f"sinkhorn: {name} found of {value.dtype}, expected real numbers",
+            _spreads(jnp.shape(vector), target),
+            f"sinkhorn: {name} found of shape {jnp.shape(vector)}, expected {target} for scores of "
+            f"{shape}",
         )
+    wide = wide_dtype(scores)
     _check("scores found with NaN or infinity, expected finite numbers", jnp.isfinite, scores)
-    for name, value in (("log_mu", log_mu), ("log_nu", log_nu)):
-        words = "found with NaN or infinity, expected finite numbers, or -inf for a mass of 0"
-        _check(f"{name} {words}", lambda x: x < jnp.inf, value)
-        words = "found with no mass at all in a problem, expected some"
-        _check(f"{name} {words}", lambda x: (x >= LOG_ZERO).any(axis=-1), value)
-    least = float(jnp.finfo(wide_dtype(scores)).tiny)  # a processor may take less for 0
+    for name, masses in (("log_mu", log_mu), ("log_nu", log_nu)):
+        words = "found with NaN, infinity or no mass at all, expected finite numbers, or -inf for a"
+        _check(f"{name} {words} mass of 0", _are_masses, masses)
+    least = float(jnp.finfo(wide).tiny)  # a processor may take less for 0
     _check(f"epsilon found {epsilon}, expected at least {least:.1e}", lambda x: x >= least, epsilon)
     _check(
-        f"epsilon found {epsilon}, by which scores overflow, expected numbers that "
-        f"{wide_dtype(scores)} can hold",
-        lambda scores, epsilon: jnp.isfinite(scores.astype(wide_dtype(scores)) / epsilon),
-        scores,
-        epsilon,
+        f"epsilon found {epsilon}, by which scores overflow, expected numbers that {wide} can hold",
+        lambda scores, epsilon: jnp.isfinite(scores.astype(wide) / epsilon),
+        *(scores, epsilon),
     )
     if equal_totals and not isinstance(log_mu, Tracer) and not isinstance(log_nu, Tracer):
-        totals = [np.exp(np.asarray(x, np.float64)).sum(axis=-1) for x in (log_mu, log_nu)]
-        unlike = ~(np.abs(totals[0] - totals[1]) <= _rounding(log_mu, log_nu) * np.abs(totals[1]))
-        worst = [np.broadcast_to(total, unlike.shape)[unlike] for total in totals]
+        mu, nu = (np.exp(np.asarray(x, np.float64)).sum(axis=-1) for x in (log_mu, log_nu))
+        mu, nu = np.broadcast_arrays(mu, nu)
+        unlike = ~(np.abs(mu - nu) <= _rounding(log_mu, log_nu) * np.abs(nu))
         require(
             not unlike.any(),
             "sinkhorn: masses exp(log_mu) and exp(log_nu) found to sum to "
-            f"{' and '.join(f'{total.flat[0]:.6g}' for total in worst if total.size)}, expected "
-            "the same",
+            f"{' and '.join(f'{total[unlike].flat[0]:.6g}' for total in (mu, nu) if unlike.any())}"
+            ", expected the same",
         )
-
-
-def check_init(init: Any, scores: Array, log_mu: Array, log_nu: Array) -> Potentials:
-    """Return the potentials to start from, if they fit the scores.
-
-    Raises:
-        InputError: they do not, or where they are known (outside of `jit`) are not finite. They
-            may be -inf where the mass is 0.
-    """
-    expected = scores.shape[:-1], (*scores.shape[:-2], scores.shape[-1])
-    is_pair = isinstance(init, tuple) and len(init) == 2
-    shapes = tuple(map(jnp.shape, init)) if is_pair else ()
-    require(
-        is_pair and all(map(_spreads, shapes, expected)),
-        f"sinkhorn: init found of {shapes or type(init).__name__}, expected Potentials of shapes "
-        f"{expected[0]} and {expected[1]}",
-    )
-    start = Potentials(*map(jnp.asarray, init))
-    for potential, log_mass in zip(start, (log_mu, log_nu), strict=True):
-        mass = jnp.full((), -jnp.inf) if isinstance(log_mass, Tracer) else log_mass
-        _check(
-            "init found with NaN or infinity, expected finite potentials",
-            lambda x, mass: jnp.isfinite(x) | (jnp.isneginf(x) & (mass < LOG_ZERO)),
-            potential,
-            mass,
-        )
-    return start
 
 
 def _check(words: str, test: Callable[..., Array], *values: Any) -> None:
@@ -141,6 +84,11 @@ def _check(words: str, test: Callable[..., Array], *values: Any) -> None:
         # Concrete values stay concrete under tracing. Only a flag is copied to the host.
         with jax.ensure_compile_time_eval():
             require(bool(jnp.all(test(*values))), f"sinkhorn: {words}")
+
+
+def _are_masses(logarithms: Array) -> Array:
+    some = (logarithms >= LOG_ZERO).any(axis=-1, keepdims=True)
+    return (logarithms < jnp.inf) & some
 
 
 def _rounding(*log_masses: Array) -> float:
@@ -172,11 +120,9 @@ def check_step(config: SinkhornConfig, problem: Problem, params: Any) -> None:
         InputError: it does not, or its parameters are missing; the message names the step.
     """
     step, name = config.step, f"step {config.step.part_name}"
-    learns = jax.eval_shape(step.init_params, jax.random.key(0))
-    require(
-        params is not None or learns is None,
-        f"{name}: found no step_params, expected those of its init_params",
-    )
+    if params is None:
+        learnt = jax.eval_shape(step.init_params, jax.random.key(0))
+        require(learnt is None, f"{name}: found no step_params, expected those of its init_params")
     prepared = jax.eval_shape(step.prepare, problem, params)
     expect_like(f"{name}, prepare", prepared, problem)
 
@@ -192,18 +138,6 @@ def check_step(config: SinkhornConfig, problem: Problem, params: Any) -> None:
     expect_like(name, after, before)
     log_plan = jax.eval_shape(plan, problem, before[0])
     expect_like(f"{name}, log_plan", log_plan, problem.kernel)
-
-
-def check_solution(solution: Any, config: SinkhornConfig, problem: Problem) -> None:
-    """Check that a gradient returns a solution of the problem's shapes.
-
-    Raises:
-        InputError: it does not; the message names the gradient.
-    """
-    zeros = problem.zeros()
-    count = jnp.zeros(zeros.row.shape[:-1], jnp.int32)
-    wanted = Solution(zeros, count, count.astype(bool))
-    expect_like(f"gradient {config.gradient.part_name}", solution, wanted)
 
 
 def _spreads(shape: tuple[int, ...], target: tuple[int, ...]) -> bool:

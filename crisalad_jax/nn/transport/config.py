@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 from jaxtyping import Array, Bool, Int
 
-from crisalad_jax.config.checks import require, require_positive
+from crisalad_jax.config.checks import require_field, require_positive
 from crisalad_jax.config.part import OrName, Part
 from crisalad_jax.config.registry import Registry, part_field, resolve_names
 from crisalad_jax.config.short_repr import short_repr
@@ -30,11 +30,14 @@ Solve = Callable[[Problem], Solution]
 class Gradient(Part):
     """A gradient of the potentials, through which JAX differentiates the plan."""
 
+    at_convergence: ClassVar[bool | None] = None
+    """Whether it is the gradient of the converged plan, which needs a tolerance, or of a fixed
+    number of iterations, which has none; None goes with both."""
+    needs_entropic: ClassVar[bool] = False
+    """Whether the step must solve the entropic problem (`Step.entropic`)."""
     takes_solver: ClassVar[bool] = False
-    """Whether `solve` takes the solver that is given to `sinkhorn.solve`."""
-
-    def check(self, config: "SinkhornConfig") -> None:
-        """Raise InputError where this gradient does not go with a configuration."""
+    """Whether `solve` takes the solver that is given to `sinkhorn.solve`, which accelerates in the
+    place of Anderson's method."""
 
     def solve(
         self, problem: Problem, config: "SinkhornConfig", params: Any, init: Potentials
@@ -80,15 +83,18 @@ class SinkhornConfig:
         """Check the ranges, and that the parts go together."""
         resolve_names(self)
         require_positive(self, "iterations")
-        if self.tolerance is not None:
+        gradient, converges = self.gradient, self.tolerance is not None
+        if converges:
             require_positive(self, "tolerance")
-        memory = self.anderson_memory
-        require(
-            isinstance(memory, int) and (memory == 0 or memory > 1),
-            f"SinkhornConfig.anderson_memory: found {memory}, expected 0 or a whole number from 2",
-        )
-        require(
-            not self.throw or self.tolerance is not None,
-            "SinkhornConfig.throw: found no tolerance to converge to",
-        )
-        self.gradient.check(self)
+        solves = gradient.part_name if gradient.takes_solver else None
+        memory = "0 or a whole number from 2" if solves is None else f"0 with gradient {solves!r}"
+        remembers = self.anderson_memory > 1 and solves is None
+        mode = "a fixed number of iterations, without a tolerance" if converges else "a tolerance"
+        step = f"a step that says it solves the entropic problem, not {self.step.part_name!r}"
+        for name, fits, expected in (
+            ("anderson_memory", self.anderson_memory == 0 or remembers, memory),
+            ("throw", converges or not self.throw, "a tolerance to converge to"),
+            ("gradient", gradient.at_convergence in (None, converges), f"{mode} beside it"),
+            ("gradient", self.step.entropic or not gradient.needs_entropic, step),
+        ):
+            require_field(self, name, fits, expected)

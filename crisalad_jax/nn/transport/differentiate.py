@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from crisalad_jax.config.checks import require
 from crisalad_jax.nn.transport.config import GRADIENTS, Gradient, SinkhornConfig, Solution
 from crisalad_jax.nn.transport.iterate import iterate
 from crisalad_jax.nn.transport.problem import Potentials, Problem, ScalingProblem, product
@@ -54,13 +53,7 @@ def solve_in_domain(
 class Unrolled(Gradient):
     """Differentiate through the iterations: the exact gradient of their number."""
 
-    def check(self, config: SinkhornConfig) -> None:
-        """Refuse a tolerance."""
-        require(
-            config.tolerance is None,
-            "SinkhornConfig.gradient: found 'unrolled' with a tolerance, expected 'implicit', "
-            "'optimistix' or 'stop': a loop of unknown length cannot be unrolled",
-        )
+    at_convergence: ClassVar[bool | None] = False
 
     def solve(
         self, problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
@@ -82,28 +75,13 @@ class Stop(Gradient):
         return solve_in_domain(fixed[0], config, fixed[1], fixed[2])
 
 
-def _require_tolerance(name: str, config: SinkhornConfig) -> None:
-    require(
-        config.tolerance is not None,
-        f"SinkhornConfig.gradient: found {name!r} with a fixed number of iterations, expected a "
-        "tolerance: it is the gradient of the converged plan",
-    )
-
-
 @GRADIENTS.register("implicit")
 @dataclasses.dataclass(frozen=True)
 class Implicit(Gradient):
     """Differentiate the optimality conditions in closed form, without storing iterations."""
 
-    def check(self, config: SinkhornConfig) -> None:
-        """Require a tolerance, and a step whose fixed point is the entropic plan."""
-        _require_tolerance("implicit", config)
-        require(
-            config.step.entropic,
-            f"SinkhornConfig.gradient: found 'implicit' with step {config.step.part_name!r}, "
-            "which does not say that it solves the entropic problem (Step.entropic), expected "
-            "'unrolled', 'optimistix' or 'stop'",
-        )
+    at_convergence: ClassVar[bool | None] = True
+    needs_entropic: ClassVar[bool] = True
 
     def solve(
         self, problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
@@ -156,16 +134,8 @@ class Optimistix(Gradient):
     called.
     """
 
+    at_convergence: ClassVar[bool | None] = True
     takes_solver: ClassVar[bool] = True
-
-    def check(self, config: SinkhornConfig) -> None:
-        """Require a tolerance, and refuse acceleration."""
-        _require_tolerance("optimistix", config)
-        require(
-            not config.anderson_memory,
-            "SinkhornConfig.anderson_memory: found with gradient 'optimistix', expected 0: give "
-            "`solve` a solver that accelerates",
-        )
 
     def solve(
         self,

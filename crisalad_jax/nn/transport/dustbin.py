@@ -66,30 +66,11 @@ class Dustbin(Part):
 DUSTBINS = Registry("dustbin", Dustbin)
 
 
-def _check_shape(params: Any, expected: tuple[int, ...] | None, name: str) -> None:
-    shape = None if params is None else jnp.shape(params)
-    require(shape == expected, f"dustbin: found shape {shape}, expected {expected} for {name!r}")
-
-
-def check_marginals(marginals: Any, dustbin: Dustbin, scores: Array) -> Marginals:
-    """Return what a dustbin returned, if it is `Marginals` that begin with patches and clusters.
-
-    Raises:
-        InputError: it is not; the message names the dustbin.
-    """
-    where = f"dustbin {dustbin.part_name}: found to return"
-    require(
-        isinstance(marginals, Marginals),
-        f"{where} {type(marginals).__name__}, expected Marginals",
-    )
-    shape, (rows, clusters) = jnp.shape(marginals.scores), scores.shape[-2:]
-    clusters -= dustbin.scores
-    require(
-        len(shape) == scores.ndim and shape[-2] >= rows and shape[-1] >= clusters,
-        f"{where} scores of shape {shape}, expected at least the {rows} patches and the "
-        f"{clusters} clusters of {scores.shape}",
-    )
-    return marginals
+def _score(params: Any, *shape: int) -> Array:
+    """Return a dustbin's parameters, an array of this shape."""
+    found = jnp.shape(params) if params is not None else None
+    require(found == shape, f"dustbin: found parameters of shape {found}, expected {shape}")
+    return jnp.asarray(params)
 
 
 @DUSTBINS.register("none")
@@ -99,7 +80,6 @@ class NoDustbin(Dustbin):
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Return the scores as they are."""
-        _check_shape(params, None, "none")
         rows, clusters = scores.shape[-2:]
         each = math.log(rows / clusters)
         return Marginals(
@@ -120,8 +100,7 @@ class ColumnDustbin(Dustbin):
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Append a column of the score."""
-        _check_shape(params, (), "column")
-        return _with_column(scores, jnp.asarray(params))
+        return _with_column(scores, _score(params))
 
 
 @DUSTBINS.register("row and column")
@@ -135,9 +114,8 @@ class RowAndColumnDustbin(Dustbin):
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Append the column, then the row."""
-        _check_shape(params, (), "row and column")
         rows, clusters = scores.shape[-2:]
-        score = jnp.asarray(params).astype(scores.dtype)
+        score = _score(params).astype(scores.dtype)
         full = append_dustbin(scores, score)
         last = jnp.broadcast_to(score, (*full.shape[:-2], 1, clusters + 1))
         log_mu = jnp.append(jnp.zeros(rows, full.dtype), math.log(clusters))
@@ -157,8 +135,7 @@ class TokenDustbin(Dustbin):
         """Use each patch's last score as the dustbin's, or `params` of one score a patch."""
         if params is None:
             scores, params = scores[..., :-1], scores[..., -1]
-        _check_shape(params, scores.shape[:-1], "token")
-        return _with_column(scores, jnp.asarray(params))
+        return _with_column(scores, _score(params, *scores.shape[:-1]))
 
 
 @DUSTBINS.register("mass")
@@ -172,9 +149,8 @@ class MassDustbin(Dustbin):
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Append a column of zero scores."""
-        _check_shape(params, (), "mass")
         rows, clusters = scores.shape[-2:]
-        logit = jnp.asarray(params)
+        logit = _score(params)
         share = jax.nn.log_sigmoid(jnp.stack([-logit, logit])).astype(scores.dtype) + math.log(rows)
         log_nu = jnp.append(jnp.broadcast_to(share[0] - math.log(clusters), clusters), share[1])
         full = append_dustbin(scores, jnp.zeros_like(logit))

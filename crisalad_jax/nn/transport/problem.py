@@ -1,4 +1,4 @@
-"""The entropic transport problem that a step is given, in the log or the scaling domain."""
+"""The entropic transport problem, in the log or the scaling domain, and the errors of a plan."""
 
 import dataclasses
 import functools
@@ -200,3 +200,37 @@ def _exponentials(potential: Array) -> tuple[Array, Array]:
     """Return the exponentials of a potential minus its largest entry, and that entry."""
     top = jax.lax.stop_gradient(potential.max(axis=-1, keepdims=True))
     return jnp.exp(potential - top), top
+
+
+def marginal_error(
+    log_plan: Matrix,
+    log_mu: Float[Array, "*#batch rows"],
+    log_nu: Float[Array, "*#batch columns"],
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """Compute the largest relative error of the row masses and of the column masses of a plan.
+
+    Args:
+        log_plan: logarithms of the masses.
+        log_mu: logarithms of the rows' marginals.
+        log_nu: logarithms of the columns' marginals.
+
+    Returns:
+        The largest |mass / marginal - 1| of the rows, and of the columns. Where a marginal is 0,
+        the error is 0 if the mass is, else infinite.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> log_plan, log_nu = jnp.log(jnp.eye(2)), jnp.log(jnp.full(2, 0.5))
+        >>> rows, columns = marginal_error(log_plan, jnp.zeros(2), log_nu)
+        >>> float(rows), float(columns)
+        (0.0, 1.0)
+    """
+    rows = _relative_error(jax.nn.logsumexp(log_plan, axis=-1), log_mu)
+    columns = _relative_error(jax.nn.logsumexp(log_plan, axis=-2), log_nu)
+    return rows.max(axis=-1), columns.max(axis=-1)
+
+
+def _relative_error(log_mass: Array, log_marginal: Array) -> Array:
+    empty = log_marginal < LOG_ZERO
+    error = jnp.abs(jnp.expm1(log_mass - jnp.where(empty, 0, log_marginal)))
+    return jnp.where(empty, jnp.where(log_mass < LOG_ZERO, 0, jnp.inf), error)

@@ -1,6 +1,7 @@
 """Solve a transport problem, or assign patches to clusters by solving one."""
 
 import math
+import operator
 from typing import Any, NamedTuple
 
 import jax
@@ -10,20 +11,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.nn.transport.checks import (
-    check_init,
-    check_inputs,
-    check_solution,
-    check_step,
-    equal_totals,
-    marginal_error,
-    wide_dtype,
-)
-from crisalad_jax.nn.transport.config import SinkhornConfig
+from crisalad_jax.nn.transport.checks import check_inputs, check_step, equal_totals, wide_dtype
+from crisalad_jax.nn.transport.config import SinkhornConfig, Solution
 from crisalad_jax.nn.transport.differentiate import centred
-from crisalad_jax.nn.transport.dustbin import DUSTBINS, Dustbin, check_marginals
-from crisalad_jax.nn.transport.problem import Matrix, Potentials, Problem, zero_potentials
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.nn.transport.dustbin import DUSTBINS, Dustbin, Marginals
+from crisalad_jax.nn.transport.problem import (
+    Matrix,
+    Potentials,
+    Problem,
+    marginal_error,
+    zero_potentials,
+)
+from crisalad_jax.utils.pytree import expect_like
 
 
 @brief
@@ -117,9 +116,7 @@ def solve(
         require(0 < tau <= 1, f"sinkhorn: {name} found {tau}, expected more than 0 and at most 1")
     # Totals may differ for a step of another problem, such as one with column capacities.
     equal = row_tau == column_tau == 1 and config.step.entropic
-    check_inputs(scores, log_mu, log_nu, epsilon, equal_totals=equal)
-    if init is not None:
-        init = check_init(init, scores, log_mu, log_nu)
+    check_inputs(scores, log_mu, log_nu, epsilon, init, equal_totals=equal)
     require(
         solver is None or config.gradient.takes_solver,
         f"sinkhorn: found a solver with gradient {config.gradient.part_name!r}, expected one that "
@@ -128,7 +125,18 @@ def solve(
     arguments = scores, log_mu, log_nu, epsilon, init, step_params, row_tau, column_tau, config
     # A solver need not be hashable, so it cannot be a static argument.
     result = _compiled(*arguments) if solver is None else _solve(*arguments, solver)
-    return _require_converged(result, config) if config.throw else result
+    if not config.throw:
+        return result
+    message = (
+        f"sinkhorn: found no convergence to {config.tolerance} in {config.iterations} iterations"
+    )
+    if isinstance(result.converged, Tracer):
+        import equinox
+
+        return equinox.error_if(result, ~result.converged.all(), message)
+    missed = int((~result.converged).sum())
+    require(not missed, f"{message} for {missed} of {result.converged.size} problems")
+    return result
 
 
 def _solve(
@@ -155,10 +163,12 @@ def _solve(
     problem = config.step.prepare(problem, step_params)
     start = problem.zeros()
     if init is not None:
-        start = Potentials(*(a.astype(wide) + b for a, b in zip(init, zeros, strict=True)))
+        start = Potentials(*(jnp.asarray(x, wide) + y for x, y in zip(init, zeros, strict=True)))
     options = {} if solver is None else {"solver": solver}
     solution = config.gradient.solve(problem, config, step_params, start, **options)
-    check_solution(solution, config, problem)
+    count = jnp.zeros(kernel.shape[:-2], jnp.int32)
+    wanted = Solution(problem.zeros(), count, count.astype(bool))
+    expect_like(f"gradient {config.gradient.part_name}", solution, wanted)
     potentials, step = problem.masked(solution.potentials), config.step
     log_plan = step.log_plan(problem, potentials)
     errors = marginal_error(log_plan, problem.log_mu, problem.log_nu)
@@ -174,20 +184,6 @@ def _solve(
 
 
 _compiled = jax.jit(_solve, static_argnames=("row_tau", "column_tau", "config"))
-
-
-def _require_converged(result: SinkhornResult, config: SinkhornConfig) -> SinkhornResult:
-    message = (
-        f"sinkhorn: found no convergence to {config.tolerance} in {config.iterations} iterations"
-    )
-    if isinstance(result.converged, Tracer):
-        import equinox
-
-        return equinox.error_if(result, ~result.converged.all(), message)
-    missed = int((~result.converged).sum())
-    if missed:
-        raise InputError(f"{message} for {missed} of {result.converged.size} problems")
-    return result
 
 
 def assign_with_dustbin(
@@ -240,13 +236,16 @@ def assign_with_dustbin(
     scores = scores.astype(wide_dtype(scores))
     if isinstance(dustbin, str):
         dustbin = DUSTBINS.make(dustbin)
-    full, log_mu, log_nu = check_marginals(
-        dustbin.marginals(params, scores, patches), dustbin, scores
+    patches_and_clusters = scores.shape[-2], scores.shape[-1] - dustbin.scores
+    marginals = dustbin.marginals(params, scores, patches)
+    found = jnp.shape(marginals.scores) if isinstance(marginals, Marginals) else ()
+    require(
+        len(found) == scores.ndim and all(map(operator.ge, found[-2:], patches_and_clusters)),
+        f"dustbin {dustbin.part_name}: found to return {type(marginals).__name__} of shape "
+        f"{found}, expected Marginals of at least {patches_and_clusters}",
     )
     result = solve(
-        full,
-        log_mu,
-        log_nu,
+        *marginals,
         epsilon=epsilon,
         row_tau=row_tau,
         column_tau=column_tau,

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from crisalad_jax.config.checks import require
+from crisalad_jax.config.checks import require, require_field
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.registry import Registry, count_arguments
 from crisalad_jax.nn.transport.problem import (
@@ -121,10 +121,8 @@ class SinkhornStep(Step):
 
     def __post_init__(self) -> None:
         """Check the range."""
-        require(
-            1 <= self.relaxation < 2,
-            f"SinkhornStep.relaxation: found {self.relaxation}, expected from 1 to less than 2",
-        )
+        fits = 1 <= self.relaxation < 2
+        require_field(self, "relaxation", fits, "from 1 to less than 2")
 
     def step(
         self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]

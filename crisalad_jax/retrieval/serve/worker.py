@@ -6,7 +6,7 @@ Nothing else searches or appends, so that every search sees a whole map.
 import collections
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -108,16 +108,16 @@ class MapWorker:
         batch = [each for each in taken if each[1].set_running_or_notify_cancel()]
         if not batch:
             return
-        with _failing([result for _, result in batch]):
+        try:
             descriptors = self._describe([work.pixels for work, _ in batch])
-            questions = []
+            jobs = [_Job(*each, row) for each, row in zip(batch, descriptors, strict=True)]
             # Additions first: an answer sees what came in with its question.
-            for (work, result), descriptor in zip(batch, descriptors, strict=True):
-                if isinstance(work, Addition):
-                    self._append(work, descriptor, result)
-                else:
-                    questions.append((work, descriptor, result))
-            self._search(questions)
+            self._append([job for job in jobs if isinstance(job.work, Addition)])
+            self._search([job for job in jobs if isinstance(job.work, Question)])
+        except Exception as error:
+            for _, result in batch:
+                if not result.done():
+                    result.set_exception(MapFailedError(str(error)))
 
     def _describe(self, images: Sequence[Pixels]) -> Float32[np.ndarray, "n d"]:
         padded = list(images)
@@ -127,31 +127,52 @@ class MapWorker:
         described = describe_prepared(self._describer, padded, self._batch_size)
         return self.places.shorten(described)[: len(images)]
 
-    def _append(
-        self, work: Addition, descriptor: Float32[np.ndarray, " d"], result: "Future[Any]"
-    ) -> None:
-        places, root = self.places, self.places.folder / ADDED
-        try:
-            self._check_name(work.name)
-            position = work.position and work.position.fitted("position", places.axes, places.zone)
-        except InputError as error:
-            result.set_exception(error)
+    def _append(self, jobs: "Sequence[_Job]") -> None:
+        """Append images at once, and one by one where that fails: a bad one fails alone."""
+        if not jobs:
             return
-        with _failing([result]):
-            with atomic_path(root / work.name, durable=True) as temporary:
-                temporary.write_bytes(work.data)
-            try:
+        first = len(self.places)
+        try:
+            self._commit([job.work for job in jobs], np.stack([job.descriptor for job in jobs]))
+        except Exception as error:
+            if len(jobs) > 1:
+                for job in jobs:
+                    self._append([job])
+            else:
+                jobs[0].result.set_exception(error)
+            return
+        for number, job in enumerate(jobs, first):
+            job.result.set_result(number)
+
+    def _commit(self, works: Sequence[Addition], descriptors: Float32[np.ndarray, "n d"]) -> None:
+        """Write the files of images, and append these to the map: all of them, or none."""
+        places, root = self.places, self.places.folder / ADDED
+        for work in works:
+            self._check_name(work.name)
+        fitted = [
+            work.position.fitted("position", places.axes, places.zone)
+            for work in works
+            if work.position is not None
+        ]
+        if len({(each.axes, each.zone) for each in fitted}) > 1:
+            raise MapFailedError("positions in several axes or zones, to be appended one by one")
+        known = {name: at for each in fitted for name, at in each.of.items()}
+        try:
+            with contextlib.ExitStack() as undo:
+                for work in works:
+                    with atomic_path(root / work.name, durable=True) as temporary:
+                        temporary.write_bytes(work.data)
+                    undo.callback((root / work.name).unlink, missing_ok=True)
                 places.append(
-                    [work.name],
-                    [len(work.data)],
-                    descriptor[None],
+                    [work.name for work in works],
+                    [len(work.data) for work in works],
+                    descriptors,
                     root=real_path(root).as_posix(),
-                    positions=position,
+                    positions=fitted[0]._replace(of=known) if fitted else None,
                 )
-            except BaseException:
-                (root / work.name).unlink()
-                raise
-            result.set_result(len(places) - 1)
+                undo.pop_all()
+        except Exception as error:
+            raise MapFailedError(str(error)) from error
 
     def _check_name(self, name: str) -> None:
         """Raise `NameTakenError` for an image of the map, or a name that crosses another's path."""
@@ -161,23 +182,21 @@ class MapWorker:
             expected = "expected one that neither an image nor a folder of the map has"
             raise NameTakenError(f"name: found {name!r}, {expected}")
 
-    def _search(self, questions: Sequence[tuple[Question, np.ndarray, "Future[Any]"]]) -> None:
+    def _search(self, jobs: "Sequence[_Job]") -> None:
         """Search for all questions at once."""
-        if not questions:
+        if not jobs:
             return
-        works, descriptors, results = zip(*questions, strict=True)
-        found = self.places.search(np.stack(descriptors), max(work.k for work in works))
-        for work, result, numbers, similarities in zip(works, results, *found, strict=True):
-            best = zip(numbers[: work.k].tolist(), similarities[: work.k].tolist(), strict=True)
-            result.set_result(list(best))
+        rows = np.stack([job.descriptor for job in jobs])
+        found = self.places.search(rows, max(job.work.k for job in jobs))
+        for job, numbers, similarities in zip(jobs, *found, strict=True):
+            k = job.work.k
+            best = zip(numbers[:k].tolist(), similarities[:k].tolist(), strict=True)
+            job.result.set_result(list(best))
 
 
-@contextlib.contextmanager
-def _failing(results: "Sequence[Future[Any]]") -> Iterator[None]:
-    """Hand an exception of the block to the results that are not there yet."""
-    try:
-        yield
-    except Exception as error:
-        for result in results:
-            if not result.done():
-                result.set_exception(MapFailedError(str(error)))
+class _Job(NamedTuple):
+    """A piece of work in hand."""
+
+    work: Any
+    result: "Future[Any]"
+    descriptor: Float32[np.ndarray, " d"]

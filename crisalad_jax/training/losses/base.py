@@ -130,28 +130,27 @@ class Loss(Part, abc.ABC):
         """Return the loss of a batch; `params` are of `init`."""
 
 
-def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
-    """Return the methods of a loss that is a plain function of a batch, or of its arrays.
+@dataclasses.dataclass(frozen=True)
+class GivenLoss(Loss):
+    """A plain function that a caller gives in the place of a registered loss."""
 
-    A function of (descriptors, labels) or (descriptors, labels, valid) is taken as well.
-    """
-    # Of a whole batch, or of its arrays.
-    whole = count_arguments(function, "descriptors", "labels", "valid") == 1
+    part_name: ClassVar[str] = "given"
+    function: Callable[..., Any]
+    """Takes a batch; or descriptors and labels, and if it likes which images are valid."""
 
-    def apply(self: Loss, params: Any, batch: LossBatch) -> LossValue:
-        if whole:
-            value = function(batch)
-        else:
-            value = call_loss(function, batch.descriptors, batch.labels, batch.valid)
+    def apply(self, params: Any, batch: LossBatch) -> LossValue:
+        """Return the function's loss."""
+        arrays = batch.descriptors, batch.labels, batch.valid
+        count = count_arguments(self.function, "descriptors", "labels", "valid")
+        value = self.function(batch) if count == 1 else self.function(*arrays[:count])
         return value if isinstance(value, LossValue) else LossValue(value)
 
-    return {"apply": apply}
 
-
-def call_loss(function: Callable[..., Any], descriptors: Any, labels: Any, valid: Any) -> Any:
-    """Call a function of (descriptors, labels), or of (descriptors, labels, valid)."""
-    takes = count_arguments(function, "descriptors", "labels", "valid")
-    return function(*(descriptors, labels, valid)[:takes])
+def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
+    """Return the methods of a loss that is a plain function, as `GivenLoss` takes it."""
+    given = GivenLoss(function)
+    count_arguments(function, "descriptors", "labels", "valid")
+    return {"apply": lambda self, params, batch: given.apply(params, batch)}
 
 
 def check_value(value: Any, name: str) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_fraction, require_positive
 from crisalad_jax.config.classes import ClassesConfig
@@ -49,65 +49,27 @@ class LargeMarginCosineConfig(Loss):
         return bound * jax.random.uniform(key, (classes, dim), jnp.float32, -1, 1)
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
-        """Return the cross entropy, and the share of images whose nearest class is their own."""
-        return large_margin_cosine_loss(
-            batch.descriptors,
-            batch.labels,
-            params,
-            scale=self.scale,
-            margin=self.margin,
-            valid=batch.valid,
-            classes=batch.classes,
-        )
+        """Compute the cross entropy of cosines to classes' vectors (CosFace, equation 4).
 
+        The margin is subtracted from the cosine of an image and its own class, then all cosines are
+        multiplied by the scale. The means are over the valid images; the accuracy is the share
+        whose nearest class is their own. Only directions count.
 
-def large_margin_cosine_loss(
-    descriptors: Float[Array, "image descriptor"],
-    labels: Int[Array, " image"],
-    weights: Float[Array, "class descriptor"],
-    *,
-    scale: float,
-    margin: float,
-    valid: Bool[Array, " image"] | None = None,
-    classes: Int[Array, ""] | int | None = None,
-) -> LossValue:
-    """Compute the cross entropy of cosines to classes' vectors (CosFace, equation 4).
-
-    `margin` is subtracted from the cosine of an image and its own class, then all cosines are
-    multiplied by `scale`. The mean is over the valid images.
-
-    Args:
-        descriptors: of any length; their directions count.
-        labels: the class of each image.
-        weights: a vector for each class, of any length.
-        scale: the paper's s.
-        margin: the paper's m.
-        valid: images that take part; None means all.
-        classes: number of leading weights that are classes; None means all.
-
-    Returns:
-        The loss and the accuracy.
-
-    Example:
-        >>> import jax.numpy as jnp
-        >>> value = large_margin_cosine_loss(
-        ...     jnp.eye(2), jnp.array([0, 1]), jnp.eye(2), scale=30.0, margin=0.4
-        ... )
-        >>> float(value.accuracy)
-        1.0
-    """
-    directions, centres = _directions(descriptors), _directions(weights)
-    cosines = jnp.matmul(directions, centres.T, precision="highest")
-    if classes is not None:
-        cosines = jnp.where(jnp.arange(len(weights)) < classes, cosines, -jnp.inf)
-    own = labels[:, None] == jnp.arange(len(weights))
-    logits = scale * jnp.where(own, cosines - margin, cosines)
-    log_share = jnp.where(own, jax.nn.log_softmax(logits, axis=1), 0).sum(axis=1)
-    counted = jnp.ones(len(labels), bool) if valid is None else valid
-    images = jnp.maximum(counted.sum(), 1)
-    loss = -jnp.where(counted, log_share, 0).sum() / images
-    right = counted & (cosines.argmax(axis=1) == labels)
-    return LossValue(loss, right.sum(dtype=loss.dtype) / images)
+        Args:
+            params: a vector for each class; those beyond `batch.classes` are padding.
+            batch: its labels are classes.
+        """
+        directions, centres = _directions(batch.descriptors), _directions(params)
+        cosines = jnp.matmul(directions, centres.T, precision="highest")
+        numbers = jnp.arange(len(params))
+        if batch.classes is not None:
+            cosines = jnp.where(numbers < batch.classes, cosines, -jnp.inf)
+        own = batch.labels[:, None] == numbers
+        logits = self.scale * jnp.where(own, cosines - self.margin, cosines)
+        log_share = jnp.where(own, jax.nn.log_softmax(logits, axis=1), 0).sum(axis=1)
+        loss = -jnp.where(batch.valid, log_share, 0).sum() / batch.anchors
+        right = batch.valid & (cosines.argmax(axis=1) == batch.labels)
+        return LossValue(loss, right.sum(dtype=loss.dtype) / batch.anchors)
 
 
 def _directions(x: Float[Array, "row column"]) -> Float[Array, "row column"]:

@@ -105,22 +105,15 @@ def metric_loss(
         f"descriptors, labels: found shapes {descriptors.shape} and {labels.shape}, expected "
         "(image, descriptor) and (image,)",
     )
-    name = f"loss {config.kind.part_name}"
-    require(
-        pairs is not None or not config.kind.of_tuples,
-        f"{name}: found places, expected the pairs of mined tuples",
-    )
-    require(
-        dense is not None or not config.kind.reads_dense,
-        f"{name}: found no local features, expected an aggregator that has them in training, such "
-        "as selavpr",
-    )
-    if params is None:
-        init = functools.partial(config.kind.init, classes=1, dim=descriptors.shape[1])
-        require(
-            jax.eval_shape(init, jax.random.key(0)) is None,
-            f"{name}: found no params, expected those of its init",
-        )
+    kind, name = config.kind, f"loss {config.kind.part_name}"
+    init = functools.partial(kind.init, classes=1, dim=descriptors.shape[1])
+    learns = params is None and jax.eval_shape(init, jax.random.key(0)) is not None
+    for lacks, what in (
+        (kind.of_tuples and pairs is None, "tuples, expected the pairs of mined ones"),
+        (kind.reads_dense and dense is None, "local features, expected those of selavpr's tokens"),
+        (learns, "params, expected those of its init"),
+    ):
+        require(not lacks, f"{name}: found no {what}")
     wide = descriptors.astype(jnp.promote_types(descriptors.dtype, jnp.float32))
     valid = jnp.ones(len(labels), bool) if valid is None else valid
     every = all_pairs(labels, valid=valid) if pairs is None else pairs
@@ -128,7 +121,7 @@ def metric_loss(
     similarities = jax.lax.stop_gradient(batch.similarities)
     mined = mine(similarities, every, margin=config.miner_margin)
     chosen = every if config.miner == "none" else mined
-    value = config.kind.apply(params, dataclasses.replace(batch, pairs=chosen))
+    value = kind.apply(params, dataclasses.replace(batch, pairs=chosen))
     check_value(value, name)
     loss = value.loss
     if config.pml_compat:

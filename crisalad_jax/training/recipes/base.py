@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from crisalad_jax.config.checks import choose, takes
+from crisalad_jax.config.checks import choose, require, takes
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.plugins import load_entry_points
 from crisalad_jax.config.preprocessing import PreprocessingConfig
@@ -13,7 +13,6 @@ from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig, has_adapters
 from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, HEAD
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 
 Make = Callable[[ModelConfig, str], TrainConfig]
@@ -45,11 +44,11 @@ def register_recipe(name: str) -> Callable[[Make], Make]:
     """
 
     def decorate(make: Make) -> Make:
-        module = RECIPES[name].__module__ if name in RECIPES else make.__module__
-        if module != make.__module__:
-            raise InputError(
-                f"register_recipe {name!r}: found the name taken by {module}, expected another"
-            )
+        module = RECIPES.get(name, make).__module__
+        require(
+            module == make.__module__,
+            f"register_recipe {name!r}: found the name taken by {module}, expected another",
+        )
         RECIPES[name] = make
         return make
 
@@ -102,12 +101,8 @@ def _of_model(config: TrainConfig, model: ModelConfig | None) -> TrainConfig:
     if model is None:
         return config
     fits = config.trainable != ADAPTERS_AND_HEAD or has_adapters(model)
-    return dataclasses.replace(
-        config,
-        model=model,
-        trainable=config.trainable if fits else HEAD,
-        validation_size=None,
-    )
+    trainable = config.trainable if fits else HEAD
+    return dataclasses.replace(config, model=model, trainable=trainable, validation_size=None)
 
 
 def resized(chain: PreprocessingConfig, **fields: Any) -> PreprocessingConfig:
@@ -178,23 +173,26 @@ def find_part(
         'newton'
     """
     kind, colon, part = name.rpartition(":")
-    kinds = [each for each in _KINDS if each == kind or not colon]
-    matches = [each for each in kinds if part in REGISTRIES[each]]
-    if not matches:
+
+    def matches() -> list[str]:
+        kinds = [each for each in _KINDS if each == kind or not colon]
+        return [each for each in kinds if part in REGISTRIES[each]]
+
+    if not matches():
         load_entry_points()
-        matches = [each for each in kinds if part in REGISTRIES[each]]
-    if not matches:
-        raise InputError(
-            f"{what}: found {name!r}, expected one of {', '.join(sorted(others))}, or a "
-            f"registered part as NAME or KIND:NAME, with a kind of {', '.join(_KINDS)} (is a "
-            "plug-in missing? --plugin FILE.py or MODULE)"
-        )
-    if len(matches) > 1:
-        raise InputError(
-            f"{what}: found {name!r}, which is a part of several kinds, expected "
-            f"{' or '.join(f'{each}:{part}' for each in matches)}"
-        )
-    return REGISTRIES[matches[0]].make(part, preset)
+    found = matches()
+    require(
+        bool(found),
+        f"{what}: found {name!r}, expected one of {', '.join(sorted(others))}, or a registered "
+        f"part as NAME or KIND:NAME, with a kind of {', '.join(_KINDS)} (is a plug-in missing? "
+        "--plugin FILE.py or MODULE)",
+    )
+    require(
+        len(found) < 2,
+        f"{what}: found {name!r}, which is a part of several kinds, expected "
+        f"{' or '.join(f'{each}:{part}' for each in found)}",
+    )
+    return REGISTRIES[found[0]].make(part, preset)
 
 
 _KINDS = ("aggregator", "step", "dustbin", "loss", "backbone", "augmentation", "gradient")
@@ -222,21 +220,24 @@ def with_part(config: TrainConfig, part: Any) -> TrainConfig:
         model = dataclasses.replace(model, backbone=part)
         return dataclasses.replace(config, model=model, trainable=trainable, validation_size=None)
     if kind == "aggregator":
-        cross_image = dataclasses.replace(model.cross_image, layers=0)
-        model = dataclasses.replace(model, aggregator=part, cross_image=cross_image)
-        return dataclasses.replace(config, model=model, validation_size=None)
+        return dataclasses.replace(config, model=with_head(model, part), validation_size=None)
     # Steps and gradients are settings of the solver, and a dustbin of the aggregator itself.
     field = "dustbin" if kind == "dustbin" else "sinkhorn"
-    if not hasattr(model.aggregator, field):
-        raise InputError(
-            f"recipe: found {kind} {part.part_name!r} for aggregator {model.aggregator.part_name}, "
-            "expected one that transports, such as salad"
-        )
+    require(
+        hasattr(model.aggregator, field),
+        f"recipe: found {kind} {part.part_name!r} for aggregator {model.aggregator.part_name}, "
+        "expected one that transports, such as salad",
+    )
     if field != kind:
         part = dataclasses.replace(getattr(model.aggregator, field), **{kind: part})
     aggregator: Any = dataclasses.replace(model.aggregator, **{field: part})
-    model = dataclasses.replace(model, aggregator=aggregator)
-    return dataclasses.replace(config, model=model)
+    return dataclasses.replace(config, model=dataclasses.replace(model, aggregator=aggregator))
+
+
+def with_head(model: ModelConfig, aggregator: Any) -> ModelConfig:
+    """Return a model with this aggregator, and no cross-image encoder."""
+    cross_image = dataclasses.replace(model.cross_image, layers=0)
+    return dataclasses.replace(model, aggregator=aggregator, cross_image=cross_image)
 
 
 @takes(config=TrainConfig)
@@ -257,17 +258,18 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
         >>> from_scratch(recipe("tiny", "crisalad+gem")).trainable
         'all'
     """
-    loss = dataclasses.replace(config.loss, kind=config.loss.kind.from_scratch())
+    augmentation = config.augmentation
+    if type(augmentation).__module__.startswith("crisalad_jax."):
+        augmentation = LightAugmentConfig(colour=0.4, gamma=0.5, illumination=0.6)
     batches = {
         "places_per_batch": TrainConfig.places_per_batch,
         "images_per_place": 2,
         "min_images": 2,
     }
-    built_in = type(config.augmentation).__module__.startswith("crisalad_jax.")
     return dataclasses.replace(
         config,
         model=dataclasses.replace(config.model, compute_dtype="float32"),
-        loss=loss,
+        loss=dataclasses.replace(config.loss, kind=config.loss.kind.from_scratch()),
         optimiser=OptimiserConfig(
             learning_rate=1e-3,
             end_lr_fraction=0.02,
@@ -277,9 +279,7 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
             clip_norm=1.0,
         ),
         trainable="all",
-        augmentation=LightAugmentConfig(colour=0.4, gamma=0.5, illumination=0.6)
-        if built_in
-        else config.augmentation,
+        augmentation=augmentation,
         **({} if config.mines else batches),
         batch_order="shuffled",
         epochs=150,

@@ -14,7 +14,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.losses.large_margin_cosine import LargeMarginCosineConfig
-from crisalad_jax.training.recipes.base import register_recipe
+from crisalad_jax.training.recipes.base import register_recipe, with_head
 from crisalad_jax.training.recipes.convolutional import model_over
 
 _VIEWPOINTS = LargeMarginCosineConfig(
@@ -86,7 +86,7 @@ def cosplace_vit(model: ModelConfig, preset: str) -> TrainConfig:
     """
     loss = LargeMarginCosineConfig(classes=ClassesConfig(steps=10_000))
     head = AGGREGATORS.make("cosplace", preset)
-    return _classified(_over_vit(model, head), loss, epochs=50)
+    return _classified(with_head(model, head), loss, epochs=50)
 
 
 @register_recipe("eigenplaces-vit")
@@ -97,9 +97,4 @@ def eigenplaces_vit(model: ModelConfig, preset: str) -> TrainConfig:
     """
     head: Any = AGGREGATORS.make("cosplace", preset)
     head = dataclasses.replace(head, dim=4 * head.dim)
-    return _classified(_over_vit(model, head), _VIEWPOINTS, epochs=80, min_images=5)
-
-
-def _over_vit(model: ModelConfig, aggregator: Any) -> ModelConfig:
-    cross_image = dataclasses.replace(model.cross_image, layers=0)
-    return dataclasses.replace(model, aggregator=aggregator, cross_image=cross_image)
+    return _classified(with_head(model, head), _VIEWPOINTS, epochs=80, min_images=5)

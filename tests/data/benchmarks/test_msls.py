@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crisalad_jax.data.benchmarks import open_benchmark, read_msls, read_msls_subtask
+from crisalad_jax.data.benchmarks import open_benchmark, read_msls
 from crisalad_jax.data.benchmarks.msls import heading_difference
 from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import lists_of, touch
@@ -132,9 +132,8 @@ def brute_force(*, radius: float = 25, degrees: float | None = None, subtask: bo
 @pytest.mark.parametrize("degrees", [None, 40.0, 0.0, 180.0])
 @pytest.mark.parametrize("radius", [25.0, 12.0])
 def test_positives_equal_brute_force(tmp_path, radius, degrees, subtask):
-    read = read_msls_subtask if subtask else read_msls
     root = write_msls(tmp_path)
-    benchmark = read(root, radius=radius, max_heading_difference=degrees)
+    benchmark = read_msls(root, radius=radius, max_heading_difference=degrees, subtask=subtask)
     database, queries, matches = brute_force(radius=radius, degrees=degrees, subtask=subtask)
     assert keys(benchmark.database) == database
     assert keys(benchmark.queries) == queries
@@ -249,7 +248,7 @@ def test_bad_tables(tmp_path, table, old, new, message):
     root = write_msls(tmp_path, {"cph": SIDE})
     edit(root / "train_val" / "cph" / "database" / table, old, new)
     with pytest.raises(InputError, match=message) as caught:
-        read_msls_subtask(root, max_heading_difference=40)
+        read_msls(root, max_heading_difference=40, subtask=True)
     assert "\n" not in str(caught.value)
 
 
@@ -275,7 +274,7 @@ def test_a_subtask_without_keys_goes_by_its_rows(tmp_path):
     root = write_msls(tmp_path, {"cph": SIDE})
     table = root / "train_val" / "cph" / "database" / "subtask_index.csv"
     table.write_text(",all\n0,False\n1,True\n")
-    assert keys(read_msls_subtask(root).database) == ["b"]
+    assert keys(read_msls(root, subtask=True).database) == ["b"]
 
 
 def test_panoramas_alone_are_nothing(tmp_path):
@@ -289,4 +288,4 @@ def test_a_subtask_without_matches_is_nothing(tmp_path):
     root = write_msls(tmp_path, {"cph": side})
     assert lists_of(read_msls(root).positives) == [[]]
     with pytest.raises(InputError, match="found no query within 25 m of the database"):
-        read_msls_subtask(root)
+        read_msls(root, subtask=True)

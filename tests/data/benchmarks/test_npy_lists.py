@@ -47,7 +47,7 @@ def test_pittsburgh(tmp_path, queries_in, named_in):
     stored = [queries_in + name for name in QUERIES]
     images = write_images(tmp_path / "photos", DATABASE + stored)
     if named_in and not queries_in:
-        with pytest.raises(InputError, match=r"qImages.npy: found no image queries_real/"):
+        with pytest.raises(InputError, match=r"3 of 3 images missing, .* first is queries_real/"):
             read_salad_lists(lists, images=images)
         return
     benchmark = read_salad_lists(lists, images=images)
@@ -145,9 +145,9 @@ def test_a_folder_of_several_sets(tmp_path):
     assert read_salad_lists(tmp_path, "val").name == "pitts30k_val (SALAD's lists)"
     chosen = read_salad_lists(tmp_path / "pitts30k_test_dbImages.npy")
     assert chosen.name == "pitts30k_test (SALAD's lists)"
-    with pytest.raises(InputError, match="and split 'train', expected those of one"):
+    with pytest.raises(InputError, match=r"expected those of one: .*, unlike train"):
         read_salad_lists(tmp_path, "train")
-    with pytest.raises(InputError, match=r"Images\.npy: found lists of pitts30k_test, .*expected"):
+    with pytest.raises(InputError, match=r"Images\.npy: found lists of no set, expected"):
         read_salad_lists(tmp_path / "pitts250k_test_qImages.npy")
 
 
@@ -157,14 +157,14 @@ def test_a_folder_of_several_sets(tmp_path):
         ({"gt": ragged([0], [1])}, r"a_gt.npy: found shape \(2,\), expected a row for each of 3"),
         ({"gt": ragged([0], [5], [1])}, "a_gt.npy: row 1: found reference indices 5 to 5"),
         ({"gt": ragged([0], ["x"], [1])}, "a_gt.npy: row 1: found values of type str"),
-        ({"gt": np.zeros(3)}, "a_gt.npy: row 0: found values of type float64"),
-        ({"qIdx": np.array([0, 3, 1])}, "a_qIdx.npy: found 3 indices, expected some from 0 to 2"),
-        ({"qIdx": np.array([0, 0, 1])}, "a_qIdx.npy: found 3 indices, .*each once"),
-        ({"qIdx": np.array([], int)}, "a_qIdx.npy: found 0 indices"),
+        ({"gt": np.zeros(3)}, "a_gt.npy: row 0: found values of type float"),
         (
-            {"qIdx": np.array([0.0])},
-            "a_qIdx.npy: row 0: found values of type float64",
+            {"qIdx": np.array([0, 3, 1])},
+            "a_qIdx.npy: found queries .0, 3, 1.*, expected some from 0 to 2",
         ),
+        ({"qIdx": np.array([0, 0, 1])}, "a_qIdx.npy: found queries .*0, 0, 1"),
+        ({"qIdx": np.array([], int)}, "a_qIdx.npy: found queries"),
+        ({"qIdx": np.array([0.0])}, "a_qIdx.npy: row 0: found values of type float"),
         ({"pIdx": TRUTH}, "a_gt.npy, a_pIdx.npy, .*expected a_qImages.npy, and one of"),
         ({"dbImages": np.arange(5)}, "a_dbImages.npy: found an array of .*, expected names"),
         ({"dbImages": np.empty(0, "<U3")}, "a_dbImages.npy: (found|cannot)"),
@@ -183,7 +183,7 @@ def test_bad_lists(tmp_path, changes, message):
 def test_missing_images_stay_in_the_set_to_be_skipped(tmp_path):
     write_images(tmp_path, DATABASE + QUERIES[1:])
     write_lists(tmp_path, "a_", dbImages=DATABASE, qImages=QUERIES, gt=TRUTH)
-    with pytest.raises(InputError, match=f"found no image {QUERIES[0]}"):
+    with pytest.raises(InputError, match=f"found 1 of 3 images missing, .* first is {QUERIES[0]}"):
         open_benchmark(tmp_path)
     found = open_benchmark(tmp_path, on_bad_image="skip")
     assert found.queries == tuple(tmp_path / name for name in QUERIES)
@@ -238,18 +238,16 @@ def test_vpr_bench_leaves_out_references_after_the_last_image(tmp_path):
     [
         ([(0, [0]), (1, [4]), (2, [0])], "row 1: found reference indices 4 to 4, expected 0 to 3"),
         ([(0, [-2]), (1, [1]), (2, [0])], "row 0: found reference indices -2 to -2"),
-        ([(0, [0]), (3, [1]), (2, [0])], r"found queries \[0, 3, 2\].*, expected each from 0 to 2"),
-        ([(0, [0]), (0, [1]), (2, [0])], r"found queries \[0, 0, 2\].*, expected each"),
+        (
+            [(0, [0]), (3, [1]), (2, [0])],
+            r"found queries \[0, 3, 2\].*, expected some from 0 to 2",
+        ),
+        ([(0, [0]), (0, [1]), (2, [0])], r"found queries \[0, 0, 2\]"),
         ([(0, [0]), (1, [1])], r"found shape \(2, 2\), expected \(3, 2\)"),
         ([(0, [0]), (1, ["a"]), (2, [0])], "row 1: .*expected whole numbers"),
-        (
-            [(0, [0]), (1, [0.5]), (2, [0])],
-            "row 1: found values of type float, expected whole",
-        ),
-        (
-            [(0, [0]), (1, [True]), (2, [0])],
-            "row 1: found values of type bool, expected whole numbers",
-        ),
+        ([(0, [0]), (1, [0.5]), (2, [0])], "row 1: found values of type float, expected whole"),
+        ([(0, [0]), (1, [True]), (2, [0])], "row 1: found values of type bool, expected whole"),
+        ([(0, [0]), (1, [2**80]), (2, [0])], "row 1: found values of type int, .* of 64 bits"),
         ([(0, [0]), (1, [[1], [2, 3]]), (2, [0])], "row 1: .*expected whole numbers"),
         ([(0, [0]), (1, None), (2, [0])], "row 1: .*expected whole numbers"),
     ],

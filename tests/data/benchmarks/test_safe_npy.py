@@ -14,7 +14,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.retrieval.descriptor_files import open_npy, read_descriptors
 from crisalad_jax.utils.errors import InputError
@@ -234,8 +233,6 @@ def test_an_archive_of_arrays_is_told(tmp_path):
     for path in (tmp_path / "gt.npz", tmp_path / "gt.npy"):
         with pytest.raises(InputError, match=words):
             read_npy(path)
-    with pytest.raises(InputError, match=words):
-        open_benchmark(tmp_path / "gt.npz")
     with pytest.raises(InputError, match=words):
         read_descriptors(tmp_path / "gt.npz")
     with pytest.raises(InputError, match=words):

@@ -72,6 +72,7 @@ def test_utm_bad_folders(tmp_path):
     (tmp_path / "images" / "test" / "queries").mkdir()
     with pytest.raises(InputError, match="queries"):
         read_utm(tmp_path)
+    touch(tmp_path / "images" / "test" / "queries" / utm_name("1", "2"))
     with pytest.raises(InputError, match="radius: found inf, expected finite metres from 0"):
         read_utm(tmp_path, radius=float("inf"))
     with pytest.raises(InputError, match="radius: found nan"):

@@ -12,8 +12,7 @@ from crisalad_jax.experiments.comparison import (
     prepare,
     runner,
 )
-from crisalad_jax.experiments.comparison.costs import Race, race
-from crisalad_jax.experiments.comparison.methods import find_line
+from crisalad_jax.experiments.comparison.costs import Spread, race, ratios
 from crisalad_jax.training.recipes import from_scratch, recipe
 from tests.cli.test_cli import fails, succeeds
 from tests.conftest import BATCH
@@ -67,7 +66,7 @@ def test_rows_change_one_thing_each():
         ("lr-1e-4", "learning rate 0.0001"),
         ("no-encoder-step", "cross-image encoder no, scheduler step"),
     ):
-        assert find_line(name, "b14", from_nothing=False).changed.startswith(words)
+        assert ABLATIONS[name].words(rows[name]).startswith(words)
 
 
 def test_from_nothing_rates_are_in_the_papers_proportion():
@@ -83,7 +82,7 @@ def test_from_nothing_rates_are_in_the_papers_proportion():
 @pytest.mark.usefixtures("quick")
 def test_ablate(flags, capfd, tmp_path, monkeypatch):
     """The row of the whole model is trained as `compare` trains CriSALAD."""
-    timed = [cost._replace(time=(1.0, 1.0, 1.0)) for cost in adapter_costs(measure=False)]
+    timed = [cost._replace(time=Spread(1.0, 1.0, 1.0)) for cost in adapter_costs(measure=False)]
     monkeypatch.setattr(runner, "adapter_costs", lambda: timed)
     out = tmp_path / "out"
     given = ("ablate", "--rows", "crisalad", "--seeds", 1, *flags[flags.index("--epochs") :])
@@ -118,9 +117,9 @@ def test_races_are_run_in_turns():
     contenders = {name: lambda name=name: lambda: order.append(name) for name in "ab"}
     found = race(contenders, rounds=2)
     assert order == ["a", "b"] + (["a"] * 4 + ["b"] * 4) * 2
-    assert {name: len(rounds) for name, rounds in found.rounds.items()} == {"a": 2, "b": 2}
+    assert {name: len(rounds) for name, rounds in found.items()} == {"a": 2, "b": 2}
 
 
 def test_ratios_are_of_one_round():
-    raced = Race({"slow": [2.0, 40.0, 9.0], "fast": [1.0, 10.0, 3.0]})
-    assert raced.slower("slow", "fast") == (3.0, 2.0, 4.0)
+    rounds = {"slow": [2.0, 40.0, 9.0], "fast": [1.0, 10.0, 3.0]}
+    assert Spread.of(ratios(rounds, "slow", "fast")) == (3.0, 2.0, 4.0)

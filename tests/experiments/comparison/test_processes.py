@@ -36,24 +36,24 @@ def plugin(tmp_path, monkeypatch):
     return path
 
 
-def test_gpus_are_dealt_out():
-    shares = shares_of("gpu", 5, 2, None)
-    assert [share.environment for share in shares] == [
-        {"CUDA_VISIBLE_DEVICES": "0,2,4"},
-        {"CUDA_VISIBLE_DEVICES": "1,3"},
-    ]
-    assert not any(share.beside for share in shares)
-
-
-def test_too_few_gpus_are_shared_with_their_memory():
-    shares = shares_of("gpu", 2, 3, "GPU-a, GPU-b")
-    assert [share.environment["CUDA_VISIBLE_DEVICES"] for share in shares] == [
-        *("GPU-a", "GPU-b", "GPU-a")
-    ]
-    assert [share.environment["XLA_PYTHON_CLIENT_MEM_FRACTION"] for share in shares] == [
-        *("0.450", "0.900", "0.450")
-    ]
-    assert [share.beside for share in shares] == [True, False, True]
+@pytest.mark.parametrize(
+    ("count", "jobs", "visible", "devices", "memory", "beside"),
+    [
+        (5, 2, None, ["0,2,4", "1,3"], [None, None], [False, False]),
+        (
+            *(2, 3, "GPU-a, GPU-b", ["GPU-a", "GPU-b", "GPU-a"]),
+            *(["0.450", "0.900", "0.450"], [True, False, True]),
+        ),
+    ],
+)
+def test_gpus_are_dealt_out_or_shared_with_their_memory(
+    count, jobs, visible, devices, memory, beside
+):
+    shares = shares_of("gpu", count, jobs, visible)
+    assert [share.environment["CUDA_VISIBLE_DEVICES"] for share in shares] == devices
+    parts = [share.environment.get("XLA_PYTHON_CLIENT_MEM_FRACTION") for share in shares]
+    assert parts == memory
+    assert [share.beside for share in shares] == beside
 
 
 def test_processes_share_a_cpu_and_no_tpu():
@@ -103,12 +103,8 @@ def workers_of(pid: int) -> list[int]:
 
 
 def is_alive(pid: int) -> bool:
-    try:
-        return (
-            "Z" not in pathlib.Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-        )
-    except FileNotFoundError:
-        return False
+    stat = pathlib.Path(f"/proc/{pid}/stat")
+    return stat.exists() and "Z" not in stat.read_text().rpartition(")")[2].split()[0]
 
 
 def wait_for(condition, seconds: float = 600) -> None:
@@ -118,17 +114,28 @@ def wait_for(condition, seconds: float = 600) -> None:
         time.sleep(0.1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
-def test_an_interruption_ends_all_and_the_same_command_goes_on(flags, tmp_path, plugin, how):
-    out = tmp_path / "out"
-    command = [sys.executable, "-m", "crisalad_jax", *map(str, flags), "--out", str(out)]
-    command += ["--plugin", str(plugin), "--jobs", "2", "--epochs", "400"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+@pytest.fixture
+def command(flags, tmp_path, plugin):
+    """A command that compares by two processes, in `out`."""
+    given = ("--out", tmp_path / "out", "--plugin", plugin, "--jobs", 2, "--epochs", 400)
+    return [sys.executable, "-m", "crisalad_jax", *map(str, (*flags, *given))]
+
+
+def start(command, out) -> tuple[subprocess.Popen[str], list[int]]:
+    """Start it; return it and its two processes, which both train."""
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     metrics = [out / "crisalad" / f"seed-{seed}" / "run" / "metrics.jsonl" for seed in (0, 1)]
     wait_for(lambda: all(path.exists() and path.stat().st_size for path in metrics))
     workers = workers_of(process.pid)
     assert len(workers) == 2
+    return process, workers
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_an_interruption_ends_all_and_the_same_command_goes_on(command, tmp_path, how):
+    out = tmp_path / "out"
+    process, workers = start(command, out)
     process.send_signal(how)
     assert process.wait(300) == (-how if how == signal.SIGKILL else 128 + how)
     wait_for(lambda: not any(map(is_alive, workers)), 60)
@@ -140,42 +147,30 @@ def test_an_interruption_ends_all_and_the_same_command_goes_on(flags, tmp_path, 
 
 
 @pytest.mark.slow
-def test_a_killed_process_leaves_its_run_to_the_other(flags, tmp_path, plugin):
-    out = tmp_path / "out"
-    command = [sys.executable, "-m", "crisalad_jax", *map(str, flags), "--out", str(out)]
-    command += ["--plugin", str(plugin), "--jobs", "2", "--epochs", "400"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    metrics = [out / "crisalad" / f"seed-{seed}" / "run" / "metrics.jsonl" for seed in (0, 1)]
-    wait_for(lambda: all(path.exists() and path.stat().st_size for path in metrics))
-    os.kill(workers_of(process.pid)[0], signal.SIGKILL)
+def test_a_killed_process_leaves_its_run_to_the_other(command, tmp_path):
+    process, workers = start(command, tmp_path / "out")
+    os.kill(workers[0], signal.SIGKILL)
     _, errors = process.communicate(timeout=500)
     assert process.returncode == 0, errors
-    assert "ended with code -9; the others go on" in errors
-    results = json.loads((out / "results.json").read_text())
+    assert "ended with code -9; its runs are left to the others" in errors
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
     (recalls,) = results["rows"][0]["recalls"].values()
     assert len(recalls["R@1"]["by_seed"]) == 2
 
 
 @pytest.mark.slow
-def test_two_commands_share_a_folder(flags, tmp_path, plugin):
+def test_two_commands_share_a_folder(command):
     """As two hosts do: each run is done once, and both print the table."""
-    out = tmp_path / "out"
-    command = [sys.executable, "-m", "crisalad_jax", *map(str, flags), "--out", str(out)]
-    command += ["--plugin", str(plugin), "--seeds", "4"]
+    command = [*command, "--jobs", "1", "--epochs", "3", "--seeds", "4"]
     command.remove("--quiet")
-    both = [
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        for _ in range(2)
-    ]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    both = [subprocess.Popen(command, **pipes) for _ in range(2)]
     said = [process.communicate(timeout=500) for process in both]
     assert [process.returncode for process in both] == [0, 0], said
-    runs = [
-        line.partition(":")[0]
-        for _, errors in said
-        for line in errors.splitlines()
-        if " runs done" in line
+    lines = [line for _, errors in said for line in errors.splitlines() if " runs done" in line]
+    assert sorted(line.partition(":")[0] for line in lines) == [
+        f"crisalad, seed {seed}" for seed in range(4)
     ]
-    assert sorted(runs) == [f"crisalad, seed {seed}" for seed in range(4)]
     tables = [output.partition("table.md")[0] for output, _ in said]
     assert "CriSALAD" in tables[0]
     assert tables[0] == tables[1]

@@ -30,6 +30,7 @@ from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, init_crisalad
+from crisalad_jax.training import start
 from crisalad_jax.utils import locks, temporaries
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
@@ -43,8 +44,17 @@ def run(config: ComparisonConfig, out) -> comparison.Summary:
     return comparison.compare(config, out, quiet=True)
 
 
-def training_of(folder):
-    return read_json(folder / "result.json", "a result")["training"]
+def result_of(folder):
+    return read_json(folder / "result.json", "a result")
+
+
+def change(folder, **changes):
+    write_json(folder / "result.json", result_of(folder) | changes)
+
+
+def row_of(out):
+    (row,) = json.loads((out / "results.json").read_text())["rows"]
+    return row
 
 
 @pytest.fixture(scope="module")
@@ -73,8 +83,7 @@ def stamps(out):
 
 def test_recalls_are_those_of_the_weights_that_are_left(finished, benchmark):
     """Evaluated again, apart; the mean and the deviation by the statistics module."""
-    results = json.loads((finished / "results.json").read_text())
-    (row,) = results["rows"]
+    row = row_of(finished)
     by_seed, digests = [], set()
     for seed in (0, 1):
         run_folder = finished / "crisalad" / f"seed-{seed}" / "run"
@@ -99,10 +108,8 @@ def test_recalls_are_those_of_the_weights_that_are_left(finished, benchmark):
     assert (row["dimension"], row["parameters"]) == (model.descriptor_dim, leaves)
     assert (row["speed"], row["images_per_second"]) == (1, None)
     # To itself: either run over either, so that its range is the runs' own.
-    seconds = []
-    for seed in (0, 1):
-        record = training_of(finished / "crisalad" / f"seed-{seed}")
-        seconds.append(record["steps"] * record["step_seconds"])
+    records = [result_of(finished / "crisalad" / f"seed-{n}")["training"] for n in (0, 1)]
+    seconds = [record["steps"] * record["step_seconds"] for record in records]
     ratio = max(seconds) / min(seconds)
     assert list(row["training"].values()) == pytest.approx([1, 1 / ratio, ratio])
     assert list(row["training_seconds"].values()) == pytest.approx(
@@ -122,20 +129,16 @@ def test_what_it_leaves(finished):
 
 
 def test_only_what_is_missing_is_done_again(finished, flags, capfd, monkeypatch):
-    path = finished / "crisalad" / "seed-1" / "result.json"
-    before, content = stamps(finished), read_json(path, "a result")
-    write_json(path, content | {"ranks": {}})
-
-    def never(*args: object, **options: object) -> None:
-        raise AssertionError("trained again")
-
-    monkeypatch.setattr(runner, "fit", never)
-    monkeypatch.setattr(runner, "race", never)
+    folder = finished / "crisalad" / "seed-1"
+    before, ranks = stamps(finished), result_of(folder)["ranks"]
+    change(folder, ranks={})
+    for name in ("fit", "race"):
+        monkeypatch.delattr(runner, name)
     succeeds(capfd, *flags, "--out", finished)
     after = stamps(finished)
     changed = {str(path) for path in after if after[path] != before.get(path)}
     assert changed == {"crisalad/seed-1/result.json", "config.json", "results.json"}
-    assert read_json(path, "a result")["ranks"] == content["ranks"]
+    assert result_of(folder)["ranks"] == ranks
 
 
 def test_interrupted_between_training_and_evaluation(finished, flags, capfd, tmp_path, monkeypatch):
@@ -152,51 +155,50 @@ def test_interrupted_between_training_and_evaluation(finished, flags, capfd, tmp
     monkeypatch.setattr(runner, "evaluate", interrupted)
     assert main([*map(str, flags), "--out", str(out)]) == 130
     capfd.readouterr()
-    ranks = [read_json(path, "a result")["ranks"] for path in sorted(out.rglob("result.json"))]
+    ranks = [result_of(path.parent)["ranks"] for path in sorted(out.rglob("result.json"))]
     assert [len(each) for each in ranks] == [1, 0]
     assert not (out / "results.json").exists()
     succeeds(capfd, *flags, "--out", out)
     assert calls == [0, 1, 1]
-    ours, theirs = (
-        json.loads((folder / "results.json").read_text())["rows"][0] for folder in (out, finished)
-    )
-    assert ours["recalls"] == theirs["recalls"]
+    assert row_of(out)["recalls"] == row_of(finished)["recalls"]
 
 
 def test_a_run_that_was_cut_short_goes_on(finished, flags, capfd, tmp_path):
     """As a kill leaves it before the end of training is recorded: no step is taken again."""
     folder = finished / "crisalad" / "seed-0"
     weights = (folder / "run" / "last.safetensors").read_bytes()
-    content = read_json(folder / "result.json", "a result")
-    write_json(folder / "result.json", content | {"training": None, "ranks": {}})
+    change(folder, training=None, ranks={})
     succeeds(capfd, *flags, "--out", finished)
     assert (folder / "run" / "last.safetensors").read_bytes() == weights
-    assert training_of(folder)["steps"] == STEPS
+    assert result_of(folder)["training"]["steps"] == STEPS
 
 
-def test_a_file_of_results_that_is_cut_short(finished, flags, capfd):
-    path = finished / "crisalad" / "seed-0" / "result.json"
-    path.write_text(path.read_text()[:40])
-    fails(capfd, *flags, "--out", finished, words=(path, "found no JSON", "delete it"))
-
-
-@pytest.mark.parametrize("name", ["crisalad/seed-0/result.json", "speed.json"])
-def test_a_file_of_results_that_was_changed(finished, flags, capfd, name):
+@pytest.mark.parametrize(
+    ("name", "spoil", "found"),
+    [
+        ("crisalad/seed-0/result.json", lambda text: text[:40], "found no JSON"),
+        *(
+            (name, lambda text: text.replace('"device": "', '"device": "x'), "found other bytes")
+            for name in ("crisalad/seed-0/result.json", "speed.json")
+        ),
+    ],
+)
+def test_a_damaged_file_of_results(finished, flags, capfd, name, spoil, found):
     path = finished / name
     text = path.read_text()
-    path.write_text(text.replace('"device": "', '"device": "x'))
+    path.write_text(spoil(text))
     assert path.read_text() != text
-    words = (path, "found other bytes than were written", "delete it, and the same command")
+    words = (path, found, "delete it, and the same command")
     fails(capfd, *flags, "--out", finished, words=words)
 
 
 def test_another_comparison_is_refused(finished, flags, capfd):
     """Before its runs are trained on, as when they were interrupted."""
-    words = (finished / "crisalad" / "seed-0", "other settings: training.epochs: was 3, is 4; give")
-    fails(capfd, *flags, "--epochs", 4, "--out", finished, words=words)
-    village = finished / "crisalad" / "seed-0" / "result.json"
-    write_json(village, read_json(village, "a result") | {"training": None, "ranks": {}})
-    fails(capfd, *flags, "--epochs", 4, "--out", finished, words=words)
+    folder = finished / "crisalad" / "seed-0"
+    for changes in ({}, {"training": None, "ranks": {}}):
+        change(folder, **changes)
+        words = (folder, "other settings: training.epochs: was 3, is 4; give")
+        fails(capfd, *flags, "--epochs", 4, "--out", finished, words=words)
 
 
 def test_weights_that_change_behind_their_name_are_refused(
@@ -275,13 +277,12 @@ def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeyp
     """Of a method that learns nothing: what the vocabulary gave is what is evaluated."""
     built = []
 
-    def with_vocabulary(params, config, paths, *, images, seed, on_bad_image, quiet):
+    def with_vocabulary(model, paths, *, images, seed, on_bad_image, quiet):
         built.append((len(paths), images, seed))
-        return dataclasses.replace(
-            params, aggregator=jax.tree.map(lambda x: x + 1, params.aggregator)
-        )
+        moved = jax.tree.map(lambda x: x + 1, model.params.aggregator)
+        return dataclasses.replace(model.params, aggregator=moved)
 
-    monkeypatch.setattr(runner, "with_vocabulary", with_vocabulary)
+    monkeypatch.setattr(start, "with_vocabulary", with_vocabulary)
     monkeypatch.delattr(runner, "fit")
     config = ComparisonConfig(**settings | {"names": ("anyloc",)})
     out = tmp_path / "out"
@@ -333,15 +334,16 @@ def test_rows_draw_seeds_together_where_they_share_them(finished, settings, shar
         ComparisonConfig(**settings | {"names": names, "weights": weights})
     )
     ranks = {0: [1] * 5, 1: [0] * 5}
-    trained = training_of(finished / "crisalad" / "seed-0")
-    for each in runs_of(prepared, finished):
+    trained = result_of(finished / "crisalad" / "seed-0")["training"]
+    runs = runs_of(prepared, finished)
+    for each in runs:
         factor = 2 if each.variant.name == "salad" else 1
         result = each.read()
         result.training = trained | {"step_seconds": factor * trained["step_seconds"]}
         result.ranks = {each.evaluations[0].key: {"single": ranks[each.seed]}}
         result.write(each.folder)
     speed = read_json(finished / "speed.json", "times") | {"rounds": dict.fromkeys(names, (1.0,))}
-    _, same, alone = comparison.summarise(prepared, finished, speed).rows
+    _, same, alone = comparison.summarise(prepared, runs, speed).rows
     assert same.recalls["town"][1].difference.interval == (0, 0)
     assert (same.training, alone.training) == ((2, 2, 2), None)  # over the reference's
     # All queries hit or miss with their seed: two seeds miss both in a quarter of the resamples.
@@ -378,8 +380,7 @@ def test_it_grows_by_a_set_and_a_seed_and_nothing_is_repeated(
     succeeds(capfd, *flags, "--test", shared / "town", village, "--seeds", 3, "--out", finished)
     assert (len(trained), len(evaluated)) == (1, 4)
     assert stamps(finished).keys() == after.keys()
-    (row,) = json.loads((finished / "results.json").read_text())["rows"]
-    first, second = row["recalls"].values()
+    first, second = row_of(finished)["recalls"].values()
     assert first == second
     assert len(first["R@1"]["by_seed"]) == 3
 
@@ -404,7 +405,7 @@ def test_runs_are_shared_with_another_process(finished, config, monkeypatch):
             other.close()
 
         monkeypatch.setattr(runner.time, "sleep", ended)
-        runner.take_runs(prepared, finished, say=lines.append)
+        runner.carry_out(config, finished, "stop", say=lines.append, quiet=True)
     assert one == [1]
     assert lines[1:] == [
         "crisalad, seed 1: 0 of 2 runs done",
@@ -416,21 +417,20 @@ def test_the_run_of_a_killed_process_is_free(finished, config, monkeypatch):
     """Its lock's file is left, and the kernel has released the lock."""
     folder = finished / "crisalad" / "seed-0"
     (folder / temporaries.LOCK).write_text(f"process 1 on {socket.gethostname()}\n")
-    write_json(folder / "result.json", read_json(folder / "result.json", "it") | {"ranks": {}})
+    change(folder, ranks={})
     monkeypatch.delattr(runner, "fit")
-    runner.take_runs(comparison.prepare(config), finished, say=print)
+    runner.carry_out(config, finished, "stop", say=print, quiet=True)
     assert not (folder / temporaries.LOCK).exists()
 
 
 def test_a_training_time_is_of_runs_with_a_device_of_their_own(finished, flags, capfd):
-    path = finished / "crisalad" / "seed-1" / "result.json"
-    second = read_json(path, "a record")
-    second["training"] |= {"beside": True, "step_seconds": 1e6}
-    write_json(path, second)
+    folder = finished / "crisalad" / "seed-1"
+    alone = result_of(folder)["training"]
+    change(folder, training=alone | {"beside": True, "step_seconds": 1e6})
     # One run is left, whose time has no spread.
     told = succeeds(capfd, *flags, "--out", finished)
     assert "of runs that had their device to themselves, at least two" in told
-    (row,) = json.loads((finished / "results.json").read_text())["rows"]
+    row = row_of(finished)
     assert (row["training"], row["training_seconds"]) == (None, None)
 
 

@@ -3,6 +3,8 @@
 import cv2
 import numpy as np
 
+from crisalad_jax.experiments.report import save
+
 GREEN = (0x2A, 0x8F, 0x3C)
 RED = (0xC6, 0x28, 0x28)
 BLUE = (0x00, 0x72, 0xB2)
@@ -11,6 +13,12 @@ ORANGE = (0xD5, 0x5E, 0x00)
 
 def read_picture(path):
     return cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+
+
+def drawn(figure, folder):
+    """The pixels of a figure, written and read back."""
+    save(figure, folder / "drawn.png")
+    return read_picture(folder / "drawn.png")
 
 
 def is_colour(picture, colour):

@@ -1,22 +1,32 @@
-"""The map and the matrix of similarities, by where their colours stand."""
+"""Charts by the colours where something must stand."""
 
 import cv2
 import numpy as np
 import pytest
 
+from crisalad_jax.evaluation.metrics import PrecisionRecall
 from crisalad_jax.evaluation.similarity import cells_of
+from crisalad_jax.experiments import report
 from crisalad_jax.experiments.report.charts import (
     Placed,
-    Verdicts,
-    _outlines,
     find_placed,
-    judge,
+    outcomes_of,
     position_map,
+    precision_curves,
     similarity_matrix,
     truth_cells,
 )
 from crisalad_jax.retrieval.neighbours import Neighbours
-from tests.experiments.report.pictures import GREEN, RED, is_colour, near_colour, read_picture
+from crisalad_jax.utils.errors import InputError
+from tests.experiments.report.pictures import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    RED,
+    drawn,
+    is_colour,
+    near_colour,
+)
 
 DATABASE = np.array([[1000.0, 5000.0], [1100, 5000], [1100, 5100], [1000, 5100]])
 QUERIES = np.array([[1005.0, 5000.0], [1100, 5097]])
@@ -24,15 +34,14 @@ LEGEND = 110
 """Rows of the picture that the legend takes."""
 
 
-def draw(path, right, matched=(True, True), first=(0, 0)):
-    verdicts = Verdicts(np.array(right), np.array(matched))
+def draw(tmp_path, *outcomes, first=(0, 0)):
     placed = Placed(np.ones(4, bool), np.ones(2, bool), np.inf)
-    position_map(path, DATABASE, QUERIES, np.array(first), verdicts, placed)
-    return read_picture(path)
+    figure = position_map(DATABASE, QUERIES, np.array(first), np.array(outcomes), placed)
+    return drawn(figure, tmp_path)
 
 
 def test_a_right_query_is_green_and_a_wrong_one_red_with_a_line_to_its_retrieval(tmp_path):
-    picture = draw(tmp_path / "map.png", [True, False])
+    picture = draw(tmp_path, "right", "wrong")
     lower = picture[LEGEND:]
     green, red = (np.argwhere(near_colour(lower, colour)) for colour in (GREEN, RED))
     # South-west is right and below left of the wrong one in the north-east.
@@ -43,12 +52,12 @@ def test_a_right_query_is_green_and_a_wrong_one_red_with_a_line_to_its_retrieval
     reddish = np.argwhere(lower[..., 0].astype(int) - lower[..., 1] > 30)
     middle = (south_west + north_east) / 2
     assert np.abs(reddish - middle).sum(axis=1).min() < 40
-    assert not near_colour(draw(tmp_path / "all.png", [True, True]), RED).any()
+    assert not near_colour(draw(tmp_path, "right", "right"), RED).any()
 
 
 def test_metres_are_as_long_on_both_axes(tmp_path):
     """Of a square of database images, drawn far apart, the corners make a square."""
-    picture = draw(tmp_path / "map.png", [True, True], first=(0, 2))
+    picture = draw(tmp_path, "right", "right", first=(0, 2))
     # The lines of the grid are paler by 32 levels.
     is_grey = (np.abs(picture[LEGEND:].astype(int) - 0xC4) < 10).all(axis=-1)
     grey = np.argwhere(cv2.erode(is_grey.astype(np.uint8), np.ones((5, 5), np.uint8)))
@@ -59,7 +68,7 @@ def test_metres_are_as_long_on_both_axes(tmp_path):
 
 
 def test_a_query_without_a_positive_is_neither_right_nor_wrong(tmp_path):
-    picture = draw(tmp_path / "map.png", [True, False], matched=(True, False))
+    picture = draw(tmp_path, "right", "no positive")
     assert not near_colour(picture, RED).any()
     assert near_colour(picture, (0x7B, 0x1F, 0xA2)).any()
 
@@ -104,28 +113,27 @@ def test_places_that_all_share_positions_are_in_place(count):
 def test_what_is_out_of_place_is_not_drawn(tmp_path):
     database = np.array([[1000.0, 5000], [1100, 5000], [1100, 5100], [1000, 5100], [0, 0]] * 5)
     queries = np.array([[1005.0, 5000], [0, 0]])
-    verdicts = Verdicts(np.array([False, False]), np.array([True, True]))
     placed = find_placed(database, queries)
     assert out_of(database, queries) == ([4, 9, 14, 19, 24], [1])
     everything = Placed(np.ones(25, bool), np.ones(2, bool), np.inf)
-    for name, drawn in (("some", placed), ("all", everything)):
-        path = tmp_path / f"{name}.png"
-        position_map(path, database, queries, np.array([4, 0]), verdicts, drawn)
+    first, outcomes = np.array([4, 0]), np.array(["wrong", "wrong"])
     # The map of all spans 5 km; without them it is the square of 100 m, whose red cross is alone:
     # no line leads to (0, 0).
-    red = np.argwhere(near_colour(read_picture(tmp_path / "some.png")[110:], RED))
-    assert np.ptp(red, axis=0).max() < 40
-    red = np.argwhere(near_colour(read_picture(tmp_path / "all.png")[110:], RED))
-    assert np.ptp(red, axis=0).max() > 200
+    some, every = (
+        np.ptp(np.argwhere(near_colour(drawn(figure, tmp_path)[LEGEND:], RED)), axis=0).max()
+        for figure in (
+            position_map(database, queries, first, outcomes, each) for each in (placed, everything)
+        )
+    )
+    assert some < 40
+    assert every > 200
 
 
-def test_verdicts_by_hand():
+def test_outcomes_by_hand():
     indices = np.array([[0, 1], [1, 0], [2, 0], [2, 1]])
     positives = [np.array([0, 2]), np.array([0]), np.array([], int), np.array([2])]
-    verdicts = judge(Neighbours(indices, np.zeros((4, 2), np.float32)), positives)
-    assert verdicts.right.tolist() == [True, False, False, True]
-    assert verdicts.matched.tolist() == [True, True, False, True]
-    assert verdicts.wrong.tolist() == [False, True, False, False]
+    found = outcomes_of(Neighbours(indices, np.zeros((4, 2), np.float32)), positives)
+    assert found.tolist() == ["right", "wrong", "no positive", "right"]
 
 
 def test_truth_by_brute_force():
@@ -139,34 +147,97 @@ def test_truth_by_brute_force():
     assert found.tolist() == [[True, True], [True, True], [False, True]]
 
 
-def test_outlines_by_hand():
-    lines = {tuple(map(tuple, line)) for line in _outlines(np.array([[True, True], [False, True]]))}
-    assert lines == {
-        ((0, 0), (1, 0)),
-        ((1, 0), (2, 0)),
-        ((0, 1), (1, 1)),
-        ((1, 2), (2, 2)),
-        ((0, 0), (0, 1)),
-        ((1, 1), (1, 2)),
-        ((2, 0), (2, 1)),
-        ((2, 1), (2, 2)),
-    }
-
-
 def test_the_matrix_shows_similarities_truth_and_first_retrievals(tmp_path):
     similarities = np.array([[0.9, 0.1, 0.1], [0.1, 0.1, 0.8]], np.float32)
     positives = [np.array([0]), np.array([1])]
-    path = tmp_path / "matrix.png"
-    right = np.array([True, False])
-    similarity_matrix(path, similarities, positives, np.array([0, 2]), right, 3)
-    picture = read_picture(path)
+    outcomes = np.array(["right", "wrong"])
+    figure = similarity_matrix(similarities, positives, np.array([0, 2]), outcomes, 3)
+    picture = drawn(figure, tmp_path)
     green, red = (np.argwhere(is_colour(picture, colour)) for colour in (GREEN, RED))
     # The first query's retrieval is right, above and left of the second's, which is not.
     assert (green.mean(axis=0) < red.mean(axis=0)).all()
-    # About both dots it is dark, and right of the first light.
-    row, column = green.mean(axis=0).astype(int)
-    cell = (red.mean(axis=0)[1] - green.mean(axis=0)[1]) / 2
-    assert picture[row, column + 20].max() < 100
-    assert picture[row, int(column + cell)].min() > 200
-    outlined = np.argwhere(is_colour(picture, (0xD5, 0x5E, 0x00)))
-    assert outlined[:, 0].min() < row < outlined[:, 0].max()
+    # About the first dot it is orange, for it is right, and so is the middle of the row below.
+    (row, column), (below, last) = (dots.mean(axis=0).astype(int) for dots in (green, red))
+    middle = (column + last) // 2
+    for at in ((row, column + 20), (below, middle)):
+        assert near_colour(picture[at], ORANGE)
+    # Similarities are dark about the second dot, and light right of the first.
+    assert picture[below, last + 20].max() < 100
+    assert picture[row, middle].min() > 200
+
+
+def test_recall_curves_are_drawn_in_order(tmp_path):
+    curves = {"low": {1: 0.1, 20: 0.3}, "high": {1: 0.6, 20: 0.9}}
+    picture = drawn(report.recall_curves(curves, "Recall", wide=True), tmp_path / "deep")
+    assert picture.shape == (540, 840, 3)  # 7 x 4.5 inches at 120 dots
+    blue, orange = (np.argwhere(near_colour(picture, colour)) for colour in (BLUE, ORANGE))
+    assert len(blue) > 500
+    assert len(orange) > 500
+    # The first curve is blue and lower, all along; above both are their names.
+    lower = 150
+    assert orange[:, 0].max() < blue[blue[:, 0] > lower][:, 0].min()
+    assert [file.name for file in (tmp_path / "deep").iterdir()] == ["drawn.png"]
+
+
+def test_nothing_touches_the_edge(tmp_path):
+    names = [f"a model with quite a long name, seed {seed}" for seed in range(9)]
+    curves = {name: {1: 0.9, 5: 0.99, 10: 1.0, 20: 1.0} for name in names}
+    figure = report.recall_curves(curves, "A title beyond any measure " * 8, wide=True)
+    picture = drawn(figure, tmp_path)
+    for edge in (picture[:4], picture[-4:], picture[:, :4], picture[:, -4:]):
+        assert (edge == 255).all()
+
+
+@pytest.mark.parametrize(
+    ("curves", "found"),
+    [({}, "none"), ({"HOG": {}}, "HOG: {}"), ({"HOG": {1: 59.2}}, "HOG: {1: 59.2}")],
+)
+def test_curves_reject_nothing_and_percent(curves, found):
+    with pytest.raises(InputError, match=f"^curves: found {found}, expected recalls as fractions"):
+        report.recall_curves(curves, "Recall")
+
+
+def test_training_curves_draw_what_the_records_hold(tmp_path):
+    training = [
+        {"step": s, "loss": 1 / (1 + s), "easy_anchor_fraction": 0.5, "learning_rate": 1e-3}
+        for s in range(90)
+    ]
+    validation = [{"step": s, "R@1": s / 100, "R@5": 0.95} for s in (10, 50, 80)]
+    heights = {}
+    for name, records in (
+        ("both", training + validation),
+        ("training", training),
+        ("validation", validation),
+        ("once", training[:1]),
+    ):
+        picture = drawn(report.training_curves(records, title="tiny"), tmp_path)
+        assert picture.shape[1] == 840
+        assert near_colour(picture, BLUE).any()
+        # R@5 is the second line of the recalls.
+        assert near_colour(picture, ORANGE).any() == (name in ("both", "validation"))
+        heights[name] = len(picture)
+    assert heights["both"] > heights["training"] == heights["once"] > heights["validation"]
+
+
+@pytest.mark.parametrize("records", [[], [{"step": 1, "images_per_second": 3.0}]])
+def test_training_curves_reject_what_they_cannot_draw(records):
+    with pytest.raises(InputError, match=f"^records: found {len(records)} without any of loss"):
+        report.training_curves(records)
+
+
+def test_precision_curves_are_drawn_where_they_are(tmp_path):
+    recall, none = np.array([0.1, 0.9]), np.zeros(2)
+    high = PrecisionRecall(none, np.array([1.0, 0.9]), recall, 0.0, 0.0)
+    low = PrecisionRecall(none, np.array([0.4, 0.2]), recall, 0.0, 0.0)
+    picture = drawn(precision_curves({"high": high, "low": low}), tmp_path)
+    lower = picture[len(picture) // 6 :]  # below the legend
+    blue, orange = (np.argwhere(near_colour(lower, colour)) for colour in (BLUE, ORANGE))
+    assert len(blue) > 500
+    assert blue[:, 0].max() < orange[:, 0].min()
+    # Both reach from a recall of 10 to one of 90 %.
+    assert np.ptp(blue[:, 1]) == pytest.approx(np.ptp(orange[:, 1]), abs=15)
+
+
+def test_narrow_curves_are_for_small_screens(tmp_path):
+    picture = drawn(report.recall_curves({"a": {1: 0.5, 5: 0.9}}), tmp_path)
+    assert picture.shape == (680, 800, 3)  # 4 inches at 200 dots

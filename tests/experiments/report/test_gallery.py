@@ -20,39 +20,41 @@ from tests.experiments.report.pictures import (
     GREEN,
     RED,
     boxes_of,
+    drawn,
     is_colour,
     near_colour,
-    read_picture,
 )
 
 
-def _gallery(photographs, path, indices, positives, **options):
-    """Draw a result, or a map's answers where what is right is unknown."""
-    indices = np.array(indices)
-    similarities = np.linspace(0.9, 0.1, indices.shape[1])[None].repeat(len(indices), axis=0)
-    near = Neighbours(indices, similarities.astype(np.float32))
+def _answers(photographs, indices, images=None):
+    """A map's answers, where what is right is unknown."""
+    database = photographs["database"]
+    images = images or [MapImage(file.name, 1, None, str(file.parent)) for file in database]
+    return Answers(photographs["queries"][: len(indices)], _near(indices), images, None)
+
+
+def _near(indices):
+    similarities = np.linspace(0.9, 0.1, len(indices[0]), dtype=np.float32)
+    return Neighbours(np.array(indices), np.tile(similarities, (len(indices), 1)))
+
+
+def _gallery(photographs, folder, indices, positives, **options):
+    """Draw a result of an evaluation."""
     queries, database = photographs["queries"][: len(indices)], photographs["database"]
-    if positives is None:
-        images = [MapImage(file.name, 1, None, str(file.parent)) for file in database]
-        found, benchmark = Answers(queries, near, images, None), None
-    else:
-        found = GroupingResult("single", {1: 0.5}, near)
-        benchmark = Benchmark(
-            "town",
-            queries[0].parent.parent,
-            tuple(database),
-            tuple(queries),
-            tuple(np.array(each, np.int64) for each in positives),
-            "by hand",
-        )
-    report.save(report.show_retrievals(found, benchmark, **options), path)
-    return read_picture(path)
+    positives = tuple(np.array(each, np.int64) for each in positives)
+    root = queries[0].parent.parent
+    benchmark = Benchmark("town", root, tuple(database), tuple(queries), positives, "by hand")
+    found = GroupingResult("single", {1: 0.5}, _near(indices))
+    return drawn(report.show_retrievals(found, benchmark, **options), folder)
+
+
+def _is_level(picture, number):
+    """Where a picture of `photographs` is, by its colour."""
+    return is_colour(picture, (60, 20 * number + 60, 90))
 
 
 def test_gallery_frames_are_green_where_right_and_red_where_wrong(photographs, tmp_path):
-    picture = _gallery(
-        photographs, tmp_path / "gallery.png", [[2, 1, 0], [3, 4, 5]], [[2, 0], [5]], title="T"
-    )
+    picture = _gallery(photographs, tmp_path, [[2, 1, 0], [3, 4, 5]], [[2, 0], [5]], title="T")
     height, width = picture.shape[:2]
     # Four columns of 1.7 inches at 120 dots, three gaps and two margins, two rows of 4 : 3.
     assert 850 < width < 1000
@@ -74,22 +76,20 @@ def test_gallery_frames_are_green_where_right_and_red_where_wrong(photographs, t
 def test_gallery_without_positives_is_neither_green_nor_red(photographs, tmp_path):
     """Two of four queries, from first to last, each with its own two pictures beside it."""
     indices = [[0, 5], [1, 4], [2, 3], [3, 2]]
-    picture = _gallery(photographs, tmp_path / "g.png", indices, None, rows=2, columns=2)
+    figure = report.show_retrievals(_answers(photographs, indices), rows=2, columns=2)
+    picture = drawn(figure, tmp_path)
     assert not is_colour(picture, GREEN).any()
     assert not is_colour(picture, RED).any()
     # Queries 0 and 3, in the colours of pictures 0 and 3; found: 0 and 5, 3 and 2.
-    levels = [is_colour(picture, (60, 20 * number + 60, 90)).sum() for number in range(6)]
+    levels = [_is_level(picture, number).sum() for number in range(6)]
     assert levels[1] == levels[4] == 0
     assert levels[0] == levels[3] == 2 * levels[5] == 2 * levels[2] > 0
 
 
 def test_gallery_shows_the_pictures_asked_for(photographs, tmp_path):
-    picture = _gallery(photographs, tmp_path / "gallery.png", [[4, 1]], [[4]])
+    picture = _gallery(photographs, tmp_path, [[4, 1]], [[4]])
     # Query 0, then database 4 and 1, from left to right, in the colours they were written in.
-    found = [
-        np.argwhere(is_colour(picture, (60, 20 * number + 60, 90)))[:, 1].mean()
-        for number in (0, 4, 1)
-    ]
+    found = [np.argwhere(_is_level(picture, number))[:, 1].mean() for number in (0, 4, 1)]
     assert found == sorted(found)
 
 
@@ -114,8 +114,7 @@ def test_gallery_is_deterministic_and_takes_mixed_sizes(photographs, tmp_path):
         cv2.imwrite(str(photographs["database"][number]), np.full(shape, 77, np.uint8))
     arguments = [[0, 1, 2, 3]] * 4, [[1], [], [3], [0]]
     first, second = (
-        _gallery(photographs, tmp_path / f"{name}.png", *arguments, rows=9, columns=9)
-        for name in "ab"
+        _gallery(photographs, tmp_path, *arguments, rows=9, columns=9) for _ in range(2)
     )
     np.testing.assert_array_equal(first, second)
     assert len(boxes_of(first, GREEN)) == 3
@@ -125,7 +124,6 @@ def test_gallery_is_deterministic_and_takes_mixed_sizes(photographs, tmp_path):
 
 
 def test_gallery_rejects_what_does_not_fit(photographs, tmp_path):
-    path = tmp_path / "gallery.png"
     for options, message in (
         ({"rows": 0}, r"^rows: found 0"),
         ({"columns": 0}, r"^columns: found 0"),
@@ -133,43 +131,39 @@ def test_gallery_rejects_what_does_not_fit(photographs, tmp_path):
         ({"queries": []}, r"^queries: found \[\], expected numbers from 0 to 0"),
     ):
         with pytest.raises(InputError, match=message):
-            _gallery(photographs, path, [[0, 1]], [[0]], **options)
+            _gallery(photographs, tmp_path, [[0, 1]], [[0]], **options)
     photographs["database"][1].write_bytes(b"")
     with pytest.raises(InputError, match=r"database.1\.png: found an empty file"):
-        _gallery(photographs, path, [[0, 1]], [[0]])
-    assert not path.exists()
+        _gallery(photographs, tmp_path, [[0, 1]], [[0]])
 
 
 def test_values_of_a_narrow_range_are_shown_with_contrast(tmp_path):
     """Of 16 bits, half 7,200 and half 8,900, which by their high bytes are both dark grey."""
     file = tmp_path / "thermal.png"
     cv2.imwrite(str(file), np.repeat(np.full((60, 2), [7200, 8900], np.uint16), 40, axis=1))
-    pictures = {"queries": [file], "database": [file]}
-    black = is_colour(_gallery(pictures, tmp_path / "g.png", [[0]], None), (0, 0, 0))
+    answers = _answers({"queries": [file], "database": [file]}, [[0]])
+    black = is_colour(drawn(report.show_retrievals(answers), tmp_path), (0, 0, 0))
     # Half of the query and of what was found, of 1.7 x 1.275 inches at 120 dots.
     assert black.sum() > 0.9 * 204 * 153
 
 
 def test_a_picture_of_a_map_that_is_gone_is_a_grey_box_and_a_note(photographs, tmp_path):
     """The first of two answers; it is found where --map-images says."""
-    images = [MapImage(path.name, 1, None, str(path.parent)) for path in photographs["database"]]
-    near = Neighbours(np.array([[4, 1]]), np.array([[0.9, 0.8]], np.float32))
-    answers = Answers(photographs["queries"][:1], near, images, None)
+    answers = _answers(photographs, [[4, 1]])
     photographs["database"][4].rename(tmp_path / photographs["database"][4].name)
-    path = tmp_path / "gallery.png"
     words = r"1 picture shown as a grey box, as of .*4\.png: found no such .*; --map-images"
     with pytest.warns(Note, match=words):
-        report.save(report.show_retrievals(answers), path)
-    grey, there = (is_colour(read_picture(path), c) for c in ((196, 196, 196), (60, 80, 90)))
+        picture = drawn(report.show_retrievals(answers), tmp_path)
+    grey, there = is_colour(picture, (196, 196, 196)), _is_level(picture, 1)
     # As large as the picture of the other answer, but for edges that are drawn softly.
     assert grey.sum() == pytest.approx(there.sum(), rel=0.02)
     for each in photographs["database"][:4]:
         shutil.copy(each, tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("error", Note)
-        report.save(report.show_retrievals(answers, root=tmp_path), path)
+        picture = drawn(report.show_retrievals(answers, root=tmp_path), tmp_path)
     # The soft edges of letters have any grey.
-    assert is_colour(read_picture(path), (196, 196, 196)).sum() < 0.01 * grey.sum()
+    assert is_colour(picture, (196, 196, 196)).sum() < 0.01 * grey.sum()
 
 
 def test_names_stand_below_the_captions_as_they_are(photographs):
@@ -177,30 +171,25 @@ def test_names_stand_below_the_captions_as_they_are(photographs):
     long, plain = "a" * 200, photographs["database"][0].name
     folder = str(photographs["database"][0].parent)
     images = [MapImage(plain, 1, None, folder), MapImage(long, 1, None, folder)]
-    near = Neighbours(np.array([[0]]), np.array([[1.0]], np.float32))
-    figure = report.show_retrievals(Answers(photographs["queries"][:1], near, images, None))
+    figure = report.show_retrievals(_answers(photographs, [[0]], images))
     names = [axes.texts[0] for axes in figure.axes]
     assert [name.get_text() for name in names][1] == plain
     assert not any(name.get_parse_math() for name in names)
 
 
-def test_long_names_are_shortened_in_the_middle():
-    assert shortened("abcdefgh", 8) == "abcdefgh"
-    assert shortened("abcdefghi", 8) == "abcd\N{HORIZONTAL ELLIPSIS}ghi"
-    assert shortened("abcdefghi", 7) == "abc\N{HORIZONTAL ELLIPSIS}ghi"
+@pytest.mark.parametrize(
+    ("name", "most", "expected"),
+    [("abcdefgh", 8, "abcdefgh"), ("abcdefghi", 8, "abcd…ghi"), ("abcdefghi", 7, "abc…ghi")],
+)
+def test_long_names_are_shortened_in_the_middle(name, most, expected):
+    assert shortened(name, most) == expected
 
 
 def test_gallery_shows_the_queries_chosen_in_their_order(photographs, tmp_path):
-    picture = _gallery(
-        photographs, tmp_path / "gallery.png", [[0], [1], [2], [3]], [[0]] * 4, queries=[3, 1]
-    )
+    picture = _gallery(photographs, tmp_path, [[0], [1], [2], [3]], [[0]] * 4, queries=[3, 1])
     rows = {n: np.argwhere(_is_level(picture, n))[:, 0].mean() for n in (1, 3)}
     assert rows[3] < rows[1]
     assert not _is_level(picture, 0).any()
-
-
-def _is_level(picture, number):
-    return is_colour(picture, (60, 20 * number + 60, 90))
 
 
 def test_names_of_any_letters_are_drawn_without_a_word(photographs, tmp_path, recwarn):
@@ -210,17 +199,17 @@ def test_names_of_any_letters_are_drawn_without_a_word(photographs, tmp_path, re
         path = tmp_path / name
         path.write_bytes(moved["database"][number].read_bytes())
         moved["database"][number] = path
-    _gallery(moved, tmp_path / "g.png", [[0, 1, 2]], [[0]], title="\x1b[31m caf\udce9")
+    _gallery(moved, tmp_path, [[0, 1, 2]], [[0]], title="\x1b[31m caf\udce9")
     assert not [str(warning.message) for warning in recwarn]
 
 
 def test_what_is_shown_is_of_the_right_class(photographs, benchmark):
-    near = Neighbours(np.array([[0]]), np.array([[1.0]], np.float32))
-    with pytest.raises(InputError, match="found: found 'own', expected Answers, or GroupingResult"):
-        report.show_retrievals("own")
-    with pytest.raises(InputError, match="benchmark: found 'town', expected Benchmark, or None"):
-        report.show_retrievals(GroupingResult("single", {1: 1.0}, near), "town")
-    with pytest.raises(InputError, match="benchmark: found none for a result"):
-        report.show_retrievals(GroupingResult("single", {1: 1.0}, near))
-    with pytest.raises(InputError, match="benchmark: found one for answers"):
-        report.show_retrievals(Answers(photographs["queries"][:1], near, [], None), benchmark)
+    result, answers = GroupingResult("single", {1: 1.0}, _near([[0]])), _answers(photographs, [[0]])
+    for arguments, words in (
+        (("own",), "found: found 'own', expected Answers, or GroupingResult"),
+        ((result, "town"), "benchmark: found 'town', expected Benchmark, or None"),
+        ((result,), "benchmark: found none for a result"),
+        ((answers, benchmark), "benchmark: found one for answers"),
+    ):
+        with pytest.raises(InputError, match=words):
+            report.show_retrievals(*arguments)

@@ -18,7 +18,7 @@ from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.metrics import Interval, precision_recall
 from crisalad_jax.evaluation.results import GroupingResult, Scores
 from crisalad_jax.experiments.report import write_report
-from crisalad_jax.experiments.report.charts import judge
+from crisalad_jax.experiments.report.charts import outcomes_of
 from crisalad_jax.experiments.report.page import Subject, page_rows, write_results
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad
@@ -97,22 +97,18 @@ GROUPINGS = [
 ]
 
 
+def write(out, benchmark, groupings, params, config=MODEL, **options):
+    given = {"model_name": "a <b>model</b>", "settings": {"note": "</pre><script>"}}
+    return write_report(out, benchmark, groupings, params=params, config=config, **given, **options)
+
+
 @pytest.fixture(scope="module")
 def written(
     benchmark: Benchmark, params: Crisalad, tmp_path_factory: pytest.TempPathFactory
 ) -> pathlib.Path:
     """The folder of a page with everything on it."""
-    out = tmp_path_factory.mktemp("report") / "deep"
-    path = write_report(
-        out,
-        small(benchmark),
-        GROUPINGS,
-        params=params,
-        config=MODEL,
-        model_name="a <b>model</b>",
-        settings={"seed": 7, "note": "</pre><script>"},
-        similarities=np.eye(3, dtype=np.float32),
-    )
+    out, similarities = tmp_path_factory.mktemp("report") / "deep", np.eye(3, dtype=np.float32)
+    path = write(out, small(benchmark), GROUPINGS, params, similarities=similarities)
     assert path == out / "index.html"
     return out
 
@@ -125,17 +121,8 @@ def page(written: pathlib.Path) -> Page:
 def test_every_section_is_there_and_linked(page: Page):
     names = [e["id"] for e in page.all("section")]
     assert names == [
-        *(
-            "recall",
-            "queries",
-            "right",
-            "wrong",
-            "unmatched",
-            "map",
-            "similarities",
-            "transport",
-            "settings",
-        ),
+        *("recall", "queries", "right", "wrong", "no-positive"),
+        *("map", "similarities", "transport", "settings"),
     ]
     assert {e["href"] for e in page.all("a")} == {f"#{name}" for name in names}
     assert [e["text"] for e in page.all("h1")] == ["town/test (@UTM, 25 m)"]
@@ -144,13 +131,10 @@ def test_every_section_is_there_and_linked(page: Page):
 
 
 def test_nothing_is_asked_for_outside_of_the_page(written: pathlib.Path, page: Page):
-    for element in page.elements:
-        for name in ("src", "srcset", "href"):
-            if element.get(name) is not None:
-                assert re.match("data:|#", element[name])
+    named = [element.get(name) for element in page.elements for name in ("src", "srcset", "href")]
+    assert all(re.match("data:|#", each) for each in named if each is not None)
     style = page.all("style")[0]["text"]
-    assert "url(" not in style
-    assert "@import" not in style
+    assert not re.search(r"url\(|@import", style)
     data, program = page.all("script")
     assert data["type"] == "application/json"
     assert not re.search(r"https?:|fetch|import|XMLHttp|innerHTML", program["text"])
@@ -226,17 +210,10 @@ def test_names_of_files_are_no_markup(
         queries=(tmp_path / name, *benchmark.queries[1:3]),
         query_positions=None,
     )
-    path = write_report(
-        tmp_path / "out",
-        some,
-        [GroupingResult("any", {1: 1.0}, NEIGHBOURS)],
-        params=dataclasses.replace(params, aggregator=None, cross_image=None),
-        config=dataclasses.replace(
-            MODEL, aggregator="class-token", cross_image=CrossImageConfig(layers=0)
-        ),
-        model_name="model",
-        settings={},
-    )
+    plain = dataclasses.replace(params, aggregator=None, cross_image=None)
+    alone = {"aggregator": "class-token", "cross_image": CrossImageConfig(layers=0)}
+    found = [GroupingResult("any", {1: 1.0}, NEIGHBOURS)]
+    path = write(tmp_path / "out", some, found, plain, dataclasses.replace(MODEL, **alone))
     page = Page(path.read_text(encoding="utf-8"))
     assert len(page.all("script")) == 2
     (data,) = page.all("script", id="results")
@@ -251,36 +228,26 @@ def test_names_of_files_are_no_markup(
     assert set(shown) <= asked
     # Of what this model and set lack there is no section, nor a word.
     names = [e["id"] for e in page.all("section")]
-    assert names == ["recall", "queries", "right", "wrong", "unmatched", "settings"]
+    assert names == ["recall", "queries", "right", "wrong", "no-positive", "settings"]
     assert "No descriptor of this model" in " ".join(page.all("main")[0]["text"].split())
     assert [e["text"] for e in page.all("figcaption")][1].split() == ["✓", "1", "0.910"]
 
 
 def test_a_page_without_results(benchmark: Benchmark, params: Crisalad, tmp_path: pathlib.Path):
-    def write(groupings: list[GroupingResult]) -> None:
-        write_report(
-            tmp_path / "out",
-            small(benchmark),
-            groupings,
-            params=params,
-            config=MODEL,
-            model_name="model",
-            settings={},
-        )
-
-    with pytest.raises(InputError, match=r"^groupings: found none"):
-        write([])
-    with pytest.raises(InputError, match=r"^single: found recall 33 at 1, expected a fraction"):
-        write([GroupingResult("single", {1: 33}, NEIGHBOURS)])
+    percent = [GroupingResult("single", {1: 33}, NEIGHBOURS)]
+    for groupings, found in (([], "none"), (percent, "single: .1: 33., expected")):
+        with pytest.raises(InputError, match=f"^groupings: found {found}"):
+            write(tmp_path / "out", small(benchmark), groupings, params)
     assert not (tmp_path / "out").exists()
 
 
-def subject_of(benchmark, tmp_path, **changes):
-    return Subject.of(dataclasses.replace(small(benchmark), root=tmp_path, **changes), NEIGHBOURS)
+def subject_of(benchmark, root, **changes):
+    return Subject.of(dataclasses.replace(small(benchmark), root=root, **changes), NEIGHBOURS)
 
 
 def test_a_row_for_every_query_and_grouping(benchmark, tmp_path: pathlib.Path):
-    queries = tuple(tmp_path / "a" / name for name in ("=1+1.jpg", "b,\x1b.jpg", "c.jpg"))
+    """Control characters are escaped, and what begins as a formula is quoted."""
+    queries = tuple(tmp_path / name for name in ("=1+1.jpg", "a/b,\x1b.jpg", "@c.jpg"))
     database = tuple(tmp_path / "d" / f"{number}.jpg" for number in range(3))
     subject = subject_of(benchmark, tmp_path, queries=queries, database=database)
     write_results(tmp_path / "results.csv", subject, GROUPINGS)
@@ -289,30 +256,20 @@ def test_a_row_for_every_query_and_grouping(benchmark, tmp_path: pathlib.Path):
     assert [(row["grouping"], row["query"]) for row in rows] == [
         (grouping, name)
         for grouping in ("single", "shuffled/single")
-        for name in ("a/=1+1.jpg", "a/b,\\x1b.jpg", "a/c.jpg")
+        for name in ("'=1+1.jpg", "a/b,\\x1b.jpg", "'@c.jpg")
     ]
-    found = [tuple(row.values())[3:] for row in rows[:3]]
     # The first is right at once, the second's image 1 stands third, the third has none to find.
     # Queries are at 3, 45 and 9,000 m, and the database at 0, 40 and 80 m.
-    assert found == [
-        ("right", "1", "d/0.jpg", "0.910000", "3.00"),
-        ("wrong", "3", "d/2.jpg", "0.820000", "35.00"),
-        ("no positive", "", "d/1.jpg", "0.730000", "8960.00"),
+    assert [tuple(row.values())[3:] for row in rows[:3]] == [
+        ("right", "1", "d/0.jpg", "0.91", "3.0"),
+        ("wrong", "3", "d/2.jpg", "0.82", "35.0"),
+        ("no positive", "", "d/1.jpg", "0.73", "8960.0"),
     ]
     assert page_rows(subject, GROUPINGS[0]) == [
-        ["=1+1.jpg", 2, 1, "0.jpg", 0.91, 3.0],
-        ["b,\\x1b.jpg", 0, 3, "2.jpg", 0.82, 35.0],
-        ["c.jpg", 1, None, "1.jpg", 0.73, 8960.0],
+        ["=1+1.jpg", 2, 1, "d/0.jpg", 0.91, 3.0],
+        ["a/b,\\x1b.jpg", 0, 3, "d/2.jpg", 0.82, 35.0],
+        ["@c.jpg", 1, None, "d/1.jpg", 0.73, 8960.0],
     ]
-
-
-def test_a_name_that_begins_as_a_formula_is_quoted(benchmark, tmp_path: pathlib.Path):
-    queries = (tmp_path / "=HYPERLINK(1).jpg", tmp_path / "@b.jpg", tmp_path / "c.jpg")
-    subject = subject_of(benchmark, tmp_path, queries=queries)
-    write_results(tmp_path / "results.csv", subject, GROUPINGS[:1])
-    with (tmp_path / "results.csv").open(newline="", encoding="utf-8") as file:
-        names = [row["query"] for row in csv.DictReader(file)]
-    assert names == ["'=HYPERLINK(1).jpg", "'@b.jpg", "c.jpg"]
 
 
 def test_a_placeholder_has_no_distance(benchmark, tmp_path: pathlib.Path):
@@ -331,10 +288,10 @@ def test_the_most_confident_mistakes_come_first_and_right_ones_are_spread(benchm
     positives = (*[np.array([0])] * 10, np.array([], int))
     similarities = np.array([0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.2, 0.9, 0.2, 0.3, 0.1])
     neighbours = Neighbours(indices, similarities[:, None].astype(np.float32))
-    subject = Subject(benchmark, neighbours, judge(neighbours, positives), None)
+    subject = Subject(benchmark, neighbours, outcomes_of(neighbours, positives), None)
     # Of six right ones the first, the last, and one of the two in the middle. 6 and 8 are as
     # similar: file order.
-    shown = {"right": [0, 2, 5], "wrong": [7, 9, 6], "unmatched": [10]}
+    shown = {"right": [0, 2, 5], "wrong": [7, 9, 6], "no positive": [10]}
     assert subject.choose(3) == subject.choose(3) == shown
     assert subject.choose(50)["wrong"] == [7, 9, 6, 8]
     assert subject.choose(50)["right"] == [0, 1, 2, 3, 4, 5]

@@ -14,7 +14,7 @@ from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import describe, extract_features, parameter_shapes
+from crisalad_jax.nn.model import describe, extract_features
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import random_params
 
@@ -93,13 +93,6 @@ def test_backbones_without_that_attention_are_refused(monkeypatch: pytest.Monkey
         InputError, match="found vit for aggregator fol, expected one with a class token that"
     ):
         dataclasses.replace(CONFIG)
-
-
-def test_not_beside_side_adapters() -> None:
-    backbone = dataclasses.replace(CONFIG.backbone, adapter=AdapterConfig(kind="side"))
-    config = dataclasses.replace(CONFIG, backbone=backbone)
-    with pytest.raises(InputError, match="found the class token's attention and adapters"):
-        jax.eval_shape(lambda p: describe(p, IMAGES, config), parameter_shapes(config))
 
 
 def test_a_cut_stack_of_blocks_gives_the_same() -> None:

@@ -39,7 +39,7 @@ def test_levels_are_evenly_apart_and_end_at_the_last(levels: int, depth: int, ex
 
 
 def test_more_levels_than_blocks_are_refused() -> None:
-    with pytest.raises(InputError, match=r"TransVprConfig.levels: found 6, expected at most 3"):
+    with pytest.raises(InputError, match=r"TransVprConfig.levels: found 6, expected 1 to 3"):
         dataclasses.replace(CONFIG, aggregator=TransVprConfig(levels=6))
 
 

@@ -11,21 +11,23 @@ import pytest
 
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.vlad import (
+    BURST,
     AnyLoc,
     AnyLocConfig,
     NetVlad,
     NetVladConfig,
     SuperVladConfig,
+    VladBuff,
     VladBuffConfig,
-    hard_vlad,
-    netvlad,
+    VladConfig,
+    burst_weights,
     scores_from_centroids,
 )
 from crisalad_jax.nn.backbones.base import Features, FeatureSpec
 from crisalad_jax.nn.backbones.vit import ViTConfig, vit
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.layers import Linear
+from crisalad_jax.nn.layers import Linear, init_linear, l2_normalise
 from crisalad_jax.nn.model import attend_across_images, self_mask
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.errors import InputError
@@ -46,11 +48,16 @@ def unit(x: np.ndarray) -> np.ndarray:
     return x / np.linalg.norm(x)
 
 
+def sums_of(config: VladConfig, params: Any, patches: jax.Array) -> jax.Array:
+    features = Features(patches[..., 0, :0], patches)
+    return config.apply(params, features, (1, patches.shape[-2]), key=None).local
+
+
 def test_netvlad_is_the_papers_sum() -> None:
     """Eq. 4, patch by patch and cluster by cluster, in float64."""
     weight = np.random.default_rng(2).normal(size=(6, 4)).astype(np.float32)
     params = NetVlad(Linear(jnp.asarray(weight), None), jnp.asarray(CENTROIDS))
-    found = netvlad(params, jnp.asarray(PATCHES))
+    found = sums_of(NetVladConfig(clusters=4), params, jnp.asarray(PATCHES))
     for image, clusters in zip(PATCHES.astype(np.float64), found, strict=True):
         sums = np.zeros((4, 6))
         for patch in map(unit, image):
@@ -75,7 +82,8 @@ def test_hard_vlad_takes_the_nearest_word_alone(assignment: Any, far: Any) -> No
     # Two of other lengths, which only the distance minds; and one that no patch is near to.
     words = np.concatenate([0.3 * CENTROIDS, -9 * PATCHES.sum(axis=(0, 1))[None]])
     words[1] *= 5
-    found = hard_vlad(jnp.asarray(words), jnp.asarray(PATCHES), assignment=assignment)
+    config = AnyLocConfig(clusters=5, assignment=assignment)
+    found = sums_of(config, AnyLoc(jnp.asarray(words)), jnp.asarray(PATCHES))
     for image, clusters in zip(PATCHES.astype(np.float64), found, strict=True):
         sums = np.zeros((5, 6))
         for patch in map(unit, image):
@@ -251,3 +259,26 @@ def test_a_files_metadata_keep_whose_vocabulary_it_is() -> None:
     # Of any other method there is nothing to keep.
     assert MODEL.aggregator.metadata(None) == {}
     assert MODEL.aggregator.attach_backbone_hash(words, None) is words
+
+
+def test_patches_that_are_alike_share_their_weight() -> None:
+    """Three equal patches, and two at right angles to all: sigmoids of 7 and of 7 - 8 x 2."""
+    patches = jnp.eye(4)[jnp.array([0, 0, 0, 1, 2])]
+    same, other = 1 / (1 + np.exp(-7.0)), 1 / (1 + np.exp(9.0))
+    expected = np.array([3 * same + 2 * other] * 3 + [same + 4 * other] * 2)
+    # Float32 sums of five numbers.
+    np.testing.assert_allclose(burst_weights(jnp.array(BURST), patches), expected, rtol=1e-6)
+    squared = burst_weights(jnp.array([8.0, 7.0, 2.0]), patches)
+    np.testing.assert_allclose(squared, expected**2, rtol=1e-6)
+
+
+def test_equal_weights_leave_netvlad() -> None:
+    """A slope of 0 makes all patches alike; a common factor falls to the intra-normalisation."""
+    conv = init_linear(jax.random.key(0), 6, 3, bias=False)
+    centroids = l2_normalise(jax.random.normal(jax.random.key(1), (3, 6)))
+    patches = jax.random.normal(jax.random.key(2), (2, 7, 6))
+    params = VladBuff(None, conv, centroids, jnp.array([0.0, 7.0, 1.0]))
+    found = sums_of(VladBuffConfig(clusters=3, reduced=0), params, patches)
+    expected = sums_of(NetVladConfig(clusters=3), NetVlad(conv, centroids), patches)
+    # Other orders of the same sums, at cancelling residuals.
+    np.testing.assert_allclose(found, expected, atol=1e-5)

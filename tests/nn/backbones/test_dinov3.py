@@ -135,7 +135,7 @@ def test_inserted_tokens_have_no_place() -> None:
 def test_sides_are_multiples_of_16() -> None:
     with pytest.raises(InputError, match=r"56 x 64, expected .* multiples of 16 .*48 x 64|64 x 64"):
         vit(PARAMS.backbone, jnp.zeros((1, 56, 64, 3)), CONFIG)
-    with pytest.raises(InputError, match="found 2 of width 6, expected a width that is a multiple"):
+    with pytest.raises(InputError, match="heads: found 2, expected a divisor of a fourth of dim"):
         DinoV3Config(dim=12, depth=1, heads=2)
 
 

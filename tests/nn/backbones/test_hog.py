@@ -179,5 +179,5 @@ def test_what_it_cannot_do_is_one_line(
     recipe = dataclasses.replace(RECIPE, model=CONFIG)
     with pytest.raises(InputError, match=r"found all, of which backbone hog with .* no parameters"):
         check_learns(recipe)
-    with pytest.raises(InputError, match="found dim 9 and depth 1, expected 8100 and 1"):
+    with pytest.raises(InputError, match="dim: found 9, expected 8100 to 8100"):
         HogConfig(dim=9)

@@ -106,17 +106,6 @@ def test_a_cut_stack_of_blocks_gives_the_same_features() -> None:
         np.testing.assert_allclose(a, b, atol=1e-6)  # the same sums, compiled twice
 
 
-def test_an_untrained_adapter_leaves_the_backbone_unchanged() -> None:
-    params = CONFIG.init(jax.random.key(0))
-    bare_blocks = dataclasses.replace(params.blocks, adapter=None)
-    bare = dataclasses.replace(params, blocks=bare_blocks)
-    config = dataclasses.replace(CONFIG, adapter=AdapterConfig(kind="none"))
-    ours, _ = vit(params, images(1, 28, 42), CONFIG)
-    theirs, _ = vit(bare, images(1, 28, 42), config)
-    for a, b in zip(*map(jax.tree.leaves, (ours, theirs)), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-6)
-
-
 def test_alpha_and_layer_scale_weigh_the_adapter() -> None:
     """x + ls2 * (MLP + alpha * adapter): tripling alpha triples the adapter's share."""
     params = dataclasses.replace(CONFIG, depth=1, layer_scale_init=0.5).init(jax.random.key(0))
@@ -195,17 +184,22 @@ def test_side_adapters_take_the_sum_of_both_paths() -> None:
     ("config", "request_", "words"),
     [
         (SIDE, FeatureSpec((1,)), "levels or a facet and adapters on a side path, expected one"),
-        (SIDE, FeatureSpec((2, 3)), "levels or a facet and adapters on a side path, expected one"),
+        (SIDE, FeatureSpec(class_attention=True), "token's attention and adapters on a side path"),
+        (
+            SIDE,
+            FeatureSpec(insertion=1, inserted=jnp.ones((2, 16))),
+            "inserted tokens and adapters on a side path",
+        ),
         (
             CONFIG,
             FeatureSpec((2,), class_attention=True),
             "levels or a facet and the class token's",
         ),
-        (CONFIG, FeatureSpec((1, 2), "key"), r"found \(1, 2\), expected one for the facet key"),
+        (CONFIG, FeatureSpec((1, 2), "key"), r"found \(1, 2\) of facet key, expected numbers"),
         (
             CONFIG,
             FeatureSpec((2, 1)),
-            r"found \(2, 1\), expected numbers of blocks in order, 1 to 3",
+            r"found \(2, 1\) of facet token, expected numbers of blocks in order, 1 to 3",
         ),
     ],
 )

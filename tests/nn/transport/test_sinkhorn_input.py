@@ -38,16 +38,6 @@ def _plain_tuple(problem: Problem, at: Potentials) -> Any:
     return tuple(at)
 
 
-@register_step("test-input-short")
-def _short(problem: Problem, at: Potentials) -> Potentials:
-    return at._replace(row=at.row[:2])
-
-
-@register_step("test-input-half")
-def _half(problem: Problem, at: Potentials) -> Potentials:
-    return at._replace(row=at.row.astype(jnp.float16))
-
-
 @register_step("test-input-state")
 @dataclasses.dataclass(frozen=True)
 class _Unsteady(Step):
@@ -69,21 +59,21 @@ class _Alone(Step):
 
 MU, NU = jnp.zeros(6), jnp.log(jnp.array([1.0, 2.0, 3.0]))
 BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
-    "one axis": (lambda: solve(jnp.zeros(3), MU, NU), r"scores of shape \(3,\) and log_mu"),
-    "rows": (lambda: solve(jnp.zeros((5, 3)), MU, NU), r"\(5, 3\) and log_mu of \(6,\)"),
-    "columns": (lambda: solve(jnp.zeros((6, 4)), MU, NU), r"\(6, 4\) and log_nu of \(3,\)"),
-    "no axis": (lambda: solve(jnp.zeros((6, 3)), MU, MU[0]), r"log_nu of \(\)"),
+    "one axis": (
+        lambda: solve(jnp.zeros(3), MU, NU),
+        r"float32 and shape \(3,\), expected",
+    ),
+    "rows": (
+        lambda: solve(jnp.zeros((5, 3)), MU, NU),
+        r"log_mu found of shape \(6,\), expected \(5,\)",
+    ),
     "batches": (
         lambda: solve(jnp.zeros((2, 6, 3)), jnp.zeros((3, 6)), NU),
-        r"\(2, 6, 3\) and log_mu of \(3, 6\)",
-    ),
-    "more axes": (
-        lambda: solve(jnp.zeros((6, 3)), MU, jnp.zeros((2, 3))),
-        r"\(6, 3\) and log_nu of \(2, 3\)",
+        r"log_mu found of shape \(3, 6\), expected \(2, 6\) for scores of \(2, 6, 3\)",
     ),
     "epsilons": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, epsilon=jnp.ones(3)),
-        r"epsilon found of shape \(3,\), expected a single number",
+        r"epsilon found of shape \(3,\), expected \(\)",
     ),
     "newton, relaxed rows": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, row_tau=0.5, config=SinkhornConfig("newton")),
@@ -107,29 +97,17 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         ),
         "a solver with gradient 'unrolled', expected one that takes it",
     ),
-    "no clusters": (
-        lambda: assign_with_dustbin(jnp.zeros((6, 0)), 1.0),
-        r"assign_with_dustbin: found scores of shape \(6, 0",
-    ),
     "no columns": (
         lambda: solve(jnp.zeros((6, 0)), MU, MU[:0]),
-        r"of shape \(6, 0\) and log_mu",
+        r"and shape \(6, 0\), expected real numbers",
     ),
     "complex": (
         lambda: solve(jnp.zeros((6, 3), complex), MU, NU),
-        "scores found of complex64, expected real numbers",
+        "found scores of complex64 and shape .*, expected real numbers",
     ),
     "a step's tuple": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-tuple")),
         r"^step test-input-tuple: found to return \(\(float32.*, expected \(Potentials\(row",
-    ),
-    "a step's shapes": (
-        lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-short")),
-        r"^step test-input-short: found to return \(Potentials\(row=float32\[2\]",
-    ),
-    "a step's type": (
-        lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-half")),
-        "^step test-input-half: found to return .*float16.*, expected .*float32",
     ),
     "a step's state": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-state")),
@@ -151,25 +129,9 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: assign_with_dustbin(jnp.zeros((6, 6)), jnp.float32(1)),
         "6 patches for 6 clusters",
     ),
-    "less mass": (
-        lambda: assign_with_dustbin(jnp.zeros((4, 6)), jnp.float32(1)),
-        "4 patches for 6 clusters",
-    ),
     "token, one": (
         lambda: assign_with_dustbin(jnp.zeros((6, 3)), jnp.float32(1), "token"),
-        r"dustbin: found shape \(\), expected \(6,\) for 'token'",
-    ),
-    "column, many": (
-        lambda: assign_with_dustbin(jnp.zeros((6, 3)), jnp.ones(6)),
-        r"dustbin: found shape \(6,\), expected \(\) for 'column'",
-    ),
-    "mass, none": (
-        lambda: assign_with_dustbin(jnp.zeros((6, 3)), None, "mass"),
-        r"dustbin: found shape None, expected \(\) for 'mass'",
-    ),
-    "none, one": (
-        lambda: assign_with_dustbin(jnp.zeros((6, 3)), jnp.float32(1), "none"),
-        r"dustbin: found shape \(\), expected None for 'none'",
+        r"dustbin: found parameters of shape \(\), expected \(6,\)",
     ),
 }
 
@@ -190,11 +152,11 @@ def test_bad_shapes_and_pairs_raise(name: str, traced: bool) -> None:
     [
         (jnp.nan, MU, NU, 1.0, "scores found with NaN or infinity"),
         (jnp.inf, MU, NU, 1.0, "scores found with NaN or infinity"),
-        (0.0, MU.at[1].set(jnp.inf), NU, 1.0, "log_mu found with NaN or infinity"),
+        (0.0, MU.at[1].set(jnp.inf), NU, 1.0, "log_mu found with NaN, infinity or no mass"),
         (0.0, MU.at[1].set(-jnp.inf), NU, 1.0, "found to sum to 5 and 6, expected the same"),
-        (0.0, MU, NU.at[1].set(jnp.nan), 1.0, "log_nu found with NaN or infinity"),
+        (0.0, MU, NU.at[1].set(jnp.nan), 1.0, "log_nu found with NaN, infinity or no mass"),
         (0.0, MU, NU, 0.0, "epsilon found 0.0, expected at least 1.2e-38"),
-        (0.0, MU, NU, -1.0, "epsilon found -1.0, expected at least"),
+        (0.0, MU, NU, 1e-300, "epsilon found 1e-300, expected at least"),
         (0.0, MU, NU, jnp.float32(jnp.nan), "epsilon found nan, expected at least"),
         (1e10, MU, NU, 1e-35, "scores overflow, expected numbers that float32 can hold"),
         (0.0, MU, NU + 1e-3, 1.0, "found to sum to 6 and 6.006, expected the same"),
@@ -317,7 +279,6 @@ def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
             {"gradient": "exact"},
             "SinkhornConfig.gradient: found 'exact', expected one of implicit, optim",
         ),
-        (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),
         (
             SinkhornConfig,
             {"iterations": 2.5},
@@ -334,29 +295,24 @@ def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
         (
             SinkhornConfig,
             {"gradient": "implicit"},
-            "found 'implicit' with a fixed number of iterations",
+            "found Implicit.*expected a tolerance",
         ),
-        (
-            SinkhornConfig,
-            {"gradient": "optimistix"},
-            "found 'optimistix' with a fixed number of iterations",
-        ),
-        (SinkhornConfig, {"tolerance": 1e-3}, "found 'unrolled' with a tolerance"),
-        (SinkhornConfig, {"throw": True}, "throw: found no tolerance"),
+        (SinkhornConfig, {"tolerance": 1e-3}, "expected a fixed number of iterations"),
+        (SinkhornConfig, {"throw": True}, "throw: found True, expected a tolerance"),
         (
             SinkhornConfig,
             {"gradient": "optimistix", "tolerance": 1e-3, "anderson_memory": 3},
-            "anderson_memory: found with gradient 'optimistix'",
+            "anderson_memory: found 3, expected 0 with gradient 'optimistix'",
         ),
         (
             SinkhornConfig,
             {"step": "softmax", "gradient": "implicit", "tolerance": 1e-3},
-            "gradient: found 'implicit' with step 'softmax', which does not say that it solves",
+            "expected a step that says it solves the entropic problem, not 'softmax'",
         ),
         (
             SinkhornConfig,
             {"step": "test-input-tuple", "gradient": "implicit", "tolerance": 1e-3},
-            "found 'implicit' with step 'test-input-tuple', which does not say that it solves",
+            "expected a step that says it solves the entropic problem, not 'test-input-tuple'",
         ),
         (SinkhornStep, {"relaxation": 2.0}, "SinkhornStep.relaxation: found 2.0"),
         (SinkhornStep, {"relaxation": 0.9}, "SinkhornStep.relaxation: found 0.9"),
@@ -366,8 +322,6 @@ def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
             {"dustbin": "row"},
             "SaladConfig.dustbin: found 'row', expected one of column, mass, none",
         ),
-        (SaladConfig, {"epsilon": 0.0}, "SaladConfig.epsilon: found 0.0"),
-        (SaladConfig, {"epsilon": float("nan")}, "SaladConfig.epsilon: found nan"),
         (SaladConfig, {"epsilon": float("inf")}, "SaladConfig.epsilon: found inf"),
         (SaladConfig, {"row_tau": 0.0}, "SaladConfig.row_tau: found 0.0"),
         (SaladConfig, {"column_tau": 1.1}, "SaladConfig.column_tau: found 1.1"),
@@ -435,19 +389,15 @@ def test_a_dustbin_of_ones_own() -> None:
     assert (named.log_plan == expected.log_plan).all()
 
 
-@pytest.mark.parametrize("epsilon", [1e-38, 1e-300, 0.0, -1.0])
-def test_an_epsilon_that_float32_has_no_number_for_is_refused(epsilon):
-    with pytest.raises(InputError, match=f"^sinkhorn: epsilon found {epsilon}, expected "):
-        solve(jnp.zeros((6, 3)), MU, NU, epsilon=epsilon)
-
-
 @pytest.mark.usefixtures("_unchecked")
 @pytest.mark.parametrize(
     ("init", "words"),
     [
-        (Potentials(jnp.zeros(5), jnp.zeros(3)), r"init found of \(\(5,\), \(3,\)\), expected Pot"),
-        (jnp.zeros(6), r"init found of \w+, expected Potentials of shapes \(6,\) and \(3,\)"),
-        (Potentials(jnp.zeros(6), jnp.full(3, jnp.nan)), "init found with NaN or infinity, expect"),
+        (
+            Potentials(jnp.zeros(5), jnp.zeros(3)),
+            r"init.row .* \(5,\), expected \(6,\)",
+        ),
+        (jnp.zeros(6), r"init.column found of shape \(6,\), expected \(3,\)"),
     ],
 )
 def test_potentials_to_start_from_that_do_not_fit_are_refused(init, words):

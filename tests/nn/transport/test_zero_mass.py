@@ -19,7 +19,6 @@ from crisalad_jax.sinkhorn import (
     Potentials,
     Problem,
     SinkhornConfig,
-    SinkhornResult,
     SinkhornStep,
     Step,
     marginal_error,
@@ -359,16 +358,17 @@ def test_forward_mode_and_second_order(fields: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "bad", "message"),
+    ("name", "bad"),
     [
-        ("log_mu", np.nan, "log_mu found with NaN or infinity, expected finite numbers, or -inf"),
-        ("log_nu", np.nan, "log_nu found with NaN or infinity, expected finite numbers, or -inf"),
-        ("log_mu", np.inf, "log_mu found with NaN or infinity"),
-        ("log_mu", -np.inf, "log_mu found with no mass at all in a problem, expected some"),
-        ("log_nu", -np.inf, "log_nu found with no mass at all in a problem, expected some"),
+        ("log_mu", np.nan),
+        ("log_nu", np.nan),
+        ("log_mu", np.inf),
+        ("log_mu", -np.inf),
+        ("log_nu", -np.inf),
     ],
 )
-def test_bad_masses_are_refused_where_they_are_known(name: str, bad: float, message: str) -> None:
+def test_bad_masses_are_refused_where_they_are_known(name: str, bad: float) -> None:
+    message = f"{name} found with NaN, infinity or no mass at all, expected finite numbers, or -inf"
     at = whole()
     masses = getattr(at, name)
     # One number, or all of one problem where none is by itself bad.
@@ -379,14 +379,6 @@ def test_bad_masses_are_refused_where_they_are_known(name: str, bad: float, mess
     assert "\n" not in str(raised.value)
     with pytest.raises(InputError, match=message):  # and beside scores that are traced
         jax.jit(lambda scores: solve(scores, at.log_mu, at.log_nu))(at.scores)
-
-
-def test_minus_infinity_where_there_is_mass_is_no_start() -> None:
-    at = whole()
-    start = Potentials(jnp.zeros((2, ROWS)).at[0, 3].set(-jnp.inf), jnp.zeros((2, COLUMNS)))
-    with pytest.raises(InputError, match=r"^sinkhorn: init found with NaN or infinity"):
-        solve(*at, init=start)
-    assert solve(*at, init=start._replace(row=start.row.at[0, 3].set(0))).finite.all()
 
 
 SOME = [
@@ -491,12 +483,3 @@ def test_no_nan_on_the_way() -> None:
             at.scores
         )
     assert np.isfinite(slopes).all()
-
-
-def test_the_plan_may_be_multiplied_by_its_logarithm() -> None:
-    """0 times a finite logarithm: the entropy of a plan with empty rows is a number."""
-    result: SinkhornResult = solve(*whole(), config=to_rest())
-    entropy = -(jnp.exp(result.log_plan) * result.log_plan).sum(axis=(1, 2))
-    kept = without(result.log_plan, True, True)
-    # Sums in another order.
-    np.testing.assert_allclose(entropy, -(np.exp(kept) * kept).sum(axis=(1, 2)), rtol=1e-12)

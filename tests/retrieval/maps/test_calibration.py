@@ -11,7 +11,7 @@ import pytest
 
 import crisalad_jax.retrieval.maps.build
 import crisalad_jax.retrieval.maps.tracking
-from crisalad_jax.cli.answers import answer_lines
+from crisalad_jax.cli.query import answer_lines
 from crisalad_jax.data.images import list_images
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.calibrate import calibrate, operating_point_of

@@ -12,7 +12,7 @@ import pytest
 
 import crisalad_jax.retrieval.maps.query
 from crisalad_jax.checkpoints.weights import save_weights
-from crisalad_jax.cli.answers import answer_lines
+from crisalad_jax.cli.query import answer_lines
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.live import FolderWatch, Frame
 from crisalad_jax.data.reading import Reading

@@ -27,13 +27,14 @@ from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.calibration import Calibration, write_calibration
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.metadata import SEGMENTS
 from crisalad_jax.retrieval.maps.query import answer_fields, query
 from crisalad_jax.retrieval.serve.worker import ADDED
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.conftest import BATCH, MODEL, read_options, write_video
 from tests.data.test_sources import write_jpeg
-from tests.retrieval.serve.conftest import LIMIT, serving
+from tests.retrieval.serve.conftest import LIMIT, TOGETHER, serving
 
 # Batches of other sizes round otherwise; similarities are printed with six digits.
 ROUNDING = 5e-6
@@ -505,13 +506,29 @@ def test_adding_while_others_ask(own_map, params, pictures):
         assert len(places) == 15
 
 
+def test_images_that_come_together_are_one_addition(own_map, params, pictures):
+    go_on, data = threading.Event(), pictures[1].read_bytes()
+    with serving(own_map, params, appends=True) as own:
+        own.worker._thread.submit(go_on.wait, 60)
+        with concurrent.futures.ThreadPoolExecutor(TOGETHER) as pool:
+            paths = [f"/images?name={number}.jpg" for number in range(TOGETHER)]
+            replies = pool.map(lambda path: own.ask("POST", path, data), paths)
+            while len(own.worker._waiting) < TOGETHER:
+                time.sleep(0.01)
+            go_on.set()
+            assert sorted(reply.json["number"] for reply in replies) == [7, 8, 9]
+    with Map.open(own_map) as places:
+        assert len(places) == 10
+    assert len(list((own_map / SEGMENTS).glob("*.json"))) == 2
+
+
 def test_an_addition_that_cannot_be_written_fails_alone(own_map, params, pictures, monkeypatch):
     data = pictures[1].read_bytes()
     with serving(own_map, params, appends=True) as own:
         append = own.worker.places.append
 
         def full(names, *arguments, **named):
-            if names == ["bad.jpg"]:
+            if "bad.jpg" in names:
                 raise OSError("No space left on device")
             append(names, *arguments, **named)
 

@@ -1,0 +1,216 @@
+"""Rows of tables: which arrays of a torch file are which of ours, and how their axes are permuted.
+
+Forms permute numbers alone. Gradients can therefore be converted like weights, and a round trip
+gives the same bits.
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from crisalad_jax.nn.aggregators.gem import START
+from crisalad_jax.nn.backbones.dinov3 import rotary_periods
+from crisalad_jax.nn.backbones.vgg import VggConfig
+
+
+class Form(NamedTuple):
+    """Two functions, inverse to each other, between our arrays and theirs."""
+
+    ours: Callable[..., Sequence[np.ndarray]]
+    theirs: Callable[..., Sequence[np.ndarray]]
+
+
+SAME = Form(lambda x: (x,), lambda x: (x,))
+FIRST = Form(lambda x: (x[0],), lambda x: (x[None],))
+
+
+class Extra(NamedTuple):
+    """An array of theirs that no model of ours uses, stored so that a round trip is exact."""
+
+    initial: Callable[[Any], np.ndarray]
+    """Function of the model's configuration that makes it, where no such file was read."""
+    form: Form = SAME
+
+
+class Absent(NamedTuple):
+    """An array of ours that no output needs and their files leave out: filled when read."""
+
+    value: float
+
+
+class Row(NamedTuple):
+    """Arrays that correspond, or layers whose arrays a table has. "#" is counted from 0."""
+
+    ours: tuple[str, ...]
+    theirs: tuple[str, ...]
+    form: "Form | Extra | Absent | Rows"
+
+
+Rows = tuple[Row, ...]
+"""A table in the public order."""
+
+
+def side(area: int) -> int:
+    """Return the side of a square grid."""
+    return math.isqrt(area)
+
+
+def _mask_of(bias: np.ndarray) -> np.ndarray:
+    """Make `bias_mask`: 0 for keys, and for all where no bias is other than 0, as published."""
+    mask = np.full_like(bias, float(bias.any()))
+    mask[len(mask) // 3 : 2 * len(mask) // 3] = 0
+    return mask
+
+
+def _by_cluster(rows: np.ndarray) -> np.ndarray:
+    """Reorder rows of (channel, cluster) to rows of (cluster, channel)."""
+    return rows.reshape(VggConfig().dim, -1, rows.shape[1]).swapaxes(0, 1).reshape(rows.shape)
+
+
+def _by_channel(rows: np.ndarray) -> np.ndarray:
+    return rows.reshape(-1, VggConfig().dim, rows.shape[1]).swapaxes(0, 1).reshape(rows.shape)
+
+
+FORMS = {
+    "same": SAME,
+    "first": FIRST,
+    "transposed": Form(lambda w: (w.T,), lambda w: (w.T,)),
+    "class-token": Form(lambda x: (x[0, 0],), lambda x: (x[None, None],)),
+    "positions": Form(
+        lambda x: (x[0, 0], x[0, 1:].reshape(side(x.shape[1]), side(x.shape[1]), -1)),
+        lambda first, grid: (
+            np.concatenate([first[None], grid.reshape(-1, grid.shape[-1])])[None],
+        ),
+    ),
+    "qkv": Form(lambda q, k, v: (np.concatenate([q, k, v]).T,), lambda w: np.split(w.T, 3)),
+    "qkv-bias": Form(lambda q, k, v: (np.concatenate([q, k, v]),), lambda b: np.split(b, 3)),
+    "qv-bias": Form(
+        lambda q, v: (np.concatenate([q, np.zeros_like(q), v]),),
+        lambda b: (b[: len(b) // 3], b[2 * len(b) // 3 :]),
+    ),
+    "masked-bias": Form(lambda bias, mask: (bias * mask,), lambda bias: (bias, _mask_of(bias))),
+    "pair": Form(lambda a, b: (np.concatenate([a, b]).T,), lambda w: np.split(w.T, 2)),
+    "pair-bias": Form(lambda a, b: (np.concatenate([a, b]),), lambda b: np.split(b, 2)),
+    "scores": Form(lambda w: (w[:, :, 0].T,), lambda w: (w.T[:, :, None],)),
+}
+"""Forms of arrays by name."""
+_LAYERS = {
+    "norm": SAME,
+    "linear": FORMS["transposed"],
+    "pointwise": Form(lambda w: (w[:, :, 0, 0].T,), lambda w: (w.T[:, :, None, None],)),
+    "conv": Form(lambda w: (w.transpose(2, 3, 1, 0),), lambda w: (w.transpose(3, 2, 0, 1),)),
+    # A transposed convolution, whose torch weight begins with the channels that come in.
+    "upconv": Form(lambda w: (w.transpose(2, 3, 0, 1),), lambda w: (w.transpose(2, 3, 0, 1),)),
+    "depthwise": Form(
+        lambda w: (w[:, 0].transpose(1, 2, 0),), lambda w: (w.transpose(2, 0, 1)[:, None],)
+    ),
+    "patches": Form(
+        lambda w: (w.transpose(2, 3, 1, 0).reshape(-1, w.shape[0]),),
+        lambda w: (w.reshape(side(len(w) // 3), side(len(w) // 3), 3, -1).transpose(3, 2, 0, 1),),
+    ),
+    # In hloc a descriptor has all clusters' first channel before whitening, then their second.
+    "hloc-whitening": Form(lambda w: (_by_cluster(w.T),), lambda w: (_by_channel(w).T,)),
+}
+"""Forms of the weights of layers, which may have a bias, by the layer's name."""
+
+
+def _blank_mask(config: Any) -> np.ndarray:
+    return np.zeros((1, config.backbone.dim), np.float32)
+
+
+def _published_periods(config: Any) -> np.ndarray:
+    """Return a head's periods as DINOv3's public files have them, rounded to bfloat16."""
+    periods = rotary_periods(config.backbone.dim // config.backbone.heads)
+    return np.asarray(periods.astype(jnp.bfloat16), np.float32)
+
+
+EXTRAS = {
+    "extra-count": Extra(lambda config: np.zeros((), np.int64)),
+    "extra-zero": Extra(lambda config: np.zeros((), np.float32)),
+    "extra-levels": Extra(lambda config: np.zeros(config.aggregator.levels, np.float32)),
+    "extra-mask": Extra(_blank_mask),
+    "extra-first-mask": Extra(_blank_mask, FIRST),
+    "extra-periods": Extra(_published_periods),
+}
+"""What files have and no descriptor needs, by name."""
+ABSENT = {
+    "absent-zero": Absent(0.0),
+    "absent-one": Absent(1.0),
+    "absent-exponent": Absent(START),
+}
+"""What files lack, by name."""
+
+
+def read_tables(texts: Mapping[str, str]) -> dict[str, Rows]:
+    """Read tables that have rows of one another, the later ones of the earlier ones."""
+    bias = Row(("bias",), ("bias",), SAME)
+    tables: dict[str, Rows] = {
+        name: (Row(("weight",), ("weight",), form), bias) for name, form in _LAYERS.items()
+    }
+    for name, text in texts.items():
+        tables[name] = read_table(text, tables)
+    return tables
+
+
+def read_table(text: str, tables: Mapping[str, Rows]) -> Rows:
+    """Read a table, line by line; "+" stands for all rows of another one."""
+    kinds = {**FORMS, **EXTRAS, **ABSENT, **tables}
+    rows: list[Row] = []
+    for line in filter(None, text.splitlines()):
+        ours, theirs, form = line.split()
+        if ours == "+":
+            before = theirs.removesuffix("+")
+            rows += [
+                row._replace(theirs=tuple(before + name for name in row.theirs))
+                for row in tables[form]
+            ]
+        else:
+            rows.append(Row(tuple(ours.split(",")), tuple(theirs.split(",")), kinds[form]))
+    return tuple(rows)
+
+
+def expand(rows: Rows, names: Iterable[str], ours: str = "", theirs: str = "") -> Iterator[Row]:
+    """Yield the rows of a model's arrays, and of the extra ones of its layers.
+
+    Rows of what the model lacks are left out, and those with "#" are repeated for all that it has.
+
+    Args:
+        rows: the table.
+        names: the model's arrays; blocks are numbered.
+        ours: what comes before all our names in the table.
+        theirs: what comes before all their names in it.
+    """
+    parts = (itertools.accumulate(name.split("."), "{}.{}".format) for name in names)
+    return _expand(rows, set(itertools.chain.from_iterable(parts)), ours, theirs)
+
+
+def _expand(rows: Rows, known: set[str], ours: str, theirs: str) -> Iterator[Row]:
+    for row in rows:
+        for number in map(str, itertools.count() if "#" in row.ours[0] else [0]):
+            here = tuple(ours + name.replace("#", number) for name in row.ours)
+            there = tuple(theirs + name.replace("#", number) for name in row.theirs)
+            if here[0] not in known and not isinstance(row.form, Extra):
+                break
+            if isinstance(row.form, Form | Extra | Absent):
+                yield Row(here, there, row.form)
+            else:
+                yield from _expand(row.form, known, f"{here[0]}.", f"{there[0]}.")
+
+
+def first_names(rows: Rows, ours: str = "", theirs: str = "") -> dict[str, str]:
+    """Return their names by ours, of the first of several; "#" is 0."""
+    named: dict[str, str] = {}
+    for row in rows:
+        here, there = (
+            prefix + names[0].replace("#", "0")
+            for prefix, names in ((ours, row.ours), (theirs, row.theirs))
+        )
+        if isinstance(row.form, Form | Extra | Absent):
+            named[here] = there
+        else:
+            named |= first_names(row.form, f"{here}.", f"{there}.")
+    return named
