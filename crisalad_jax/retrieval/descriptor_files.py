@@ -57,7 +57,12 @@ def record_of(path: pathlib.Path) -> pathlib.Path:
 
 
 def targets(path: pathlib.Path) -> list[pathlib.Path]:
-    """List all files that a set of descriptors in `path` consists of."""
+    """List all files that a set of descriptors in `path` consists of.
+
+    Raises:
+        InputError: what `check_suffix` raises.
+    """
+    check_suffix(path)
     return [*_files_of(path).values(), record_of(path)]
 
 

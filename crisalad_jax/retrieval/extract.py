@@ -35,7 +35,6 @@ from crisalad_jax.retrieval.describe import (
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.descriptor_files import (
     Descriptors,
-    check_suffix,
     open_npy,
     read_descriptors,
     record_of,
@@ -197,10 +196,11 @@ def extract(
     common = {name: value for name, value in record.items() if name not in ("weights", "images")}
     folder = out.with_name(f"{out.name}.shares")
     shares = Shares(folder, Share.parse(share), digest_of(names, common | work.plan()))
-    if _is_joined(out, shares.digest):
+    is_there = all(file.exists() for file in targets(out))
+    known = read_json(record_of(out), "a record of descriptors") if is_there else {}
+    if known.get(_SHARES) == shares.digest:  # joined from shares of these images and settings
         listed, descriptors = read_descriptors(out)
-        skipped = read_json(record_of(out), "a record of descriptors")["skipped"]
-        return Extracted(listed, descriptors, skipped)
+        return Extracted(listed, descriptors, known["skipped"])
     mine = shares.share.of(len(paths), reading.batch_size)
     with lock(shares.own):
         own = work.resume(shares.own, paths[mine], names[mine])
@@ -246,8 +246,6 @@ def check_extraction(
         >>> check_extraction("descriptors.npy", grouping="single")
     """
     files = [] if out is None else targets(pathlib.Path(out))
-    if out is not None:
-        check_suffix(out)
     for target in (*files, *([] if pairs is None else [pairs])):
         check_target(target)
     choose("grouping", grouping, GROUPINGS)
@@ -484,13 +482,6 @@ def _digest(plan: str, paths: Sequence[pathlib.Path]) -> str:
             line = f"{os.fspath(path)} {there.st_size} {there.st_mtime_ns}\n"
             files.update(line.encode(errors="surrogateescape"))
     return files.hexdigest()
-
-
-def _is_joined(out: pathlib.Path, digest: str) -> bool:
-    """Return whether the set is there, joined from shares of these images and settings."""
-    if not all(file.exists() for file in targets(out)):
-        return False
-    return read_json(record_of(out), "a record of descriptors").get(_SHARES) == digest
 
 
 def _listed(

@@ -48,10 +48,13 @@ def nearest_pairs(
 def write_pairs(path: str | os.PathLike[str], pairs: Sequence[tuple[str, str]]) -> None:
     """Write a line for each pair: the query, one space, the database image.
 
+    Args:
+        path: the file.
+        pairs: of names that `check_names` takes.
+
     Raises:
-        InputError: what `check_names` raises, or the file cannot be made.
+        InputError: the file cannot be made.
     """
-    check_names(path, [name for pair in pairs for name in pair])
     with atomic_path(path) as temporary:
         text = "".join(f"{query} {other}\n" for query, other in pairs)
         temporary.write_text(text, encoding="utf-8")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+from typing import Literal
 
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.segments import write_record
@@ -10,8 +11,6 @@ from crisalad_jax.utils.files import read_json
 
 CALIBRATION = "calibration.json"
 """Name of the file, beside the map's description."""
-FORMAT = 1
-"""Version of the file."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +38,8 @@ class Calibration:
     model: str
     """The `model_hash` of the map, and so of the descriptors that were compared."""
     created: str = ""
-    format: int = FORMAT
+    format: Literal[1] = 1
+    """Version of the file."""
 
     def __post_init__(self) -> None:
         """Check the similarity."""
@@ -58,15 +58,11 @@ def read_calibration(folder: pathlib.Path, model: str) -> Calibration | None:
     try:
         value = read_json(path, "a map's calibration", sealed=False)
         calibration = from_plain(Calibration, value, source=str(path))
-        for name, found, expected in (
-            ("format", calibration.format, FORMAT),
-            ("model", calibration.model[:12], model[:12]),
-        ):
-            if found != expected:
-                raise InputError(
-                    f"{path}: found a calibration of {name} {found}, expected {expected} as of the "
-                    "map; `crisalad calibrate` replaces it"
-                )
+        if calibration.model != model:
+            raise InputError(
+                f"{path}: found a calibration of model {calibration.model[:12]}, expected "
+                f"{model[:12]}, which made the map; `crisalad calibrate` replaces it"
+            )
     except InputError as error:
         raise InputError(
             f"{error}; the file may be removed: the map then answers every query, as with "

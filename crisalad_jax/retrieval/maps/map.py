@@ -107,12 +107,11 @@ class Map:
 
     Example:
         >>> import jax
-        >>> from crisalad_jax import PRESETS, index, init_crisalad, save_weights
-        >>> config = PRESETS["tiny"]
-        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> from crisalad_jax import PRESETS, Model, index, init_crisalad, save_weights
+        >>> model = Model(init_crisalad(jax.random.key(0), PRESETS["tiny"]), PRESETS["tiny"])
         >>> weights = folder / "weights.safetensors"
-        >>> save_weights(weights, params, config)
-        >>> _ = index(params, config, pictures, folder / "map", weights=weights, quiet=True)
+        >>> save_weights(weights, model)
+        >>> _ = index(model, pictures, folder / "map", weights=weights, quiet=True)
         >>> places = Map.open(folder / "map")
         >>> len(places)
         4
