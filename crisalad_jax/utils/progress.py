@@ -1,7 +1,6 @@
 """Progress on the terminal: a bar with rate and time left, on stderr, silent when asked."""
 
 import contextlib
-import importlib.util
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -42,13 +41,17 @@ def progress_bar(
         quiet: show nothing.
         done: units that were done before, which do not count for the rate.
     """
-    if quiet or importlib.util.find_spec("rich") is None:  # every extra installs it
-        yield Bar(quiet=quiet)
+    if quiet:
+        yield Bar()
         return
-    import rich.console
-    import rich.progress as parts
-    import rich.table
-    import rich.text
+    try:
+        import rich.console
+        import rich.progress as parts
+        import rich.table
+        import rich.text
+    except ModuleNotFoundError:  # every extra installs it
+        yield Bar(quiet=False)
+        return
 
     class Rate(parts.ProgressColumn):
         def render(self, task: parts.Task) -> str:

@@ -272,15 +272,18 @@ class Mine(cj.Loss):
 def test_the_command_line_takes_several(flags, monkeypatch, tmp_path):
     """With --row the paper's rows are left out but for the first, unless --rows names them."""
     seen = []
-    monkeypatch.setattr(ablate, "run_comparison", lambda config, arguments: seen.append(config))
+
+    def run_comparison(flags, command, names, *, rows):
+        seen.append((command, names, rows, flags.reference))
+
+    monkeypatch.setattr(ablate, "run_comparison", run_comparison)
     given = ["ablate", *map(str, flags[flags.index("--epochs") :]), "--preset", "tiny"]
     given += ["--out", str(tmp_path / "out")]
     rows = ["--row", "a: epochs=2", "--row", "b: loss.miner=none", "--reference", "a"]
     assert main([*given, *rows]) == 0
     assert main([*given, *rows, "--rows", "crisalad,step"]) == 0
-    assert [config.names for config in seen] == [
-        ("crisalad", "a", "b"),
-        ("crisalad", "step", "a", "b"),
+    texts = ("a: epochs=2", "b: loss.miner=none")
+    assert seen == [
+        ("ablate", ("crisalad",), texts, "a"),
+        ("ablate", ("crisalad", "step"), texts, "a"),
     ]
-    assert seen[0].rows == ("a: epochs=2", "b: loss.miner=none")
-    assert seen[0].reference == "a"
