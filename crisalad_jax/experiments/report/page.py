@@ -6,6 +6,7 @@ import json
 import math
 import os
 import pathlib
+import posixpath
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -15,8 +16,9 @@ from jaxtyping import Float
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.metres import flattened
-from crisalad_jax.evaluation.operating_point import OperatingPoint, caveats
-from crisalad_jax.evaluation.results import ANY, GroupingResult, percent
+from crisalad_jax.evaluation.operating_point import OperatingPoint
+from crisalad_jax.evaluation.record import table_notes
+from crisalad_jax.evaluation.results import GroupingResult, percent
 from crisalad_jax.experiments.report.charts import (
     OUTCOMES,
     Placed,
@@ -39,7 +41,6 @@ from crisalad_jax.experiments.report.tables import (
 from crisalad_jax.experiments.report.transport import draw_transport, transport_of
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
-from crisalad_jax.retrieval.grouping import GROUPINGS, Grouping
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.locks import staged_folder
 from crisalad_jax.utils.output import printable
@@ -61,7 +62,7 @@ def write_report(
     params: Crisalad,
     config: ModelConfig,
     model_name: str,
-    settings: Mapping[str, Any],
+    settings: dict[str, Any],
     similarities: Float[np.ndarray, "rows columns"] | None = None,
 ) -> pathlib.Path:
     """Write index.html, its charts and results.csv into the folder `out`; return the page's path.
@@ -76,7 +77,7 @@ def write_report(
         params: the model's, for the section on its transport; a model without one has none.
         config: the model's.
         model_name: which weights.
-        settings: the evaluation's settings as JSON values, shown folded.
+        settings: what `evaluation_settings` returns, shown folded.
         similarities: what `similarity.similarity_map` gives of the first grouping.
 
     Raises:
@@ -97,9 +98,7 @@ def write_report(
             "groupings": groupings,
             "main": main,
             "table": _table(groupings),
-            "caveats": caveats,
-            "meanings": _meanings(groupings),
-            "depends": params.cross_image is not None,
+            "notes": table_notes(groupings, settings),
             "curves": _curves(folder, groupings),
             "galleries": {
                 outcome: [_photographs(subject, query) for query in chosen]
@@ -195,7 +194,7 @@ def _table(groupings: Sequence[GroupingResult]) -> Table:
         "same place, database": [cell(g.database_share) for g in groupings],
         "AP": [cell(g.average_precision) for g in groupings],
         "recall at 100 % precision": [cell(g.recall_at_full_precision) for g in groupings],
-        f"at {100 * asked:g} %": [_point(g.operating_point) for g in groupings],
+        f"answered right at {100 * asked:g} %": [_point(g.operating_point) for g in groupings],
     }
     columns = {
         header: cells
@@ -222,15 +221,6 @@ def _point(point: OperatingPoint | None) -> Cell:
     if not point.reached:
         return Cell(_DASH, f"highest precision {percent(point.precision)}")
     return Cell(percent(point.recall), f"similarity from {point.min_similarity:.9g}")
-
-
-def _meanings(groupings: Sequence[GroupingResult]) -> dict[str, str]:
-    """Explain which images attend to each other, for every kind of grouping in the results."""
-    named = [Grouping.parse(g.grouping) for g in groupings if g.grouping != ANY]
-    meanings = {kind: GROUPINGS[kind] for each in named for kind in (each.queries, each.database)}
-    if any(each.queries != each.database for each in named):
-        meanings["a/b"] = "queries by a, database by b"
-    return meanings
 
 
 def _curves(folder: pathlib.Path, groupings: Sequence[GroupingResult]) -> list[Drawing]:
@@ -284,14 +274,20 @@ def write_results(
     write_text(path, text.getvalue())
 
 
-_SHOWN_COLUMNS = ("rank_of_first_positive", "first_retrieval", "similarity", "distance_m")
-
-
 def page_rows(subject: Subject, grouping: GroupingResult) -> list[list[Any]]:
-    """Return the rows of the page's table, as short as JSON allows; see queries.js."""
+    """Return the rows of the page's table, as short as JSON allows; see queries.js.
+
+    Names lack the folder that all of a column are in.
+    """
+    rows = list(query_results(subject, grouping))
+    for name in ("query", "first_retrieval"):
+        folder = posixpath.commonpath([posixpath.dirname(row[name]) for row in rows])
+        for row in rows:
+            row[name] = row[name].removeprefix(f"{folder}/")
+    columns = ("rank_of_first_positive", "first_retrieval", "similarity", "distance_m")
     return [
-        [row["query"], OUTCOMES.index(row["outcome"]), *(row[name] for name in _SHOWN_COLUMNS)]
-        for row in query_results(subject, grouping)
+        [row["query"], OUTCOMES.index(row["outcome"]), *(row[name] for name in columns)]
+        for row in rows
     ]
 
 
