@@ -21,7 +21,7 @@ from crisalad_jax.evaluation.record import table_notes
 from crisalad_jax.evaluation.results import GroupingResult, percent
 from crisalad_jax.experiments.report.charts import (
     OUTCOMES,
-    Placed,
+    Positions,
     find_placed,
     outcomes_of,
     position_map,
@@ -138,15 +138,16 @@ class Subject(NamedTuple):
     neighbours: Neighbours
     outcomes: np.ndarray
     """What became of each query, one of `OUTCOMES`."""
-    placed: Placed | None
-    """Which images have a likely position; None where none has one."""
+    positions: Positions | None
+    """Where the images were taken; None where that is unknown."""
 
     @classmethod
     def of(cls, benchmark: Benchmark, neighbours: Neighbours) -> "Subject":
         """Judge an evaluation's retrievals and positions."""
         places, asked = benchmark.database_positions, benchmark.query_positions
-        placed = None if places is None or asked is None else find_placed(places, asked)
-        return cls(benchmark, neighbours, outcomes_of(neighbours, benchmark.ground_truth()), placed)
+        positions = None if places is None or asked is None else find_placed(places, asked)
+        outcomes = outcomes_of(neighbours, benchmark.ground_truth())
+        return cls(benchmark, neighbours, outcomes, positions)
 
     def name(self, path: pathlib.Path) -> str:
         """Name a file of the benchmark by its path in the benchmark's folder."""
@@ -155,12 +156,12 @@ class Subject(NamedTuple):
 
     def metres(self, query: int, index: int) -> float | None:
         """Measure the metres from a query to a database image; None without likely positions."""
-        places, asked = self.benchmark.database_positions, self.benchmark.query_positions
-        if places is None or asked is None or self.placed is None:
+        places = self.positions
+        if places is None:
             return None
-        if not (self.placed.queries[query] and self.placed.database[index]):
+        if not (places.queries_placed[query] and places.database_placed[index]):
             return None
-        return math.dist(asked[query], places[index])
+        return math.dist(places.queries[query], places.database[index])
 
     def choose(self, most: int = _SHOWN) -> dict[str, list[int]]:
         """Choose at most `most` queries of each outcome, by similarity and then in file order.
@@ -330,15 +331,16 @@ def _away(subject: Subject, query: int, index: int) -> tuple[str, ...]:
 
 def _map(folder: pathlib.Path, subject: Subject) -> Drawing | None:
     """Draw the map of all images; None without positions."""
-    places, asked = subject.benchmark.database_positions, subject.benchmark.query_positions
-    placed, outcomes = subject.placed, subject.outcomes
-    if places is None or asked is None or placed is None:
+    positions, outcomes = subject.positions, subject.outcomes
+    if positions is None:
         return None
-    places, asked = np.split(flattened(np.concatenate([places, asked])), [len(places)])
-    figure = position_map(places, asked, subject.neighbours.indices[:, 0], outcomes, placed)
+    count = len(positions.database)
+    points = flattened(np.concatenate([positions.database, positions.queries]))
+    positions = positions._replace(database=points[:count], queries=points[count:])
+    figure = position_map(positions, subject.neighbours.indices[:, 0], outcomes)
     right, wrong = ((outcomes == outcome).sum() for outcome in ("right", "wrong"))
     words = (
-        f"Map of {len(places)} database images and {len(asked)} queries, of which {right} are "
+        f"Map of {count} database images and {len(points) - count} queries, of which {right} are "
         f"right and {wrong} wrong"
     )
     return chart(figure, folder / "positions.png", words)
