@@ -118,14 +118,11 @@ def _run(config: DemoConfig, out: pathlib.Path, quiet: bool) -> DemoSummary:
         for result in of_model
     ]
     curves = {f"{r.model}, {r.grouping}": r.recalls for r in rows if r.grouping != "shuffled"}
-    titles = (
-        "Recall@K on places never seen in training",
-        "Queries and what the trained model finds, every image described independently",
-    )
+    title = "Queries and what the trained model finds, every image described independently"
     figures = {
-        "recall.png": recall_curves(curves, titles[0], wide=True),
+        "recall.png": recall_curves(curves, "Recall@K on places never seen in training", wide=True),
         "training.png": training_curves(read_metrics(out / "run" / "metrics.jsonl")),
-        "gallery.png": show_retrievals(results["trained"][0], benchmark, rows=6, title=titles[1]),
+        "gallery.png": show_retrievals(results["trained"][0], benchmark, rows=6, title=title),
     }
     for name, figure in figures.items():
         save(figure, out / name)

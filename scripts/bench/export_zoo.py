@@ -17,12 +17,12 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 import safetensors.numpy
+from tables import put
 
 from crisalad_jax.checkpoints.export import FORMATS, ExportConfig, write_export
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, describe, init_crisalad, self_mask
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import split_markers
 
 ROOT = pathlib.Path(__file__).parents[2]
 MODELS = (
@@ -110,8 +110,7 @@ def main() -> None:
         print(f"| {' | '.join(rows[-1])} |", flush=True)
         gc.collect()
     if given.page is not None:
-        before, after = split_markers(given.page, "zoo")
-        given.page.write_text(before + table(rows) + after, encoding="utf-8")
+        put(given.page, "zoo", table(rows))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Iterator
 
 import numpy as np
+from tables import put
 
 from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
@@ -24,7 +25,6 @@ from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.extract import extract
-from crisalad_jax.utils.files import split_markers
 
 KS = (1, 5, 10)
 ENGINES: tuple[tuple[EngineName, ExportConfig], ...] = (
@@ -91,8 +91,7 @@ def main() -> None:
             lines.append(f"| {' | '.join(cells)} |")
             print(lines[-1], flush=True)
     if given.page is not None:
-        before, after = split_markers(given.page, "runtimes")
-        given.page.write_text(before + "\n".join(lines) + "\n" + after, encoding="utf-8")
+        put(given.page, "runtimes", "\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import pathlib
 from collections.abc import Iterator, Mapping
 
 import jax
+from tables import put
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import load
@@ -22,7 +23,6 @@ from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.metrics import Interval
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
-from crisalad_jax.utils.files import split_markers
 
 KS = (1, 5, 10)
 Models = dict[str, tuple[Crisalad, ModelConfig]]
@@ -69,8 +69,7 @@ def main() -> None:
         lines.append(line)
         print(line, flush=True)
     if given.page is not None:
-        before, after = split_markers(given.page, "recalls")
-        given.page.write_text(before + "\n".join(lines) + "\n" + after, encoding="utf-8")
+        put(given.page, "recalls", "\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

@@ -61,13 +61,18 @@ def save(name: str, study: Study, out: pathlib.Path) -> None:
 
 
 def splice(page: pathlib.Path, name: str, table: Table) -> None:
-    """Put the table in the page, between its two comments that name the study.
+    """Put the table in the page; raises as `put`."""
+    put(page, name, markdown(table))
+
+
+def put(page: pathlib.Path, name: str, text: str) -> None:
+    """Put a text in the page, between its two comments of this name.
 
     Raises:
         InputError: the page has no such comments.
     """
     before, after = split_markers(page, name)
-    tables.write_text(page, before + markdown(table) + after)
+    tables.write_text(page, before + text + after)
 
 
 def flags(description: str, out: str) -> argparse.ArgumentParser:

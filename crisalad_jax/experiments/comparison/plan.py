@@ -105,7 +105,8 @@ class ComparisonConfig:
         _check_distinct(self.flag, names, file_name)
         _check_distinct("--test", self.test, str)
         for name in names:
-            _draft(self, name)  # which raises for an unknown name
+            if name not in self.models:
+                _draft(self, name)  # which raises for an unknown name
         if self.reference not in (None, *names):
             raise InputError(
                 f"--reference: found {self.reference}, expected one of those compared, "

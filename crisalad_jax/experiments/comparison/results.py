@@ -163,10 +163,9 @@ def paired_difference(
     *,
     same_seeds: bool = True,
     resamples: int = RESAMPLES,
-    confidence: float = 0.95,
     seed: int = 0,
 ) -> Difference:
-    """Compute the difference of two recalls, and its percentile bootstrap's interval.
+    """Compute the difference of two recalls, and its percentile bootstrap's 95 % interval.
 
     A resample draws as many queries with replacement, the same ones for both methods, and as many
     seeds. Runs of one seed share initial values and batches, so that the same seeds are drawn for
@@ -179,26 +178,25 @@ def paired_difference(
         same_seeds: whether row i of both is a run of the same seed. If not, as for a model from a
             file, the seeds of each method are drawn independently.
         resamples: number of resamples.
-        confidence: of the interval, 0 to 1.
         seed: of the resampling; the same one gives the same interval.
 
     Returns:
         The difference, positive where the method recalls more.
 
     Raises:
-        InputError: no queries or seeds, other queries than the reference's, another number of seeds
-            although they are the same, or no such confidence.
+        InputError: no queries or seeds, other queries than the reference's, or another number of
+            seeds although they are the same.
 
     Example:
         >>> first, second = np.array([[True, True, True, False]]), np.array([[False] * 4])
         >>> paired_difference(first, second).mean
         0.75
     """
-    fits = hits.size and hits.shape[1] == reference.shape[1] and 0 < confidence < 1
+    fits = hits.size and hits.shape[1] == reference.shape[1]
     if not fits or (same_seeds and len(hits) != len(reference)):
         raise InputError(
             f"hits: found shapes {hits.shape} and {reference.shape}, expected (seeds, queries) of "
-            "the same queries, as many seeds unless same_seeds=False, and a confidence below 1"
+            "the same queries, and as many seeds unless same_seeds=False"
         )
     generator = np.random.default_rng(seed)
     queries = hits.shape[1]
@@ -209,9 +207,8 @@ def paired_difference(
     weights = _drawn_seeds(generator, resamples, len(hits))
     other = weights if same_seeds else _drawn_seeds(generator, resamples, len(reference))
     differences = (weights * ours).sum(axis=1) - (other * theirs).sum(axis=1)
-    tail = (1 - confidence) / 2
     # Sums that are equal in exact arithmetic must not differ by their rounding.
-    low, high = np.quantile(differences.round(12), (tail, 1 - tail))
+    low, high = np.quantile(differences.round(12), (0.025, 0.975))
     verdict = "better" if low > 0 else "worse" if high < 0 else "not told apart"
     mean = float(hits.mean() - reference.mean())
     return Difference(mean, Interval(float(low), float(high)), verdict)

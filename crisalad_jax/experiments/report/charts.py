@@ -180,18 +180,20 @@ def outcomes_of(neighbours: Neighbours, positives: Sequence[Int[np.ndarray, " _"
     return np.where(right, "right", np.where(matched, "wrong", "no positive"))
 
 
-class Placed(NamedTuple):
-    """Which images are where the others are."""
+class Positions(NamedTuple):
+    """Where images were taken, and which of them are where the others are."""
 
-    database: Bool[np.ndarray, " n"]
-    queries: Bool[np.ndarray, " q"]
+    database: Float[np.ndarray, "n axis"]
+    queries: Float[np.ndarray, "q axis"]
+    database_placed: Bool[np.ndarray, " n"]
+    queries_placed: Bool[np.ndarray, " q"]
     limit: float
     """Metres from the centre beyond which an image is out of place."""
 
 
 def find_placed(
     database: Float[np.ndarray, "n axis"], queries: Float[np.ndarray, "q axis"]
-) -> Placed:
+) -> Positions:
     """Tell images with a likely position from those with a placeholder, such as (0, 0).
 
     An image is out of place if it is ten times farther from the median position than nine tenths
@@ -207,30 +209,26 @@ def find_placed(
     reach = np.quantile(np.linalg.norm(trusted - centre, axis=1), 0.9)
     limit = max(_TIMES * float(reach), _LEAST)
     placed = np.linalg.norm(points - centre, axis=1) <= limit
-    return Placed(placed[: len(database)], placed[len(database) :], limit)
+    count = len(database)
+    return Positions(database, queries, placed[:count], placed[count:], limit)
 
 
 def position_map(
-    database: Float[np.ndarray, "n 2"],
-    queries: Float[np.ndarray, "q 2"],
-    first: Int[np.ndarray, " q"],
-    outcomes: np.ndarray,
-    placed: Placed,
+    positions: Positions, first: Int[np.ndarray, " q"], outcomes: np.ndarray
 ) -> Picture:
-    """Draw a map in metres, with the same scale on both axes.
+    """Draw a map in metres, with the same scale on both axes, of the images that are in place.
 
     The database is grey. A query is a green dot if its first retrieval is right, or a red cross,
     with a line to the retrieval, if it is wrong. It is a hollow triangle if no database image is
     right.
 
     Args:
-        database: positions in metres, east and north or any two axes.
-        queries: those of the queries.
+        positions: in metres, east and north or any two axes.
         first: the first retrieval of each query, an index of the database.
         outcomes: what `outcomes_of` returns.
-        placed: the images that are drawn.
     """
-    points = np.concatenate([database[placed.database], queries[placed.queries]])
+    database, queries, database_placed, queries_placed, _ = positions
+    points = np.concatenate([database[database_placed], queries[queries_placed]])
     low, span = points.min(axis=0), np.ptp(points, axis=0)
     # A narrow place gets room around it, so that nothing is squeezed into a line.
     widened = np.maximum(span, max(span.max() / 2.5, 1))
@@ -245,9 +243,9 @@ def position_map(
 
     database, queries = database - low, queries - low
     size = float(np.clip(4000 / len(points), 2, 18))
-    there = database[placed.database]
+    there = database[database_placed]
     axes.scatter(*there.T, s=2.5 * size, c=PLAIN, linewidths=0, label="database")
-    joined = (outcomes == "wrong") & placed.queries & placed.database[first]
+    joined = (outcomes == "wrong") & queries_placed & database_placed[first]
     lines = np.stack([queries[joined], database[first[joined]]], axis=1)
     # Paler where there are many, so that what is below them shows.
     alpha = float(np.clip(60 / max(len(lines), 1), 0.05, 0.45))
@@ -258,7 +256,7 @@ def position_map(
         ("wrong", {"c": WRONG, "marker": "x", "linewidths": 1}),
         ("no positive", hollow),
     ):
-        mask = (outcomes == outcome) & placed.queries
+        mask = (outcomes == outcome) & queries_placed
         if mask.any():
             axes.scatter(*queries[mask].T, s=1.4 * size, label=f"{outcome} ({mask.sum()})", **marks)
     legend_above(figure)

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import pathlib
+import posixpath
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -15,11 +16,12 @@ from jaxtyping import Float
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.metres import flattened
-from crisalad_jax.evaluation.operating_point import OperatingPoint, caveats
-from crisalad_jax.evaluation.results import ANY, GroupingResult, percent
+from crisalad_jax.evaluation.operating_point import OperatingPoint
+from crisalad_jax.evaluation.record import table_notes
+from crisalad_jax.evaluation.results import GroupingResult, percent
 from crisalad_jax.experiments.report.charts import (
     OUTCOMES,
-    Placed,
+    Positions,
     find_placed,
     outcomes_of,
     position_map,
@@ -39,7 +41,6 @@ from crisalad_jax.experiments.report.tables import (
 from crisalad_jax.experiments.report.transport import draw_transport, transport_of
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad
-from crisalad_jax.retrieval.grouping import GROUPINGS, Grouping
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.locks import staged_folder
 from crisalad_jax.utils.output import printable
@@ -61,7 +62,7 @@ def write_report(
     params: Crisalad,
     config: ModelConfig,
     model_name: str,
-    settings: Mapping[str, Any],
+    settings: dict[str, Any],
     similarities: Float[np.ndarray, "rows columns"] | None = None,
 ) -> pathlib.Path:
     """Write index.html, its charts and results.csv into the folder `out`; return the page's path.
@@ -76,7 +77,7 @@ def write_report(
         params: the model's, for the section on its transport; a model without one has none.
         config: the model's.
         model_name: which weights.
-        settings: the evaluation's settings as JSON values, shown folded.
+        settings: what `evaluation_settings` returns, shown folded.
         similarities: what `similarity.similarity_map` gives of the first grouping.
 
     Raises:
@@ -97,9 +98,7 @@ def write_report(
             "groupings": groupings,
             "main": main,
             "table": _table(groupings),
-            "caveats": caveats,
-            "meanings": _meanings(groupings),
-            "depends": params.cross_image is not None,
+            "notes": table_notes(groupings, settings),
             "curves": _curves(folder, groupings),
             "galleries": {
                 outcome: [_photographs(subject, query) for query in chosen]
@@ -139,15 +138,16 @@ class Subject(NamedTuple):
     neighbours: Neighbours
     outcomes: np.ndarray
     """What became of each query, one of `OUTCOMES`."""
-    placed: Placed | None
-    """Which images have a likely position; None where none has one."""
+    positions: Positions | None
+    """Where the images were taken; None where that is unknown."""
 
     @classmethod
     def of(cls, benchmark: Benchmark, neighbours: Neighbours) -> "Subject":
         """Judge an evaluation's retrievals and positions."""
         places, asked = benchmark.database_positions, benchmark.query_positions
-        placed = None if places is None or asked is None else find_placed(places, asked)
-        return cls(benchmark, neighbours, outcomes_of(neighbours, benchmark.ground_truth()), placed)
+        positions = None if places is None or asked is None else find_placed(places, asked)
+        outcomes = outcomes_of(neighbours, benchmark.ground_truth())
+        return cls(benchmark, neighbours, outcomes, positions)
 
     def name(self, path: pathlib.Path) -> str:
         """Name a file of the benchmark by its path in the benchmark's folder."""
@@ -156,12 +156,12 @@ class Subject(NamedTuple):
 
     def metres(self, query: int, index: int) -> float | None:
         """Measure the metres from a query to a database image; None without likely positions."""
-        places, asked = self.benchmark.database_positions, self.benchmark.query_positions
-        if places is None or asked is None or self.placed is None:
+        places = self.positions
+        if places is None:
             return None
-        if not (self.placed.queries[query] and self.placed.database[index]):
+        if not (places.queries_placed[query] and places.database_placed[index]):
             return None
-        return math.dist(asked[query], places[index])
+        return math.dist(places.queries[query], places.database[index])
 
     def choose(self, most: int = _SHOWN) -> dict[str, list[int]]:
         """Choose at most `most` queries of each outcome, by similarity and then in file order.
@@ -195,7 +195,7 @@ def _table(groupings: Sequence[GroupingResult]) -> Table:
         "same place, database": [cell(g.database_share) for g in groupings],
         "AP": [cell(g.average_precision) for g in groupings],
         "recall at 100 % precision": [cell(g.recall_at_full_precision) for g in groupings],
-        f"at {100 * asked:g} %": [_point(g.operating_point) for g in groupings],
+        f"answered right at {100 * asked:g} %": [_point(g.operating_point) for g in groupings],
     }
     columns = {
         header: cells
@@ -222,15 +222,6 @@ def _point(point: OperatingPoint | None) -> Cell:
     if not point.reached:
         return Cell(_DASH, f"highest precision {percent(point.precision)}")
     return Cell(percent(point.recall), f"similarity from {point.min_similarity:.9g}")
-
-
-def _meanings(groupings: Sequence[GroupingResult]) -> dict[str, str]:
-    """Explain which images attend to each other, for every kind of grouping in the results."""
-    named = [Grouping.parse(g.grouping) for g in groupings if g.grouping != ANY]
-    meanings = {kind: GROUPINGS[kind] for each in named for kind in (each.queries, each.database)}
-    if any(each.queries != each.database for each in named):
-        meanings["a/b"] = "queries by a, database by b"
-    return meanings
 
 
 def _curves(folder: pathlib.Path, groupings: Sequence[GroupingResult]) -> list[Drawing]:
@@ -284,14 +275,20 @@ def write_results(
     write_text(path, text.getvalue())
 
 
-_SHOWN_COLUMNS = ("rank_of_first_positive", "first_retrieval", "similarity", "distance_m")
-
-
 def page_rows(subject: Subject, grouping: GroupingResult) -> list[list[Any]]:
-    """Return the rows of the page's table, as short as JSON allows; see queries.js."""
+    """Return the rows of the page's table, as short as JSON allows; see queries.js.
+
+    Names lack the folder that all of a column are in.
+    """
+    rows = list(query_results(subject, grouping))
+    for name in ("query", "first_retrieval"):
+        folder = posixpath.commonpath([posixpath.dirname(row[name]) for row in rows])
+        for row in rows:
+            row[name] = row[name].removeprefix(f"{folder}/")
+    columns = ("rank_of_first_positive", "first_retrieval", "similarity", "distance_m")
     return [
-        [row["query"], OUTCOMES.index(row["outcome"]), *(row[name] for name in _SHOWN_COLUMNS)]
-        for row in query_results(subject, grouping)
+        [row["query"], OUTCOMES.index(row["outcome"]), *(row[name] for name in columns)]
+        for row in rows
     ]
 
 
@@ -334,15 +331,16 @@ def _away(subject: Subject, query: int, index: int) -> tuple[str, ...]:
 
 def _map(folder: pathlib.Path, subject: Subject) -> Drawing | None:
     """Draw the map of all images; None without positions."""
-    places, asked = subject.benchmark.database_positions, subject.benchmark.query_positions
-    placed, outcomes = subject.placed, subject.outcomes
-    if places is None or asked is None or placed is None:
+    positions, outcomes = subject.positions, subject.outcomes
+    if positions is None:
         return None
-    places, asked = np.split(flattened(np.concatenate([places, asked])), [len(places)])
-    figure = position_map(places, asked, subject.neighbours.indices[:, 0], outcomes, placed)
+    count = len(positions.database)
+    points = flattened(np.concatenate([positions.database, positions.queries]))
+    positions = positions._replace(database=points[:count], queries=points[count:])
+    figure = position_map(positions, subject.neighbours.indices[:, 0], outcomes)
     right, wrong = ((outcomes == outcome).sum() for outcome in ("right", "wrong"))
     words = (
-        f"Map of {len(places)} database images and {len(asked)} queries, of which {right} are "
+        f"Map of {count} database images and {len(points) - count} queries, of which {right} are "
         f"right and {wrong} wrong"
     )
     return chart(figure, folder / "positions.png", words)

@@ -157,6 +157,12 @@ def test_another_size_for_parameters_of_one(settings):
     assert variant.model.image_size == (56, 70)
 
 
+def test_a_size_that_fits_a_file_alone_is_left_to_it(settings):
+    """The default backbone takes multiples of 14, a ResNet any sides."""
+    given = {"names": ("ours",), "weights": ("ours=resnet.safetensors",), "image_size": (480, 640)}
+    assert ComparisonConfig(**settings | given).models == ("ours",)
+
+
 def test_a_page_without_a_place(flags, capfd, tmp_path):
     page = tmp_path / "page.md"
     page.write_text("nothing\n")

@@ -103,8 +103,11 @@ def workers_of(pid: int) -> list[int]:
 
 
 def is_alive(pid: int) -> bool:
-    stat = pathlib.Path(f"/proc/{pid}/stat")
-    return stat.exists() and "Z" not in stat.read_text().rpartition(")")[2].split()[0]
+    try:
+        stat = pathlib.Path(f"/proc/{pid}/stat").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return "Z" not in stat.rpartition(")")[2].split()[0]
 
 
 def wait_for(condition, seconds: float = 600) -> None:

@@ -8,7 +8,7 @@ from crisalad_jax.evaluation.metrics import PrecisionRecall
 from crisalad_jax.evaluation.similarity import cells_of
 from crisalad_jax.experiments import report
 from crisalad_jax.experiments.report.charts import (
-    Placed,
+    Positions,
     find_placed,
     outcomes_of,
     position_map,
@@ -35,8 +35,8 @@ LEGEND = 110
 
 
 def draw(tmp_path, *outcomes, first=(0, 0)):
-    placed = Placed(np.ones(4, bool), np.ones(2, bool), np.inf)
-    figure = position_map(DATABASE, QUERIES, np.array(first), np.array(outcomes), placed)
+    places = Positions(DATABASE, QUERIES, np.ones(4, bool), np.ones(2, bool), np.inf)
+    figure = position_map(places, np.array(first), np.array(outcomes))
     return drawn(figure, tmp_path)
 
 
@@ -80,7 +80,7 @@ ASKED = CITY[:40] + 3.0
 
 def out_of(database, queries=ASKED):
     placed = find_placed(database, queries)
-    return np.flatnonzero(~placed.database).tolist(), np.flatnonzero(~placed.queries).tolist()
+    return tuple(np.flatnonzero(~mask).tolist() for mask in placed[2:4])
 
 
 def test_a_city_has_no_placeholders():
@@ -115,15 +115,13 @@ def test_what_is_out_of_place_is_not_drawn(tmp_path):
     queries = np.array([[1005.0, 5000], [0, 0]])
     placed = find_placed(database, queries)
     assert out_of(database, queries) == ([4, 9, 14, 19, 24], [1])
-    everything = Placed(np.ones(25, bool), np.ones(2, bool), np.inf)
+    everything = Positions(database, queries, np.ones(25, bool), np.ones(2, bool), np.inf)
     first, outcomes = np.array([4, 0]), np.array(["wrong", "wrong"])
     # The map of all spans 5 km; without them it is the square of 100 m, whose red cross is alone:
     # no line leads to (0, 0).
     some, every = (
         np.ptp(np.argwhere(near_colour(drawn(figure, tmp_path)[LEGEND:], RED)), axis=0).max()
-        for figure in (
-            position_map(database, queries, first, outcomes, each) for each in (placed, everything)
-        )
+        for figure in (position_map(each, first, outcomes) for each in (placed, everything))
     )
     assert some < 40
     assert every > 200

@@ -98,7 +98,8 @@ GROUPINGS = [
 
 
 def write(out, benchmark, groupings, params, config=MODEL, **options):
-    given = {"model_name": "a <b>model</b>", "settings": {"note": "</pre><script>"}}
+    settings = {"batch_size": 8, "seeds": 2, "same_place": "</pre><script>"}
+    given = {"model_name": "a <b>model</b>", "settings": settings}
     return write_report(out, benchmark, groupings, params=params, config=config, **given, **options)
 
 
@@ -172,7 +173,7 @@ def test_the_table_holds_the_numbers(page: Page):
     ]
     text = page.all("main")[0]["text"]
     assert "every image alone" in text
-    assert "95 % interval" in text
+    assert "95 % by bootstrap" in text
 
 
 def test_galleries_show_what_was_retrieved_with_distances(page: Page):
@@ -229,7 +230,7 @@ def test_names_of_files_are_no_markup(
     # Of what this model and set lack there is no section, nor a word.
     names = [e["id"] for e in page.all("section")]
     assert names == ["recall", "queries", "right", "wrong", "no-positive", "settings"]
-    assert "No descriptor of this model" in " ".join(page.all("main")[0]["text"].split())
+    assert "no descriptor depends on its batch" in " ".join(page.all("main")[0]["text"].split())
     assert [e["text"] for e in page.all("figcaption")][1].split() == ["✓", "1", "0.910"]
 
 
@@ -266,9 +267,9 @@ def test_a_row_for_every_query_and_grouping(benchmark, tmp_path: pathlib.Path):
         ("no positive", "", "d/1.jpg", "0.73", "8960.0"),
     ]
     assert page_rows(subject, GROUPINGS[0]) == [
-        ["=1+1.jpg", 2, 1, "d/0.jpg", 0.91, 3.0],
-        ["a/b,\\x1b.jpg", 0, 3, "d/2.jpg", 0.82, 35.0],
-        ["@c.jpg", 1, None, "d/1.jpg", 0.73, 8960.0],
+        ["=1+1.jpg", 2, 1, "0.jpg", 0.91, 3.0],
+        ["a/b,\\x1b.jpg", 0, 3, "2.jpg", 0.82, 35.0],
+        ["@c.jpg", 1, None, "1.jpg", 0.73, 8960.0],
     ]
 
 
