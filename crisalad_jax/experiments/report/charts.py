@@ -24,7 +24,7 @@ from crisalad_jax.experiments.report.style import (
     WRONG,
     Picture,
     label_axes,
-    legend_above,
+    legend_below,
     new_figure,
 )
 from crisalad_jax.experiments.report.tables import check_recalls
@@ -70,7 +70,7 @@ def recall_curves(
     label_axes(axes, "K, database images retrieved", "Recall@K")
     _draw_recalls(axes, curves)
     axes.set_xticks(sorted({k for curve in curves.values() for k in curve}))
-    legend_above(figure)
+    legend_below(figure)
     return figure
 
 
@@ -84,7 +84,7 @@ def precision_curves(curves: Mapping[str, PrecisionRecall]) -> Picture:
     axes.set(xlim=(0, 100), ylim=(0, 100))
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter("{x:.0f} %")
-    legend_above(figure)
+    legend_below(figure)
     return figure
 
 
@@ -143,7 +143,7 @@ def _draw_recalls(axes: Axes, curves: Mapping[str, Mapping[int, float]]) -> None
     # The scale starts at 0 unless the lines are high, where that would hide their differences.
     axes.set_ylim(0 if least < 50 else None, None)
     axes.yaxis.set_major_locator(MaxNLocator(6, integer=True, steps=(1, 2, 5, 10)))
-    axes.yaxis.set_major_formatter("{x:.0f} %")
+    axes.yaxis.set_major_formatter("{x:g} %")
 
 
 def _draw_line(axes: Axes, number: int, name: str, x: Any, y: Any, marker: str = "") -> None:
@@ -259,7 +259,7 @@ def position_map(
         mask = (outcomes == outcome) & queries_placed
         if mask.any():
             axes.scatter(*queries[mask].T, s=1.4 * size, label=f"{outcome} ({mask.sum()})", **marks)
-    legend_above(figure)
+    legend_below(figure)
     return figure
 
 

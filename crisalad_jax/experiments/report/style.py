@@ -79,12 +79,12 @@ def label_axes(
     axes.set_axisbelow(True)
 
 
-def legend_above(figure: Figure) -> None:
-    """Name what is drawn above the axes, in two columns if the names are short enough."""
+def legend_below(figure: Figure) -> None:
+    """Name what is drawn below the axes, in two columns if the names are short enough."""
     names = [name for axes in figure.axes for name in axes.get_legend_handles_labels()[1]]
     room = figure.get_figwidth() / 2 - 0.6  # inches; a letter of 9 points is 0.08 wide
     columns = 2 if max(map(len, names)) * 0.08 <= room else 1
-    where = {"loc": "outside upper left", "ncols": columns}
+    where = {"loc": "outside lower left", "ncols": columns}
     figure.legend(frameon=False, fontsize=9, labelcolor=INK, **where)
 
 

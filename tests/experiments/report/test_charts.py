@@ -42,7 +42,7 @@ def draw(tmp_path, *outcomes, first=(0, 0)):
 
 def test_a_right_query_is_green_and_a_wrong_one_red_with_a_line_to_its_retrieval(tmp_path):
     picture = draw(tmp_path, "right", "wrong")
-    lower = picture[LEGEND:]
+    lower = picture[:-LEGEND]
     green, red = (np.argwhere(near_colour(lower, colour)) for colour in (GREEN, RED))
     # South-west is right and below left of the wrong one in the north-east.
     south_west, north_east = green.mean(axis=0), red.mean(axis=0)
@@ -59,7 +59,7 @@ def test_metres_are_as_long_on_both_axes(tmp_path):
     """Of a square of database images, drawn far apart, the corners make a square."""
     picture = draw(tmp_path, "right", "right", first=(0, 2))
     # The lines of the grid are paler by 32 levels.
-    is_grey = (np.abs(picture[LEGEND:].astype(int) - 0xC4) < 10).all(axis=-1)
+    is_grey = (np.abs(picture[:-LEGEND].astype(int) - 0xC4) < 10).all(axis=-1)
     grey = np.argwhere(cv2.erode(is_grey.astype(np.uint8), np.ones((5, 5), np.uint8)))
     height, width = np.ptp(grey, axis=0)
     # Dots are drawn to half a pixel.
@@ -120,7 +120,7 @@ def test_what_is_out_of_place_is_not_drawn(tmp_path):
     # The map of all spans 5 km; without them it is the square of 100 m, whose red cross is alone:
     # no line leads to (0, 0).
     some, every = (
-        np.ptp(np.argwhere(near_colour(drawn(figure, tmp_path)[LEGEND:], RED)), axis=0).max()
+        np.ptp(np.argwhere(near_colour(drawn(figure, tmp_path)[:-LEGEND], RED)), axis=0).max()
         for figure in (position_map(each, first, outcomes) for each in (placed, everything))
     )
     assert some < 40
@@ -171,9 +171,9 @@ def test_recall_curves_are_drawn_in_order(tmp_path):
     blue, orange = (np.argwhere(near_colour(picture, colour)) for colour in (BLUE, ORANGE))
     assert len(blue) > 500
     assert len(orange) > 500
-    # The first curve is blue and lower, all along; above both are their names.
-    lower = 150
-    assert orange[:, 0].max() < blue[blue[:, 0] > lower][:, 0].min()
+    # The first curve is blue and lower, all along; below both are their names.
+    names = 450
+    assert orange[orange[:, 0] < names][:, 0].max() < blue[:, 0].min()
     assert [file.name for file in (tmp_path / "deep").iterdir()] == ["drawn.png"]
 
 
@@ -228,7 +228,7 @@ def test_precision_curves_are_drawn_where_they_are(tmp_path):
     high = PrecisionRecall(none, np.array([1.0, 0.9]), recall, 0.0, 0.0)
     low = PrecisionRecall(none, np.array([0.4, 0.2]), recall, 0.0, 0.0)
     picture = drawn(precision_curves({"high": high, "low": low}), tmp_path)
-    lower = picture[len(picture) // 6 :]  # below the legend
+    lower = picture[: -len(picture) // 6]  # above the legend
     blue, orange = (np.argwhere(near_colour(lower, colour)) for colour in (BLUE, ORANGE))
     assert len(blue) > 500
     assert blue[:, 0].max() < orange[:, 0].min()
