@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.backbones.vit import vit
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import (
@@ -225,7 +224,7 @@ def test_transport_masses_by_scaling_a_matrix_in_float64(params):
     """Sinkhorn's algorithm as it is usually written: columns, then rows, three times."""
     images = pictures(2)
     pixels = jax.vmap(lambda image: normalise(image, PreprocessingConfig()))(images)
-    patches = np.asarray(vit(params.backbone, pixels, CONFIG.backbone)[0].patches, np.float64)
+    patches = np.asarray(CONFIG.backbone.apply(params.backbone, pixels)[0].patches, np.float64)
     network = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params.aggregator.score)
     hidden = np.maximum(patches @ network.fc1.weight + network.fc1.bias, 0)
     scores = hidden @ network.fc2.weight + network.fc2.bias

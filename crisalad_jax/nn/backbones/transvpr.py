@@ -38,7 +38,6 @@ from crisalad_jax.nn.layers import (
 )
 from crisalad_jax.utils.pytree import pytree_dataclass
 
-NORM_EPSILON = 1e-5
 WIDTHS = (64, 128, 256, 512)
 """Widths of the convolutions; each is followed by a maximum that halves the grid."""
 
@@ -155,7 +154,7 @@ class TransVprNetConfig(Backbone):
             _, outputs = jax.lax.scan(body, tokens, params.blocks)
         chosen = [outputs[level - 1] for level in levels]
         if request.norm:
-            chosen = [layer_norm(params.norm, x, epsilon=NORM_EPSILON) for x in chosen]
+            chosen = [layer_norm(params.norm, x) for x in chosen]
         patches = jnp.concatenate([x[:, 1:] for x in chosen], axis=-1)
         return Features(chosen[-1][:, 0], patches), params
 
@@ -190,8 +189,8 @@ def block(
     params: TransVprBlock, x: Float[Array, "image token dim"], heads: int
 ) -> Float[Array, "image token dim"]:
     """Add attention to the tokens, normalise them, and add the feed-forward network's output."""
-    normed = layer_norm(params.pre_norm, x, epsilon=NORM_EPSILON)
+    normed = layer_norm(params.pre_norm, x)
     x = x + attention(params.self_attn, normed, heads)
-    x = layer_norm(params.norm1, x, epsilon=NORM_EPSILON)
+    x = layer_norm(params.norm1, x)
     update = linear(params.linear2, gelu(linear(params.linear1, x)))
     return (at_least_float32(x) + at_least_float32(update)).astype(x.dtype)
