@@ -35,15 +35,7 @@ TOLERANCE = 2e-6
 
 @pytest.fixture(scope="module")
 def params():
-    """With LayerNorms off their start, so that no symmetry hides an error."""
-    params = init_crisalad(jax.random.key(0), CONFIG)
-    leaves, structure = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.key(1), len(leaves))
-    noisy = [
-        leaf + 0.05 * jax.random.normal(key, leaf.shape)
-        for leaf, key in zip(leaves, keys, strict=True)
-    ]
-    return jax.tree.unflatten(structure, noisy)
+    return random_params(CONFIG)
 
 
 def pictures(count: int, seed: int = 0) -> np.ndarray:

@@ -65,7 +65,7 @@ def test_a_file_keeps_it(tmp_path) -> None:
 
 
 def test_layouts_without_a_place_for_it_refuse_it() -> None:
-    with pytest.raises(InputError, match=r"found a model of .*, a projection, expected aggr"):
+    with pytest.raises(InputError, match=r"found a model of .*, projection yes, expected aggr"):
         check_holds(CONFIG, "dino-salad")
 
 
