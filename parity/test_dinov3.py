@@ -23,7 +23,6 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.backbones import FeatureSpec
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
-from crisalad_jax.nn.backbones.vit import vit
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, parameter_shapes
@@ -205,7 +204,7 @@ def test_facets_are_transformers(tmp_path: pathlib.Path) -> None:
     backbone, config = found.params.backbone, found.config.backbone
     for name, expected in outputs.items():
         request = FeatureSpec((2,), name, norm=False)
-        ours, _ = vit(backbone, jnp.asarray(images), config, request)
+        ours, _ = config.apply(backbone, jnp.asarray(images), request)
         assert relative_error(ours.patches, expected[:, 1 + REGISTERS :]) < OUTPUT_BOUND
         assert relative_error(ours.class_token, expected[:, 0]) < OUTPUT_BOUND
 

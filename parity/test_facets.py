@@ -13,7 +13,6 @@ import torch
 from crisalad_jax.checkpoints.formats import to_state
 from crisalad_jax.checkpoints.public import read_checkpoint
 from crisalad_jax.nn.backbones import Features, FeatureSpec
-from crisalad_jax.nn.backbones.vit import vit
 from crisalad_jax.nn.model import Crisalad
 from parity.reference.model import Crisalad as TorchCrisalad
 from parity.test_goldens import OUTPUT_BOUND
@@ -71,7 +70,7 @@ def test_facets_are_transformers(kind: Kind, number: int, tmp_path: pathlib.Path
     def all_of(images: jax.Array) -> dict[str, Features]:
         def one(name: Any) -> Features:
             request = FeatureSpec((number + 1,), name, norm=False)
-            return vit(params.backbone, images, config.backbone, request)[0]
+            return config.backbone.apply(params.backbone, images, request)[0]
 
         return {name: one(name) for name in theirs}
 

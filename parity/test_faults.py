@@ -134,6 +134,7 @@ def _transposed_mask(encoder: Any) -> Any:
 
 
 PARTS, VIT = parity.cases.parts, crisalad_jax.nn.backbones.vit
+TORCH = crisalad_jax.nn.torch_layers
 FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
     "blocks swapped": (
         "attention",
@@ -166,7 +167,7 @@ FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
     "epsilon of the encoder's norms": (
         "cross-image encoder",
         FORWARD,
-        replace(crisalad_jax.nn.torch_layers, "NORM_EPSILON", lambda _: 1e-6),
+        replace(TORCH, "layer_norm", lambda norm: functools.partial(norm, epsilon=1e-6)),
     ),
     "epsilon of batch norm": (
         "block, multi-resolution adapter",

@@ -17,7 +17,7 @@ from crisalad_jax.checkpoints.public import read_checkpoint
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.salad import FolConfig
 from crisalad_jax.nn.backbones import FeatureSpec
-from crisalad_jax.nn.backbones.vit import ViTConfig, vit
+from crisalad_jax.nn.backbones.vit import ViTConfig
 from parity.reference.vit import Block, ViT, grid_of
 from parity.test_goldens import OUTPUT_BOUND, relative_error
 from parity.test_independent import (
@@ -145,8 +145,8 @@ def test_the_class_tokens_attention_is_transformers(kind: Kind, tmp_path: pathli
 
     @jax.jit
     def features(images: jax.Array) -> tuple[jax.Array, ...]:
-        asked, _ = vit(checkpoint.params.backbone, images, backbone, request)
-        plain, _ = vit(checkpoint.params.backbone, images, backbone)
+        asked, _ = backbone.apply(checkpoint.params.backbone, images, request)
+        plain, _ = backbone.apply(checkpoint.params.backbone, images)
         assert asked.class_attention is not None
         assert plain.class_attention is None
         return asked.class_attention, asked.patches - plain.patches

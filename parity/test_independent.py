@@ -36,7 +36,7 @@ from crisalad_jax.checkpoints.formats.families import TABLES
 from crisalad_jax.checkpoints.public import read_checkpoint, write_checkpoint
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
-from crisalad_jax.nn.backbones.vit import ViTConfig, vit
+from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig, cross_image_encoder, init_cross_image
 from crisalad_jax.nn.model import Crisalad
@@ -171,7 +171,7 @@ def their_features(model: Any, images: Tensor, registers: int) -> dict[str, Tens
 
 
 def our_features(params: Crisalad, images: Any, config: ModelConfig) -> dict[str, jax.Array]:
-    return vit(params.backbone, images, config.backbone)[0]._asdict()
+    return config.backbone.apply(params.backbone, images)[0]._asdict()
 
 
 def torch_loss(outputs: dict[str, Tensor]) -> Tensor:

@@ -7,6 +7,7 @@ SelaVPR has a second one after the attention.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Literal
 
 import jax
@@ -25,7 +26,6 @@ from crisalad_jax.nn.layers import (
     Linear,
     Valid,
     depthwise_conv,
-    gelu,
     init_batch_norm,
     init_depthwise_conv,
     init_linear,
@@ -111,15 +111,7 @@ class MultiResolutionAdapter:
 
 @pytree_dataclass
 class MlpAdapter:
-    """A plain MLP, which acts on every token alone."""
-
-    down: Linear
-    up: Linear
-
-
-@pytree_dataclass
-class SideAdapter:
-    """EDTformer's adapter: an MLP with GELU, on a path parallel to the blocks (Jin et al. 2025)."""
+    """A plain MLP, which acts on every token alone; EDTformer's has GELU (Jin et al. 2025)."""
 
     down: Linear
     up: Linear
@@ -133,7 +125,7 @@ class SerialParallelAdapter:
     parallel: MlpAdapter
 
 
-SingleAdapter = DepthwiseAdapter | MultiResolutionAdapter | MlpAdapter | SideAdapter
+SingleAdapter = DepthwiseAdapter | MultiResolutionAdapter | MlpAdapter
 Adapter = SingleAdapter | SerialParallelAdapter
 
 
@@ -147,35 +139,34 @@ def init_adapter(key: PRNGKeyArray, dim: int, config: AdapterConfig) -> Adapter 
     if kind == "none":
         return None
     if kind == "serial-parallel":
-        plain = dataclasses.replace(config, kind="mlp")
-        serial, parallel = (init_adapter(each, dim, plain) for each in random_init.split(key))
-        assert isinstance(serial, MlpAdapter)
-        assert isinstance(parallel, MlpAdapter)
-        return SerialParallelAdapter(serial, parallel)
-    down_key, first, second, up_key = random_init.split(key, 4)
-    depthwise, convolutions = kind == "depthwise", config.bias == "convolutions"
-    down = init_linear(down_key, dim, width, bias=not depthwise)
-    up = init_linear(up_key, width, dim, bias=not (depthwise and convolutions))
-    up = jax.tree.map(lambda leaf: random_init.zeros(*leaf.shape), up)
-    if kind == "mlp":
-        return MlpAdapter(down, up)
-    if kind == "side":
-        return SideAdapter(down, up)
-    if depthwise:
+        return SerialParallelAdapter(*(_init_mlp(k, dim, width) for k in random_init.split(key)))
+    if kind in ("mlp", "side"):
+        return _init_mlp(key, dim, width)
+    down_key, first, second = random_init.split(key, 3)
+    if kind == "depthwise":
+        convolutions = config.bias == "convolutions"
         return DepthwiseAdapter(
-            down=down,
+            down=init_linear(down_key, dim, width, bias=False),
             depthwise=init_depthwise_conv(first, config.kernel_size, width, bias=convolutions),
             pointwise=init_linear(second, width, width, bias=convolutions),
-            up=up,
+            up=_init_up(width, dim, bias=not convolutions),
         )
     half, quarter, narrow = width // 2, width // 4, width // 16
     return MultiResolutionAdapter(
-        down=down,
+        down=init_linear(down_key, dim, width),
         branch1=_init_conv_norm(1, width, half),
         branch2=(_init_conv_norm(1, width, narrow), _init_conv_norm(3, narrow, quarter)),
         branch3=(_init_conv_norm(1, width, narrow), _init_conv_norm(5, narrow, quarter)),
-        up=up,
+        up=_init_up(width, dim),
     )
+
+
+def _init_mlp(key: PRNGKeyArray, dim: int, width: int) -> MlpAdapter:
+    return MlpAdapter(init_linear(random_init.split(key)[0], dim, width), _init_up(width, dim))
+
+
+def _init_up(width: int, dim: int, *, bias: bool = True) -> Linear:
+    return Linear(random_init.zeros(width, dim), random_init.zeros(dim) if bias else None)
 
 
 def _init_conv_norm(kernel_size: int, d_in: int, d_out: int) -> ConvNorm:
@@ -190,13 +181,13 @@ def adapter(
     *,
     length: int | None = None,
     valid: Valid = None,
+    activation: Callable[[Array], Array] = jax.nn.relu,
 ) -> tuple[Float[Array, "*batch token dim"], SingleAdapter]:
     """Apply an adapter: down, ReLU, convolutions on the patch grid plus skip, up (paper Eq. 2).
 
     The last `grid[0] * grid[1]` of the first `length` tokens are patches in row order. The
     convolutions are the identity on the class and register tokens before them. With the skip these
-    tokens therefore count twice, as in CricaVPR. The MLP and side adapters have neither
-    convolutions nor skip, and the latter has GELU.
+    tokens therefore count twice, as in CricaVPR. A plain MLP has neither convolutions nor skip.
 
     Args:
         params: the adapter.
@@ -205,14 +196,12 @@ def adapter(
         length: number of first tokens that are not padding; None is all.
         valid: images of a training batch whose statistics batch norms normalise by; None takes the
             stored ones, which stay.
+        activation: after the projection down.
 
     Returns:
         (tokens, updated): the adapter's output, and the adapter with updated running statistics.
     """
-    narrow = checkpoint_name(linear(params.down, tokens), "down")
-    if isinstance(params, SideAdapter):
-        return linear(params.up, gelu(narrow)), params
-    hidden = jax.nn.relu(narrow)
+    hidden = activation(checkpoint_name(linear(params.down, tokens), "down"))
     if isinstance(params, MlpAdapter):
         return linear(params.up, hidden), params
     *batch, count, width = hidden.shape

@@ -37,9 +37,11 @@ def init_he_conv(
     return Conv(weight, random_init.zeros(d_out) if bias else None)
 
 
-def init_conv_norm(key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int) -> ConvNorm:
-    """Draw a convolution without bias, and start its batch norm as the identity."""
-    return ConvNorm(init_he_conv(key, kernel_size, d_in, d_out), init_batch_norm(d_out))
+def init_conv_norm(
+    key: PRNGKeyArray, kernel_size: int, d_in: int, d_out: int, *, bias: bool = False
+) -> ConvNorm:
+    """Draw a convolution, and start its batch norm as the identity."""
+    return ConvNorm(init_he_conv(key, kernel_size, d_in, d_out, bias=bias), init_batch_norm(d_out))
 
 
 def conv_norm(

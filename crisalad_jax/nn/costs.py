@@ -5,14 +5,12 @@ import dataclasses
 import functools
 import math
 import re
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.extend import core
 
-from crisalad_jax.nn.adapter import SerialParallelAdapter, adapter, init_adapter
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import TAPS
 from crisalad_jax.nn.model import attend_across_images, extract_tokens, parameter_shapes, self_mask
@@ -65,17 +63,17 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
     params = parameter_shapes(config)
     config = dataclasses.replace(config, compute_dtype="float32")  # counts are of any type
 
-    def tokens_of(count: int) -> Any:
-        pixels = jax.ShapeDtypeStruct((count, *config.input_size, 3), jnp.uint8)
-        return jax.make_jaxpr(functools.partial(extract_tokens, config=config))(params, pixels)
+    extract = functools.partial(extract_tokens, config=config)
 
-    single, double = (_count(tokens_of(count)) for count in (1, 2))
+    def pixels(count: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((count, *config.input_size, 3), jnp.uint8)
+
+    single, double = (_count_traced(extract, params, pixels(count)) for count in (1, 2))
     macs = {part: double[part] - single[part] for part in _SCOPES.values()}
     if params.cross_image is not None:
-        pixels = jax.ShapeDtypeStruct((images, *config.input_size, 3), jnp.uint8)
-        tokens = jax.eval_shape(functools.partial(extract_tokens, config=config), params, pixels)
+        tokens = jax.eval_shape(extract, params, pixels(images))
         attend = functools.partial(attend_across_images, config=config, mask=self_mask(images))
-        attended = _count(jax.make_jaxpr(attend)(params, tokens))
+        attended = _count_traced(attend, params, tokens)
         macs["cross-image encoder"] = attended["cross-image encoder"] // images
     if params.projection is not None:
         macs["projection"] = math.prod(params.projection.weight.shape)
@@ -111,40 +109,36 @@ def count_macs(function: Any, *arguments: Any) -> int:
         >>> count_macs(jnp.matmul, jnp.zeros((2, 3)), jnp.zeros((3, 4)))
         24
     """
-    return _count(jax.make_jaxpr(function)(*arguments)).total()
+    return _count_traced(function, *arguments).total()
 
 
-def _count(closed: Any) -> "collections.Counter[str]":
+def _count_traced(function: Any, *arguments: Any) -> "collections.Counter[str]":
+    return _count(jax.make_jaxpr(function)(*arguments).jaxpr)
+
+
+def _count(program: Any, scope: str = "", times: int = 1) -> "collections.Counter[str]":
+    """Count the multiply-accumulates of each part in a program (a jaxpr)."""
     totals = collections.Counter[str]()
-    _walk(closed.jaxpr, "", 1, totals)
-    return totals
-
-
-def _walk(jaxpr: Any, scope: str, times: int, totals: "collections.Counter[str]") -> None:
-    for equation in jaxpr.eqns:
+    for equation in program.eqns:
         here = f"{scope}/{equation.source_info.name_stack}"
         name = equation.primitive.name
+        inside = times * equation.params["length"] if name == "scan" else times
+        inner = [_count(each, here, inside) for each in _inner_programs(equation)]
         if name == "cond":
-            branches = []
-            for branch in equation.params["branches"]:
-                branches.append(collections.Counter[str]())
-                _walk(branch.jaxpr, here, times, branches[-1])
-            totals.update(min(branches, key=lambda branch: branch.total()))
-            continue
-        inside = times * equation.params.get("length", 1) if name == "scan" else times
-        for inner in _inner(equation):
-            _walk(inner, here, inside, totals)
+            inner = [min(inner, key=collections.Counter.total)]
+        for each in inner:
+            totals.update(each)
         macs = times * _macs(equation, name, here)
         if macs:
             totals[_part_of(here)] += macs
+    return totals
 
 
-def _inner(equation: Any) -> Iterator[Any]:
-    """Yield the inner programs (jaxprs) of an equation."""
-    for value in equation.params.values():
-        inner = getattr(value, "jaxpr", value)  # a closed one has it
-        if isinstance(inner, core.Jaxpr):
-            yield inner
+def _inner_programs(equation: Any) -> list[Any]:
+    """Return the programs in an equation's parameters, of which one may be a tuple of branches."""
+    values = jax.tree.leaves(equation.params)
+    programs = (getattr(value, "jaxpr", value) for value in values)  # a closed one has it
+    return [each for each in programs if isinstance(each, core.Jaxpr)]
 
 
 def _macs(equation: Any, name: str, scope: str) -> int:
@@ -163,24 +157,19 @@ def _macs(equation: Any, name: str, scope: str) -> int:
 
 def adapter_macs(config: ModelConfig) -> int:
     """Count one block's adapters' true multiply-accumulates per image, linears at every token."""
-    backbone: Any = config.backbone
-    grid = config.grid
-    tokens = 1 + backbone.registers + math.prod(grid)
-    make = functools.partial(init_adapter, dim=backbone.dim, config=backbone.adapter)
-    params = jax.eval_shape(make, jax.random.key(0))
-    x = jax.ShapeDtypeStruct((1, tokens, backbone.dim), jnp.float32)
-    pair = isinstance(params, SerialParallelAdapter)
-    parts = (params.serial, params.parallel) if pair else (params,)
-    return sum(count_macs(functools.partial(adapter, grid=grid), part, x) for part in parts)
+    (macs,) = (cost.macs for cost in part_costs(config) if cost.part == "adapters")
+    return macs // config.backbone.depth
 
 
-def paper_adapter_macs(config: ModelConfig) -> int:
+def paper_adapter_macs(config: ModelConfig, macs: int) -> int:
     """Count an adapter's multiply-accumulates as the paper (Table 3: 39.223 M), each linear once.
 
-    `adapter_macs` counts a linear layer at every token instead.
+    Args:
+        config: the model.
+        macs: those of `adapter_macs`, which counts a linear layer at every token instead.
     """
     backbone: Any = config.backbone
     tokens = 1 + backbone.registers + config.patches
     adapters = 2 if backbone.adapter.kind == "serial-parallel" else 1
     linears = adapters * 2 * backbone.dim * backbone.adapter_dim
-    return adapter_macs(config) - (tokens - 1) * linears
+    return macs - (tokens - 1) * linears

@@ -153,9 +153,12 @@ def columns(params: Linear, start: int, stop: int) -> Linear:
 
 
 def layer_norm(
-    params: LayerNorm, x: Float[Array, "*batch dim"], *, epsilon: float
+    params: LayerNorm, x: Float[Array, "*batch dim"], *, epsilon: float = 1e-5
 ) -> Float[Array, "*batch dim"]:
-    """Normalise the last axis to mean 0 and variance 1, in float32, and return the type of `x`."""
+    """Normalise the last axis to mean 0 and variance 1, in float32, and return the type of `x`.
+
+    The default of `epsilon` is torch's.
+    """
     y = _standardise(at_least_float32(x), epsilon) * params.weight + params.bias
     return y.astype(x.dtype)
 

@@ -18,9 +18,6 @@ from crisalad_jax.nn.layers import (
 )
 from crisalad_jax.utils.pytree import pytree_dataclass
 
-NORM_EPSILON = 1e-5
-"""Epsilon of torch's `nn.LayerNorm`."""
-
 
 @pytree_dataclass
 class EncoderLayer:
@@ -65,7 +62,7 @@ def encoder_layer(
         keys: of these three; None means inference.
     """
     x = x + dropout(attended, rate, key=keys[0])
-    x = layer_norm(params.norm1, x, epsilon=NORM_EPSILON)
+    x = layer_norm(params.norm1, x)
     hidden = dropout(activation(linear(params.linear1, x)), rate, key=keys[1])
     update = dropout(linear(params.linear2, hidden), rate, key=keys[2])
-    return layer_norm(params.norm2, x + update, epsilon=NORM_EPSILON)
+    return layer_norm(params.norm2, x + update)

@@ -6,7 +6,7 @@ from crisalad_jax.config.checks import check_count, takes
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.costs import PartCost, adapter_macs, paper_adapter_macs, part_costs
+from crisalad_jax.nn.costs import PartCost, paper_adapter_macs, part_costs
 from crisalad_jax.training.config import has_adapters
 from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, HEAD, count_trainable
 
@@ -73,9 +73,9 @@ def model_summary(
     parts = part_costs(config, images=images)
     adapter = None
     if has_adapters(config):
-        total = sum(cost.parameters for cost in parts if cost.part == "adapters")
-        count = total // config.backbone.depth
-        adapter = AdapterSummary(count, adapter_macs(config), paper_adapter_macs(config))
+        (all_blocks,) = (cost for cost in parts if cost.part == "adapters")
+        count, macs = (x // config.backbone.depth for x in (all_blocks.parameters, all_blocks.macs))
+        adapter = AdapterSummary(count, macs, paper_adapter_macs(config, macs))
     return ModelSummary(
         config.image_size,
         config.images_in_words,

@@ -24,9 +24,13 @@ from crisalad_jax.utils.target import CPU, GPU, TPU, Target, lowering_for
 TOKENS, DIM, HEADS = 7, 12, 3
 
 
+def network(dim: int) -> Attention:
+    qkv, proj = jax.random.split(jax.random.key(2))
+    return Attention(init_linear(qkv, dim, 3 * dim), init_linear(proj, dim, dim))
+
+
 def make() -> tuple[Attention, jax.Array, torch.nn.MultiheadAttention]:
-    qkv, proj, data = jax.random.split(jax.random.key(0), 3)
-    params = Attention(init_linear(qkv, DIM, 3 * DIM), init_linear(proj, DIM, DIM))
+    params, data = network(DIM), jax.random.key(0)
     theirs = torch.nn.MultiheadAttention(DIM, HEADS, batch_first=True)
     with torch.no_grad():
         for target, source in (
@@ -149,11 +153,6 @@ def test_scores_of_bfloat16_are_float32() -> None:
     np.testing.assert_allclose(np.asarray(ours, np.float32), attention(params, x, HEADS), atol=0.02)
 
 
-def network(dim: int) -> Attention:
-    qkv, proj = jax.random.split(jax.random.key(2))
-    return Attention(init_linear(qkv, dim, 3 * dim), init_linear(proj, dim, dim))
-
-
 def sample(tokens: int, dim: int, batch: int = 2) -> jax.Array:
     return jax.random.normal(jax.random.key(3), (batch, tokens, dim))
 
@@ -175,18 +174,11 @@ def with_gradient(x: jax.Array, heads: int, **options: Any) -> tuple[jax.Array, 
     return y, gradient
 
 
-@pytest.fixture
-def interpreted(monkeypatch: pytest.MonkeyPatch) -> list[None]:
-    """Runs kernels without a TPU, by JAX's own operations, and counts them."""
-    called = []
-
-    def call(*args: Any, **options: Any) -> Any:
-        called.append(None)
-        return original(*args, **options, interpret=True)
-
-    original = attention_pallas.pl.pallas_call
-    monkeypatch.setattr(attention_pallas.pl, "pallas_call", call)
-    return called
+def assert_slopes_agree(found: Any, expected: Any, share: float) -> None:
+    """To a share of the largest number of each array."""
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        ours, theirs = (np.asarray(each, np.float32) for each in (ours, theirs))
+        np.testing.assert_allclose(ours, theirs, atol=share * np.abs(theirs).max())
 
 
 @pytest.mark.parametrize(
@@ -200,7 +192,7 @@ def interpreted(monkeypatch: pytest.MonkeyPatch) -> list[None]:
     ],
 )
 def test_a_tpus_kernel_is_the_cpus_attention(
-    interpreted: list[None], tokens: int, dim: int, heads: int
+    interpreted: list[Any], tokens: int, dim: int, heads: int
 ) -> None:
     x = sample(tokens, dim, batch=1)
     expected, slopes = with_gradient(x, heads)
@@ -209,12 +201,10 @@ def test_a_tpus_kernel_is_the_cpus_attention(
     assert len(interpreted) == 2
     # Averages of values of order 1 in float32; the issue asks for 1e-6.
     np.testing.assert_allclose(found, expected, atol=1e-6)
-    for ours, theirs in zip(jax.tree.leaves(gradients), jax.tree.leaves(slopes), strict=True):
-        # Sums over some hundred tokens: 1e-5 of the largest.
-        np.testing.assert_allclose(ours, theirs, atol=1e-5 * np.abs(theirs).max())
+    assert_slopes_agree(gradients, slopes, 1e-5)  # sums over some hundred tokens
 
 
-def test_a_tpus_kernel_takes_rotated_heads_and_bfloat16(interpreted: list[None]) -> None:
+def test_a_tpus_kernel_takes_rotated_heads_and_bfloat16(interpreted: list[Any]) -> None:
     x = sample(53, 128)
     expected, slopes = with_gradient(x, 2, rotation=angles(48, 64))
     with lowering_for(TPU):
@@ -222,15 +212,12 @@ def test_a_tpus_kernel_takes_rotated_heads_and_bfloat16(interpreted: list[None])
         half, halves = with_gradient(x.astype(jnp.bfloat16), 2, rotation=angles(48, 64))
     assert len(interpreted) == 4
     np.testing.assert_allclose(found, expected, atol=1e-6)
-    for ours, theirs in zip(jax.tree.leaves(gradients), jax.tree.leaves(slopes), strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=1e-5 * np.abs(theirs).max())
+    assert_slopes_agree(gradients, slopes, 1e-5)
     assert half.dtype == jnp.bfloat16
     # bfloat16 keeps 8 bits: inputs, weights and outputs of order 1 are each off by up to 2^-9.
     np.testing.assert_allclose(half.astype(jnp.float32), expected, atol=0.02)
-    for ours, theirs in zip(jax.tree.leaves(halves), jax.tree.leaves(slopes), strict=True):
-        # The same numbers of 8 bits, twice: of the forward pass and of the gradient.
-        atol = 0.03 * np.abs(theirs).max()
-        np.testing.assert_allclose(ours.astype(jnp.float32), theirs, atol=atol)
+    # The same numbers of 8 bits, twice: of the forward pass and of the gradient.
+    assert_slopes_agree(halves, slopes, 0.03)
 
 
 def kernels(jaxpr: Any) -> Iterator[Any]:
@@ -281,7 +268,7 @@ def test_a_tpus_kernel_runs_on_the_device_of_its_sequences() -> None:
     assert "f32[2,9,384]" in kernel  # two of sixteen sequences on each of eight devices
 
 
-def test_a_tpus_kernel_works_under_vmap(interpreted: list[None]) -> None:
+def test_a_tpus_kernel_works_under_vmap(interpreted: list[Any]) -> None:
     params, x = network(128), sample(9, 128, 6).reshape(3, 2, 9, 128)
     expected = attention(params, x, 2)
     with lowering_for(TPU):
@@ -299,7 +286,7 @@ UNFUSED = {
 
 @pytest.mark.parametrize("name", UNFUSED)
 def test_what_a_tpus_kernel_does_not_take_is_computed_all_the_same(
-    interpreted: list[None], name: str, monkeypatch: pytest.MonkeyPatch
+    interpreted: list[Any], name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(attention_pallas._TOKENS, jnp.dtype("float32"), 10)
     told = {"x": sample(9, 128), "heads": 2} | UNFUSED[name]
@@ -342,21 +329,6 @@ def test_an_accelerators_cross_attention_is_the_cpus() -> None:
     np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
-@pytest.fixture
-def stand_in(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Puts XLA in cuDNN's place, which takes the same arguments; lists shapes and lengths."""
-    asked = []
-
-    def attend(q: jax.Array, *others: jax.Array, implementation: str, **options: Any) -> jax.Array:
-        assert implementation == "cudnn"
-        asked.append((q.shape, options["key_value_seq_lengths"] is not None))
-        return original(q, *others, implementation="xla", **options)
-
-    original = jax.nn.dot_product_attention
-    monkeypatch.setattr(jax.nn, "dot_product_attention", attend)
-    return asked
-
-
 @pytest.mark.parametrize(("tokens", "patches"), [(257, 256), (261, 256), (264, 256), (50, 49)])
 def test_cudnn_sees_eights_and_no_padding(stand_in: list[Any], tokens: int, patches: int) -> None:
     x = sample(tokens, 128).astype(jnp.bfloat16)
@@ -375,9 +347,7 @@ def test_cudnn_sees_eights_and_no_padding(stand_in: list[Any], tokens: int, patc
     # The last bit of 8, of numbers of order 0.1: larger products add up in another order.
     padded = padded[:, :tokens].astype(jnp.float32)
     np.testing.assert_allclose(padded, found.astype(jnp.float32), atol=1e-3)
-    for ours, theirs in zip(jax.tree.leaves(gradients), jax.tree.leaves(slopes), strict=True):
-        ours, theirs = (np.asarray(each, np.float32) for each in (ours, theirs))
-        np.testing.assert_allclose(ours, theirs, atol=0.02 * np.abs(theirs).max())
+    assert_slopes_agree(gradients, slopes, 0.02)
 
 
 def test_cudnn_is_asked_only_where_it_can_answer(stand_in: list[Any]) -> None:
@@ -416,7 +386,7 @@ def test_only_fused_attention_wants_padding() -> None:
             assert padded_length(257, dtype, 768, heads) == expected
 
 
-def test_a_tpus_kernel_sees_no_padding(interpreted: list[None]) -> None:
+def test_a_tpus_kernel_sees_no_padding(interpreted: list[Any]) -> None:
     x = sample(50, 128)
     more = jnp.pad(x, ((0, 0), (0, 6), (0, 0)), constant_values=100)
 

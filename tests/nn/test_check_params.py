@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 import re
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -62,66 +62,64 @@ def trained(config: ModelConfig) -> Any:
     return dataclasses.replace(RECIPE, model=config)
 
 
-def a_step(params: Crisalad, config: ModelConfig, out: pathlib.Path, shared: pathlib.Path) -> None:
+class At(NamedTuple):
+    """What a door is tried with."""
+
+    params: Crisalad
+    config: ModelConfig
+    out: pathlib.Path
+    shared: pathlib.Path
+
+    @property
+    def model(self) -> Model:
+        return Model(self.params, self.config)
+
+
+def a_step(at: At) -> None:
     """A state of MODEL in a step of the other configuration."""
     options = {"steps": 2}
     state, frozen = init_train_state(
         PARAMS, "head", step_config(RECIPE, **options), key=jax.random.key(0)
     )
-    state = state._replace(trainable=params)
-    step = make_train_step(step_config(trained(config), **options))
+    state = state._replace(trainable=at.params)
+    step = make_train_step(step_config(trained(at.config), **options))
     step(state, jax.tree.map(lambda _: None, frozen), IMAGES, LABELS, jax.random.key(0))
 
 
-DOORS: dict[str, Callable[..., Any]] = {
-    "describe": lambda params, config, out, shared: describe(params, IMAGES, config),
-    "extract_tokens": lambda params, config, out, shared: extract_tokens(params, IMAGES, config),
-    "extract_features": lambda params, config, out, shared: extract_features(
-        params, IMAGES, config
+def of_images(function: Callable[..., Any]) -> Callable[[At], Any]:
+    return lambda at: function(at.params, IMAGES, at.config)
+
+
+def a_run(at: At) -> None:
+    places = read_places(at.shared / "city", min_images=2)
+    fit(trained(at.config), places, at.out / "run", initial=at.params, quiet=True)
+
+
+OF_IMAGES = (describe, extract_tokens, extract_features)
+QUIET = Reading(quiet=True)
+DOORS: dict[str, Callable[[At], Any]] = {
+    **{door.__name__: of_images(door) for door in (*OF_IMAGES, unit_features, transport_masses)},
+    "attend_across_images": lambda at: attend_across_images(
+        at.params, extract_tokens(PARAMS, IMAGES, MODEL), at.config
     ),
-    "unit_features": lambda params, config, out, shared: unit_features(params, IMAGES, config),
-    "transport_masses": lambda params, config, out, shared: transport_masses(
-        params, IMAGES, config
+    "describe, jitted": lambda at: jax.jit(lambda x: describe(x, IMAGES, at.config))(at.params),
+    "describe, mapped": lambda at: jax.vmap(lambda x: describe(at.params, x, at.config))(
+        IMAGES[None]
     ),
-    "attend_across_images": lambda params, config, out, shared: attend_across_images(
-        params, extract_tokens(PARAMS, IMAGES, MODEL), config
-    ),
-    "describe, jitted": lambda params, config, out, shared: jax.jit(
-        lambda params: describe(params, IMAGES, config)
-    )(params),
-    "describe, mapped": lambda params, config, out, shared: jax.vmap(
-        lambda images: describe(params, images, config)
-    )(IMAGES[None]),
-    "init_train_state": lambda params, config, out, shared: init_train_state(
-        params, "head", step_config(trained(config), steps=2)
+    "init_train_state": lambda at: init_train_state(
+        at.params, "head", step_config(trained(at.config), steps=2)
     ),
     "a step": a_step,
-    "fit": lambda params, config, out, shared: fit(
-        trained(config),
-        read_places(shared / "city", min_images=2),
-        out / "run",
-        initial=params,
-        quiet=True,
+    "fit": a_run,
+    "extract": lambda at: extract(at.model, at.shared / "town", at.out / "d.npy", reading=QUIET),
+    "index": lambda at: index(
+        at.model, at.shared / "town", at.out / "map", weights=at.out / "none", reading=QUIET
     ),
-    "extract": lambda params, config, out, shared: extract(
-        Model(params, config), shared / "town", out / "d.npy", reading=Reading(quiet=True)
+    "evaluate": lambda at: evaluate(at.model, open_benchmark(at.shared / "town"), reading=QUIET),
+    "write_export": lambda at: write_export(
+        at.out / "export", at.model, ExportConfig(platforms=("cpu",))
     ),
-    "index": lambda params, config, out, shared: index(
-        Model(params, config),
-        shared / "town",
-        out / "map",
-        weights=out / "none",
-        reading=Reading(quiet=True),
-    ),
-    "evaluate": lambda params, config, out, shared: evaluate(
-        Model(params, config), open_benchmark(shared / "town"), reading=Reading(quiet=True)
-    ),
-    "write_export": lambda params, config, out, shared: write_export(
-        out / "export", Model(params, config), ExportConfig(platforms=("cpu",))
-    ),
-    "save_weights": lambda params, config, out, shared: save_weights(
-        out / "w.safetensors", Model(params, config)
-    ),
+    "save_weights": lambda at: save_weights(at.out / "w.safetensors", at.model),
 }
 DIFFERENCES: dict[str, tuple[Any, ModelConfig, str]] = {
     "clusters": (
@@ -161,7 +159,7 @@ def test_every_door_refuses_parameters_of_another_configuration(
 ) -> None:
     params, config, words = DIFFERENCES[difference]
     with pytest.raises(InputError, match=re.escape(words)) as caught:
-        DOORS[door](params, config, tmp_path, shared)
+        DOORS[door](At(params, config, tmp_path, shared))
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
@@ -254,11 +252,6 @@ def test_differences_are_told_of_names_shapes_and_types() -> None:
     assert diff_trees(expected, expected) == []
 
 
-DOORS_OF_IMAGES: dict[str, Callable[[Any], Any]] = {
-    "describe": lambda images: describe(PARAMS, images, MODEL),
-    "extract_tokens": lambda images: extract_tokens(PARAMS, images, MODEL),
-    "extract_features": lambda images: extract_features(PARAMS, images, MODEL),
-}
 PICTURES: dict[str, tuple[Any, str]] = {
     "a list": (
         list(IMAGES),
@@ -284,13 +277,13 @@ PICTURES: dict[str, tuple[Any, str]] = {
 }
 
 
-@pytest.mark.parametrize("door", DOORS_OF_IMAGES)
+@pytest.mark.parametrize("door", OF_IMAGES)
 @pytest.mark.parametrize("kind", PICTURES)
 @pytest.mark.usefixtures("_unchecked")
-def test_every_door_refuses_images_of_another_kind(door: str, kind: str) -> None:
+def test_every_door_refuses_images_of_another_kind(door: Callable[..., Any], kind: str) -> None:
     images, words = PICTURES[kind]
     with pytest.raises(InputError, match=f"^images: {re.escape(words)}") as caught:
-        DOORS_OF_IMAGES[door](images)
+        door(PARAMS, images, MODEL)
     assert "\n" not in str(caught.value)
 
 

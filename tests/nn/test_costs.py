@@ -33,33 +33,31 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.sinkhorn import SinkhornConfig
 
+LINEARS = 257 * 768 * 384 * 2
+"""An adapter's projections down and up, of 257 tokens."""
 
-def with_adapter(kind: str) -> ModelConfig:
+
+@pytest.mark.parametrize(
+    ("kind", "macs", "paper"),
+    [
+        # 256 patches through 9 taps and a 384 x 384 product; the paper's Table 3.
+        ("depthwise", LINEARS + 256 * (9 * 384 + 384 * 384), 39_223_296),
+        # CricaVPR's branches: 384 -> 192, and twice 384 -> 24 and then 3 x 3 or 5 x 5 to 96.
+        (
+            "multi-resolution",
+            LINEARS + 256 * (384 * 192 + 2 * 384 * 24 + (9 + 25) * 24 * 96),
+            44_236_800,
+        ),
+        ("mlp", LINEARS, 2 * 768 * 384),
+        ("side", LINEARS, 2 * 768 * 384),
+        ("serial-parallel", 2 * LINEARS, 4 * 768 * 384),
+    ],
+)
+def test_one_blocks_adapters_by_hand(kind: Any, macs: int, paper: int) -> None:
     backbone = dataclasses.replace(PRESETS["b14"].backbone, adapter=AdapterConfig(kind=kind))
-    return dataclasses.replace(PRESETS["b14"], backbone=backbone)
-
-
-def test_table_3() -> None:
-    assert paper_adapter_macs(PRESETS["b14"]) == 39_223_296
-    costs = {cost.part: cost for cost in part_costs(PRESETS["b14"])}
-    assert costs["adapters"].parameters == 12 * 741_504
-    assert paper_adapter_macs(with_adapter("multi-resolution")) == 44_236_800
-
-
-def test_one_adapter_by_hand() -> None:
-    """257 tokens down and up, 256 patches through 9 taps and a 384 x 384 product."""
-    by_hand = 257 * 768 * 384 * 2 + 256 * (9 * 384 + 384 * 384)
-    assert adapter_macs(PRESETS["b14"]) == by_hand == 190_218_240
-
-
-def test_the_other_adapters_by_hand() -> None:
-    """CricaVPR's branches: 384 -> 192, and twice 384 -> 24 and then 3 x 3 or 5 x 5 to 96."""
-    linears = 257 * 768 * 384 * 2
-    branches = 384 * 192 + 2 * 384 * 24 + (9 + 25) * 24 * 96
-    assert adapter_macs(with_adapter("multi-resolution")) == linears + 256 * branches
-    assert adapter_macs(with_adapter("mlp")) == adapter_macs(with_adapter("side")) == linears
-    assert adapter_macs(with_adapter("serial-parallel")) == 2 * linears
-    assert paper_adapter_macs(with_adapter("serial-parallel")) == 4 * 768 * 384
+    config = dataclasses.replace(PRESETS["b14"], backbone=backbone)
+    assert adapter_macs(config) == macs
+    assert paper_adapter_macs(config, macs) == paper
 
 
 def test_parameters_of_the_public_backbone() -> None:

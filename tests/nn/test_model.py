@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.backbones.vit import vit
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import (
@@ -36,15 +35,7 @@ TOLERANCE = 2e-6
 
 @pytest.fixture(scope="module")
 def params():
-    """With LayerNorms off their start, so that no symmetry hides an error."""
-    params = init_crisalad(jax.random.key(0), CONFIG)
-    leaves, structure = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.key(1), len(leaves))
-    noisy = [
-        leaf + 0.05 * jax.random.normal(key, leaf.shape)
-        for leaf, key in zip(leaves, keys, strict=True)
-    ]
-    return jax.tree.unflatten(structure, noisy)
+    return random_params(CONFIG)
 
 
 def pictures(count: int, seed: int = 0) -> np.ndarray:
@@ -225,7 +216,7 @@ def test_transport_masses_by_scaling_a_matrix_in_float64(params):
     """Sinkhorn's algorithm as it is usually written: columns, then rows, three times."""
     images = pictures(2)
     pixels = jax.vmap(lambda image: normalise(image, PreprocessingConfig()))(images)
-    patches = np.asarray(vit(params.backbone, pixels, CONFIG.backbone)[0].patches, np.float64)
+    patches = np.asarray(CONFIG.backbone.apply(params.backbone, pixels)[0].patches, np.float64)
     network = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params.aggregator.score)
     hidden = np.maximum(patches @ network.fc1.weight + network.fc1.bias, 0)
     scores = hidden @ network.fc2.weight + network.fc2.bias

@@ -169,12 +169,13 @@ def _adapter_cost(kind: AdapterKind, seconds: Mapping[str, Sequence[float]]) -> 
     model = dataclasses.replace(PRESETS["b14"], backbone=backbone)
     make = functools.partial(init_adapter, dim=backbone.dim, config=config)
     leaves = jax.tree.leaves(jax.eval_shape(make, jax.random.key(0)))
-    macs = paper_adapter_macs(model)
+    true_macs = adapter_macs(model)
+    macs = paper_adapter_macs(model, true_macs)
     if kind == "mlp":  # the paper counts each weight twice here, and the biases
         macs = 2 * macs + backbone.dim // 2 + backbone.dim
     time = Spread.of(ratios(seconds, kind, "depthwise")) if seconds else None
     parameters = sum(leaf.size for leaf in leaves)
-    return AdapterCost(kind, _PAPER_PARAMETERS[kind], parameters, macs, adapter_macs(model), time)
+    return AdapterCost(kind, _PAPER_PARAMETERS[kind], parameters, macs, true_macs, time)
 
 
 def _adapter_call(kind: AdapterKind, images: int) -> Callable[[], Any]:

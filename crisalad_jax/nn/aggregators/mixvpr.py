@@ -27,8 +27,6 @@ from crisalad_jax.nn.layers import (
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
 
-NORM_EPSILON = 1e-5
-
 
 @pytree_dataclass
 class FeatureMixer:
@@ -97,7 +95,7 @@ class MixVprConfig(Aggregator):
         """Return a token of `channels` numbers for each row (paper Eqs. 1 to 4)."""
         maps = features.patches.swapaxes(-2, -1)
         for mixer in params.mix:
-            hidden = linear(mixer.fc1, layer_norm(mixer.norm, maps, epsilon=NORM_EPSILON))
+            hidden = linear(mixer.fc1, layer_norm(mixer.norm, maps))
             maps = maps + linear(mixer.fc2, jax.nn.relu(hidden))
         channels = linear(params.channel_proj, maps.swapaxes(-2, -1)).swapaxes(-2, -1)
         return Tokens.of_local(at_least_float32(linear(params.row_proj, channels)).swapaxes(-2, -1))

@@ -31,7 +31,6 @@ from crisalad_jax.nn.layers import (
 )
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.nn.torch_layers import (
-    NORM_EPSILON,
     EncoderLayer,
     encoder_layer,
     init_encoder_layer,
@@ -114,7 +113,7 @@ class BoqConfig(Aggregator):
         maps = patches.reshape(-1, *grid, patches.shape[-1])
         maps = conv(params.proj_c, maps)
         x = maps.reshape(*patches.shape[:-1], maps.shape[-1])
-        x = layer_norm(params.norm_input, x, epsilon=NORM_EPSILON)
+        x = layer_norm(params.norm_input, x)
         answers = []
         for block in params.boqs:
             attended = attention(block.encoder.attn, x, self.heads)
@@ -145,9 +144,9 @@ def ask(
     """
     queries = params.queries.astype(x.dtype)
     queries = queries + attention(params.self_attn, queries, heads)
-    queries = layer_norm(params.norm_q, queries, epsilon=NORM_EPSILON)
+    queries = layer_norm(params.norm_q, queries)
     answers = cross_attention(params.cross_attn, queries, x, heads)
-    return layer_norm(params.norm_out, answers, epsilon=NORM_EPSILON)
+    return layer_norm(params.norm_out, answers)
 
 
 @pytree_dataclass
@@ -255,7 +254,7 @@ def decode(params: EdtFormer, features: Features, heads: int) -> Float[Array, "*
     queries = params.queries.astype(memory.dtype)
     for layer in params.layers:
         queries = queries + attention(layer.self_attn, queries, heads)
-        queries = layer_norm(layer.norm1, queries, epsilon=NORM_EPSILON)
+        queries = layer_norm(layer.norm1, queries)
         queries = queries + cross_attention(layer.multihead_attn, queries, memory, heads)
-        queries = layer_norm(layer.norm2, queries, epsilon=NORM_EPSILON)
+        queries = layer_norm(layer.norm2, queries)
     return queries

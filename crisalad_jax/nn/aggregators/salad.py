@@ -1,6 +1,5 @@
 """SALAD (Izquierdo and Civera, CVPR 2024) and FoL (Wang et al., AAAI 2025): optimal transport."""
 
-import abc
 import dataclasses
 import math
 from typing import Any, ClassVar
@@ -29,7 +28,7 @@ from crisalad_jax.nn.layers import (
 )
 from crisalad_jax.nn.tokens import Tokens, TransportStatistics
 from crisalad_jax.nn.transport.config import SinkhornConfig
-from crisalad_jax.nn.transport.dustbin import DUSTBINS, Dustbin
+from crisalad_jax.nn.transport.dustbin import DUSTBINS, Dustbin, TokenDustbin
 from crisalad_jax.nn.transport.solve import SinkhornResult, assign_with_dustbin
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -65,9 +64,10 @@ class Salad:
 _TINY = {"clusters": 16, "cluster_dim": 32, "token_dim": 64, "hidden": 128, "dropout": 0.0}
 
 
+@AGGREGATORS.register("salad", tiny=_TINY)
 @dataclasses.dataclass(frozen=True)
-class TransportAggregator(Aggregator):
-    """Three networks, and a transport from patches to clusters: what SALAD and FoL share."""
+class SaladConfig(Aggregator):
+    """SALAD aggregation (Izquierdo and Civera, CVPR 2024)."""
 
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     clusters: int = 64
@@ -76,32 +76,91 @@ class TransportAggregator(Aggregator):
     """Width of the global token."""
     hidden: int = 512
     dropout: float = non_semantic_field(0.3)
+    dustbin: OrName[Dustbin] = part_field(DUSTBINS, "column")
+    """Registered dustbin, or its name; it takes the patches that belong to no cluster."""
+    epsilon: float = 1.0
+    """Entropic regularisation, by which scores are divided."""
+    learn_epsilon: bool = False
+    """Whether epsilon is learnt, from `epsilon` as its initial value."""
+    row_tau: float = 1.0
+    """1 fixes the patches' masses. Below 1 a Kullback-Leibler penalty of epsilon * tau / (1 - tau)
+    draws them to their marginals. With both sides free, high scores make masses that overflow
+    outside of logarithms."""
+    column_tau: float = 1.0
+    """The same as `row_tau` for the masses of the clusters and the dustbin."""
+    sinkhorn: SinkhornConfig = SinkhornConfig()
+    """Solver of the transport."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require_positive(self, "clusters", "cluster_dim", "token_dim", "hidden")
+        resolve_names(self)
+        require_positive(self, "clusters", "cluster_dim", "token_dim", "hidden", "epsilon")
         require_fraction(self, "dropout")
+        for name in ("row_tau", "column_tau"):
+            require_field(self, name, 0 < getattr(self, name) <= 1, "more than 0 and at most 1")
+
+    @property
+    def scores(self) -> int:
+        """Number of scores of a patch: one for each cluster, and the dustbin's."""
+        return self.clusters + self.dustbin.scores
+
+    def features(self, depth: int) -> FeatureSpec:
+        """Request the last patches and the class token."""
+        return FeatureSpec(class_token=True)
+
+    def check_grid(self, grid: Grid, patch_size: int) -> None:
+        """Require more patches than clusters, where the dustbin's mass is the difference."""
+        patches = math.prod(grid)
+        height, width = (patch_size * side for side in grid)
+        side = patch_size * (math.isqrt(self.clusters) + 1)
+        require(
+            patches > self.clusters or not self.dustbin.takes_difference,
+            f"image size: found {height} x {width}, which is {patches} patches for {self.clusters} "
+            "clusters; expected more patches than clusters (the smallest square that works: "
+            f"{side} x {side})",
+        )
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the tokens' shape, which does not depend on the backbone."""
         return TokenShape(self.token_dim, self.clusters, self.cluster_dim)
 
-    def init_networks(self, key: PRNGKeyArray, dim: int, scores: int) -> dict[str, TwoLayer]:
-        """Draw networks as the public code: torch's default linears."""
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Salad:
+        """Draw parameters as the public code: torch's default linears, dustbin score 1."""
         token_key, cluster_key, score_key = random_init.split(key, 3)
-        return {
-            "token_features": init_two_layer(token_key, dim, self.hidden, self.token_dim),
-            "cluster_features": init_two_layer(cluster_key, dim, self.hidden, self.cluster_dim),
-            "score": init_two_layer(score_key, dim, self.hidden, scores),
-        }
+        dim, hidden = backbone.dim, self.hidden
+        return Salad(
+            token_features=init_two_layer(token_key, dim, hidden, self.token_dim),
+            cluster_features=init_two_layer(cluster_key, dim, hidden, self.cluster_dim),
+            score=init_two_layer(score_key, dim, hidden, self.scores),
+            # Start at 3: `split` may derive the keys above from 0 to 2.
+            dust_bin=self.dustbin.init(jax.random.fold_in(key, 3), dim),
+            log_epsilon=jnp.log(jnp.full((), self.epsilon)) if self.learn_epsilon else None,
+            step=self.sinkhorn.step.init_params(jax.random.fold_in(key, 4)),
+        )
 
-    @abc.abstractmethod
+    def dustbin_params(self, params: Any, features: Features) -> Any:
+        """Return the dustbin's parameters, by default those that are learnt."""
+        return params.dust_bin
+
     def transport(self, params: Any, features: Features, *, key: Keys | None) -> SinkhornResult:
         """Assign patches to clusters, dustbin last (SALAD's Eqs. 3 to 5), in float32.
 
         Raises:
             InputError: there are not more patches than clusters.
         """
+        patches, learnt = features.patches, params.log_epsilon
+        scores = at_least_float32(two_layer(params.score, patches, self.dropout, key))
+        return assign_with_dustbin(
+            scores,
+            self.dustbin_params(params, features),
+            self.dustbin,
+            patches=at_least_float32(patches),
+            epsilon=self.epsilon if learnt is None else jnp.exp(learnt),
+            row_tau=self.row_tau,
+            column_tau=self.column_tau,
+            config=self.sinkhorn,
+            step_params=params.step,
+        )
 
     def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
         """Return the global token and cluster tokens (paper Eq. 6), each L2-normalised, in float32.
@@ -126,95 +185,22 @@ class TransportAggregator(Aggregator):
         return jnp.exp(self.transport(params, features, key=None).log_plan)
 
 
-@AGGREGATORS.register("salad", tiny=_TINY)
-@dataclasses.dataclass(frozen=True)
-class SaladConfig(TransportAggregator):
-    """SALAD aggregation (Izquierdo and Civera, CVPR 2024)."""
-
-    dustbin: OrName[Dustbin] = part_field(DUSTBINS, "column")
-    """Registered dustbin, or its name; it takes the patches that belong to no cluster."""
-    epsilon: float = 1.0
-    """Entropic regularisation, by which scores are divided."""
-    learn_epsilon: bool = False
-    """Whether epsilon is learnt, from `epsilon` as its initial value."""
-    row_tau: float = 1.0
-    """1 fixes the patches' masses. Below 1 a Kullback-Leibler penalty of epsilon * tau / (1 - tau)
-    draws them to their marginals. With both sides free, high scores make masses that overflow
-    outside of logarithms."""
-    column_tau: float = 1.0
-    """The same as `row_tau` for the masses of the clusters and the dustbin."""
-    sinkhorn: SinkhornConfig = SinkhornConfig()
-    """Solver of the transport."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        resolve_names(self)
-        super().__post_init__()
-        require_positive(self, "epsilon")
-        for name in ("row_tau", "column_tau"):
-            require_field(self, name, 0 < getattr(self, name) <= 1, "more than 0 and at most 1")
-
-    @property
-    def scores(self) -> int:
-        """Number of scores of a patch: one for each cluster, and the dustbin's."""
-        return self.clusters + self.dustbin.scores
-
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches and the class token."""
-        return FeatureSpec(class_token=True)
-
-    def check_grid(self, grid: Grid, patch_size: int) -> None:
-        """Require more patches than clusters, where the dustbin's mass is the difference."""
-        if self.dustbin.takes_difference:
-            require_more_patches(self.clusters, grid, patch_size)
-
-    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Salad:
-        """Draw parameters as the public code: torch's default linears, dustbin score 1."""
-        dim = backbone.dim
-        return Salad(
-            **self.init_networks(key, dim, self.scores),
-            # Start at 3: `split` may derive the keys above from 0 to 2.
-            dust_bin=self.dustbin.init(jax.random.fold_in(key, 3), dim),
-            log_epsilon=jnp.log(jnp.full((), self.epsilon)) if self.learn_epsilon else None,
-            step=self.sinkhorn.step.init_params(jax.random.fold_in(key, 4)),
-        )
-
-    def transport(self, params: Salad, features: Features, *, key: Keys | None) -> SinkhornResult:
-        """Assign patches to clusters with the configured dustbin and solver."""
-        patches, learnt = features.patches, params.log_epsilon
-        scores = at_least_float32(two_layer(params.score, patches, self.dropout, key))
-        return assign_with_dustbin(
-            scores,
-            params.dust_bin,
-            self.dustbin,
-            patches=at_least_float32(patches),
-            epsilon=self.epsilon if learnt is None else jnp.exp(learnt),
-            row_tau=self.row_tau,
-            column_tau=self.column_tau,
-            config=self.sinkhorn,
-            step_params=params.step,
-        )
-
-
 LEAST_ATTENTION = 0.01
 """Attention below which a patch counts as one that the class token does not see, as published."""
 
 
 @pytree_dataclass
-class Fol:
-    """SALAD's three networks, and two transposed convolutions of 3 x 3 for local features."""
+class Fol(Salad):
+    """SALAD's parameters, and two transposed convolutions of 3 x 3 for local features."""
 
-    token_features: TwoLayer
-    cluster_features: TwoLayer
-    score: TwoLayer
-    upconv1: Conv
+    upconv1: Conv = dataclasses.field(kw_only=True)
     """Part of the public files, as `upconv2`; no descriptor needs it."""
-    upconv2: Conv
+    upconv2: Conv = dataclasses.field(kw_only=True)
 
 
 @AGGREGATORS.register("fol", tiny={**_TINY, "local_hidden": 32, "local": 16})
 @dataclasses.dataclass(frozen=True)
-class FolConfig(TransportAggregator):
+class FolConfig(SaladConfig):
     """FoL's global descriptor: SALAD's with a dustbin of attention (Wang et al., AAAI 2025).
 
     Written from the paper, with the constants of the public model.
@@ -226,6 +212,7 @@ class FolConfig(TransportAggregator):
         8448
     """
 
+    dustbin: ClassVar[Dustbin] = TokenDustbin()  # pyright: ignore[reportIncompatibleVariableOverride]
     local_hidden: int = 256
     """Number of channels between the transposed convolutions."""
     local: int = 128
@@ -236,50 +223,32 @@ class FolConfig(TransportAggregator):
         super().__post_init__()
         require_positive(self, "local_hidden", "local")
 
+    @property
+    def scores(self) -> int:
+        """Number of scores of a patch: one for each cluster. The dustbin's is no network's."""
+        return self.clusters
+
     def features(self, depth: int) -> FeatureSpec:
         """Request the last patches, the class token and its attention."""
         return FeatureSpec(class_token=True, class_attention=True)
-
-    def check_grid(self, grid: Grid, patch_size: int) -> None:
-        """Require more patches than clusters: the dustbin's mass is the difference."""
-        require_more_patches(self.clusters, grid, patch_size)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Fol:
         """Draw parameters as torch's default layers, as the public code."""
         *_, first, second = random_init.split(key, 5)
         return Fol(
-            **self.init_networks(key, backbone.dim, self.clusters),
+            **vars(super().init(key, backbone, grid)),
             upconv1=init_transposed_conv(first, 3, backbone.dim, self.local_hidden),
             upconv2=init_transposed_conv(second, 3, self.local_hidden, self.local),
         )
 
-    def transport(self, params: Fol, features: Features, *, key: Keys | None) -> SinkhornResult:
-        """Assign patches by three plain iterations; the dustbin reads the class token's attention.
+    def dustbin_params(self, params: Fol, features: Features) -> Float[Array, "*batch patch"]:
+        """Return a score a patch: 1 minus the class token's attention to it.
 
-        A patch's dustbin score is 1 minus its attention, which counts as 0 below `LEAST_ATTENTION`.
+        Attention below `LEAST_ATTENTION` counts as 0.
         """
         attention = features.class_attention
         assert attention is not None
-        scores = at_least_float32(two_layer(params.score, features.patches, self.dropout, key))
-        dustbin = 1 - jnp.where(attention >= LEAST_ATTENTION, attention, 0)
-        return assign_with_dustbin(scores, dustbin, "token", config=SinkhornConfig())
-
-
-def require_more_patches(clusters: int, grid: Grid, patch_size: int) -> None:
-    """Check that there are more patches than clusters, as a dustbin of the difference needs.
-
-    Raises:
-        InputError: there are not.
-    """
-    patches = math.prod(grid)
-    height, width = (patch_size * side for side in grid)
-    side = patch_size * (math.isqrt(clusters) + 1)
-    require(
-        patches > clusters,
-        f"image size: found {height} x {width}, which is {patches} patches for {clusters} "
-        "clusters; expected more patches than clusters (the smallest square that works: "
-        f"{side} x {side})",
-    )
+        return 1 - jnp.where(attention >= LEAST_ATTENTION, attention, 0)
 
 
 def init_two_layer(key: PRNGKeyArray, d_in: int, hidden: int, d_out: int) -> TwoLayer:

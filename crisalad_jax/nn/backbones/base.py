@@ -151,7 +151,6 @@ class Backbone(Part, abc.ABC):
             params: its parameters.
             fresh: parameters of this backbone, for what the other's lack.
         """
-        del fresh
         return config, params
 
     def grid(self, image_size: tuple[int, int]) -> Grid:

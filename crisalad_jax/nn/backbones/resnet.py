@@ -97,7 +97,6 @@ class ResNetConfig(StagedBackbone):
 
     def adapt_checkpoint(self, config: Any, params: Stages, fresh: Any) -> tuple[Any, Stages]:
         """Take the first stages of a backbone with more, as torchvision's files have four."""
-        del fresh
         stages = min(config.stages, self.stages)
         blocks: Any = params.blocks[:stages]
         changed = dataclasses.replace(config, stages=stages)

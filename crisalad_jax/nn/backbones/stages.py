@@ -56,12 +56,12 @@ class StagedBackbone(Backbone):
     dim: ClassVar[int]  # pyright: ignore[reportIncompatibleVariableOverride]
     depth: ClassVar[int]  # pyright: ignore[reportIncompatibleVariableOverride]
 
-    @abc.abstractmethod
     def run_stem(self, params: Any, images: Map, valid: Valid) -> tuple[Map, Any]:
         """Return what the first stage takes, and the stem with updated statistics.
 
-        `valid` is that of `apply_training`; None takes the stored statistics, which stay.
+        By default nothing comes before the first stage. `valid` is that of `apply`.
         """
+        return images, params
 
     @abc.abstractmethod
     def run_stage(self, number: int, params: Stage, x: Map, valid: Valid) -> tuple[Map, Stage]:

@@ -5,6 +5,7 @@ RuotongWANG/TransVPR-model-implementation.
 """
 
 import dataclasses
+import itertools
 from typing import ClassVar
 
 import jax
@@ -22,7 +23,13 @@ from crisalad_jax.nn.backbones.base import (
     Pixels,
     Valid,
 )
-from crisalad_jax.nn.convolutions import ConvNorm, conv_norm, init_he_conv, max_pool
+from crisalad_jax.nn.convolutions import (
+    ConvNorm,
+    conv_norm,
+    init_conv_norm,
+    init_he_conv,
+    max_pool,
+)
 from crisalad_jax.nn.layers import (
     Conv,
     LayerNorm,
@@ -30,7 +37,6 @@ from crisalad_jax.nn.layers import (
     at_least_float32,
     conv,
     gelu,
-    init_batch_norm,
     init_layer_norm,
     init_small_linear,
     layer_norm,
@@ -38,7 +44,6 @@ from crisalad_jax.nn.layers import (
 )
 from crisalad_jax.utils.pytree import pytree_dataclass
 
-NORM_EPSILON = 1e-5
 WIDTHS = (64, 128, 256, 512)
 """Widths of the convolutions; each is followed by a maximum that halves the grid."""
 
@@ -89,18 +94,15 @@ class TransVprNetConfig(Backbone):
     def init(self, key: PRNGKeyArray) -> TransVprNet:
         """Draw parameters: convolutions as He et al., linears normal of deviation 0.02."""
         conv_key, token_key, block_key = random_init.split(key, 3)
-        maps = range(len(WIDTHS))
-        pairs = zip(random_init.split(conv_key, len(WIDTHS)), (3, *WIDTHS), WIDTHS, strict=False)
+        conv_keys, token_keys = (random_init.split(x, len(WIDTHS)) for x in (conv_key, token_key))
         part = self.dim // len(WIDTHS)
-        token_keys = random_init.split(token_key, len(WIDTHS))
+        convs, tokenizers = [], []
+        for i, (d_in, d_out) in enumerate(itertools.pairwise((3, *WIDTHS))):
+            convs.append(init_conv_norm(conv_keys[i], 3, d_in, d_out, bias=True))
+            tokenizers.append(init_he_conv(token_keys[i], _side(i), d_out, part, bias=True))
         return TransVprNet(
-            convs=tuple(
-                ConvNorm(init_he_conv(each, 3, a, b, bias=True), init_batch_norm(b))
-                for each, a, b in pairs
-            ),
-            tokenizers=tuple(
-                init_he_conv(token_keys[i], _side(i), WIDTHS[i], part, bias=True) for i in maps
-            ),
+            convs=tuple(convs),
+            tokenizers=tuple(tokenizers),
             cls_token=random_init.zeros(self.dim),
             blocks=random_init.stacked(self._init_block, random_init.split(block_key, self.depth)),
             norm=init_layer_norm(self.dim),
@@ -155,7 +157,7 @@ class TransVprNetConfig(Backbone):
             _, outputs = jax.lax.scan(body, tokens, params.blocks)
         chosen = [outputs[level - 1] for level in levels]
         if request.norm:
-            chosen = [layer_norm(params.norm, x, epsilon=NORM_EPSILON) for x in chosen]
+            chosen = [layer_norm(params.norm, x) for x in chosen]
         patches = jnp.concatenate([x[:, 1:] for x in chosen], axis=-1)
         return Features(chosen[-1][:, 0], patches), params
 
@@ -190,8 +192,8 @@ def block(
     params: TransVprBlock, x: Float[Array, "image token dim"], heads: int
 ) -> Float[Array, "image token dim"]:
     """Add attention to the tokens, normalise them, and add the feed-forward network's output."""
-    normed = layer_norm(params.pre_norm, x, epsilon=NORM_EPSILON)
+    normed = layer_norm(params.pre_norm, x)
     x = x + attention(params.self_attn, normed, heads)
-    x = layer_norm(params.norm1, x, epsilon=NORM_EPSILON)
+    x = layer_norm(params.norm1, x)
     update = linear(params.linear2, gelu(linear(params.linear1, x)))
     return (at_least_float32(x) + at_least_float32(update)).astype(x.dtype)

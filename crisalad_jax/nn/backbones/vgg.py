@@ -41,10 +41,6 @@ class VggConfig(StagedBackbone):
         layers = iter([init_he_conv(each, 3, a, b, bias=True) for each, a, b in pairs])
         return Stages(None, tuple(Stage(tuple(itertools.islice(layers, len(w)))) for w in WIDTHS))
 
-    def run_stem(self, params: None, images: Map, valid: Valid) -> tuple[Map, None]:
-        """Return the images: nothing comes before the first stage."""
-        return images, None
-
     def run_stage(self, number: int, params: Stage, x: Map, valid: Valid) -> tuple[Map, Stage]:
         """Run the convolutions, after maxima that halve the grid; the last one has no ReLU."""
         x = max_pool(x, 2) if number else x

@@ -32,7 +32,6 @@ from crisalad_jax.nn.adapter import (
     Adapter,
     AdapterConfig,
     SerialParallelAdapter,
-    SideAdapter,
     adapter,
     init_adapter,
 )
@@ -219,10 +218,83 @@ class VisionTransformer(Backbone):
         )
 
     def apply(
-        self, params: ViT, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
+        self,
+        params: ViT,
+        images: Pixels,
+        request: FeatureSpec = FeatureSpec(),
+        *,
+        remat: str = "dots",
+        valid: Valid = None,
     ) -> tuple[Features, ViT]:
-        """Return the features, and the statistics of adapters' batch norms; see `vit`."""
-        return vit(params, images, self, request, remat=remat, valid=valid)
+        """Compute features of a batch of normalised images whose sides are multiples of a patch's.
+
+        Levels are concatenated, to a width of levels times dim. The class token is the last
+        level's. With several levels the stack of blocks is cut at each, which for inference needs
+        the memory of its parameters once more. Blocks after the last level are not run.
+
+        Args:
+            params: the backbone.
+            images: normalised pixels.
+            request: the features to return.
+            remat: `ModelConfig.remat`.
+            valid: images that the statistics of adapters' batch norms are taken of, if all blocks
+                are run; None takes the stored ones, which stay.
+
+        Returns:
+            (features, updated): the second holds the running statistics, and None for all other
+            leaves where `valid` is given.
+
+        Raises:
+            InputError: while tracing, for levels that are not in order or more than there are
+                blocks, or for more than one of levels or a facet, inserted tokens, the class
+                token's attention, and adapters on a side path.
+        """
+        levels = _checked_levels(request, self)
+        stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
+        depth, grid = self.depth, self.grid((images.shape[1], images.shape[2]))
+        ends = list(levels)
+        if request.facet != "token":
+            ends = [levels[0] - 1]
+        elif request.inserted is not None:
+            ends = [request.insertion or 0, depth]
+        elif request.class_attention:
+            ends = [depth - 1, depth]
+        is_whole = ends[-1] == depth
+        valid = valid if is_whole else None
+        tokens = embed(params, images, self)
+        outputs, measured, attended, front = [], [], None, 0
+        for begin, end in itertools.pairwise((0, *ends)):
+            part, count = _between(stacks, begin, end), None
+            if not is_whole and len(ends) == len(stacks) == 1:
+                part, count = stacks, end
+            tokens, statistics = run_blocks(
+                part, tokens, grid, self, remat=remat, valid=valid, count=count
+            )
+            measured += statistics
+            if end in levels:
+                outputs.append(tokens)
+            elif request.facet != "token":
+                outputs.append(_facet(_block_at(stacks, end), tokens, self, request.facet))
+            elif request.inserted is not None:
+                front = len(request.inserted)
+                first = jnp.broadcast_to(
+                    request.inserted, (tokens.shape[0], *request.inserted.shape)
+                )
+                tokens = jnp.concatenate([first.astype(tokens.dtype), tokens], axis=1)
+            else:
+                attended = _class_attention(_block_at(stacks, end), tokens, grid, self)
+        if request.norm:
+            outputs = [
+                layer_norm(params.norm, level, epsilon=self.norm_epsilon) for level in outputs
+            ]
+        patches = [level[:, front + 1 + self.registers :] for level in outputs]
+        features = Features(
+            outputs[-1][:, front],
+            patches[0] if len(patches) == 1 else jnp.concatenate(patches, axis=-1),
+            None if request.inserted is None else outputs[-1][:, :front],
+            attended,
+        )
+        return features, params if valid is None else _statistics(params, measured)
 
     def split_blocks(self, params: ViT, first: int) -> ViT:
         """Cut the stack of blocks in two."""
@@ -302,87 +374,13 @@ def _sincos_positions(side: int, dim: int) -> np.ndarray:
     return np.concatenate([rows, columns], axis=-1)
 
 
-def vit(
-    params: ViT,
-    images: Pixels,
-    config: VisionTransformer,
-    request: FeatureSpec = FeatureSpec(),
-    *,
-    remat: str = "dots",
-    valid: Valid = None,
-) -> tuple[Features, ViT]:
-    """Compute features of a batch of normalised images whose sides are multiples of a patch's.
-
-    Levels are concatenated, to a width of levels times dim. The class token is the last level's.
-    With several levels the stack of blocks is cut at each, which for inference needs the memory of
-    its parameters once more. Blocks after the last level are not run.
-
-    Args:
-        params: the backbone.
-        images: normalised pixels.
-        config: the backbone's.
-        request: the features to return.
-        remat: `ModelConfig.remat`.
-        valid: images that the statistics of adapters' batch norms are taken of, if all blocks are
-            run; None takes the stored ones, which stay.
-
-    Returns:
-        (features, updated): the second holds the running statistics, and None for all other leaves
-        where `valid` is given.
-
-    Raises:
-        InputError: while tracing, for levels that are not in order or more than there are blocks,
-            or for more than one of levels or a facet, inserted tokens, the class token's attention,
-            and adapters on a side path.
-    """
-    levels = _checked_levels(request, config)
-    stacks = params.blocks if isinstance(params.blocks, tuple) else (params.blocks,)
-    depth, grid = config.depth, config.grid((images.shape[1], images.shape[2]))
-    ends = list(levels)
-    if request.facet != "token":
-        ends = [levels[0] - 1]
-    elif request.inserted is not None:
-        ends = [request.insertion or 0, depth]
-    elif request.class_attention:
-        ends = [depth - 1, depth]
-    is_whole = ends[-1] == depth
-    valid = valid if is_whole else None
-    tokens = embed(params, images, config)
-    outputs, measured, attended, front = [], [], None, 0
-    for begin, end in itertools.pairwise((0, *ends)):
-        part, count = _between(stacks, begin, end), None
-        if not is_whole and len(ends) == len(stacks) == 1:
-            part, count = stacks, end
-        tokens, statistics = run_blocks(
-            part, tokens, grid, config, remat=remat, valid=valid, count=count
-        )
-        measured += statistics
-        if end in levels:
-            outputs.append(tokens)
-        elif request.facet != "token":
-            outputs.append(_facet(_block_at(stacks, end), tokens, config, request.facet))
-        elif request.inserted is not None:
-            front = len(request.inserted)
-            first = jnp.broadcast_to(request.inserted, (tokens.shape[0], *request.inserted.shape))
-            tokens = jnp.concatenate([first.astype(tokens.dtype), tokens], axis=1)
-        else:
-            attended = _class_attention(_block_at(stacks, end), tokens, grid, config)
-    if request.norm:
-        outputs = [layer_norm(params.norm, level, epsilon=config.norm_epsilon) for level in outputs]
-    patches = [level[:, front + 1 + config.registers :] for level in outputs]
-    features = Features(
-        outputs[-1][:, front],
-        patches[0] if len(patches) == 1 else jnp.concatenate(patches, axis=-1),
-        None if request.inserted is None else outputs[-1][:, :front],
-        attended,
-    )
-    if valid is None:
-        return features, params
+def _statistics(params: ViT, measured: Sequence[Block]) -> ViT:
+    """Return the running statistics of blocks, in stacks as those of `params`."""
     blocks: Any = _joined(measured)
     if isinstance(params.blocks, tuple):
-        cuts = 0, *itertools.accumulate(len(stack.ls1) for stack in stacks)
+        cuts = 0, *itertools.accumulate(len(stack.ls1) for stack in params.blocks)
         blocks = tuple(_cut(blocks, *pair) for pair in itertools.pairwise(cuts))
-    return features, split_statistics(dataclasses.replace(params, blocks=blocks))[0]
+    return split_statistics(dataclasses.replace(params, blocks=blocks))[0]
 
 
 def _checked_levels(request: FeatureSpec, config: VisionTransformer) -> tuple[int, ...]:
@@ -488,7 +486,7 @@ def run_blocks(
         grid: rows and columns of patches.
         config: the backbone's.
         remat: `ModelConfig.remat`.
-        valid: see `vit`.
+        valid: see `VisionTransformer.apply`.
         count: number of first blocks of a single stack that are run; None is all. They are indexed,
             because a slice of the stack would copy its weights.
 
@@ -534,9 +532,9 @@ def side_path(
     layer: Block, tokens: TokenBatch, grid: Grid, config: VisionTransformer, length: int | None
 ) -> TokenBatch:
     """Apply a block's side adapter, with its skip."""
-    assert isinstance(layer.adapter, SideAdapter)
+    side: Any = layer.adapter
     with jax.named_scope("adapter"):
-        adapted, _ = adapter(layer.adapter, tokens, grid, length=length)
+        adapted, _ = adapter(side, tokens, grid, length=length, activation=gelu)
         return _residual(tokens, config.adapter.alpha, adapted)
 
 
@@ -573,7 +571,7 @@ def block(
     tokens = checkpoint_name(_residual(tokens, params.ls1, attended), "attended")
     normed = layer_norm(params.norm2, tokens, epsilon=config.norm_epsilon)
     update = feed_forward(params.mlp, normed)
-    if parallel is not None and not isinstance(parallel, SideAdapter):
+    if parallel is not None and config.adapter.kind != "side":
         with jax.named_scope("adapter"):
             adapted, updated = adapter(parallel, normed, grid, length=length, valid=valid)
             update = update + config.adapter.alpha * adapted

@@ -12,6 +12,7 @@ from jaxtyping import Array
 from crisalad_jax.config.checks import require
 from crisalad_jax.nn.transport.config import SinkhornConfig
 from crisalad_jax.nn.transport.problem import LOG_ZERO, Potentials, Problem
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import expect_like
 
 
@@ -70,12 +71,12 @@ def check_inputs(
         mu, nu = (np.exp(np.asarray(x, np.float64)).sum(axis=-1) for x in (log_mu, log_nu))
         mu, nu = np.broadcast_arrays(mu, nu)
         unlike = ~(np.abs(mu - nu) <= _rounding(log_mu, log_nu) * np.abs(nu))
-        require(
-            not unlike.any(),
-            "sinkhorn: masses exp(log_mu) and exp(log_nu) found to sum to "
-            f"{' and '.join(f'{total[unlike].flat[0]:.6g}' for total in (mu, nu) if unlike.any())}"
-            ", expected the same",
-        )
+        if unlike.any():
+            sums = " and ".join(f"{total[unlike].flat[0]:.6g}" for total in (mu, nu))
+            raise InputError(
+                f"sinkhorn: masses exp(log_mu) and exp(log_nu) found to sum to {sums}, expected "
+                "the same"
+            )
 
 
 def _check(words: str, test: Callable[..., Array], *values: Any) -> None:

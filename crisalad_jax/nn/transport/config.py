@@ -1,7 +1,6 @@
 """Configure how a transport problem is solved: the step, the stopping rule and the gradient."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, ClassVar, Literal, NamedTuple
 
 from jaxtyping import Array, Bool, Int
@@ -21,9 +20,6 @@ class Solution(NamedTuple):
     iterations: Int[Array, "*batch"]
     met: Bool[Array, "*batch"]
     """Whether the tolerance was met; False where there is none."""
-
-
-Solve = Callable[[Problem], Solution]
 
 
 @dataclasses.dataclass(frozen=True)

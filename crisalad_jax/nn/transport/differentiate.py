@@ -71,13 +71,13 @@ class Stop(Gradient):
         self, problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
     ) -> Solution:
         """Solve without a gradient."""
-        fixed = jax.lax.stop_gradient((problem, params, init))
-        return solve_in_domain(fixed[0], config, fixed[1], fixed[2])
+        problem, params, init = jax.lax.stop_gradient((problem, params, init))
+        return solve_in_domain(problem, config, params, init)
 
 
 @GRADIENTS.register("implicit")
 @dataclasses.dataclass(frozen=True)
-class Implicit(Gradient):
+class Implicit(Stop):
     """Differentiate the optimality conditions in closed form, without storing iterations."""
 
     at_convergence: ClassVar[bool | None] = True
@@ -87,8 +87,7 @@ class Implicit(Gradient):
         self, problem: Problem, config: SinkhornConfig, params: Any, init: Potentials
     ) -> Solution:
         """Solve, with the derivative of the solution."""
-        fixed = jax.lax.stop_gradient((problem, params, init))
-        solution = solve_in_domain(fixed[0], config, fixed[1], fixed[2])
+        solution = super().solve(problem, config, params, init)
         return solution._replace(potentials=_at_solution(problem, solution.potentials))
 
 

@@ -10,7 +10,7 @@ import torch
 
 from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
-from crisalad_jax.nn.aggregators.base import to_descriptor
+from crisalad_jax.nn.aggregators.base import Aggregator, to_descriptor
 from crisalad_jax.nn.aggregators.gem import Gem, GemPyramidConfig, gem_pyramid
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.base import Features
@@ -20,11 +20,20 @@ from crisalad_jax.nn.tokens import Tokens
 KEY, VIT = jax.random.key(0), ViTConfig()
 
 
-def test_salads_descriptor_is_the_global_token_then_clusters_by_dimension() -> None:
+@pytest.mark.parametrize(
+    ("aggregator", "order"),
+    [
+        (SaladConfig(clusters=3), [3, 4, 1, 5, 7, 2, 6, 8]),  # clusters by dimension
+        (GemPyramidConfig(), [3, 4, 1, 2, 5, 6, 7, 8]),  # region after region
+    ],
+)
+def test_a_descriptor_is_the_global_token_then_the_local_ones(
+    aggregator: Aggregator, order: list[int]
+) -> None:
     tokens = Tokens(jnp.array([3.0, 4.0]), jnp.array([[1.0, 2.0], [5.0, 6.0], [7.0, 8.0]]))
-    expected = np.array([3, 4, 1, 5, 7, 2, 6, 8]) / np.sqrt(204)
     # One rounding of a square root and of a product, of numbers below 1.
-    np.testing.assert_allclose(to_descriptor(tokens, SaladConfig(clusters=3)), expected, atol=1e-7)
+    expected = np.array(order) / np.sqrt(204)
+    np.testing.assert_allclose(to_descriptor(tokens, aggregator), expected, atol=1e-7)
 
 
 DIMENSION_FIRST = {"boq", "conv-ap", "edtformer", "fol", "mixvpr", "salad"}
@@ -38,12 +47,6 @@ def test_descriptors_have_the_published_order(name: str) -> None:
     first = np.array([0, 4, 8, 1] if name in DIMENSION_FIRST else [0, 1, 2, 3])
     # Divided by the root of 0 + 1 + 4 ... + 121.
     np.testing.assert_allclose(to_descriptor(tokens, aggregator)[:4], first / 506**0.5, rtol=1e-6)
-
-
-def test_a_pyramids_descriptor_is_region_after_region() -> None:
-    tokens = Tokens(jnp.array([3.0, 4.0]), jnp.array([[1.0, 2.0], [5.0, 6.0], [7.0, 8.0]]))
-    expected = np.array([3, 4, 1, 2, 5, 6, 7, 8]) / np.sqrt(204)
-    np.testing.assert_allclose(to_descriptor(tokens, GemPyramidConfig()), expected, atol=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -5,15 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from crisalad_jax.nn.aggregators.base import to_descriptor
-from crisalad_jax.nn.aggregators.gem import Gem, GemConfig, generalised_mean, log_units
+from crisalad_jax.nn.aggregators.gem import Gem, GemConfig, gem
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 
 PATCHES = np.random.default_rng(0).normal(size=(2, 9, 20)).astype(np.float32)
-
-
-def gem(patches: jax.Array, p: jax.Array) -> jax.Array:
-    return generalised_mean(log_units(patches), p, axis=-2)
 
 
 def test_two_patches_by_hand() -> None:

@@ -14,7 +14,6 @@ from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.sinkhorn import SinkhornConfig
-from crisalad_jax.utils.errors import InputError
 
 CONFIG = SaladConfig(clusters=3, cluster_dim=4, token_dim=8, hidden=16, dropout=0.5)
 
@@ -54,13 +53,6 @@ def test_dropout_is_on_with_a_key_only() -> None:
     assert not np.allclose(first.local, plain.local, atol=1e-3)
     # The public implementation has no dropout in the global token's network.
     np.testing.assert_array_equal(first.global_token, plain.global_token)
-
-
-@pytest.mark.parametrize("patches", [2, 3])
-def test_no_more_patches_than_clusters_raises(patches: int) -> None:
-    params = init_salad(CONFIG)
-    with pytest.raises(InputError, match=f"found {patches} patches for 3 clusters"):
-        salad(params, features(patches), CONFIG, key=None)
 
 
 def test_dropout_stands_before_relu_of_the_two_local_networks(monkeypatch) -> None:

@@ -10,7 +10,7 @@ import pytest
 from crisalad_jax.nn.aggregators.base import to_descriptor
 from crisalad_jax.nn.aggregators.transvpr import TransVpr, TransVprConfig, attentions, key_features
 from crisalad_jax.nn.backbones.base import Features
-from crisalad_jax.nn.backbones.vit import ViTConfig, vit
+from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.layers import Linear
@@ -49,7 +49,7 @@ def test_a_models_last_level_is_its_backbones_last_layer() -> None:
     features = extract_features(params, images, CONFIG)
     assert features.patches.shape == (2, 12, 3 * 16)
     # The same sums, compiled twice, of numbers of order 1.
-    last, _ = vit(params.backbone, images, CONFIG.backbone)
+    last, _ = CONFIG.backbone.apply(params.backbone, images)
     np.testing.assert_allclose(features.patches[..., -16:], last.patches, atol=1e-5)
     np.testing.assert_allclose(features.class_token, last.class_token, atol=1e-5)
     descriptors = describe(params, images, CONFIG)

@@ -24,7 +24,7 @@ from crisalad_jax.nn.aggregators.vlad import (
     scores_from_centroids,
 )
 from crisalad_jax.nn.backbones.base import Features, FeatureSpec
-from crisalad_jax.nn.backbones.vit import ViTConfig, vit
+from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.layers import Linear, init_linear, l2_normalise
@@ -46,6 +46,9 @@ MODEL = ModelConfig(
 
 def unit(x: np.ndarray) -> np.ndarray:
     return x / np.linalg.norm(x)
+
+
+FEATURES = np.stack([unit(row) for row in PATCHES.reshape(-1, 6)])
 
 
 def sums_of(config: VladConfig, params: Any, patches: jax.Array) -> jax.Array:
@@ -96,13 +99,12 @@ def test_hard_vlad_takes_the_nearest_word_alone(assignment: Any, far: Any) -> No
 
 def test_the_start_shares_a_patch_out_a_hundred_to_one() -> None:
     """The mean logarithm of the largest share over the second largest; directions stay."""
-    features = np.stack([unit(row) for row in PATCHES.reshape(-1, 6)])
-    params = NetVladConfig().from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(features))
+    params = NetVladConfig().from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(FEATURES))
     # SuperVLAD's code makes the same scores, and keeps no centroids.
-    other = SuperVladConfig().from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(features))
+    other = SuperVladConfig().from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(FEATURES))
     np.testing.assert_array_equal(other.conv.weight, params.conv.weight)
     assert SuperVladConfig(clusters=4, ghosts=1).count_centroids(32) == 5
-    scores = features.astype(np.float64) @ np.asarray(params.conv.weight)
+    scores = FEATURES.astype(np.float64) @ np.asarray(params.conv.weight)
     shares = np.exp(scores) / np.exp(scores).sum(axis=1, keepdims=True)
     largest = np.sort(shares, axis=1)
     ratio = np.exp(np.log(largest[:, -1] / largest[:, -2]).mean())
@@ -119,14 +121,13 @@ def test_the_start_shares_a_patch_out_a_hundred_to_one() -> None:
 
 def test_image_starts_from_directions_of_netvlads_first_scores() -> None:
     """Its code: unit centroids times ln 100 over the mean gap of the two largest cosines."""
-    features = np.stack([unit(row) for row in PATCHES.reshape(-1, 6)])
     config = AggregationTokensConfig(tokens=4)
     assert config.count_centroids(6) == 4
     assert (config.centroid_images, SuperVladConfig.centroid_images) == (5000, 5000)
     assert (VladBuffConfig.centroid_images, NetVladConfig.centroid_images) == (500, 500)
-    params = config.from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(features))
+    params = config.from_centroids(jnp.asarray(CENTROIDS), jnp.asarray(FEATURES))
     directions = np.stack([unit(row) for row in CENTROIDS.astype(np.float64)])
-    largest = np.sort(features.astype(np.float64) @ directions.T, axis=1)
+    largest = np.sort(FEATURES.astype(np.float64) @ directions.T, axis=1)
     alpha = np.log(100) / (largest[:, -1] - largest[:, -2]).mean()
     # Numbers of some tens in float32, over a mean of differences.
     np.testing.assert_allclose(params.tokens, alpha * directions, rtol=1e-5, atol=1e-5)
@@ -200,7 +201,7 @@ def test_a_facet_looks_at_no_block_after_its_own() -> None:
 
     @functools.partial(jax.jit, static_argnums=2)
     def run(params: Any, images: jax.Array, name: Any) -> Features:
-        return vit(params, images, VIT, AnyLocConfig(layer=1, facet=name).features(VIT.depth))[0]
+        return VIT.apply(params, images, AnyLocConfig(layer=1, facet=name).features(VIT.depth))[0]
 
     assert AnyLocConfig(layer=1).features(3) == FeatureSpec((2,), "value", norm=False)
     for name, blocks in (("value", beyond), ("token", spoilt)):

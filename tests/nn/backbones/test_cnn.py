@@ -4,6 +4,7 @@ parity/test_cnn.py compares outputs and gradients with torch, parity/test_zoo.py
 """
 
 import dataclasses
+import itertools
 import math
 
 import jax
@@ -16,7 +17,7 @@ from torch.nn import functional as F
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones import stages
 from crisalad_jax.nn.backbones.base import Backbone, FeatureSpec
-from crisalad_jax.nn.backbones.resnet import Layers, ResNetConfig
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.stages import StagedBackbone
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -50,39 +51,36 @@ def macs(backbone: StagedBackbone) -> int:
     return count_macs(apply, params, image)
 
 
-@pytest.mark.parametrize(
-    ("layers", "parameters", "gmacs"),
-    # torchvision's pages: all parameters, and "GFLOPS", which are multiply-accumulates.
-    [(18, 11_689_512, 1.81), (50, 25_557_032, 4.09), (101, 44_549_160, 7.80)],
-)
-def test_a_resnet_has_the_published_parameters_and_work(
-    layers: Layers, parameters: int, gmacs: float
-) -> None:
-    backbone = ResNetConfig(layers=layers)
+def count_learnt(backbone: StagedBackbone) -> int:
     shapes = jax.eval_shape(backbone.init, jax.random.key(0))
     leaves = jax.tree_util.tree_leaves_with_path(shapes)
-    learnt = sum(leaf.size for path, leaf in leaves if "running" not in str(path[-1]))
-    classifier = 1000 * backbone.dim + 1000
-    assert learnt + classifier == parameters
-    assert (macs(backbone) + 1000 * backbone.dim) / 1e9 == pytest.approx(gmacs, abs=0.01)
+    return sum(leaf.size for path, leaf in leaves if "running" not in str(path[-1]))
+
+
+@pytest.mark.parametrize(
+    ("backbone", "classifier", "parameters", "gmacs"),
+    [
+        # torchvision's pages: all parameters, and "GFLOPS", which are multiply-accumulates.
+        (ResNetConfig(layers=18), (512, 1000), 11_689_512, 1.81),
+        (ResNetConfig(layers=50), (2048, 1000), 25_557_032, 4.09),
+        (ResNetConfig(layers=101), (2048, 1000), 44_549_160, 7.80),
+        # Of the paper's 138 M parameters 123,642,856 are the classifier's, by its shapes.
+        (VggConfig(), (25_088, 4096, 4096, 1000), 138_357_544, 15.47),
+    ],
+)
+def test_published_parameters_and_work(
+    backbone: StagedBackbone, classifier: tuple[int, ...], parameters: int, gmacs: float
+) -> None:
+    products = sum(a * b for a, b in itertools.pairwise(classifier))
+    assert count_learnt(backbone) + products + sum(classifier[1:]) == parameters
+    assert (macs(backbone) + products) / 1e9 == pytest.approx(gmacs, abs=0.01)
 
 
 def test_a_narrower_resnet_has_the_parameters_of_its_widths() -> None:
     """One stage of width 32: a kernel of 7 x 7, four of 3 x 3, a scale and a shift after each."""
     backbone = ResNetConfig(layers=18, stages=1, width=32)
-    leaves = jax.tree_util.tree_leaves_with_path(jax.eval_shape(backbone.init, jax.random.key(0)))
-    learnt = sum(leaf.size for path, leaf in leaves if "running" not in str(path[-1]))
-    assert learnt == 7 * 7 * 3 * 32 + 4 * 3 * 3 * 32 * 32 + 5 * 2 * 32
+    assert count_learnt(backbone) == 7 * 7 * 3 * 32 + 4 * 3 * 3 * 32 * 32 + 5 * 2 * 32
     assert backbone.dim == 32
-
-
-def test_vgg_16_has_the_published_parameters_and_work() -> None:
-    """Of the paper's 138 M parameters 123,642,856 are the classifier's, by its shapes."""
-    shapes = jax.eval_shape(VggConfig().init, jax.random.key(0))
-    classifier = 25_088 * 4096 + 4096 + 4096**2 + 4096 + 4096 * 1000 + 1000
-    assert sum(leaf.size for leaf in jax.tree.leaves(shapes)) + classifier == 138_357_544
-    products = 25_088 * 4096 + 4096**2 + 4096 * 1000
-    assert (macs(VggConfig()) + products) / 1e9 == pytest.approx(15.47, abs=0.01)
 
 
 @pytest.mark.parametrize("size", [(32, 64), (37, 52), (33, 65)])

@@ -14,7 +14,7 @@ from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.attention import rotate
 from crisalad_jax.nn.backbones import Features, FeatureSpec
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config, rotary_angles
-from crisalad_jax.nn.backbones.vit import ViT, vit
+from crisalad_jax.nn.backbones.vit import ViT
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.training.config import OptimiserConfig
@@ -113,7 +113,7 @@ def test_keys_have_no_bias() -> None:
     @jax.jit
     def features(value: Any) -> list[Features]:
         params = with_key_bias(PARAMS.backbone, value)
-        return [vit(params, images(), CONFIG, request)[0] for request in requests]
+        return [CONFIG.apply(params, images(), request)[0] for request in requests]
 
     jax.tree.map(np.testing.assert_array_equal, features(0.0), features(5.0))
 
@@ -123,7 +123,7 @@ def test_inserted_tokens_have_no_place() -> None:
     tokens = jax.random.normal(jax.random.key(1), (4, 32))
     order = jnp.array([2, 0, 3, 1])
     first, second = (
-        vit(PARAMS.backbone, images(), CONFIG, FeatureSpec(insertion=1, inserted=each))[0]
+        CONFIG.apply(PARAMS.backbone, images(), FeatureSpec(insertion=1, inserted=each))[0]
         for each in (tokens, tokens[order])
     )
     # The same sums in another order, through two blocks.
@@ -134,7 +134,7 @@ def test_inserted_tokens_have_no_place() -> None:
 
 def test_sides_are_multiples_of_16() -> None:
     with pytest.raises(InputError, match=r"56 x 64, expected .* multiples of 16 .*48 x 64|64 x 64"):
-        vit(PARAMS.backbone, jnp.zeros((1, 56, 64, 3)), CONFIG)
+        CONFIG.apply(PARAMS.backbone, jnp.zeros((1, 56, 64, 3)))
     with pytest.raises(InputError, match="heads: found 2, expected a divisor of a fourth of dim"):
         DinoV3Config(dim=12, depth=1, heads=2)
 

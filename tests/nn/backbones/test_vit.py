@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.nn import attention_pallas
 from crisalad_jax.nn.adapter import AdapterConfig, MlpAdapter
 from crisalad_jax.nn.attention import attention
 from crisalad_jax.nn.backbones.base import FeatureSpec
@@ -26,7 +25,6 @@ from crisalad_jax.nn.backbones.vit import (
     feed_forward,
     interpolate_positions,
     run_blocks,
-    vit,
 )
 from crisalad_jax.nn.layers import LayerNorm, layer_norm
 from crisalad_jax.utils.errors import InputError
@@ -101,7 +99,7 @@ def test_a_cut_stack_of_blocks_gives_the_same_features() -> None:
         jax.tree.map(lambda leaf: leaf[1:], params.blocks),
     )
     cut = dataclasses.replace(params, blocks=parts)
-    ours, theirs = (vit(each, images(1, 28, 42), CONFIG)[0] for each in (cut, params))
+    ours, theirs = (CONFIG.apply(each, images(1, 28, 42))[0] for each in (cut, params))
     for a, b in zip(*map(jax.tree.leaves, (ours, theirs)), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)  # the same sums, compiled twice
 
@@ -208,7 +206,7 @@ def test_requests_that_cannot_be_met_are_refused(
 ) -> None:
     params = jax.eval_shape(config.init, jax.random.key(0))
     with pytest.raises(InputError, match=words):
-        jax.eval_shape(lambda p, x: vit(p, x, config, request_), params, images(1, 28, 42))
+        jax.eval_shape(lambda p, x: config.apply(p, x, request_), params, images(1, 28, 42))
 
 
 def test_sincos_positions_tell_places_apart_and_fall_off_with_distance() -> None:
@@ -225,10 +223,9 @@ def test_sincos_positions_tell_places_apart_and_fall_off_with_distance() -> None
 def test_levels_are_the_normed_tokens_of_backbones_cut_short(depths: tuple[int, ...]) -> None:
     params = CONFIG.init(jax.random.key(0))
     expected = [
-        vit(
+        CONFIG.apply(
             dataclasses.replace(params, blocks=jax.tree.map(lambda x, d=d: x[:d], params.blocks)),
             images(1, 28, 42),
-            CONFIG,
         )[0]
         for d in depths
     ]
@@ -237,7 +234,7 @@ def test_levels_are_the_normed_tokens_of_backbones_cut_short(depths: tuple[int, 
     )
     for blocks in (params.blocks, two):  # as it stands, and as training cuts it
         whole = dataclasses.replace(params, blocks=blocks)
-        found, _ = vit(whole, images(1, 28, 42), CONFIG, FeatureSpec(depths))
+        found, _ = CONFIG.apply(whole, images(1, 28, 42), FeatureSpec(depths))
         # The same sums, compiled twice.
         np.testing.assert_allclose(found.class_token, expected[-1].class_token, atol=1e-6)
         patches = np.concatenate([features.patches for features in expected], axis=-1)
@@ -285,56 +282,38 @@ def fresh(config: VisionTransformer) -> ViT:
     ids=lambda each: each if isinstance(each, str) else "",
 )
 def test_padding_for_cudnn_changes_no_feature(
-    monkeypatch: pytest.MonkeyPatch, config: VisionTransformer, name: str
+    stand_in: list[Any], config: VisionTransformer, name: str
 ) -> None:
-    """With XLA in cuDNN's place, which takes the same arguments."""
-    asked = []
-
-    def attend(q: jax.Array, *others: jax.Array, implementation: str, **options: Any) -> jax.Array:
-        asked.append((implementation, q.shape[1]))
-        return original(q, *others, implementation="xla", **options)
-
-    original = jax.nn.dot_product_attention
-    monkeypatch.setattr(jax.nn, "dot_product_attention", attend)
     params, side = fresh(config), config.patch_size
     pixels = images(2, 3 * side, 4 * side).astype(jnp.bfloat16)
 
     def features(chosen: Target) -> list[np.ndarray]:
         with lowering_for(chosen):
-            found, _ = vit(params, pixels, config, REQUESTS[name])
+            found, _ = config.apply(params, pixels, REQUESTS[name])
         return [np.asarray(leaf, np.float32) for leaf in jax.tree.leaves(found)]
 
     expected, found = features(CPU), features(GPU)
     # The blocks pad once: where attention is reached, its tokens are eights already.
-    assert all(implementation == "cudnn" and not tokens % 8 for implementation, tokens in asked)
-    assert asked or name == "keys"
+    assert not any(shape[1] % 8 for shape, _ in stand_in)
+    assert stand_in or name == "keys"
     for ours, theirs in zip(found, expected, strict=True):
         # bfloat16 keeps 8 bits, and the two divide at different places, in two blocks.
         np.testing.assert_allclose(ours, theirs, atol=0.04 * np.abs(theirs).max())
 
 
 @pytest.mark.parametrize("name", ["the last tokens", "inserted tokens", "class attention"])
-def test_a_tpus_kernel_changes_no_feature(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """Interpreted by JAX's own operations; 13 tokens are padded to 16, and 15 to as many."""
-    called = []
-
-    def call(*args: Any, **options: Any) -> Any:
-        called.append(options["out_shape"])
-        return original(*args, **options, interpret=True)
-
-    original = attention_pallas.pl.pallas_call
-    monkeypatch.setattr(attention_pallas.pl, "pallas_call", call)
+def test_a_tpus_kernel_changes_no_feature(interpreted: list[Any], name: str) -> None:
+    """Where 13 tokens are padded to 16, and 15 to as many."""
     config = dataclasses.replace(HALF, dim=128)
     inserted = jax.random.normal(jax.random.key(9), (2, 128))
     request = dataclasses.replace(
         REQUESTS[name], inserted=None if REQUESTS[name].inserted is None else inserted
     )
     params, pixels = fresh(config), images(2, 42, 56)
-    expected, _ = vit(params, pixels, config, request)
+    expected, _ = config.apply(params, pixels, request)
     with lowering_for(TPU), jax.default_matmul_precision("highest"):
-        found, _ = vit(params, pixels, config, request)
-    assert called
-    assert {shape.shape for shape in called} == {(2, 16, 128)}
+        found, _ = config.apply(params, pixels, request)
+    assert {shape.shape for shape in interpreted} == {(2, 16, 128)}
     for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         # Two blocks in float32, of features up to 4.
         np.testing.assert_allclose(ours, theirs, atol=1e-5)

@@ -146,7 +146,7 @@ def test_over_relaxation_never_makes_the_dual_fall() -> None:
 
 
 def test_three_iterations_leave_sharp_scores_unbalanced_and_say_so() -> None:
-    result = assign_with_dustbin(scores_of(0, 50, 8, scale=10.0), jnp.float32(1))
+    result = assign_with_dustbin(scores_of(0, 50, 8, scale=10.0), 1.0)
     masses = plan_of(result).sum(axis=0)
     relative = np.abs(masses / np.array([1] * 8 + [42]) - 1).max()
     np.testing.assert_allclose(result.column_error, relative, rtol=1e-4)
@@ -181,9 +181,7 @@ def test_iterations_are_counted_until_nothing_changes_more() -> None:
         expected = int(np.argmax(np.array(changes) <= tolerance)) + 1
         assert 3 < expected < 60
         for config in (implicit(tolerance=tolerance), implicit(tolerance=tolerance, domain="log")):
-            result = assign_with_dustbin(
-                jnp.asarray(scores, jnp.float32), jnp.float32(0), config=config
-            )
+            result = assign_with_dustbin(jnp.asarray(scores, jnp.float32), 0.0, config=config)
             assert result.iterations == expected
             assert result.converged
             assert result.column_error <= tolerance
@@ -194,7 +192,7 @@ def test_the_tolerance_bounds_the_error_that_is_left() -> None:
         for tolerance in (0.1, 1e-3):
             scores = scores_of(seed, 16, 40, 6, scale=5.0)
             result = assign_with_dustbin(
-                scores, jnp.float32(0), config=implicit(tolerance=tolerance, iterations=2000)
+                scores, 0.0, config=implicit(tolerance=tolerance, iterations=2000)
             )
             assert result.converged.all()
             # The change is of logarithms: exp(0.1) is 0.105 from 1. And rounding.
@@ -228,7 +226,7 @@ def test_what_is_not_finite_says_so_and_has_not_converged(config: SinkhornConfig
 
     @jax.jit
     def flags(scores: jax.Array) -> Any:
-        result = assign_with_dustbin(scores, jnp.float32(1), config=config)
+        result = assign_with_dustbin(scores, 1.0, config=config)
         return result.finite, result.converged
 
     # Without a tolerance nothing is known of convergence.
@@ -257,20 +255,20 @@ SLOW = pytest.mark.slow
 def test_too_small_a_budget_is_reported_and_can_raise(fields: Any) -> None:
     scores = scores_of(0, 2, 30, 5, scale=20.0).at[1].multiply(0.001)
     config = implicit(iterations=4, **fields)
-    result = assign_with_dustbin(scores, jnp.float32(0), config=config)
+    result = assign_with_dustbin(scores, 0.0, config=config)
     np.testing.assert_array_equal(result.converged, [False, True])
     assert result.iterations[0] == 4
     assert result.iterations[1] < 4
     assert result.column_error[0] > 1e-4
     strict = dataclasses.replace(config, throw=True)
-    assert assign_with_dustbin(0.001 * scores, jnp.float32(0), config=strict).converged.all()
+    assert assign_with_dustbin(0.001 * scores, 0.0, config=strict).converged.all()
     message = "no convergence to 1e-05 in 4 iterations"
     with pytest.raises(InputError, match=f"^sinkhorn: found {message} for 1 of 2 problems$"):
-        assign_with_dustbin(scores, jnp.float32(0), config=strict)
+        assign_with_dustbin(scores, 0.0, config=strict)
     if not fields:
         with pytest.raises(RuntimeError, match=message):
             jax.block_until_ready(
-                jax.jit(lambda x: assign_with_dustbin(x, jnp.float32(0), config=strict))(scores)
+                jax.jit(lambda x: assign_with_dustbin(x, 0.0, config=strict))(scores)
             )
 
 
@@ -286,11 +284,9 @@ def test_too_small_a_budget_is_reported_and_can_raise(fields: Any) -> None:
 def test_acceleration_accelerates(fields: Any) -> None:
     """Sharp scores, where the plain iteration takes hundreds."""
     scores = scores_of(1, 4, 40, 6, scale=6.0)
-    plain = assign_with_dustbin(
-        scores, jnp.float32(0), config=implicit(tolerance=1e-3, iterations=2000)
-    )
+    plain = assign_with_dustbin(scores, 0.0, config=implicit(tolerance=1e-3, iterations=2000))
     fast = assign_with_dustbin(
-        scores, jnp.float32(0), config=implicit(tolerance=1e-3, iterations=2000, **fields)
+        scores, 0.0, config=implicit(tolerance=1e-3, iterations=2000, **fields)
     )
     assert plain.converged.all()
     assert fast.converged.all()
@@ -453,9 +449,7 @@ def test_scaling_is_for_scores_in_a_row_up_to_60_apart(apart: int, scaled: bool)
     """Over epsilon, which is 2. The log domain has other roundings: some of 120 numbers differ."""
     scores = scores_of(3, 2, 12, 4).at[1, 5].set(jnp.array([0.0, 2.0 * apart, 0.0, 0.0]))
     scaling, logarithmic = (
-        assign_with_dustbin(
-            scores, jnp.float32(0), epsilon=2.0, config=SinkhornConfig(domain=domain)
-        ).log_plan
+        assign_with_dustbin(scores, 0.0, epsilon=2.0, config=SinkhornConfig(domain=domain)).log_plan
         for domain in ("scaling", "log")
     )
     assert (scaling != logarithmic).any() == scaled
@@ -468,7 +462,7 @@ def test_too_far_apart_for_scaling_falls_back_to_the_log_domain(iterations: int)
     def both(domain: Any) -> Any:
         def of(scores: jax.Array) -> Any:
             config = SinkhornConfig(domain=domain, iterations=iterations)
-            log_plan = assign_with_dustbin(scores, jnp.float32(1), config=config).log_plan
+            log_plan = assign_with_dustbin(scores, 1.0, config=config).log_plan
             return (weights * jnp.exp(log_plan)).sum(), log_plan
 
         return jax.jit(jax.grad(of, has_aux=True))
@@ -491,12 +485,10 @@ def test_too_far_apart_for_scaling_falls_back_to_the_log_domain(iterations: int)
 def test_a_plan_owes_nothing_to_its_batch(fields: Any) -> None:
     """The second problem takes many times the iterations of the first."""
     scores = scores_of(5, 3, 20, 4) * jnp.array([0.5, 4.0, 1.0])[:, None, None]
-    together = assign_with_dustbin(scores, jnp.float32(0), config=implicit(**fields))
+    together = assign_with_dustbin(scores, 0.0, config=implicit(**fields))
     assert together.iterations[1] > together.iterations[0]
     for index in range(3):
-        alone = assign_with_dustbin(
-            scores[index : index + 1], jnp.float32(0), config=implicit(**fields)
-        )
+        alone = assign_with_dustbin(scores[index : index + 1], 0.0, config=implicit(**fields))
         assert alone.iterations[0] == together.iterations[index]
         # Rounding: matrix products of a batch may add up in another order.
         np.testing.assert_allclose(plan_of(together)[index], plan_of(alone)[0], rtol=1e-5)
@@ -517,7 +509,7 @@ def test_any_leading_axes_jit_and_vmap_agree(config: SinkhornConfig) -> None:
     weights = scores_of(7, 12, 5)
 
     def of(scores: jax.Array) -> Any:
-        result = assign_with_dustbin(scores, jnp.float32(1), config=config)
+        result = assign_with_dustbin(scores, 1.0, config=config)
         return (weights * jnp.exp(result.log_plan)).sum(), result
 
     both = jax.grad(of, has_aux=True)
@@ -553,7 +545,7 @@ def test_newton_meets_sharp_scores_in_float32() -> None:
     )
     cosines = jnp.einsum("bnd,bkd->bnk", patches, clusters)
     for scores, epsilon in ((cosines, 1e-3), (scores_of(0, 4, 30, 6, scale=100.0), 1.0)):
-        result = assign_with_dustbin(scores, jnp.float32(0), epsilon=epsilon, config=config)
+        result = assign_with_dustbin(scores, 0.0, epsilon=epsilon, config=config)
         assert result.converged.all()
         masses = plan_of(result).sum(axis=1)
         rows, columns = scores.shape[1:]
@@ -595,7 +587,7 @@ def test_counts_and_flags_may_be_used_while_differentiating(gradient: Any) -> No
     scores = scores_of(6, 2, 12, 4)
 
     def of(scores: jax.Array, use: bool) -> jax.Array:
-        result = assign_with_dustbin(scores, jnp.float32(1), config=config)
+        result = assign_with_dustbin(scores, 1.0, config=config)
         loss = jnp.exp(2 * result.log_plan).sum()
         kept = jnp.where(result.finite.all(), loss, 0 * loss) * result.iterations.max()
         return kept / result.iterations.max() if use else loss
@@ -623,9 +615,7 @@ def test_no_nan_on_the_way_where_scaling_does_not_do() -> None:
     """What the unused domain computes is finite: a hunt for NaNs finds none."""
     scores = jnp.zeros((12, 4)).at[3, 2].set(-80.0)
     with jax.debug_nans(True):
-        gradient = jax.grad(
-            lambda s: jnp.exp(assign_with_dustbin(s, jnp.float32(1)).log_plan).max()
-        )(scores)
+        gradient = jax.grad(lambda s: jnp.exp(assign_with_dustbin(s, 1.0).log_plan).max())(scores)
     assert np.isfinite(gradient).all()
 
 
@@ -636,7 +626,7 @@ def test_no_nan_on_the_way_where_scaling_does_not_do() -> None:
 )
 def test_no_problems_at_all(config: SinkhornConfig) -> None:
     def of(scores: jax.Array) -> jax.Array:
-        return assign_with_dustbin(scores, jnp.float32(1), config=config).log_plan.sum()
+        return assign_with_dustbin(scores, 1.0, config=config).log_plan.sum()
 
     assert jax.grad(of)(jnp.zeros((0, 6, 3))).shape == (0, 6, 3)
 
@@ -645,7 +635,7 @@ def test_half_precision_is_widened() -> None:
     scores = scores_of(8, 12, 4).astype(jnp.bfloat16)
     result = assign_with_dustbin(scores, jnp.bfloat16(1))
     assert result.log_plan.dtype == jnp.float32
-    wide = assign_with_dustbin(scores.astype(jnp.float32), jnp.float32(1))
+    wide = assign_with_dustbin(scores.astype(jnp.float32), 1.0)
     np.testing.assert_array_equal(result.log_plan, wide.log_plan)
     gradient = jax.grad(
         lambda s: jnp.exp(assign_with_dustbin(s, jnp.bfloat16(1)).log_plan)[:, 0].sum()
@@ -688,7 +678,7 @@ over = NamedSharding(Mesh(np.array(jax.devices()), ("batch",)), PartitionSpec("b
 spread = jax.device_put(scores, over)
 for fields in ({}, {"gradient": "implicit", "tolerance": 1e-5, "iterations": 300}):
     def of(scores):
-        result = assign_with_dustbin(scores, jnp.float32(1), config=SinkhornConfig(**fields))
+        result = assign_with_dustbin(scores, 1.0, config=SinkhornConfig(**fields))
         return (weights * jnp.exp(result.log_plan)).sum(), result
 
     mapped = jax.shard_map(

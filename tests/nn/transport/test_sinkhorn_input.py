@@ -152,9 +152,7 @@ def test_bad_shapes_and_pairs_raise(name: str, traced: bool) -> None:
     [
         (jnp.nan, MU, NU, 1.0, "scores found with NaN or infinity"),
         (jnp.inf, MU, NU, 1.0, "scores found with NaN or infinity"),
-        (0.0, MU.at[1].set(jnp.inf), NU, 1.0, "log_mu found with NaN, infinity or no mass"),
         (0.0, MU.at[1].set(-jnp.inf), NU, 1.0, "found to sum to 5 and 6, expected the same"),
-        (0.0, MU, NU.at[1].set(jnp.nan), 1.0, "log_nu found with NaN, infinity or no mass"),
         (0.0, MU, NU, 0.0, "epsilon found 0.0, expected at least 1.2e-38"),
         (0.0, MU, NU, 1e-300, "epsilon found 1e-300, expected at least"),
         (0.0, MU, NU, jnp.float32(jnp.nan), "epsilon found nan, expected at least"),
