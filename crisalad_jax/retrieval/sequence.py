@@ -95,9 +95,7 @@ class BayesFilter:
                 raise InputError(f"BayesFilter.{name}: found {value}, expected {expected}")
 
     def start(
-        self,
-        common: Float[np.ndarray, " place"],
-        along: Float[np.ndarray, " place"] | None = None,
+        self, common: Float[np.ndarray, " place"], along: Float[np.ndarray, " place"] | None = None
     ) -> SequenceState:
         """Begin a sequence anywhere in a map.
 
@@ -142,10 +140,7 @@ class BayesFilter:
         return (1 - self.jump) * (total[end] - total[first]) + self.jump / len(along)
 
     def step(
-        self,
-        state: SequenceState,
-        similarities: Float[np.ndarray, " place"],
-        moved: float = 1.0,
+        self, state: SequenceState, similarities: Float[np.ndarray, " place"], moved: float = 1.0
     ) -> SequenceState:
         """Take the next frame into account.
 

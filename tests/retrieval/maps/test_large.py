@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.images import list_images
-from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import Indexed, index
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
@@ -176,13 +175,7 @@ def test_a_map_of_components_shortens_queries_too(shared, params, database, whol
         stored = np.concatenate(list(places.descriptors))
         # Products of other shapes round otherwise, by some units in the last place.
         np.testing.assert_allclose(stored, fitted.apply(full), atol=1e-5)
-        answers = query(
-            places,
-            queries,
-            model=Model(params, places.config),
-            k=3,
-            reading=Reading(batch_size=BATCH, quiet=True),
-        )
+        answers = query(places, queries, k=3, **read_options({}))
     expected = brute_force(fitted.apply(full), fitted.apply(asked), 3)
     np.testing.assert_array_equal(answers.neighbours.indices, expected)
     other = fit_pca(full, 2)
