@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.checks import check_types
+from crisalad_jax.config.checks import check_types, require_field
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Float64, Int64
@@ -85,14 +85,9 @@ class BayesFilter:
     def __post_init__(self) -> None:
         """Check the types and ranges."""
         check_types(self)
-        for name, fits, expected in (
-            ("reach", 1 <= self.reach < np.inf, "at least 1"),
-            ("jump", 0 < self.jump < 1, "above 0 and below 1"),
-            ("sharpness", 0 < self.sharpness < np.inf, "above 0"),
-        ):
-            if not fits:
-                value = getattr(self, name)
-                raise InputError(f"BayesFilter.{name}: found {value}, expected {expected}")
+        require_field(self, "reach", 1 <= self.reach < np.inf, "at least 1")
+        require_field(self, "jump", 0 < self.jump < 1, "above 0 and below 1")
+        require_field(self, "sharpness", 0 < self.sharpness < np.inf, "above 0")
 
     def start(
         self, common: Float[np.ndarray, " place"], along: Float[np.ndarray, " place"] | None = None
