@@ -179,8 +179,8 @@ def _padded(rows: Descriptors, size: int) -> Float[np.ndarray, "size d"]:
 @functools.partial(compiler.jit, static_argnames=("mesh", "width"))
 def _largest(
     rows: Float[Array, "rows d"],
-    valid: Int32[Array, ""],
-    queries: Float32[Array, "q d"],
+    valid: Int32[Array | np.generic, ""],
+    queries: Float32[Array | np.ndarray, "q d"],
     mesh: Mesh,
     width: int,
 ) -> tuple[Float32[Array, "m q"], Int32[Array, "m q"]]:

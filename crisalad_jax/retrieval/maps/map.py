@@ -517,6 +517,7 @@ class Map:
             from crisalad_jax.nn.model import Model
 
             found = read_weights(file)
+            assert found.digest is not None  # a file of this package says it
             check_model(self.metadata, self.folder, found.digest, file)
             model = Model(found.params, self.config)
         else:

@@ -175,29 +175,24 @@ class MilvusStore:
         def ask(queries: Queries, k: int) -> Neighbours:
             # Answers are bounded too: 12 bytes for each neighbour, and 8 for its number again.
             size = max(1, min(self._rows, _MESSAGE_BYTES // (20 * k)))
-            parts = [
-                self._ask(queries[start : start + size], k, count)
-                for start in range(0, len(queries), size)
-            ]
-            return Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
+            found: list[list[dict[str, Any]]] = []
+            with _one_line(self._address):
+                for start in range(0, len(queries), size):
+                    found += self._client.search(
+                        self._collection,
+                        data=list(queries[start : start + size]),
+                        limit=k,
+                        filter=f"id < {count}",
+                        # milvus-lite reads an empty list as all fields, descriptors included.
+                        output_fields=["id"],
+                        search_params={"metric_type": "IP"},
+                    )
+            return Neighbours(
+                np.array([[hit["id"] for hit in hits] for hits in found], np.int64),
+                np.array([[hit["distance"] for hit in hits] for hits in found], np.float32),
+            )
 
         return break_ties(ask, queries, k, min(count, _MOST))
-
-    def _ask(self, queries: Queries, k: int, count: int) -> Neighbours:
-        with _one_line(self._address):
-            answers = self._client.search(
-                self._collection,
-                data=list(queries),
-                limit=k,
-                filter=f"id < {count}",
-                # milvus-lite reads an empty list as all fields, descriptors included.
-                output_fields=["id"],
-                search_params={"metric_type": "IP"},
-            )
-        return Neighbours(
-            np.array([[hit["id"] for hit in hits] for hits in answers], np.int64),
-            np.array([[hit["distance"] for hit in hits] for hits in answers], np.float32),
-        )
 
     def close(self) -> None:
         """Disconnect; other processes may then open the file."""

@@ -25,7 +25,9 @@ _LEAST_MATCHES = 4
 """Number of matches that a homography needs."""
 
 
-def mutual_matches(query: Float[Array, "m d"], candidate: Float[Array, "n d"]) -> Int[Array, " m"]:
+def mutual_matches(
+    query: Float[AnyArray, "m d"], candidate: Float[AnyArray, "n d"]
+) -> Int[Array, " m"]:
     """Match patches that are each other's nearest: for each of the query's, the candidate's.
 
     The nearest patch has the largest inner product; of equal ones it is the first. The result is

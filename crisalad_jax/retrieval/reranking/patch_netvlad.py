@@ -125,7 +125,7 @@ def spatial_scores(
 ) -> Float[Array, "candidate size"]:
     """Compute the rapid spatial score of each size of windows (paper section 3.4)."""
 
-    def of_one(candidate: Array) -> Array:
+    def of_one(candidate: AnyArray) -> Array:
         matched = [(mutual_matches(query[w], candidate[w]), grid) for w, grid in _parts(config)]
         return jnp.stack([spatial_score(matches, grid) for matches, grid in matched])
 
@@ -138,7 +138,7 @@ def _matches_to(
     candidates: Float[AnyArray, "candidate window dim"],
     config: ModelConfig,
 ) -> list[Int[Array, "candidate part"]]:
-    def of_one(candidate: Array) -> list[Array]:
+    def of_one(candidate: AnyArray) -> list[Array]:
         return [mutual_matches(candidate[w], query[w]) for w, _ in _parts(config)]
 
     return jax.vmap(of_one)(candidates)

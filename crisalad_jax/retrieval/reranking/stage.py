@@ -256,8 +256,8 @@ class Reranker:
             part = new[start : start + step]
             # The last part is padded, so that all have one shape and compile once.
             filled = np.resize(part, step)
-            pair = self._queries.features[query], self._database.features[filled]
-            found = self._method.score(*map(np.asarray, pair), self._config)
+            ours, theirs = self._queries.features[query], self._database.features[filled]
+            found = self._method.score(np.asarray(ours), np.asarray(theirs), self._config)
             values = np.asarray(found)[: len(part)]
             self._scores |= {(query, int(c)): s for c, s in zip(part, values.tolist(), strict=True)}
         scores = np.array([self._scores[query, int(c)] for c in candidates])

@@ -3,7 +3,6 @@
 import dataclasses
 import pathlib
 import shutil
-import warnings
 
 import numpy as np
 import pyproj
@@ -20,7 +19,6 @@ from crisalad_jax.retrieval.maps.build import index as index_source
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import new_metadata
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.output import Note
 from tests.conftest import MODEL, read_options
 
 
@@ -172,6 +170,7 @@ def test_a_folder_of_unreadable_images_makes_no_map(params, tmp_path):
     assert not (tmp_path / "map").exists()
 
 
+@pytest.mark.filterwarnings("error::crisalad_jax.utils.output.Note")
 def test_images_of_several_zones_make_a_map_of_degrees(params, database, tmp_path):
     """Zones 31 and 32 at their edge: both are near 48.85, 6.0, whatever their numbers."""
     names = ("@0719985.00@5415018.00@31@U@.png", "@0280015.00@5415018.00@32@U@.png")
@@ -181,9 +180,7 @@ def test_images_of_several_zones_make_a_map_of_degrees(params, database, tmp_pat
     with pytest.warns(UserWarning, match="of several zones of UTM: positions become lat, lon"):
         first = index_folder(tmp_path / "map", params, tmp_path / "images")
     assert (first.added, first.positions) == (2, 2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", Note)  # that is known by now
-        again = index_folder(tmp_path / "map", params, tmp_path / "images")
+    again = index_folder(tmp_path / "map", params, tmp_path / "images")
     assert (again.added, again.there) == (0, 2)
     with Map.open(tmp_path / "map") as places:
         assert places.axes == ("lat", "lon")

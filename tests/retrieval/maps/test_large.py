@@ -5,7 +5,6 @@ import pathlib
 import shutil
 import subprocess
 import sys
-import warnings
 from typing import Any
 
 import numpy as np
@@ -239,28 +238,23 @@ def test_candidates_come_from_the_index(grown, monkeypatch):
         )
 
 
+@pytest.mark.filterwarnings("error::crisalad_jax.utils.output.Note")
 def test_a_map_that_grew_is_searched_exactly(grown):
     build(grown, "hnsw")
     with open_for_appending(grown, metadata("files")) as target:
         target.append(names(40, 1), [7], rows(40, 1), root="/images")
     with Map.open(grown) as places:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Note)  # who asks for an exact search needs no note
-            assert places.search(rows(40, 1), 1, exact=True).indices.tolist() == [[40]]
+        assert places.search(rows(40, 1), 1, exact=True).indices.tolist() == [[40]]
         assert (places.search_kind, places.stale_search) == ("exact", "hnsw")
         assert places.summary()["stale_search"] == "hnsw"
         with pytest.warns(Note, match="exactly; `crisalad index --search hnsw` builds it anew"):
             assert places.search(rows(40, 1), 1).indices.tolist() == [[40]]
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Note)  # once
-            places.search(rows(40, 1), 1)
+        places.search(rows(40, 1), 1)
     build(grown, "hnsw")
     assert len(list((grown / "approximate").glob("*.index"))) == 1
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", Note)
-        with Map.open(grown) as places:
-            assert places.search(rows(40, 1), 1).indices.tolist() == [[40]]
-            assert (places.search_kind, places.stale_search) == ("hnsw", None)
+    with Map.open(grown) as places:
+        assert places.search(rows(40, 1), 1).indices.tolist() == [[40]]
+        assert (places.search_kind, places.stale_search) == ("hnsw", None)
     assert build(grown, "exact") is None
     assert not (grown / "approximate").exists()
 
