@@ -13,7 +13,7 @@ from crisalad_jax.utils.shapes import Float, Float32, Int
 Descriptors = Float[np.ndarray, "n d"]
 """Descriptors of n images, a row of d numbers each."""
 Queries = Float32[np.ndarray, "q d"]
-"""Unit descriptors of q queries."""
+"""Unit descriptors of q images, in float32."""
 # Descriptors may arrive as float16, whose unit vectors are off by up to 1e-3.
 UNIT_TOLERANCE = 1e-2
 WIDE = np.dtype(np.float32)
@@ -45,9 +45,7 @@ def as_rows(array: np.ndarray, name: str, length: int | None = None) -> Descript
     return array
 
 
-def as_unit_rows(
-    array: np.ndarray, name: str, length: int | None = None
-) -> Float32[np.ndarray, "n d"]:
+def as_unit_rows(array: np.ndarray, name: str, length: int | None = None) -> Queries:
     """Check that an array is a matrix of unit descriptors, and return them in float32.
 
     Raises:
@@ -58,9 +56,7 @@ def as_unit_rows(
     return wide
 
 
-def as_sides(
-    database: np.ndarray, queries: np.ndarray
-) -> tuple[Descriptors, Float[np.ndarray, "q d"]]:
+def as_sides(database: np.ndarray, queries: np.ndarray) -> tuple[Descriptors, Descriptors]:
     """Check that database and queries are matrices of descriptors of one length.
 
     Raises:

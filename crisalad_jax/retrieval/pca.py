@@ -74,7 +74,7 @@ class Pca(NamedTuple):
             InputError: descriptors of another length than those that were fitted, no matrix, or
                 rows that are not finite.
         """
-        if len(descriptors):
+        if len(descriptors):  # none are shortened too: a batch may have no readable image
             descriptors = as_rows(descriptors, "descriptors", len(self.mean))
         reduced = np.empty((len(descriptors), len(self.components)), np.float32)
         size = _rows_at_a_time(len(self.mean))
