@@ -5,6 +5,7 @@ The protocol is the public one of visual place recognition: exact nearest neighb
 
 import functools
 from collections.abc import Generator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -195,7 +196,7 @@ def _largest(
         return values.T, start + places.T
 
     image, alike = PartitionSpec(IMAGE), PartitionSpec()
-    shared = jax.shard_map(
+    shared: Any = jax.shard_map(
         on_a_device, mesh=mesh, in_specs=(image, alike, alike), out_specs=(image, image)
     )
     return shared(rows, valid, queries)
