@@ -9,12 +9,7 @@ from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
 from crisalad_jax.retrieval.maps.build import Indexed, index
-from crisalad_jax.retrieval.maps.metadata import (
-    has_images,
-    model_config,
-    read_metadata,
-    weights_of,
-)
+from crisalad_jax.retrieval.maps.metadata import model_config, read_metadata, weights_of
 from crisalad_jax.utils.output import counted
 
 COMMON = (
@@ -61,7 +56,7 @@ class Index(ReadFlags, ModelFlags, JsonFlag):
 def run(arguments: Index) -> dict[str, Any]:
     """Index the images, and print what became of them."""
     out, weights, like, reading = arguments.out, None, None, arguments.reading
-    metadata = read_metadata(out) if has_images(out) else None
+    metadata = read_metadata(out)
     if metadata is not None:
         like = model_config(metadata, out)
         weights = None if arguments.weights else weights_of(metadata, out)

@@ -10,6 +10,10 @@ import numpy as np
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Float32, Int
 
+Descriptors = Float[np.ndarray, "n d"]
+"""Descriptors of n images, a row of d numbers each."""
+Queries = Float32[np.ndarray, "q d"]
+"""Unit descriptors of q images, in float32."""
 # Descriptors may arrive as float16, whose unit vectors are off by up to 1e-3.
 UNIT_TOLERANCE = 1e-2
 WIDE = np.dtype(np.float32)
@@ -22,7 +26,7 @@ _SCATTERED = 4
 """Number of scattered rows that are read before their pages are released."""
 
 
-def as_rows(array: np.ndarray, name: str, length: int | None = None) -> Float[np.ndarray, "n d"]:
+def as_rows(array: np.ndarray, name: str, length: int | None = None) -> Descriptors:
     """Check that an array is a matrix of descriptors, of a length if that is given, and view it so.
 
     Numpy has no name for bfloat16: a .npy file holds it as two bytes without a type ("V2").
@@ -41,9 +45,7 @@ def as_rows(array: np.ndarray, name: str, length: int | None = None) -> Float[np
     return array
 
 
-def as_unit_rows(
-    array: np.ndarray, name: str, length: int | None = None
-) -> Float32[np.ndarray, "n d"]:
+def as_unit_rows(array: np.ndarray, name: str, length: int | None = None) -> Queries:
     """Check that an array is a matrix of unit descriptors, and return them in float32.
 
     Raises:
@@ -54,9 +56,7 @@ def as_unit_rows(
     return wide
 
 
-def as_sides(
-    database: np.ndarray, queries: np.ndarray
-) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "q d"]]:
+def as_sides(database: np.ndarray, queries: np.ndarray) -> tuple[Descriptors, Descriptors]:
     """Check that database and queries are matrices of descriptors of one length.
 
     Raises:
@@ -76,7 +76,7 @@ class Block(NamedTuple):
 
 
 def blocks(
-    array: Float[np.ndarray, "n d"],
+    array: Descriptors,
     name: str,
     size: int,
     *,
@@ -133,9 +133,7 @@ def joined(stream: Iterable[Block], size: int) -> Generator[Block, None, None]:
         yield Block(start, np.concatenate(parts))
 
 
-def gathered(
-    array: Float[np.ndarray, "n d"], places: Int[np.ndarray, " m"]
-) -> Float[np.ndarray, "m d"]:
+def gathered(array: Descriptors, places: Int[np.ndarray, " m"]) -> Float[np.ndarray, "m d"]:
     """Read the rows at some places in ascending order, and release their pages."""
     parts = []
     for start in range(0, len(places), _SCATTERED):
@@ -185,7 +183,7 @@ def check_rows(
         )
 
 
-def check_all_rows(array: Float[np.ndarray, "n d"], name: str, *, unit: bool) -> None:
+def check_all_rows(array: Descriptors, name: str, *, unit: bool) -> None:
     """Check all rows of an array in memory or on disk, as `check_rows`, before they are used.
 
     Raises:

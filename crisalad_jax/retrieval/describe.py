@@ -3,7 +3,6 @@
 Nothing here imports JAX: what computes is a `Describer`.
 """
 
-import collections
 import itertools
 import os
 import pathlib
@@ -125,8 +124,7 @@ def describe_files(
     describer = describer_of(model)
     paths = [pathlib.Path(file) for file in as_list("files", files)]
     stream = described(describer, paths, reading.fitted(len(paths)))
-    (found,) = joined(shown(stream, "images", len(paths), quiet=reading.quiet), len(paths))
-    return found.descriptors
+    return _in_memory(stream, "images", len(paths), quiet=reading.quiet).descriptors
 
 
 def describe_images(
@@ -209,20 +207,16 @@ def described(
     could be read.
 
     Raises:
-        InputError: an image cannot be read and `reading` says "stop".
+        InputError: an image cannot be read and `reading` says "stop"; or what `check_window`
+            raises.
     """
     shorten = (lambda rows: rows) if components is None else components.apply
-    before: Rows | None = None
+    frames = FrameDescriber(describer, window)
     for rows, batch, unreadable in _tokens(describer, paths, reading):
         if window == 1:
             descriptors = shorten(_alone(describer, rows))[batch.valid]
         else:
-            new = rows[batch.valid]
-            held = new if before is None else np.concatenate([before, new])
-            every = group(describer, held, len(held), "window", batch_size=window)
-            descriptors = every[len(held) - len(new) :]
-            descriptors = shorten(descriptors) if len(new) else descriptors
-            before = held[1 - window :]
+            descriptors = shorten(frames.of_tokens(rows[batch.valid]))
         yield Described(batch.indices[batch.valid], descriptors, unreadable)
 
 
@@ -302,8 +296,11 @@ def read_tokens(
 ) -> Described:
     """Read the tokens of all images into memory, as `token_rows` yields them."""
     stream = token_rows(describer, paths, reading)
-    (found,) = joined(shown(stream, label, len(paths), quiet=reading.quiet), len(paths))
-    return found
+    return _in_memory(stream, label, len(paths), quiet=reading.quiet)
+
+
+def _in_memory(stream: Iterator[Described], label: str, total: int, *, quiet: bool) -> Described:
+    return _concatenated(list(shown(stream, label, total, quiet=quiet)))
 
 
 def group(
@@ -324,6 +321,7 @@ def grouped(
     *,
     batch_size: int,
     seed: int = 0,
+    first: int = 0,
     label: str = "images",
     quiet: bool = True,
 ) -> Iterator[tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n descriptor"]]]:
@@ -336,16 +334,17 @@ def grouped(
         grouping: one of `GROUPINGS`.
         batch_size: number of images that attend to each other.
         seed: draws the order of `shuffled`.
+        first: number of the first image of a `window` that is described.
         label: label of the progress bar.
         quiet: whether to show no progress bar.
     """
     batches = batches_of(count, grouping, batch_size, seed)
     # A window gives one descriptor, so `batch_size` windows are computed at a time.
-    step = batch_size if grouping == "window" else 1
+    step = max(1, min(batch_size, count - first)) if grouping == "window" else 1
     # The other groupings take little time compared with the backbone: they need no bar.
     silent = quiet or grouping != "window"
     with progress_bar(f"{label}, {grouping}", count, "images", quiet=silent) as bar:
-        for start in range(0, len(batches.images), step):
+        for start in range(first, len(batches.images), step):
             part = batches.part(start, start + step)
             # The last groups are repeated, so that all steps run one program.
             groups = np.resize(np.arange(len(part.images)), step)
@@ -380,7 +379,7 @@ class FrameDescriber:
         """
         check_window(describer.config, window)
         self._describer, self._window = describer, window
-        self._rows: collections.deque[Rows] = collections.deque(maxlen=window)
+        self.forget()
 
     def __call__(self, image: np.ndarray) -> Float32[np.ndarray, "1 d"]:
         """Describe the next image: 8-bit RGB or grey, of any size.
@@ -391,14 +390,16 @@ class FrameDescriber:
         one = self._describer.preparation.prepare(image, self._describer.check_size)[None]
         number, valid = np.zeros(1, int), np.ones(1, bool)
         ((rows, _),) = self._describer.tokens([ImageBatch(one, number, valid, number)])
-        self._rows.append(rows)
-        # The first images have fewer before them: one of these is repeated, and not attended to.
-        missing = self._window - len(self._rows)
-        held = np.concatenate([*[self._rows[0]] * missing, *self._rows])
-        filled = np.arange(self._window) >= missing
-        mask = filled[:, None] & filled | np.eye(self._window, dtype=bool)
-        return self._describer.attend(held[None], mask[None])[0, -1:]
+        return self.of_tokens(rows)
+
+    def of_tokens(self, rows: Rows) -> Float32[np.ndarray, "n d"]:
+        """Describe the next images, of which these are the tokens."""
+        held = np.concatenate([*self._before, rows])
+        first = len(held) - len(rows)
+        self._before = [held[max(0, len(held) - self._window + 1) :]]
+        options = {"batch_size": self._window, "first": first}
+        return group(self._describer, held, len(held), "window", **options)[first:]
 
     def forget(self) -> None:
         """Start again without an image."""
-        self._rows.clear()
+        self._before: list[Rows] = []

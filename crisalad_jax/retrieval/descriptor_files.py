@@ -17,7 +17,7 @@ import numpy as np
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.data.images import check_lines
-from crisalad_jax.retrieval.chunks import as_rows
+from crisalad_jax.retrieval.chunks import Descriptors, as_rows
 from crisalad_jax.utils.checksums import sha256_of, tell_unchecked
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import (
@@ -33,7 +33,6 @@ from crisalad_jax.utils.files import (
 )
 from crisalad_jax.utils.shapes import Float, Int
 
-Descriptors = Float[np.ndarray, "image descriptor"]
 _DIGESTS = "files"
 """Key of the digests in the record, by the files' roles."""
 _SUFFIXES = (".npy", ".h5")

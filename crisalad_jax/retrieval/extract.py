@@ -1,6 +1,5 @@
 """Descriptors of a folder or a list of images, in files or in memory."""
 
-import collections
 import contextlib
 import dataclasses
 import hashlib
@@ -22,7 +21,7 @@ from crisalad_jax.data.images import check_lines, read_pixels
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.data.video import file_of, frame_time, name_frame
-from crisalad_jax.retrieval.chunks import as_rows, check_all_rows, check_rows
+from crisalad_jax.retrieval.chunks import Descriptors, as_rows, check_all_rows, check_rows
 from crisalad_jax.retrieval.describe import (
     as_list,
     check_readable,
@@ -34,7 +33,6 @@ from crisalad_jax.retrieval.describe import (
 )
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.descriptor_files import (
-    Descriptors,
     open_npy,
     read_descriptors,
     record_of,
@@ -172,26 +170,33 @@ def extract(
         record["fps"] = 1.0 if fps is None else fps
     work = _Work(describer, components, length, grouping, seed, reading, source)
 
-    def finish(parts: Sequence[Segments], folder: pathlib.Path, **more: Any) -> Extracted:
-        with work.written(parts, names, folder) as (found, file), contextlib.ExitStack() as staged:
+    def finish(
+        parts: Sequence[Segments], skipped: list[str], folder: pathlib.Path, **more: Any
+    ) -> Extracted:
+        listed = _names_in(*parts)
+        check_readable(source, len(paths), len(listed))
+        file = temporary_beside(folder / "rows.npy")
+        with in_use(file), contextlib.ExitStack() as staged:
+            with wrap_os_errors(folder):
+                write_rows(file, (len(listed), length), work.descriptors(parts, len(listed)))
+            found = Extracted(listed, open_npy(file, verify=False), skipped)
             if pairs is not None:  # staged, so that pairs and descriptors appear, or none
-                between = others or (found.names, found.descriptors)
-                nearest = nearest_pairs(found.names, found.descriptors, *between, k=k)
+                between = others or (listed, found.descriptors)
+                nearest = nearest_pairs(listed, found.descriptors, *between, k=k)
                 write_pairs(staged.enter_context(atomic_path(pairs)), nearest)
                 found = found._replace(pairs=nearest)
             if out is None:
                 return found._replace(descriptors=np.array(found.descriptors))
-            whole = record | {"skipped": found.skipped, **more}
-            write_descriptors(
-                out, found.descriptors, found.names, whole, within=folder, written=file
-            )
+            whole = record | {"skipped": skipped, **more}
+            write_descriptors(out, found.descriptors, listed, whole, within=folder, written=file)
             return found
 
     if share is None or out is None:
         with _work_folder(out) as folder:
             # A single batch is nothing to resume: it needs no digest of the model.
             resumes = out is not None and len(paths) > reading.batch_size
-            return finish([work.resume(folder, paths, names, resumes=resumes)], folder)
+            rows, skipped = work.resume(folder, paths, names, resumes=resumes)
+            return finish([rows], skipped, folder)
     out = pathlib.Path(out)
     common = {name: value for name, value in record.items() if name not in ("weights", "images")}
     folder = out.with_name(f"{out.name}.shares")
@@ -203,17 +208,15 @@ def extract(
         return Extracted(listed, descriptors, known["skipped"])
     mine = shares.share.of(len(paths), reading.batch_size)
     with lock(shares.own):
-        own = work.resume(shares.own, paths[mine], names[mine])
-        listed, skipped = _names_of([own], names[mine])
-        found = Extracted(listed, np.empty((0, length), np.float32), skipped)
-        shares.finish({})
-    if left := shares.left():
-        return found._replace(shares_left=left)
-    with shares.joining() as results:
+        rows, skipped = work.resume(shares.own, paths[mine], names[mine])
+        found = Extracted(_names_in(rows), np.empty((0, length), np.float32), skipped)
+        shares.finish({"skipped": skipped})
+    with shares.joining() as (results, waiting):
         if results is None:
-            return found._replace(joined_elsewhere=True)
+            return found._replace(**waiting)
         parts = [work.opened(shares.path(index)) for index in range(shares.share.count)]
-        return finish(parts, folder, **{_SHARES: shares.digest})
+        skipped = [name for each in results for name in each["skipped"]]
+        return finish(parts, skipped, folder, **{_SHARES: shares.digest})
 
 
 def check_extraction(
@@ -307,65 +310,56 @@ class _Work:
         names: Sequence[str],
         *,
         resumes: bool = True,
-    ) -> Segments:
-        """Describe the images whose rows are not in the folder yet, and store them there."""
+    ) -> tuple[Segments, list[str]]:
+        """Describe the images whose rows are not in the folder yet, and store them there.
+
+        Returns:
+            All rows, and the names of the images that could not be read.
+        """
         plan = digest_of((), self.plan()) if resumes else ""
         if not resumes:
             _remove_work(folder)
-        done = _reusable(folder, plan, paths, complete=self.reading.on_bad_image == "stop")
+        first = _reusable(folder, plan, paths, complete=self.reading.on_bad_image == "stop")
         try:
             segments = self.opened(folder)
             segments.verify()
         except InputError as error:
             warn(f"{error}; the work in this folder starts again")
             _remove_work(folder)
-            done, segments = 0, self.opened(folder)
-        first, quiet = done, self.reading.quiet
+            first, segments = 0, self.opened(folder)
+        skipped = [name for record in segments.records for name in record["skipped"]]
+        done = first
         if self.grouping == "single":
-            new = described(self.describer, paths[done:], self.reading, components=self.components)
+            new = described(self.describer, paths[first:], self.reading, components=self.components)
         else:
-            new = token_rows(self.describer, paths[done:], self.reading)
-        for part in joined(shown(new, "images", len(paths), quiet=quiet, done=done), SEGMENT):
+            new = token_rows(self.describer, paths[first:], self.reading)
+        new = shown(new, "images", len(paths), quiet=self.reading.quiet, done=first)
+        for part in joined(new, SEGMENT):
+            images = paths[done : done + part.tried]
+            done += part.tried
+            unreadable = [names[first + int(number)] for number in part.unreadable]
+            skipped += unreadable
             if not len(part.indices):
                 continue
             if self.grouping == "single":
                 self._check(part.descriptors, part.indices)
-            images = paths[done : done + part.tried]
             record = {
                 "names": [names[first + int(number)] for number in part.indices],
-                "count": len(images),
+                "skipped": unreadable,
                 "work": _digest(plan, images),
             }
             segments.append(record, part.descriptors)
-            done += part.tried
-        return segments
+        return segments, skipped
 
     def _check(self, rows: np.ndarray, numbers: np.ndarray) -> None:
         model, components = self.describer.config, self.components
         unit = model.unit_length if components is None else components.config.renormalise
         check_rows(rows, f"{self.source}: descriptors", numbers, unit=unit)
 
-    @contextlib.contextmanager
-    def written(
-        self, parts: Sequence[Segments], names: Sequence[str], folder: pathlib.Path
-    ) -> Iterator[tuple[Extracted, pathlib.Path]]:
-        """Write the descriptors of stored rows to a temporary .npy file, and yield both.
-
-        Raises:
-            InputError: there are no rows, or the disk is full.
-        """
-        stored, skipped = _names_of(parts, names)
-        check_readable(self.source, len(names), len(stored))
-        file = temporary_beside(folder / "rows.npy")
-        with in_use(file):
-            with wrap_os_errors(folder):
-                write_rows(file, (len(stored), self.length), self._descriptors(parts, len(stored)))
-            yield Extracted(stored, open_npy(file, verify=False), skipped), file
-
-    def _descriptors(
+    def descriptors(
         self, parts: Sequence[Segments], count: int
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield descriptors, some at a time, with their numbers."""
+        """Yield the descriptors of stored rows, some at a time, with their numbers."""
         if self.grouping == "single":
             start = 0
             for block in itertools.chain.from_iterable(part.blocks() for part in parts):
@@ -381,16 +375,9 @@ class _Work:
             yield numbers, short
 
 
-def _names_of(parts: Sequence[Segments], names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the names whose rows are stored, and the others, which could not be read."""
-    stored = [name for part in parts for record in part.records for name in record["names"]]
-    skipped, waiting = [], collections.deque(stored)  # in order: a list may have a name twice
-    for name in names:
-        if waiting and name == waiting[0]:
-            waiting.popleft()
-        else:
-            skipped.append(name)
-    return stored, skipped
+def _names_in(*parts: Segments) -> list[str]:
+    """Return the names whose rows are stored, in order."""
+    return [name for part in parts for record in part.records for name in record["names"]]
 
 
 @contextlib.contextmanager
@@ -453,7 +440,7 @@ def _reusable(
     for number, path in enumerate(records):
         try:
             record = read_json(path, "a record of images")
-            images = paths[done : done + record["count"]]
+            images = paths[done : done + len(record["names"]) + len(record["skipped"])]
             is_usable = record["work"] == _digest(plan, images)
         except (InputError, LookupError, TypeError):
             is_usable = False
@@ -466,7 +453,7 @@ def _reusable(
                 old.unlink()
                 old.with_suffix(".npy").unlink(missing_ok=True)
             break
-        if complete and len(record["names"]) < record["count"]:
+        if complete and record["skipped"]:
             for image in images:
                 read_pixels(image)  # raises for the image that was skipped
         done += len(images)
@@ -485,10 +472,7 @@ def _digest(plan: str, paths: Sequence[pathlib.Path]) -> str:
 
 
 def _listed(
-    images: StrPath | Sequence[StrPath],
-    root: StrPath | None,
-    fps: float | None,
-    reading: Reading,
+    images: StrPath | Sequence[StrPath], root: StrPath | None, fps: float | None, reading: Reading
 ) -> tuple[list[pathlib.Path], list[str]]:
     """List the images, and their names relative to the root."""
     if isinstance(images, str | os.PathLike):

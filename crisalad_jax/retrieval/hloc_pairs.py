@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 
-from crisalad_jax.retrieval.descriptor_files import Descriptors
+from crisalad_jax.retrieval.chunks import Descriptors
 from crisalad_jax.retrieval.search import search
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path

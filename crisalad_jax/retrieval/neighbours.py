@@ -9,7 +9,7 @@ import numpy as np
 
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.loader import one_ahead, read_ahead
-from crisalad_jax.retrieval.chunks import UNIT_TOLERANCE, Block
+from crisalad_jax.retrieval.chunks import UNIT_TOLERANCE, Block, Descriptors, Queries
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.shapes import Float, Float32, Int, Int64
 
@@ -74,8 +74,8 @@ def rounding(length: int) -> float:
 
 
 def exact_similarities(
-    queries: Float32[np.ndarray, "q d"],
-    rows: Float[np.ndarray, "n d"],
+    queries: Queries,
+    rows: Descriptors,
     query: Int[np.ndarray, " pair"],
     row: Int[np.ndarray, " pair"],
 ) -> Float32[np.ndarray, " pair"]:
@@ -91,7 +91,7 @@ def exact_similarities(
 
 
 def similarities_of(
-    queries: Float32[np.ndarray, "q d"],
+    queries: Queries,
     query: Int[np.ndarray, " pair"],
     index: Int[np.ndarray, " pair"],
     read_rows: ReadRows,
@@ -118,7 +118,7 @@ def similarities_of(
 
 
 def multiply(
-    stream: Generator[Block, None, None], queries: Float32[np.ndarray, "q d"], size: int
+    stream: Generator[Block, None, None], queries: Queries, size: int
 ) -> Generator[Products, None, None]:
     """Multiply all queries and all blocks, of at most `size` rows, by numpy."""
     # Allocating new memory takes longer than writing the products. Two, for `one_ahead`.
@@ -135,7 +135,7 @@ def multiply(
 
 def nearest(
     stream: Stream,
-    queries: Float32[np.ndarray, "q d"],
+    queries: Queries,
     k: int,
     read_rows: ReadRows,
     size: int,

@@ -14,10 +14,10 @@ from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.config.checks import PATH, check_seed, check_types, takes
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.retrieval.chunks import WIDE, as_rows, blocks, sample
+from crisalad_jax.retrieval.chunks import WIDE, Descriptors, as_rows, blocks, sample
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import progress_bar
-from crisalad_jax.utils.shapes import Float, Float32, Float64
+from crisalad_jax.utils.shapes import Float32, Float64
 
 if TYPE_CHECKING:
     from crisalad_jax.nn.config import ModelConfig
@@ -67,14 +67,15 @@ class Pca(NamedTuple):
         """Share of the variance that lies along the components, 0 to 1."""
         return float(self.variances.sum() / self.total)
 
-    def apply(self, descriptors: Float[np.ndarray, "n d"]) -> Float32[np.ndarray, "n dim"]:
+    def apply(self, descriptors: Descriptors) -> Float32[np.ndarray, "n dim"]:
         """Reduce descriptors to their components, a few thousand rows at a time.
 
         Raises:
             InputError: descriptors of another length than those that were fitted, no matrix, or
                 rows that are not finite.
         """
-        descriptors = as_rows(descriptors, "descriptors", len(self.mean))
+        if len(descriptors):  # none are shortened too: a batch may have no readable image
+            descriptors = as_rows(descriptors, "descriptors", len(self.mean))
         reduced = np.empty((len(descriptors), len(self.components)), np.float32)
         size = _rows_at_a_time(len(self.mean))
         for start, rows in blocks(descriptors, "descriptors", size, unit=False):
@@ -149,7 +150,7 @@ def shortened_length(
 
 
 def fit_pca(
-    descriptors: Float[np.ndarray, "n d"],
+    descriptors: Descriptors,
     dim: int,
     config: PcaConfig | None = None,
     *,

@@ -17,6 +17,8 @@ from crisalad_jax.config.checks import check_count
 from crisalad_jax.data.loader import one_ahead
 from crisalad_jax.retrieval.chunks import (
     Block,
+    Descriptors,
+    Queries,
     as_sides,
     as_unit_rows,
     blocks,
@@ -25,13 +27,13 @@ from crisalad_jax.retrieval.chunks import (
 )
 from crisalad_jax.retrieval.neighbours import QUERY_CHUNK, Neighbours, Products, multiply, nearest
 from crisalad_jax.utils import compiler
-from crisalad_jax.utils.devices import devices_for
+from crisalad_jax.utils.devices import IMAGE, devices_for
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.target import target
 
 
 def search(
-    database: Float[np.ndarray, "n d"],
+    database: Descriptors,
     queries: Float[np.ndarray, "q d"],
     k: int,
     *,
@@ -77,12 +79,29 @@ def search(
         check_count(name, value)
     database, queries = as_sides(database, queries)
     queries = as_unit_rows(queries, "queries")
-    on_host = target().platform == "cpu"
-    return _search(database, queries, k, chunk, on_host=on_host, label=label, quiet=quiet)
+    count, on_host = len(database), target().platform == "cpu"
+    devices = len(jax.local_devices())
+    size = -(-min(chunk, count) // devices) * devices
+    stream = functools.partial(blocks, database, "database", size)
+
+    with progress_bar(label, count, "rows", quiet=quiet) as bar:
+
+        def shown() -> Generator[Block, None, None]:
+            for block in blocks(database, "database", size, narrow=not on_host):
+                yield block
+                bar.advance(len(block.rows))
+
+        def products(width: int) -> Generator[Products, None, None]:
+            if on_host:
+                return multiply(shown(), queries, size)
+            return _by_devices(shown(), queries, size, width)
+
+        read_rows = functools.partial(gathered, database)
+        return nearest(stream, queries, min(k, count), read_rows, size, products)
 
 
 def to_unit_vectors(
-    database: Float[np.ndarray, "n d"], queries: Float[np.ndarray, "q d"]
+    database: Descriptors, queries: Float[np.ndarray, "q d"]
 ) -> tuple[Float32[np.ndarray, "n d+3"], Float32[np.ndarray, "q d+3"]]:
     r"""Embed descriptors so that their cosines rank as the Euclidean distances do.
 
@@ -127,47 +146,15 @@ def to_unit_vectors(
     return embedded[0], embedded[1]
 
 
-def _search(
-    database: Float[np.ndarray, "n d"],
-    queries: Float32[np.ndarray, "q d"],
-    k: int,
-    chunk: int,
-    *,
-    on_host: bool,
-    label: str = "search",
-    quiet: bool = True,
-) -> Neighbours:
-    """Search with numpy (`on_host`) or with the devices; see `search`."""
-    count, k = len(database), min(k, len(database))
-    share = len(jax.local_devices())
-    size = -(-min(chunk, count) // share) * share
-    stream = functools.partial(blocks, database, "database", size)
-
-    with progress_bar(label, count, "rows", quiet=quiet) as bar:
-
-        def shown() -> Generator[Block, None, None]:
-            for block in blocks(database, "database", size, narrow=not on_host):
-                yield block
-                bar.advance(len(block.rows))
-
-        def products(width: int) -> Generator[Products, None, None]:
-            if on_host:
-                return multiply(shown(), queries, size)
-            return _by_devices(shown(), queries, size, width)
-
-        read_rows = functools.partial(gathered, database)
-        return nearest(stream, queries, k, read_rows, size, products)
-
-
 def _by_devices(
-    stream: Generator[Block, None, None], queries: Float32[np.ndarray, "q d"], size: int, width: int
+    stream: Generator[Block, None, None], queries: Queries, size: int, width: int
 ) -> Generator[Products, None, None]:
     """Multiply on the devices, over which the rows of a block are sharded.
 
     Each device names the `width` largest products of its rows with each query.
     """
     devices = devices_for(size)
-    program = _program(devices.mesh, min(width, size // devices.mesh.size))
+    width = min(width, size // devices.mesh.size)
     together = min(QUERY_CHUNK, len(queries))
     firsts = range(0, len(queries), together)
     parts = [
@@ -178,31 +165,38 @@ def _by_devices(
         for block in one_ahead(stream):
             rows, valid = devices.shard_batch(_padded(block.rows, size)), np.int32(len(block.rows))
             for first, part in zip(firsts, parts, strict=True):
-                yield first, block.start, program(rows, valid, part)
+                yield first, block.start, _largest(rows, valid, part, devices.mesh, width)
 
     for first, start, arrays in one_ahead(dispatched()):
         values, places = (np.asarray(array)[:, : len(queries) - first] for array in arrays)
         yield Products(first, values, start + places.astype(np.int64))
 
 
-def _padded(rows: Float[np.ndarray, "n d"], size: int) -> Float[np.ndarray, "size d"]:
+def _padded(rows: Descriptors, size: int) -> Float[np.ndarray, "size d"]:
     """Append rows of zeros."""
     return np.pad(rows, ((0, size - len(rows)), (0, 0))) if len(rows) < size else rows
 
 
-@functools.cache
-def _program(mesh: Mesh, width: int) -> Any:
-    def largest(
-        rows: Float[Array, "rows d"], valid: Int32[Array, ""], queries: Float32[Array, "q d"]
-    ) -> tuple[Float32[Array, "m q"], Int32[Array, "m q"]]:
+@functools.partial(compiler.jit, static_argnames=("mesh", "width"))
+def _largest(
+    rows: Float[Array, "rows d"],
+    valid: Int32[Array | np.generic, ""],
+    queries: Float32[Array | np.ndarray, "q d"],
+    mesh: Mesh,
+    width: int,
+) -> tuple[Float32[Array, "m q"], Int32[Array, "m q"]]:
+    """Find the largest products of each device's rows, and their places; rows from `valid` pad."""
+
+    def on_a_device(rows: Array, valid: Array, queries: Array) -> tuple[Array, Array]:
         wide = rows.astype(jnp.float32)
         products = jnp.matmul(queries, wide.T, precision=jax.lax.Precision.HIGHEST)
-        start = jax.lax.axis_index("image") * len(rows)
+        start = jax.lax.axis_index(IMAGE) * len(rows)
         is_valid = start + jnp.arange(len(rows)) < valid
         values, places = jax.lax.top_k(jnp.where(is_valid, products, -jnp.inf), width)
         return values.T, start + places.T
 
-    image, alike = PartitionSpec("image"), PartitionSpec()
-    return compiler.jit(
-        jax.shard_map(largest, mesh=mesh, in_specs=(image, alike, alike), out_specs=(image, image))
+    image, alike = PartitionSpec(IMAGE), PartitionSpec()
+    shared: Any = jax.shard_map(
+        on_a_device, mesh=mesh, in_specs=(image, alike, alike), out_specs=(image, image)
     )
+    return shared(rows, valid, queries)

@@ -18,13 +18,14 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from crisalad_jax.retrieval.chunks import Descriptors
 from crisalad_jax.retrieval.maps.store import Store
 from crisalad_jax.utils.checksums import checksummed_json
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, read_json, write_json
 from crisalad_jax.utils.locks import BusyFolderError, lock
 from crisalad_jax.utils.output import warn
-from crisalad_jax.utils.shapes import Float, Int64
+from crisalad_jax.utils.shapes import Int64
 
 SEGMENT = 256
 """Number of images appended together, and so described again at most after a kill."""
@@ -87,7 +88,7 @@ class Segments:
         self.spans.append(Segment(len(self), len(names), digest))
         self.records.append(record)
 
-    def append(self, record: Mapping[str, Any], rows: Float[np.ndarray, "n d"]) -> None:
+    def append(self, record: Mapping[str, Any], rows: Descriptors) -> None:
         """Append a segment: it is there for good once this returns, and not at all before.
 
         Args:
@@ -104,12 +105,12 @@ class Segments:
         write_record(path, whole)
         self._take(whole, path)
 
-    def blocks(self) -> Iterator[Float[np.ndarray, "n d"]]:
+    def blocks(self) -> Iterator[Descriptors]:
         """Yield the rows of each segment in order."""
         for span in self.spans:
             yield self.store.read(span.first, span.count)
 
-    def __getitem__(self, numbers: Int64[np.ndarray, " n"]) -> Float[np.ndarray, "n d"]:
+    def __getitem__(self, numbers: Int64[np.ndarray, " n"]) -> Descriptors:
         """Read rows of files by number, in any order."""
         return self.store.rows(numbers)  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -217,27 +218,30 @@ class Shares(NamedTuple):
         """Record that this process's share is done."""
         write_json(self._marker(self.share.index), {"shares": self.digest, **result})
 
-    def left(self) -> int:
-        """Count the shares that are not done."""
-        return sum(self.result(index) is None for index in range(self.share.count))
-
     @contextlib.contextmanager
-    def joining(self) -> Iterator[list[dict[str, Any]] | None]:
+    def joining(self) -> Iterator[tuple[list[dict[str, Any]] | None, dict[str, Any]]]:
         """Yield the results of all shares while no other process joins them; then remove them.
 
-        Yields None where another process joins them, or has done so.
+        Where they cannot be joined now, None is yielded with the reason: `shares_left`, the number
+        of shares that are not done, or `joined_elsewhere`, by another process.
         """
         with contextlib.ExitStack() as stack:
+            if left := self._left():
+                yield None, {"shares_left": left}
+                return
             try:
                 stack.enter_context(lock(self.folder))
             except BusyFolderError:
                 warn(f"{self.folder}: another process joins the shares")
-                yield None
+                yield None, {"joined_elsewhere": True}
                 return
-            if self.left():  # another process has joined them meanwhile
-                yield None
+            if self._left():  # another process has joined them meanwhile
+                yield None, {"joined_elsewhere": True}
                 return
-            yield [self.result(index) or {} for index in range(self.share.count)]
+            yield [self.result(index) or {} for index in range(self.share.count)], {}
             for index in range(self.share.count):
                 self._marker(index).unlink()
         shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _left(self) -> int:
+        return sum(self.result(index) is None for index in range(self.share.count))

@@ -13,11 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.checks import check_types
+from crisalad_jax.config.checks import check_types, require_field
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Float64, Int64
 
+PerPlace = Float[np.ndarray, " place"]
+"""A number for each image of a map, float64 in a `SequenceState`."""
 _PRIOR_FRAMES = 10
 """Number of frames that the map's own mean counts for in the mean of the frames so far."""
 _ROUNDING = 5e-4
@@ -28,15 +30,15 @@ _ROUNDING = 5e-4
 class SequenceState(NamedTuple):
     """What a filter knows after some frames."""
 
-    belief: Float64[np.ndarray, " place"]
+    belief: PerPlace
     """Probability that the camera is at each image of the map."""
-    common: Float64[np.ndarray, " place"]
+    common: PerPlace
     """Similarity of each image to the mean descriptor of the map."""
-    seen: Float64[np.ndarray, " place"]
+    seen: PerPlace
     """Sum of the similarities of the frames so far to each image."""
     frames: int
     """Number of frames so far."""
-    along: Float64[np.ndarray, " place"]
+    along: PerPlace
     """How far along the map each image is: its number, or seconds or metres."""
 
 
@@ -85,20 +87,11 @@ class BayesFilter:
     def __post_init__(self) -> None:
         """Check the types and ranges."""
         check_types(self)
-        for name, fits, expected in (
-            ("reach", 1 <= self.reach < np.inf, "at least 1"),
-            ("jump", 0 < self.jump < 1, "above 0 and below 1"),
-            ("sharpness", 0 < self.sharpness < np.inf, "above 0"),
-        ):
-            if not fits:
-                value = getattr(self, name)
-                raise InputError(f"BayesFilter.{name}: found {value}, expected {expected}")
+        require_field(self, "reach", 1 <= self.reach < np.inf, "at least 1")
+        require_field(self, "jump", 0 < self.jump < 1, "above 0 and below 1")
+        require_field(self, "sharpness", 0 < self.sharpness < np.inf, "above 0")
 
-    def start(
-        self,
-        common: Float[np.ndarray, " place"],
-        along: Float[np.ndarray, " place"] | None = None,
-    ) -> SequenceState:
+    def start(self, common: PerPlace, along: PerPlace | None = None) -> SequenceState:
         """Begin a sequence anywhere in a map.
 
         Args:
@@ -121,7 +114,7 @@ class BayesFilter:
             )
         return SequenceState(np.full(count, 1 / count), common, np.zeros(count), 0, along)
 
-    def predict(self, state: SequenceState, moved: float = 1.0) -> Float64[np.ndarray, " place"]:
+    def predict(self, state: SequenceState, moved: float = 1.0) -> PerPlace:
         """Move a belief from one frame to the next, by the model of motion.
 
         Args:
@@ -142,10 +135,7 @@ class BayesFilter:
         return (1 - self.jump) * (total[end] - total[first]) + self.jump / len(along)
 
     def step(
-        self,
-        state: SequenceState,
-        similarities: Float[np.ndarray, " place"],
-        moved: float = 1.0,
+        self, state: SequenceState, similarities: PerPlace, moved: float = 1.0
     ) -> SequenceState:
         """Take the next frame into account.
 
@@ -176,8 +166,8 @@ class BayesFilter:
     def follow(
         self,
         similarities: Float[np.ndarray, "frame place"],
-        common: Float[np.ndarray, " place"],
-        along: Float[np.ndarray, " place"] | None = None,
+        common: PerPlace,
+        along: PerPlace | None = None,
         moved: Float[np.ndarray, " frame"] | None = None,
     ) -> "Followed":
         """Follow a camera through all frames of a sequence.
@@ -213,11 +203,7 @@ class Followed(NamedTuple):
     """Probability that the camera is there; images beside it share what they have in common."""
 
 
-def _without_means(
-    row: Float64[np.ndarray, " place"],
-    mean: Float64[np.ndarray, " place"],
-    common: Float64[np.ndarray, " place"],
-) -> Float64[np.ndarray, " place"]:
+def _without_means(row: PerPlace, mean: PerPlace, common: PerPlace) -> PerPlace:
     """Compute similarities of a frame without its side's mean to images without the map's.
 
     With unit descriptors d of the map, their mean m, a frame q and the mean f of the frames, it is

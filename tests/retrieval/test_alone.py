@@ -56,14 +56,6 @@ def test_files_are_described_as_extract_describes_them(
     )
 
 
-@pytest.mark.parametrize("shape", [(42, 56), (42, 56, 1)])
-def test_grey_is_described_as_its_three_channels(params: Crisalad, shape: tuple[int, ...]) -> None:
-    grey = np.random.default_rng(2).integers(0, 256, shape, dtype=np.uint8)
-    found = describe_images(Model(params, MODEL), [grey])
-    repeated = cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB)
-    np.testing.assert_array_equal(found, describe_images(Model(params, MODEL), [repeated]))
-
-
 def test_nothing_and_other_types_are_refused(params: Crisalad) -> None:
     with pytest.raises(InputError, match="images: found none, expected at least one image"):
         describe_images(Model(params, MODEL), [])

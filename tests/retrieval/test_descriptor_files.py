@@ -141,17 +141,13 @@ def test_a_npy_file_is_mapped_with_its_type(tmp_path, kind):
 
 def test_files_that_are_no_descriptors_are_named(tmp_path):
     path = tmp_path / "map.npy"
-    with path.open("wb") as file:
-        np.savez(file, DESCRIPTORS)
-    with pytest.raises(
-        InputError, match=r"map\.npy: found an \.npz archive of arr_0, expected one"
+    for save, array, words in (
+        (np.savez, DESCRIPTORS, r"found an \.npz archive of arr_0, expected one"),
+        (np.save, DESCRIPTORS[0], r"found shape \(6,\), expected \(images, descriptor\)"),
+        (np.save, DESCRIPTORS[:0], r"found shape \(0, 6\), expected"),
+        (np.save, np.array(["a"]), "found <U1, expected an array of floating-point numbers"),
     ):
-        open_npy(path)
-    for array, words in (
-        (DESCRIPTORS[0], r"map\.npy: found shape \(6,\), expected \(images, descriptor\)"),
-        (DESCRIPTORS[:0], r"map\.npy: found shape \(0, 6\), expected"),
-        (np.array(["a"]), r"map\.npy: found <U1, expected an array of floating-point numbers"),
-    ):
-        np.save(path, array)
-        with pytest.raises(InputError, match=words):
+        with path.open("wb") as file:
+            save(file, array)
+        with pytest.raises(InputError, match=rf"map\.npy: {words}"):
             open_npy(path)

@@ -140,6 +140,7 @@ def segments(out: pathlib.Path) -> list[str]:
 # What is done is kept
 
 
+@pytest.mark.filterwarnings("error::crisalad_jax.utils.output.Note")
 @pytest.mark.parametrize("error", [KeyboardInterrupt, InputError])
 @pytest.mark.parametrize("after", range(1, PARTS + 1))
 def test_the_same_call_does_the_rest_with_the_same_bits(
@@ -157,9 +158,7 @@ def test_the_same_call_does_the_rest_with_the_same_bits(
         advice = f"what is done is stored in {out}.partial: the same command resumes"
         assert str(found) == f"cut short ({advice})"
     described.clear()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", Note)
-        result = run(params, town, out)
+    result = run(params, town, out)
     assert described == names_from(town, BATCH * after)
     assert contents(tmp_path) == whole
     assert result.descriptors.tobytes() == np.load(out).tobytes()
@@ -397,6 +396,7 @@ def test_a_record_of_something_else_is_refused(tmp_path, record):
     assert read_descriptors(out, verify=False)[0] == ["a", "b"]
 
 
+@pytest.mark.filterwarnings("error::crisalad_jax.utils.output.Note")
 def test_a_set_without_a_record_is_read_with_a_note(tmp_path):
     """As numpy and hloc write them."""
     np.save(tmp_path / "d.npy", np.eye(2, dtype=np.float32))
@@ -410,6 +410,4 @@ def test_a_set_without_a_record_is_read_with_a_note(tmp_path):
         assert len(told) == 1
         assert names == ["a", "b"]
         np.testing.assert_array_equal(found, np.eye(2))
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            read_descriptors(tmp_path / name, verify=False)
+        read_descriptors(tmp_path / name, verify=False)

@@ -93,39 +93,36 @@ def test_a_sample_is_drawn_by_the_seed(tmp_path):
 
 def test_too_many_components_name_the_rank():
     rows = np.repeat(_descriptors(5, 12), 8, axis=0)
-    for some, rank in ((rows, 4), (rows[:10], 1)):
-        with pytest.raises(InputError, match=rf"^dim: found 6, expected at most {rank}, the rank"):
-            fit_pca(some, 6)
-    alike = np.ones((20, 12), np.float32)
-    with pytest.raises(InputError, match=r"^dim: found 2, expected at most 0, the rank"):
-        fit_pca(alike, 2)
-    with pytest.raises(InputError, match=r"^dim: found 13, expected 1 to 12, .* 40 descriptors"):
-        fit_pca(rows, 13)
-    with pytest.raises(InputError, match=r"^dim: found 12, expected 1 to 11"):
-        fit_pca(_descriptors(12, 30), 12)
-    with pytest.raises(InputError, match=r"^dim: found 0, expected 1 to 12"):
-        fit_pca(rows, 0)
+    for some, dim, words in (
+        (rows, 6, "at most 4, the rank"),
+        (rows[:10], 6, "at most 1, the rank"),
+        (np.ones((20, 12), np.float32), 2, "at most 0, the rank"),
+        (rows, 13, "1 to 12, .* 40 descriptors"),
+        (_descriptors(12, 30), 12, "1 to 11"),
+        (rows, 0, "1 to 12"),
+    ):
+        with pytest.raises(InputError, match=f"^dim: found {dim}, expected {words}"):
+            fit_pca(some, dim)
 
 
 def test_bad_descriptors_are_named():
     rows = _descriptors(30, 12)
-    with pytest.raises(InputError, match=r"^dim: found 1, expected 1 to 0, the highest rank"):
-        fit_pca(rows[:1], 1)
-    with pytest.raises(InputError, match=r"^descriptors: found shape \(30,\)"):
-        fit_pca(rows[:, 0], 1)
-    with pytest.raises(InputError, match=r"^seed: found -3, expected at least 0, and less than"):
-        fit_pca(rows, 1, samples=20, seed=-3)
-    found = fit_pca(rows, 3)
-    with pytest.raises(
-        InputError, match=r"^descriptors: found shape \(30, 5\), expected \(images, 12"
-    ):
-        found.apply(rows[:, :5])
+    found, broken = fit_pca(rows, 3), rows.copy()
     assert np.isnan(found.apply(np.stack([rows[0], found.mean]))[1]).all()
-    rows[17, 3] = np.nan
-    for call in (lambda: fit_pca(rows, 3), lambda: found.apply(rows)):
-        with pytest.raises(
-            InputError, match=r"^descriptors: row 17 is not finite, expected finite"
-        ):
+    broken[17, 3] = np.nan
+    not_finite = "^descriptors: row 17 is not finite, expected finite"
+    for call, words in (
+        (lambda: fit_pca(rows[:1], 1), "^dim: found 1, expected 1 to 0, the highest rank"),
+        (lambda: fit_pca(rows[:, 0], 1), r"^descriptors: found shape \(30,\)"),
+        (
+            lambda: fit_pca(rows, 1, samples=20, seed=-3),
+            "^seed: found -3, expected at least 0, and",
+        ),
+        (lambda: found.apply(rows[:, :5]), r"found shape \(30, 5\), expected \(images, 12"),
+        (lambda: fit_pca(broken, 3), not_finite),
+        (lambda: found.apply(broken), not_finite),
+    ):
+        with pytest.raises(InputError, match=words):
             call()
 
 
@@ -172,8 +169,7 @@ def test_files_of_something_else_are_named(tmp_path):
 
 
 def test_components_that_changed_are_refused_unless_they_are_not_verified(tmp_path):
-    found = fit_pca(_descriptors(30, 12), 5)
-    path = tmp_path / "pca.safetensors"
+    found, path = fit_pca(_descriptors(30, 12), 5), tmp_path / "pca.safetensors"
     save_pca(path, found)
     data = bytearray(path.read_bytes())
     place = bytes(data).index(found.mean.tobytes())

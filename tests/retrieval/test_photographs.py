@@ -133,41 +133,22 @@ def test_descriptors_of_all_sizes_in_order(folder: pathlib.Path, tmp_path: pathl
     )
     # Float32 rounding: other images stand beside each.
     close = {"atol": 2e-6}
-    out = tmp_path / "out.npy"
-    found = extract(Model(params, config), folder, out, reading=Reading(batch_size=2, quiet=True))
+    out, model, two = tmp_path / "out.npy", Model(params, config), Reading(batch_size=2, quiet=True)
+    found = extract(model, folder, out, reading=two)
     np.testing.assert_allclose(found.descriptors, expected, **close)
     np.testing.assert_allclose(np.load(out), expected, **close)
 
     place = tmp_path / "map"
-    index(
-        Model(params, config),
-        folder,
-        place,
-        weights=weights,
-        reading=Reading(batch_size=2, quiet=True),
-    )
-    again = index(
-        Model(params, config), folder, place, weights=weights, reading=Reading(quiet=True)
-    )
+    index(model, folder, place, weights=weights, reading=two)
+    again = index(model, folder, place, weights=weights, reading=two)
     assert (again.added, again.there) == (0, len(SHAPES))
+    fixed = Model(params, config.resized(None, ["fixed"]))
     with pytest.raises(InputError, match=r"found images at 42 x 56, .* expected native size, "):
-        index(
-            Model(params, config.resized(None, ["fixed"])),
-            folder,
-            place,
-            weights=weights,
-            reading=Reading(quiet=True),
-        )
+        index(fixed, folder, place, weights=weights, reading=two)
     with Map.open(place) as places:
         assert places.summary()["resize"] == config.images_in_words
         np.testing.assert_allclose(np.concatenate(list(places.descriptors)), expected, **close)
-        answers = query(
-            places,
-            paths_in(folder)[2:4],
-            model=Model(params, places.config),
-            k=1,
-            reading=Reading(batch_size=2, quiet=True),
-        )
+        answers = query(places, paths_in(folder)[2:4], k=1, reading=two)
     assert answers.neighbours.indices.ravel().tolist() == [2, 3]
 
 

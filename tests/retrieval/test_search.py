@@ -1,6 +1,7 @@
 """Search against a float64 stable argsort, and against faiss."""
 
 import sys
+import unittest.mock
 
 import faiss
 import hypothesis
@@ -11,8 +12,8 @@ import pytest
 
 from crisalad_jax.retrieval import neighbours
 from crisalad_jax.retrieval import search as retrieval
-from crisalad_jax.retrieval.chunks import as_sides
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.target import GPU
 from tests.utils.test_compiler import in_a_program
 
 
@@ -51,7 +52,8 @@ def _by_devices(
     database: np.ndarray, queries: np.ndarray, k: int, *, chunk: int = 4096
 ) -> retrieval.Neighbours:
     """As on an accelerator; a CPU leaves it to numpy."""
-    return retrieval._search(*as_sides(database, queries), k, chunk, on_host=False)
+    with unittest.mock.patch.object(retrieval, "target", return_value=GPU):
+        return retrieval.search(database, queries, k, chunk=chunk)
 
 
 BOTH_WAYS = pytest.mark.parametrize(
@@ -133,20 +135,15 @@ def test_small_integers_are_ranked_exactly(search, count, queries, k, chunk, see
     np.testing.assert_array_equal(found.similarities, similarities)
 
 
-def test_search_reads_a_memory_map_of_half_floats(tmp_path):
-    database, queries = _random_unit(8, 70, 12).astype(np.float16), _random_unit(9, 4, 12)
+@pytest.mark.parametrize(
+    ("kind", "in_a_file"), [(np.float16, np.float16), (ml_dtypes.bfloat16, "V2")]
+)
+def test_search_reads_a_memory_map_of_half_floats(tmp_path, kind, in_a_file):
+    """A .npy file has no name for bfloat16: it comes back as two bytes each."""
+    database, queries = _random_unit(8, 70, 12).astype(kind), _random_unit(9, 4, 12)
     np.save(tmp_path / "database.npy", database)
     mapped = np.load(tmp_path / "database.npy", mmap_mode="r")
-    found = retrieval.search(mapped, queries, 6, chunk=32)
-    _assert_ranked(found, database, queries, 6)
-
-
-def test_search_reads_bfloat16_as_a_npy_file_holds_it(tmp_path):
-    """Which names no such type: it comes back as two bytes each."""
-    database, queries = _random_unit(8, 70, 12).astype(ml_dtypes.bfloat16), _random_unit(9, 4, 12)
-    np.save(tmp_path / "database.npy", database)
-    mapped = np.load(tmp_path / "database.npy", mmap_mode="r")
-    assert mapped.dtype == np.dtype("V2")
+    assert mapped.dtype == np.dtype(in_a_file)
     found = retrieval.search(mapped, queries, 6, chunk=32)
     _assert_ranked(found, database, queries, 6)
     again = retrieval.search(database, queries, 6)
@@ -212,13 +209,13 @@ _ON_DEVICES = """
 import sys
 import jax, numpy as np
 from crisalad_jax.retrieval import search as retrieval
+from crisalad_jax.utils.target import GPU
 assert len(jax.local_devices()) == int(sys.argv[2])
+retrieval.target = lambda: GPU
 arrays = np.load(sys.argv[1])
 for name, (k, chunk) in {"some": (20, 300), "tiny": (3, 1), "all": (700, 4096)}.items():
     # Which a CPU leaves to numpy.
-    found = retrieval._search(
-        arrays["database"], arrays["queries"], k, chunk, on_host=False
-    )
+    found = retrieval.search(arrays["database"], arrays["queries"], k, chunk=chunk)
     np.savez(f"{sys.argv[3]}-{name}.npz", *found)
 """
 

@@ -81,9 +81,15 @@ def test_windows_that_mean_nothing_are_refused():
     check_window(alone, 1)
 
 
-def test_components_shorten_what_is_described(town):
+def test_components_shorten_what_is_described(town, tmp_path):
+    """Also of a batch without a readable image."""
     components = fit_pca(town.expected, 4)
-    stream = described(town.describer, town.paths, READING, window=WINDOW, components=components)
-    found = np.concatenate([part.descriptors for part in stream])
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"no picture")
+    paths, skips = [broken] * BATCH + town.paths, dataclasses.replace(READING, on_bad_image="skip")
+    stream = described(town.describer, paths, skips, window=WINDOW, components=components)
+    parts = [part.descriptors for part in stream]
+    assert [part.shape for part in parts] == [(0, 4), (4, 4), (3, 4)]
+    found = np.concatenate(parts)
     # As above, times what unit length gives back of a vector that lost most of its own.
     np.testing.assert_allclose(found, components.apply(town.expected), atol=10 * ROUNDING)

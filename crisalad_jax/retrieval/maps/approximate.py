@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 import numpy as np
 
 from crisalad_jax.config.checks import choose
-from crisalad_jax.retrieval.chunks import sample
+from crisalad_jax.retrieval.chunks import Queries, sample
 from crisalad_jax.retrieval.maps.file_store import FileStore
-from crisalad_jax.retrieval.neighbours import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours, similarities_of
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
-from crisalad_jax.utils.shapes import Float32
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 if TYPE_CHECKING:
@@ -43,16 +42,15 @@ Additions = Sequence[tuple[int, int, str]]
 
 
 class Approximate(NamedTuple):
-    """An approximate search of a map's descriptors."""
+    """An approximate search of a map's descriptors, which are in files."""
 
     kind: Literal["hnsw", "ivf-pq"]
     index: "Index"
+    store: FileStore
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
 
-    def search(
-        self, store: FileStore, queries: Float32[np.ndarray, "q d"], k: int, count: int
-    ) -> Neighbours:
+    def search(self, queries: Queries, k: int, count: int) -> Neighbours:
         """Find the k most similar of `count` descriptors: candidates, ranked exactly.
 
         Queries with fewer than k candidates are searched exactly.
@@ -62,32 +60,36 @@ class Approximate(NamedTuple):
         """
         each, least = _CANDIDATES[self.kind]
         numbers = self.index.search(queries, min(count, max(least, each * k))).indices
-        similarities = store.similarities(queries, np.maximum(numbers, 0))
-        similarities[numbers < 0] = -np.inf
+        query, found = np.nonzero(numbers >= 0)
+        similarities = np.full(numbers.shape, -np.inf, np.float32)
+        similarities[query, found] = similarities_of(
+            queries, query, numbers[query, found], self.store.rows
+        )
         numbers, similarities = (
             part[:, :k] for part in Neighbours(numbers, similarities).in_order()
         )
         few = np.flatnonzero(numbers[:, -1] < 0)
         if few.size:
-            numbers[few], similarities[few] = store.search(queries[few], k, count)
+            numbers[few], similarities[few] = self.store.search(queries[few], k, count)
         return Neighbours(numbers, similarities)
 
 
 def open_approximate(
-    folder: pathlib.Path, additions: Additions, *, verify: bool
+    folder: pathlib.Path, segments: Segments, *, verify: bool
 ) -> Approximate | None:
     """Open the approximate search of the map in `folder`; None where it has none of its images.
 
     Raises:
         InputError: it is damaged, or changed where `verify` asks for that.
     """
-    path = _current(folder, additions)
+    path = _current(folder, segments.spans)
     if path is None:
         return None
     from crisalad_jax.retrieval.faiss_index import load_index
 
     index = load_index(path, verify=verify)
-    return Approximate(index.kind, index, float(_record(path)["recall"]))
+    recall = float(_record(path)["recall"])
+    return Approximate(index.kind, index, cast(FileStore, segments.store), recall)
 
 
 def indexed_images(folder: pathlib.Path) -> list[tuple[pathlib.Path, int]]:
@@ -137,17 +139,17 @@ def build_approximate(
         return None
     path = folder / FOLDER / f"{kind}-{_digest(segments.spans)}.index"
     if path.exists():
-        return open_approximate(folder, segments.spans, verify=True)
+        return open_approximate(folder, segments, verify=True)
     from crisalad_jax.retrieval.faiss_index import build, recall_against_exact, save_index
 
     count, store = len(segments), cast(FileStore, segments.store)
     index = build(cast(Any, kind), segments.blocks, seed=_SEED, quiet=quiet)
-    built = Approximate(index.kind, index, 0.0)
+    built = Approximate(index.kind, index, store, 0.0)
     places = sample(count, min(SAMPLE, count), _SEED)
     k = min(NEIGHBOURS + 1, count)
     queries = store.rows(places).astype(np.float32)
-    sides = built.search(store, queries, k, count), store.search(queries, k, count)
-    found, exact = (_others(places, side.indices) for side in sides)
+    sides = (each.search(queries, k, count).indices for each in (built, store))
+    found, exact = (_others(places, side) for side in sides)
     built = built._replace(recall=recall_against_exact(found, exact) if exact.size else 1.0)
     with made_folder(path.parent):
         remove_temporaries(path.parent)

@@ -232,29 +232,22 @@ def index(
         components = read_components(out, metadata)
     if search is not None:
         check_search(search, metadata.store)
-    work = _Indexing(
-        describer=describer,
-        source=source,
-        positions=known,
-        by_exif=table is None and not known.of,
-        metadata=metadata,
-        components=components,
-        search=search,
-        reading=reading.fitted(len(source.paths)),
-    )
+    if table is None and not known.of:
+        known = None
+    fitted = reading.fitted(len(source.paths))
+    work = _Indexing(describer, source, known, metadata, components, search, fitted)
     result = work.alone(out) if part is None else work.share(out, part)
     return result if table is not None else result._replace(stay=0)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class _Indexing:
     """Images to be described, and the map that they are appended to."""
 
     describer: Describer
     source: ImageSource
-    positions: Positions
-    by_exif: bool
-    """Whether the images' EXIF data says where they were taken."""
+    positions: Positions | None
+    """Where they were taken; None is what the images' EXIF data says."""
     metadata: MapMetadata
     components: Pca | None
     search: str | None
@@ -272,7 +265,7 @@ class _Indexing:
 
     def _describe(self, target: Map, source: ImageSource, whole: Map) -> Indexed:
         """Append images to `target`; those that `whole` has are not read."""
-        positions = _by_exif(whole, source) if self.by_exif else self.positions
+        positions = _by_exif(whole, source) if self.positions is None else self.positions
         return index_images(target, self.describer, source, positions, self.reading)
 
     def _finish(self, target: Map) -> float | None:
@@ -288,43 +281,40 @@ class _Indexing:
         Raises:
             InputError: a share of other settings is there; what `index_images` and `_finish` raise.
         """
-        metadata, source = self.metadata, self.source
+        metadata, source, known = self.metadata, self.source, self.positions or utm_positions(())
         settings = {name: getattr(metadata, name) for name in ("dtype", "pca", "config")}
         settings |= {"batch_size": self.reading.batch_size, "digest": self.describer.digest}
         shares = Shares(out / SHARES, part, digest_of(source.names, settings))
         mine = part.of(len(source.paths), self.reading.batch_size)
-        own = list(zip(source.names, source.paths, strict=True))[mine]
+        own = source._replace(names=source.names[mine], paths=source.paths[mine])
         with contextlib.ExitStack() as stack:
             whole = None
             if has_images(out):
                 whole = stack.enter_context(Map.open(out, verify=False, calibrated=False))
-                whole.fitted(source.names, self.positions)
-                new = set(_new_images(whole, source)[0])
-                own = [each for each in own if each[0] in new]
-            result = _so_far(whole, metadata, source, self.positions)
+                whole.fitted(source.names, known)
+                names, _, paths = _new_images(whole, own)
+                own = own._replace(names=names, paths=paths)
+            result = _so_far(whole, metadata, source, known)
             if result.there == len(source.names) and not shares.folder.exists():
                 return result
             if shares.result(part.index) is None:
-                named = source._replace(names=[n for n, _ in own], paths=[p for _, p in own])
                 own_metadata = dataclasses.replace(metadata, store="files")
                 with open_for_appending(shares.own, own_metadata, self.components) as target:
-                    unreadable = self._describe(target, named, whole or target).unreadable
+                    unreadable = self._describe(target, own, whole or target).unreadable
                     result = _with_added(result, target, 0)
                 shares.finish({"unreadable": unreadable})
-        if left := shares.left():
-            return result._replace(shares_left=left)
-        with shares.joining() as results:
+        with shares.joining() as (results, waiting):
             if results is None:
-                return result._replace(joined_elsewhere=True)
+                return result._replace(**waiting)
             bar = progress_bar("joining", part.count, "shares", quiet=self.reading.quiet)
             with open_for_appending(out, metadata, self.components) as target, bar as joining:
-                known = len(target)
+                before = len(target)
                 for index in range(part.count):
                     _append_share(target, shares.path(index))
                     joining.advance(1)
                 recall = self._finish(target)
         unreadable = [name for each in results for name in each["unreadable"]]
-        return _with_added(result, target, known)._replace(unreadable=unreadable, recall=recall)
+        return _with_added(result, target, before)._replace(unreadable=unreadable, recall=recall)
 
 
 def _append_share(target: Map, folder: pathlib.Path) -> None:

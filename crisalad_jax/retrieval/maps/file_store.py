@@ -7,16 +7,11 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from crisalad_jax.retrieval.chunks import Block, blocks, gathered, joined
-from crisalad_jax.retrieval.neighbours import (
-    QUERY_CHUNK,
-    Neighbours,
-    nearest,
-    similarities_of,
-)
+from crisalad_jax.retrieval.chunks import Block, Descriptors, Queries, blocks, gathered, joined
+from crisalad_jax.retrieval.neighbours import QUERY_CHUNK, Neighbours, nearest
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source, npy_header, write_npy
-from crisalad_jax.utils.shapes import Float, Float32, Int64
+from crisalad_jax.utils.shapes import Float, Int64
 
 _BLOCK = 2**23
 """Largest size of a block of descriptors, and of its products with some queries, in numbers."""
@@ -36,13 +31,12 @@ class FileStore:
         self._folder, self._length, self._dtype = folder, length, np.dtype(dtype)
         self._counts: dict[int, int] = {}
         """Number of descriptors in each file, by the number of its first, in ascending order."""
-        self._mapped: dict[int, np.ndarray] = {}
-        """Files that rows were read of one by one."""
+        self._mapped = functools.lru_cache(_MAPPED)(self._open)
 
     def _path(self, first: int) -> pathlib.Path:
         return self._folder / f"{first:010d}.npy"
 
-    def add(self, first: int, descriptors: Float[np.ndarray, "n d"]) -> None:
+    def add(self, first: int, descriptors: Descriptors) -> None:
         """Write descriptors to a file; see `Store.add`."""
         path = self._path(first)
         with atomic_path(path, durable=True) as temporary:
@@ -59,7 +53,7 @@ class FileStore:
         """Read the file of one addition; see `Store.read`."""
         return np.array(self._open(first))
 
-    def _open(self, first: int) -> Float[np.ndarray, "n d"]:
+    def _open(self, first: int) -> Descriptors:
         path = self._path(first)
         shape = (self._counts[first], self._length)
         check_source(path, "a file of a map's descriptors")
@@ -72,9 +66,10 @@ class FileStore:
                 f"{path}: found other bytes than of {self._dtype} {shape}, expected the whole .npy "
                 "file that was written"
             )
-        return np.memmap(path, self._dtype, "r", len(header), shape)
+        # Without what a `memmap` does at each indexing.
+        return np.memmap(path, self._dtype, "r", len(header), shape).view(np.ndarray)
 
-    def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
+    def search(self, queries: Queries, k: int, count: int) -> Neighbours:
         """Find the k most similar descriptors of each query; see `Store.search`."""
         size = max(1, _BLOCK // max(self._length, min(len(queries), QUERY_CHUNK)))
 
@@ -85,20 +80,7 @@ class FileStore:
         read_rows = functools.partial(self.rows, release=True)
         return nearest(lambda: joined(files(), size), queries, k, read_rows, 2 * size)
 
-    def similarities(
-        self, queries: Float32[np.ndarray, "q d"], numbers: Int64[np.ndarray, "q k"]
-    ) -> Float32[np.ndarray, "q k"]:
-        """Compute the exact similarities of queries to descriptors of these numbers.
-
-        Raises:
-            InputError: a file is damaged or gone.
-        """
-        query = np.repeat(np.arange(len(queries)), numbers.shape[1])
-        return similarities_of(queries, query, numbers.ravel(), self.rows).reshape(numbers.shape)
-
-    def rows(
-        self, numbers: Int64[np.ndarray, " n"], *, release: bool = False
-    ) -> Float[np.ndarray, "n d"]:
+    def rows(self, numbers: Int64[np.ndarray, " n"], *, release: bool = False) -> Descriptors:
         """Read the descriptors of these numbers; their files stay mapped into memory.
 
         Args:
@@ -113,15 +95,10 @@ class FileStore:
         files = firsts[np.searchsorted(firsts, numbers, side="right") - 1]
         for first in sorted(set(files.tolist())):  # `np.unique` would import masked arrays
             places = np.flatnonzero(files == first)
-            mapped = self._mapped.get(first)
-            if mapped is None:
-                if len(self._mapped) >= _MAPPED:
-                    self._mapped.clear()
-                mapped = self._mapped[first] = self._open(first).view(np.ndarray)
-            here = numbers[places] - first
+            mapped, here = self._mapped(first), numbers[places] - first
             rows[places] = gathered(mapped, here) if release else mapped[here]
         return rows
 
     def close(self) -> None:
         """Let go of files."""
-        self._mapped.clear()
+        self._mapped.cache_clear()

@@ -26,7 +26,7 @@ from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import Positions
-from crisalad_jax.retrieval.chunks import as_unit_rows
+from crisalad_jax.retrieval.chunks import Descriptors, Queries, as_unit_rows
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import (
     Approximate,
@@ -37,7 +37,6 @@ from crisalad_jax.retrieval.maps.approximate import (
 )
 from crisalad_jax.retrieval.maps.calibration import Calibration, read_calibration
 from crisalad_jax.retrieval.maps.contents import MapAddition, contents, with_addition
-from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.metadata import (
     COMPONENTS,
     METADATA,
@@ -58,7 +57,7 @@ from crisalad_jax.retrieval.segments import Segments, write_record
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.output import warn
-from crisalad_jax.utils.shapes import Float, Float32, Int64
+from crisalad_jax.utils.shapes import Float32, Int64
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 if TYPE_CHECKING:  # a map is searched without JAX
@@ -186,7 +185,7 @@ class Map:
             opened.calibration = read_calibration(folder, metadata.model)
         if verify and metadata.store == "files":
             opened.verify()
-        opened._approximate = open_approximate(folder, opened._segments.spans, verify=verify)
+        opened._approximate = open_approximate(folder, opened._segments, verify=verify)
         return opened
 
     @classmethod
@@ -260,9 +259,7 @@ class Map:
         self.axes, self.zone = self.axes or axes, self.zone or zone
         self.additions = with_addition(self.additions, added, root, len(images))
 
-    def search(
-        self, queries: Float32[np.ndarray, "q d"], k: int, *, exact: bool = False
-    ) -> Neighbours:
+    def search(self, queries: Queries, k: int, *, exact: bool = False) -> Neighbours:
         """Find the k most similar images of each query, best first; all where there are fewer.
 
         Search is exact, by inner product; of equal similarities the earlier image stands first.
@@ -281,9 +278,8 @@ class Map:
         check_count("k", k)
         queries = self._unit_rows("queries", queries)
         k = min(k, len(self))
-        store = self._segments.store
-        if self._approximate is not None and isinstance(store, FileStore) and not exact:
-            return self._approximate.search(store, queries, k, len(self))
+        if self._approximate is not None and not exact:
+            return self._approximate.search(queries, k, len(self))
         if self._tells_stale and not exact:
             self._tells_stale = False
             if (kind := self.stale_search) is not None:
@@ -291,7 +287,7 @@ class Map:
                     f"{self.folder}: found an approximate search of fewer or other images; the map "
                     f"is searched exactly; `crisalad index --search {kind}` builds it anew"
                 )
-        return store.search(queries, k, len(self))
+        return self._segments.store.search(queries, k, len(self))
 
     @property
     def search_kind(self) -> str:
@@ -372,7 +368,7 @@ class Map:
         found = self.search(self.shorten(descriptor), k)
         return ranked(self.images, found.indices[0], found.similarities[0])
 
-    def similarities(self, queries: Float32[np.ndarray, "q d"]) -> Float32[np.ndarray, "q n"]:
+    def similarities(self, queries: Queries) -> Float32[np.ndarray, "q n"]:
         """Compute the similarities of queries to all images, in the order of the images.
 
         Args:
@@ -385,7 +381,7 @@ class Map:
         parts = [queries @ part.astype(np.float32, copy=False).T for part in self.descriptors]
         return np.concatenate(parts, axis=1)
 
-    def _unit_rows(self, name: str, rows: Float[np.ndarray, "n d"]) -> Float32[np.ndarray, "n d"]:
+    def _unit_rows(self, name: str, rows: Descriptors) -> Float32[np.ndarray, "n d"]:
         return as_unit_rows(rows, name, self.metadata.descriptor_length)
 
     def fitted(self, names: Iterable[str], positions: Positions | None) -> Positions | None:
@@ -403,7 +399,7 @@ class Map:
         self,
         names: Sequence[str],
         sizes: Sequence[int],
-        descriptors: Float[np.ndarray, "n d"],
+        descriptors: Descriptors,
         *,
         root: str,
         positions: Positions | None = None,
@@ -444,7 +440,7 @@ class Map:
         self._read_record(record, path)
 
     @property
-    def descriptors(self) -> Iterator[Float[np.ndarray, "n d"]]:
+    def descriptors(self) -> Iterator[Descriptors]:
         """Descriptors in order, one array for each addition."""
         return self._segments.blocks()
 
@@ -521,6 +517,7 @@ class Map:
             from crisalad_jax.nn.model import Model
 
             found = read_weights(file)
+            assert found.digest is not None  # a file of this package says it
             check_model(self.metadata, self.folder, found.digest, file)
             model = Model(found.params, self.config)
         else:
@@ -577,9 +574,7 @@ class Map:
 
 @contextlib.contextmanager
 def open_for_appending(
-    folder: str | os.PathLike[str],
-    metadata: MapMetadata,
-    components: Pca | None = None,
+    folder: str | os.PathLike[str], metadata: MapMetadata, components: Pca | None = None
 ) -> Iterator[Map]:
     """Open the map with this metadata to append to it, or make it, with its components.
 

@@ -8,7 +8,7 @@ import datetime
 import os
 import pathlib
 import uuid
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from crisalad_jax.checkpoints.runtime import read_header
 from crisalad_jax.checkpoints.starter import FILES, recorded, resolved
@@ -24,8 +24,6 @@ if TYPE_CHECKING:  # a map is searched without JAX
     from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.retrieval.describer import Describer
 
-FORMAT = 4
-"""Version of the format."""
 METADATA, SEGMENTS = "map.json", "segments"
 """Names of the metadata's file, and of the folder of additions."""
 COMPONENTS, SHARES = "pca.safetensors", "shares"
@@ -56,7 +54,8 @@ class MapMetadata:
     pca: str = ""
     """The `pca_hash` of the components that shorten its descriptors, and those of queries; "" is
     none."""
-    format: int = FORMAT
+    format: Literal[4] = 4
+    """Version of the format."""
 
     def __post_init__(self) -> None:
         """Check the store."""
@@ -127,14 +126,7 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
             )
         return None
     # Who edits the metadata removes its checksum. A changed key would be an unknown field.
-    value = read_json(path, "a map", sealed=False)
-    version = value.get("format") if isinstance(value, dict) else None
-    if version != FORMAT:
-        raise InputError(
-            f"{path}: found a map of format {version}, expected {FORMAT}: `crisalad index` into a "
-            "new folder makes one"
-        )
-    metadata = from_plain(MapMetadata, value, source=str(path))
+    metadata = from_plain(MapMetadata, read_json(path, "a map", sealed=False), source=str(path))
     return metadata if has_images(folder) else None
 
 

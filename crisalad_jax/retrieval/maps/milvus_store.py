@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from crisalad_jax.retrieval.chunks import Descriptors, Queries
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
-from crisalad_jax.utils.shapes import Float, Float32
+from crisalad_jax.utils.shapes import Float
 
 TOKEN = "CRISALAD_MILVUS_TOKEN"
 """The environment variable that holds a server's token, or its user:password."""
@@ -130,7 +131,7 @@ class MilvusStore:
             self._client.create_index(self._collection, self._flat())
             self._client.load_collection(self._collection)
 
-    def add(self, first: int, descriptors: Float[np.ndarray, "n d"]) -> None:
+    def add(self, first: int, descriptors: Descriptors) -> None:
         """Upsert descriptors by number; see `Store.add`."""
         rows = np.ascontiguousarray(descriptors, np.float32)
         with _one_line(self._address):
@@ -166,37 +167,32 @@ class MilvusStore:
             found |= {row["id"]: row["descriptor"] for row in part}
         return np.array([found[number] for number in range(first, first + count)], np.float32)
 
-    def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
+    def search(self, queries: Queries, k: int, count: int) -> Neighbours:
         """Find the k most similar descriptors of each query; see `Store.search`."""
         if k > _MOST:
             raise InputError(f"k: found {k}, expected at most {_MOST}, of which Milvus gives")
 
-        def ask(queries: Float32[np.ndarray, "q d"], k: int) -> Neighbours:
+        def ask(queries: Queries, k: int) -> Neighbours:
             # Answers are bounded too: 12 bytes for each neighbour, and 8 for its number again.
             size = max(1, min(self._rows, _MESSAGE_BYTES // (20 * k)))
-            parts = [
-                self._ask(queries[start : start + size], k, count)
-                for start in range(0, len(queries), size)
-            ]
-            return Neighbours(*map(np.concatenate, zip(*parts, strict=True)))
+            found: list[list[dict[str, Any]]] = []
+            with _one_line(self._address):
+                for start in range(0, len(queries), size):
+                    found += self._client.search(
+                        self._collection,
+                        data=list(queries[start : start + size]),
+                        limit=k,
+                        filter=f"id < {count}",
+                        # milvus-lite reads an empty list as all fields, descriptors included.
+                        output_fields=["id"],
+                        search_params={"metric_type": "IP"},
+                    )
+            return Neighbours(
+                np.array([[hit["id"] for hit in hits] for hits in found], np.int64),
+                np.array([[hit["distance"] for hit in hits] for hits in found], np.float32),
+            )
 
         return break_ties(ask, queries, k, min(count, _MOST))
-
-    def _ask(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
-        with _one_line(self._address):
-            answers = self._client.search(
-                self._collection,
-                data=list(queries),
-                limit=k,
-                filter=f"id < {count}",
-                # milvus-lite reads an empty list as all fields, descriptors included.
-                output_fields=["id"],
-                search_params={"metric_type": "IP"},
-            )
-        return Neighbours(
-            np.array([[hit["id"] for hit in hits] for hits in answers], np.int64),
-            np.array([[hit["distance"] for hit in hits] for hits in answers], np.float32),
-        )
 
     def close(self) -> None:
         """Disconnect; other processes may then open the file."""
@@ -209,10 +205,7 @@ class MilvusStore:
 
 
 def break_ties(
-    ask: Callable[[Float32[np.ndarray, "q d"], int], Neighbours],
-    queries: Float32[np.ndarray, "q d"],
-    k: int,
-    count: int,
+    ask: Callable[[Queries, int], Neighbours], queries: Queries, k: int, count: int
 ) -> Neighbours:
     """Search so that equal similarities are ordered by number, also at the k-th place.
 

@@ -20,7 +20,6 @@ from crisalad_jax.data.video import frame_time
 from crisalad_jax.retrieval.describe import (
     as_list,
     check_readable,
-    check_window,
     described_sources,
     joined,
     shown,
@@ -156,8 +155,6 @@ def query(
     paths = list(itertools.chain(*sources))
     check_rate_used(fps, paths)
     describer = places.describer(model, groupings=["single" if window == 1 else "window"])
-    if window != 1:
-        check_window(places.config, window)
     ask = asking(places, k, sequence, exact=exact)
     reading, components = reading.fitted(len(paths)), places.components
     stream = described_sources(describer, sources, reading, window=window, components=components)

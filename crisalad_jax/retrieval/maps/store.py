@@ -11,12 +11,13 @@ from typing import Protocol
 
 import numpy as np
 
+from crisalad_jax.retrieval.chunks import Descriptors, Queries
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.milvus_store import MilvusStore, check_address
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
-from crisalad_jax.utils.shapes import Float, Float32
+from crisalad_jax.utils.shapes import Float
 
 DTYPES = ("float32", "float16")
 """Types that descriptors may be stored as."""
@@ -26,7 +27,7 @@ _MILVUS = "milvus:"
 class Store(Protocol):
     """Descriptors by number. Each method raises InputError where the store is damaged or gone."""
 
-    def add(self, first: int, descriptors: Float[np.ndarray, "n d"]) -> None:
+    def add(self, first: int, descriptors: Descriptors) -> None:
         """Write descriptors as numbers `first` and on; they are durable once this returns."""
 
     def check(self, segments: Sequence[tuple[int, int]]) -> None:
@@ -36,7 +37,7 @@ class Store(Protocol):
         """Read the descriptors that were added together as numbers `first` and on."""
         ...
 
-    def search(self, queries: Float32[np.ndarray, "q d"], k: int, count: int) -> Neighbours:
+    def search(self, queries: Queries, k: int, count: int) -> Neighbours:
         """Find the k nearest of numbers below `count`, exactly, by inner product; 1 <= k <= count.
 
         Of equal similarities the lower number stands first, also at the k-th place.

@@ -52,10 +52,7 @@ class SequenceTracker:
         self._before: _Spot | None = None
 
     def answer(
-        self,
-        descriptors: Float32[np.ndarray, "frame d"],
-        k: int,
-        frames: Sequence[pathlib.Path],
+        self, descriptors: Float32[np.ndarray, "frame d"], k: int, frames: Sequence[pathlib.Path]
     ) -> "TrackResult":
         """Take the next frames into account, and rank the map's images at each of them.
 

@@ -12,16 +12,22 @@ from jaxtyping import Array, Float, Int
 from crisalad_jax.nn.aggregators.selavpr import SelaVpr, SelaVprConfig, local_features
 from crisalad_jax.nn.aggregators.transvpr import TransVpr, TransVprConfig, key_features
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, Images, extract_features
+from crisalad_jax.nn.model import AnyArray, Crisalad, Images, extract_features
 from crisalad_jax.utils import compiler
 
+Features = Float[np.ndarray, "*candidate feature dim"]
+"""Local features of an image, or of each of some candidates."""
+Scores = Float[np.ndarray, "candidate *part"]
+"""Scores of some candidates of a query: one of each, or one of each part."""
 INLIER_DISTANCE = 1.5
 """Largest distance of an inlier from where the homography maps it, in patches (public codes)."""
 _LEAST_MATCHES = 4
 """Number of matches that a homography needs."""
 
 
-def mutual_matches(query: Float[Array, "m d"], candidate: Float[Array, "n d"]) -> Int[Array, " m"]:
+def mutual_matches(
+    query: Float[AnyArray, "m d"], candidate: Float[AnyArray, "n d"]
+) -> Int[Array, " m"]:
     """Match patches that are each other's nearest: for each of the query's, the candidate's.
 
     The nearest patch has the largest inner product; of equal ones it is the first. The result is
@@ -81,7 +87,7 @@ def inliers(matches: Int[np.ndarray, " m"], grid: tuple[int, int]) -> int:
 
 @compiler.jit
 def _match_all(
-    query: Float[Array, "m d"], candidates: Float[Array, "candidate n d"]
+    query: Float[AnyArray, "m d"], candidates: Float[AnyArray, "candidate n d"]
 ) -> Int[Array, "candidate m"]:
     # One after the other: the products of a pair of SelaVPR's images of 224 x 224 are 55 MB.
     return jax.lax.map(functools.partial(mutual_matches, query), candidates)
@@ -104,13 +110,9 @@ def describe_selavpr(
     return local.reshape(len(local), *selavpr_shape(config)).astype(jnp.float16)
 
 
-def count_matches(
-    query: Float[np.ndarray, "feature dim"],
-    candidates: Float[np.ndarray, "candidate feature dim"],
-    config: ModelConfig,
-) -> Float[np.ndarray, " candidate"]:
+def count_matches(query: Features, candidates: Features, config: ModelConfig) -> Scores:
     """Count the mutual matches (SelaVPR, section 3.4)."""
-    matches = np.asarray(_match_all(jnp.asarray(query), jnp.asarray(candidates)))
+    matches = np.asarray(_match_all(query, candidates))
     return (matches >= 0).sum(axis=1).astype(np.float32)
 
 
@@ -130,11 +132,7 @@ def describe_transvpr(
     return key_features(params.aggregator, patches, config.aggregator.levels).astype(jnp.float16)
 
 
-def count_inliers(
-    query: Float[np.ndarray, "patch dim"],
-    candidates: Float[np.ndarray, "candidate patch dim"],
-    config: ModelConfig,
-) -> Float[np.ndarray, " candidate"]:
+def count_inliers(query: Features, candidates: Features, config: ModelConfig) -> Scores:
     """Count the mutual matches that are inliers of RANSAC (TransVPR, section 3.3)."""
-    matches = np.asarray(_match_all(jnp.asarray(query), jnp.asarray(candidates)))
+    matches = np.asarray(_match_all(query, candidates))
     return np.array([inliers(each, config.grid) for each in matches], np.float32)

@@ -14,9 +14,15 @@ from jaxtyping import Array, Float, Int
 from crisalad_jax.nn.aggregators.vlad import NetVlad, shares
 from crisalad_jax.nn.config import ModelConfig, check_unit_length
 from crisalad_jax.nn.layers import at_least_float32, l2_normalise
-from crisalad_jax.nn.model import Crisalad, Images, unit_features
+from crisalad_jax.nn.model import AnyArray, Crisalad, Images, unit_features
 from crisalad_jax.nn.projection import project
-from crisalad_jax.retrieval.reranking.matching import inliers, mutual_matches, spatial_score
+from crisalad_jax.retrieval.reranking.matching import (
+    Features,
+    Scores,
+    inliers,
+    mutual_matches,
+    spatial_score,
+)
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.errors import InputError
 
@@ -112,12 +118,14 @@ def describe(
 
 
 @functools.partial(compiler.jit, static_argnames="config")
-def _spatial_scores(
-    query: Float[Array, "window dim"],
-    candidates: Float[Array, "candidate window dim"],
+def spatial_scores(
+    query: Float[AnyArray, "window dim"],
+    candidates: Float[AnyArray, "candidate window dim"],
     config: ModelConfig,
 ) -> Float[Array, "candidate size"]:
-    def of_one(candidate: Array) -> Array:
+    """Compute the rapid spatial score of each size of windows (paper section 3.4)."""
+
+    def of_one(candidate: AnyArray) -> Array:
         matched = [(mutual_matches(query[w], candidate[w]), grid) for w, grid in _parts(config)]
         return jnp.stack([spatial_score(matches, grid) for matches, grid in matched])
 
@@ -126,35 +134,22 @@ def _spatial_scores(
 
 @functools.partial(compiler.jit, static_argnames="config")
 def _matches_to(
-    query: Float[Array, "window dim"],
-    candidates: Float[Array, "candidate window dim"],
+    query: Float[AnyArray, "window dim"],
+    candidates: Float[AnyArray, "candidate window dim"],
     config: ModelConfig,
 ) -> list[Int[Array, "candidate part"]]:
-    def of_one(candidate: Array) -> list[Array]:
+    def of_one(candidate: AnyArray) -> list[Array]:
         return [mutual_matches(candidate[w], query[w]) for w, _ in _parts(config)]
 
     return jax.vmap(of_one)(candidates)
 
 
-def spatial_scores(
-    query: Float[np.ndarray, "window dim"],
-    candidates: Float[np.ndarray, "candidate window dim"],
-    config: ModelConfig,
-) -> Float[np.ndarray, "candidate size"]:
-    """Compute the rapid spatial score of each size of windows (paper section 3.4)."""
-    return np.asarray(_spatial_scores(jnp.asarray(query), jnp.asarray(candidates), config))
-
-
-def inlier_scores(
-    query: Float[np.ndarray, "window dim"],
-    candidates: Float[np.ndarray, "candidate window dim"],
-    config: ModelConfig,
-) -> Float[np.ndarray, "candidate size"]:
+def inlier_scores(query: Features, candidates: Features, config: ModelConfig) -> Scores:
     """Compute the share of windows of each size that RANSAC calls inliers (paper section 3.4).
 
     As in the authors' code the homography maps the candidate's windows to the query's.
     """
-    by_size = jax.device_get(_matches_to(jnp.asarray(query), jnp.asarray(candidates), config))
+    by_size = jax.device_get(_matches_to(query, candidates, config))
     scores = [
         [inliers(each, grid) / len(each) for each in matches]
         for matches, (_, grid) in zip(by_size, _parts(config), strict=True)
@@ -171,16 +166,12 @@ def _parts(config: ModelConfig) -> list[tuple[slice, Grid]]:
     ]
 
 
-def weighted_sum(
-    scores: Float[np.ndarray, "candidate size"], config: ModelConfig
-) -> Float[np.ndarray, " candidate"]:
+def weighted_sum(scores: Scores, config: ModelConfig) -> Scores:
     """Sum the scores of all sizes, weighted (paper Eq. 6)."""
     return scores @ np.array([weight for _, weight, _ in windows_of(config)])
 
 
-def standardised_sum(
-    scores: Float[np.ndarray, "candidate size"], config: ModelConfig
-) -> Float[np.ndarray, " candidate"]:
+def standardised_sum(scores: Scores, config: ModelConfig) -> Scores:
     """Standardise each size's scores over a query's candidates, then sum them, weighted.
 
     The authors' code does so before Eq. 6. A size at which all score the same adds 0.

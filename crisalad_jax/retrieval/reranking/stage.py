@@ -34,7 +34,7 @@ class Method:
     """Returns the number of an image's features, and their length."""
     describe: Callable[[Crisalad, Any, ModelConfig], Any]
     """Computes the features of a batch of images."""
-    score: Callable[[np.ndarray, np.ndarray, ModelConfig], Float[np.ndarray, "candidate *part"]]
+    score: Callable[[Any, Any, ModelConfig], Any]
     """Scores any number of a query's candidates, each by itself: one score, or one of each part."""
     fuse: Callable[[np.ndarray, ModelConfig], Float[np.ndarray, " candidate"]] = (
         lambda scores, config: scores
@@ -256,11 +256,9 @@ class Reranker:
             part = new[start : start + step]
             # The last part is padded, so that all have one shape and compile once.
             filled = np.resize(part, step)
-            values = self._method.score(
-                self._queries.features[query], self._database.features[filled], self._config
-            )
-            self._scores |= {
-                (query, int(c)): s for c, s in zip(part, values[: len(part)].tolist(), strict=True)
-            }
+            ours, theirs = self._queries.features[query], self._database.features[filled]
+            found = self._method.score(np.asarray(ours), np.asarray(theirs), self._config)
+            values = np.asarray(found)[: len(part)]
+            self._scores |= {(query, int(c)): s for c, s in zip(part, values.tolist(), strict=True)}
         scores = np.array([self._scores[query, int(c)] for c in candidates])
         return self._method.fuse(scores, self._config).astype(np.float32)

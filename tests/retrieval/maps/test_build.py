@@ -3,7 +3,6 @@
 import dataclasses
 import pathlib
 import shutil
-import warnings
 
 import numpy as np
 import pyproj
@@ -12,18 +11,15 @@ import pytest
 import crisalad_jax.retrieval.maps.build
 from crisalad_jax.data.images import list_images
 from crisalad_jax.data.positions import Positions, utm_positions
-from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import ImageSource
 from crisalad_jax.nn.model import Model
-from crisalad_jax.retrieval.describe import described
 from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.maps.build import Indexed, index_images
 from crisalad_jax.retrieval.maps.build import index as index_source
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import new_metadata
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.output import Note
-from tests.conftest import BATCH, MODEL, describe_single, read_options
+from tests.conftest import MODEL, read_options
 
 
 @pytest.fixture
@@ -51,17 +47,6 @@ def open_or_new(folder: pathlib.Path, metadata):
 
 def descriptors_of(target: Map) -> np.ndarray:
     return np.concatenate(list(target.descriptors))
-
-
-def test_each_image_is_described_alone(params, database):
-    paths = list_images(database)
-    assert len(paths) % BATCH
-    reading = Reading(batch_size=BATCH)
-    parts = list(described(describer_of(Model(params, MODEL)), paths, reading))
-    assert [part.indices.tolist() for part in parts] == [[0, 1, 2, 3], [4, 5, 6]]
-    found = np.concatenate([part.descriptors for part in parts])
-    # Which test_evaluation compares with batches of one.
-    np.testing.assert_array_equal(found, describe_single(Model(params, MODEL), paths))
 
 
 @pytest.mark.parametrize("segment", [1, 256])
@@ -104,7 +89,7 @@ def test_a_missing_image_of_a_list_is_left_out(params, database, tmp_path, share
     table.write_text("name,x,y\n" + "".join(f"{name},1,2\n" for name in ["none.jpg", *names]))
     model, options = Model(params, MODEL), {"weights": shared / "weights.safetensors"}
     out = tmp_path / "map"
-    with pytest.raises(InputError, match=r"line 2: .*none.jpg: found no such file"):
+    with pytest.raises(InputError, match=r"table.csv: .*none.jpg: found no such file"):
         index_source(model, table, out, **options, **read_options({}))
     assert not out.exists()
     result = index_source(model, table, out, **options, **read_options({"on_bad_image": "skip"}))
@@ -185,6 +170,7 @@ def test_a_folder_of_unreadable_images_makes_no_map(params, tmp_path):
     assert not (tmp_path / "map").exists()
 
 
+@pytest.mark.filterwarnings("error::crisalad_jax.utils.output.Note")
 def test_images_of_several_zones_make_a_map_of_degrees(params, database, tmp_path):
     """Zones 31 and 32 at their edge: both are near 48.85, 6.0, whatever their numbers."""
     names = ("@0719985.00@5415018.00@31@U@.png", "@0280015.00@5415018.00@32@U@.png")
@@ -194,9 +180,7 @@ def test_images_of_several_zones_make_a_map_of_degrees(params, database, tmp_pat
     with pytest.warns(UserWarning, match="of several zones of UTM: positions become lat, lon"):
         first = index_folder(tmp_path / "map", params, tmp_path / "images")
     assert (first.added, first.positions) == (2, 2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", Note)  # that is known by now
-        again = index_folder(tmp_path / "map", params, tmp_path / "images")
+    again = index_folder(tmp_path / "map", params, tmp_path / "images")
     assert (again.added, again.there) == (0, 2)
     with Map.open(tmp_path / "map") as places:
         assert places.axes == ("lat", "lon")

@@ -50,22 +50,9 @@ def remembered(folder: pathlib.Path, **changes) -> Calibration:
     """A calibration that was never measured, in the map."""
     with Map.open(folder) as places:
         model = places.metadata.model
-    calibration = dataclasses.replace(
-        Calibration(
-            min_similarity=0.5,
-            precision=0.9,
-            answered=4,
-            right=4,
-            queries=5,
-            unknown=1,
-            unknown_answered=0,
-            database=7,
-            benchmark="town",
-            rule="25 m",
-            model=model,
-        ),
-        **changes,
-    )
+    counts = {"answered": 4, "right": 4, "queries": 5, "unknown": 1, "unknown_answered": 0}
+    known = {"min_similarity": 0.5, "precision": 0.9, "benchmark": "town", "rule": "25 m"}
+    calibration = Calibration(**counts | known | {"database": 7, "model": model} | changes)
     write_calibration(folder, calibration)
     return calibration
 
@@ -116,9 +103,7 @@ def test_a_precision_out_of_reach_leaves_what_was_there(folder, params, benchmar
 def test_another_model_calibrates_nothing(folder, benchmark):
     changed = jax.tree.map(lambda leaf: np.asarray(leaf) * 1.5, random_params(MODEL))
     with Map.open(folder) as places, pytest.raises(InputError, match="but the given model is"):
-        calibrate(
-            places, benchmark, model=Model(changed, places.config), reading=Reading(quiet=True)
-        )
+        calibrate(places, benchmark, model=Model(changed, places.config), reading=QUIET)
     assert not (folder / CALIBRATION).exists()
 
 
@@ -150,9 +135,8 @@ def test_a_calibration_that_is_not_this_maps_is_refused(folder):
 
 def test_a_map_with_a_calibration_grows(folder, params, shared, queries):
     before = remembered(folder)
-    grown = index(
-        Model(params, MODEL), queries, folder, weights=shared / "weights.safetensors", reading=QUIET
-    )
+    weights = shared / "weights.safetensors"
+    grown = index(Model(params, MODEL), queries, folder, weights=weights, reading=QUIET)
     assert grown.images == 12
     with Map.open(folder) as places:
         assert places.calibration == before

@@ -5,14 +5,12 @@ import pathlib
 import shutil
 import subprocess
 import sys
-import warnings
 from typing import Any
 
 import numpy as np
 import pytest
 
 from crisalad_jax.data.images import list_images
-from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import Indexed, index
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
@@ -176,13 +174,7 @@ def test_a_map_of_components_shortens_queries_too(shared, params, database, whol
         stored = np.concatenate(list(places.descriptors))
         # Products of other shapes round otherwise, by some units in the last place.
         np.testing.assert_allclose(stored, fitted.apply(full), atol=1e-5)
-        answers = query(
-            places,
-            queries,
-            model=Model(params, places.config),
-            k=3,
-            reading=Reading(batch_size=BATCH, quiet=True),
-        )
+        answers = query(places, queries, k=3, **read_options({}))
     expected = brute_force(fitted.apply(full), fitted.apply(asked), 3)
     np.testing.assert_array_equal(answers.neighbours.indices, expected)
     other = fit_pca(full, 2)
@@ -246,28 +238,23 @@ def test_candidates_come_from_the_index(grown, monkeypatch):
         )
 
 
+@pytest.mark.filterwarnings("error::crisalad_jax.utils.output.Note")
 def test_a_map_that_grew_is_searched_exactly(grown):
     build(grown, "hnsw")
     with open_for_appending(grown, metadata("files")) as target:
         target.append(names(40, 1), [7], rows(40, 1), root="/images")
     with Map.open(grown) as places:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Note)  # who asks for an exact search needs no note
-            assert places.search(rows(40, 1), 1, exact=True).indices.tolist() == [[40]]
+        assert places.search(rows(40, 1), 1, exact=True).indices.tolist() == [[40]]
         assert (places.search_kind, places.stale_search) == ("exact", "hnsw")
         assert places.summary()["stale_search"] == "hnsw"
         with pytest.warns(Note, match="exactly; `crisalad index --search hnsw` builds it anew"):
             assert places.search(rows(40, 1), 1).indices.tolist() == [[40]]
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Note)  # once
-            places.search(rows(40, 1), 1)
+        places.search(rows(40, 1), 1)
     build(grown, "hnsw")
     assert len(list((grown / "approximate").glob("*.index"))) == 1
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", Note)
-        with Map.open(grown) as places:
-            assert places.search(rows(40, 1), 1).indices.tolist() == [[40]]
-            assert (places.search_kind, places.stale_search) == ("hnsw", None)
+    with Map.open(grown) as places:
+        assert places.search(rows(40, 1), 1).indices.tolist() == [[40]]
+        assert (places.search_kind, places.stale_search) == ("hnsw", None)
     assert build(grown, "exact") is None
     assert not (grown / "approximate").exists()
 

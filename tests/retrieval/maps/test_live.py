@@ -36,21 +36,19 @@ class Given:
             yield Frame(path.as_posix(), 1.5, read_image(path), 0.0)
 
 
+def live(places: Map, source, params, **options):
+    return query_live(places, source, model=Model(params, places.config), **options)
+
+
 @pytest.mark.parametrize("window", [1, 3])
 def test_the_answers_are_those_of_query(town_map, shared, params, window):
     paths = list_images(shared / "town" / "images" / "test" / "queries")
     source = Given(paths)
     expected = ask(town_map, params, paths[0].parent, k=2, window=window)
     with Map.open(town_map) as places:
-        stream = query_live(
-            places,
-            source,
-            model=Model(params, places.config),
-            k=2,
-            window=window,
-            ready=lambda: seen.append(source.taken),
-        )
         seen = []
+        options = {"k": 2, "window": window, "ready": lambda: seen.append(source.taken)}
+        stream = live(places, source, params, **options)
         assert not seen  # nothing is compiled before the first answer is asked for
         found = list(stream)
     assert seen == [0]  # ready before the first frame is taken
@@ -76,12 +74,12 @@ def test_a_watched_folder_and_a_camera(town_map, shared, params, tmp_path):
     shutil.copy(image, tmp_path / "in")
     video = write_video(tmp_path / "walk.avi", 4)
     with Map.open(town_map) as places:
-        first = next(query_live(places, watch, model=Model(params, places.config), k=1))
+        first = next(live(places, watch, params, k=1))
         line = json.loads(first.json_line())
         assert line["neighbours"][0]["name"] == image.name
         assert 0 < line["latency_ms"] < 60_000
         with Camera(video) as camera:
-            last = list(query_live(places, camera, model=Model(params, places.config), k=1))[-1]
+            last = list(live(places, camera, params, k=1))[-1]
     assert (last.time, json.loads(last.json_line())["query"]) == (0.3, "walk.avi#t=0.300")
 
 
@@ -118,10 +116,9 @@ def test_latencies_in_words():
 
 def test_what_is_refused(town_map, params):
     with Map.open(town_map) as places:
-        with pytest.raises(InputError, match="k: found 0, expected at least 1"):
-            query_live(places, Given([]), model=Model(params, places.config), k=0)
-        with pytest.raises(InputError, match="window: found 0, expected at least 1"):
-            query_live(places, Given([]), model=Model(params, places.config), window=0)
+        for name in ("k", "window"):
+            with pytest.raises(InputError, match=f"{name}: found 0, expected at least 1"):
+                live(places, Given([]), params, **{name: 0})
 
 
 def test_a_filter_and_a_least_similarity_are_those_of_query(town_map, shared, params):
@@ -134,9 +131,7 @@ def test_a_filter_and_a_least_similarity_are_those_of_query(town_map, shared, pa
     options = {"k": 2, "sequence": BayesFilter(reach=1), "min_similarity": between}
     expected = ask(town_map, params, paths, **options)
     with Map.open(town_map) as places:
-        found = list(
-            query_live(places, Given(paths), model=Model(params, places.config), **options)
-        )
+        found = list(live(places, Given(paths), params, **options))
     lines = [json.loads(answer.json_line()) for answer in found]
     for line, right in zip(lines, map(json.loads, json_lines(expected)), strict=True):
         assert line["known"] == right["known"]

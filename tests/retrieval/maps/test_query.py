@@ -108,12 +108,7 @@ def test_lines_for_people(answers):
     image = answers.images[0]._replace(name="a[red].jpg", position=None)
     answers = answers._replace(images=[image] * 7)
     head, *lines = answer_lines(answers)
-    assert head.split() == [
-        "rank",
-        "similarity",
-        *["east,", "north", "(zone", "10", "south)"],
-        "name",
-    ]
+    assert head.split() == ["rank", "similarity", "east,", "north", "(zone", "10", "south)", "name"]
     assert lines[0] == answers.queries[0].name
     best = answers.neighbours.similarities[0, 0]
     assert lines[1].split() == ["1", f"{best:.3f}", "-", "a[red].jpg"]
@@ -130,14 +125,8 @@ def test_lines_for_people(answers):
     ],
 )
 def test_what_is_refused(town_map, params, images, options, words):
-    with Map.open(town_map) as places, pytest.raises(InputError, match=words):
-        query(
-            places,
-            images,
-            model=Model(params, places.config),
-            **options,
-            reading=Reading(quiet=True),
-        )
+    with pytest.raises(InputError, match=words):
+        ask(town_map, params, images, **options)
 
 
 def test_the_model_of_a_map(town_map, shared, params, tmp_path):
@@ -244,29 +233,26 @@ def test_a_map_of_thermal_images_reads_queries_as_it_was_made(tmp_path, shared, 
 
 def test_what_locate_refuses(town_map, params, answers):
     places = Map.open(town_map)
-    with pytest.raises(InputError, match="k: found 0, expected at least 1"):
-        places.locate(answers.queries[0], k=0)
-    with pytest.raises(InputError, match=r"nowhere\.png"):
-        places.locate("nowhere.png")
-    with pytest.raises(InputError, match="image: found float64 of shape"):
-        places.locate(np.zeros((8, 8, 3)))
-    with pytest.raises(InputError, match="found a map made by model"):
-        places.locate(
-            answers.queries[0], model=Model(jax.tree.map(lambda x: x + 1, params), places.config)
-        )
+    other = Model(jax.tree.map(lambda leaf: leaf + 1, params), places.config)
+    for image, options, words in (
+        (answers.queries[0], {"k": 0}, "k: found 0, expected at least 1"),
+        ("nowhere.png", {}, r"nowhere\.png"),
+        (np.zeros((8, 8, 3)), {}, "image: found float64 of shape"),
+        (answers.queries[0], {"model": other}, "found a map made by model"),
+    ):
+        with pytest.raises(InputError, match=words):
+            places.locate(image, **options)
 
 
 @pytest.mark.parametrize("k", [1.5, 2.0, "3", None, True, np.float32(1)])
-def test_a_number_of_answers_is_a_whole_number(town_map, params, answers, k):
+def test_a_number_of_answers_is_a_whole_number(town_map, answers, k):
     with Map.open(town_map) as places:
         rows = np.eye(1, places.metadata.descriptor_length, dtype=np.float32)
         for ask_for in (
             lambda: places.locate(answers.queries[0], k=k),
             lambda: places.search(rows, k),
-            lambda: query(places, answers.queries, model=Model(params, places.config), k=k),
-            lambda: query_live(
-                places, FolderWatch(town_map), model=Model(params, places.config), k=k
-            ),
+            lambda: query(places, answers.queries, k=k),
+            lambda: query_live(places, FolderWatch(town_map), k=k),
         ):
             with pytest.raises(InputError, match=r"k: found .*, expected a whole number"):
                 ask_for()

@@ -25,8 +25,9 @@ def unit_rows(count: int, seed: int = 0, length: int = LENGTH) -> np.ndarray:
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
-def opened(folder: pathlib.Path, name: str, dtype: str = "float32", new: bool = True) -> Store:
-    return open_store(name, folder, collection="rows", length=LENGTH, dtype=dtype, new=new)
+def opened(folder: pathlib.Path, name: str, **options) -> Store:
+    usual = {"collection": "rows", "length": LENGTH, "dtype": "float32", "new": True}
+    return open_store(name, folder, **usual | options)
 
 
 @pytest.fixture(params=STORES)
@@ -157,7 +158,7 @@ def test_files_give_the_bits_of_an_exact_search_whatever_else_is_asked(tmp_path)
     rows = np.concatenate([first, first[generator.choice(256, 37, replace=False)]])
     queries = unit_rows(200, seed=1, length=96)
     queries[:100] = rows[generator.choice(256, 100)]
-    store = open_store("files", tmp_path, collection="", length=96, dtype="float32", new=True)
+    store = opened(tmp_path, "files", length=96)
     fill(store, rows, (256, 37))
     expected = search(rows, queries, 2)
     for size in (200, 7, 1):
@@ -219,14 +220,7 @@ def test_what_is_missing_in_milvus_is_named(tmp_path, in_milvus):
     with pytest.raises(InputError, match=r"gone\.db: found nothing, expected the descriptors"):
         opened(tmp_path, "milvus:gone.db", new=False)
     with pytest.raises(InputError, match=r"rows\.db: found no collection other, expected it"):
-        open_store(
-            "milvus:rows.db",
-            tmp_path,
-            collection="other",
-            length=LENGTH,
-            dtype="float32",
-            new=False,
-        )
+        opened(tmp_path, "milvus:rows.db", collection="other", new=False)
 
 
 def test_an_index_that_a_kill_cut_short_is_made_again(tmp_path, in_milvus, capfd):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import pathlib
-import warnings
 
 import numpy as np
 import pytest
@@ -63,15 +62,15 @@ def recalls(folder, of_map: float, of_frames: float, name, name_frames=None) -> 
     )
 
 
+@pytest.mark.filterwarnings("error::crisalad_jax.utils.output.Note")
 @pytest.mark.parametrize("name", [in_video, since_1970])
 @pytest.mark.parametrize(("of_map", "of_frames"), [(5, 1), (1, 5), (5, 5)])
 def test_a_filter_loses_nothing_whatever_the_rates(tmp_path, name, of_map, of_frames):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", Note)
-        single, filtered = recalls(tmp_path, of_map, of_frames, name)
+    single, filtered = recalls(tmp_path, of_map, of_frames, name)
     assert filtered > single
 
 
+@pytest.mark.filterwarnings("error::crisalad_jax.utils.output.Note")
 def test_a_map_of_positions_is_followed_in_metres(tmp_path):
     """The camera of the map walks at 1.5 m/s, and so does this one."""
     there, database = walk(5, 2, 0.1)
@@ -83,9 +82,7 @@ def test_a_map_of_positions_is_followed_in_metres(tmp_path):
     places = made(tmp_path, names, database, Positions(("lat", "lon"), of))
     follower = SequenceTracker(places, BayesFilter())
     frames = [pathlib.Path(each) for each in in_metres(when)]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", Note)
-        found = follower.answer(queries.astype(np.float32), 1, frames).numbers[:, 0]
+    found = follower.answer(queries.astype(np.float32), 1, frames).numbers[:, 0]
     # UTM shrinks by 0.9996 at the central meridian; the sums of 500 roundings are less.
     assert np.ptp(follower.state.along) == pytest.approx(1.5 * 99.8, rel=5e-4)
     single = (queries @ database.T).argmax(axis=1)
