@@ -134,17 +134,15 @@ def decode_image(
     """
     # Check before decoding: OpenCV 4 fills missing parts of a JPEG with grey, and libpng and
     # libjpeg write warnings to stderr that OpenCV's log level does not silence.
-    if (data.startswith(b"\xff\xd8") and not _jpeg_is_whole(data)) or (
+    is_cut = (data.startswith(b"\xff\xd8") and not _jpeg_is_whole(data)) or (
         data.startswith(_PNG_SIGNATURE) and not _png_is_whole(data)
-    ):
-        raise InputError(
-            f"{path}: found an image cut short after {len(data)} bytes, or damaged, expected a "
-            "whole one"
-        )
+    )
     image, found = None, f"{len(data)} bytes that do not decode" if data else "an empty file"
     try:
-        with QUIET:
-            if data:
+        if is_cut:
+            found = f"an image cut short after {len(data)} bytes, or damaged"
+        elif data:
+            with QUIET:
                 image = _decoded(np.frombuffer(data, np.uint8), data[:12], _reduction(data, enough))
     except cv2.error as error:
         found = " ".join(error.err.split())

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 import numpy as np
 
 from crisalad_jax.config.checks import choose, takes
-from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
+from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import OnBadImage, read_pixels
 from crisalad_jax.data.opencv import ONE_THREAD
@@ -65,7 +65,6 @@ class ImageCache:
         self,
         path: str | os.PathLike[str],
         how: Preparation,
-        check: Callable[[Size], None] | None = None,
         *,
         quickly: bool = False,
     ) -> Pixels:
@@ -80,7 +79,7 @@ class ImageCache:
         image = self._images.get(key)
         if image is None:
             pixels = read_pixels(path, enough=how.image_size if quickly else None)
-            image = how.prepare(pixels, check, os.fspath(path))
+            image = how.prepare(pixels, os.fspath(path))
             image.setflags(write=False)
             with self._lock:
                 if key not in self._images and image.nbytes <= self._room:

@@ -56,10 +56,7 @@ class Reading:
         return dataclasses.replace(self, batch_size=min(self.batch_size, padded))
 
     def batches(
-        self,
-        paths: Sequence[str | os.PathLike[str]],
-        preparation: Preparation,
-        check_size: Callable[[Size], None] | None = None,
+        self, paths: Sequence[str | os.PathLike[str]], preparation: Preparation
     ) -> Iterator[ImageBatch]:
         """Yield batches of image files, in order; the last one is padded.
 
@@ -70,7 +67,6 @@ class Reading:
         Args:
             paths: the files.
             preparation: how the model's images are prepared.
-            check_size: raises InputError for a height and width that the model cannot describe.
 
         Raises:
             InputError: while iterating under "stop" for an image that cannot be read.
@@ -81,7 +77,7 @@ class Reading:
         cache = self.cache or ImageCache(0)
         indices = np.arange(len(paths))
         return read_batches(
-            lambda position: cache.read(paths[position], preparation, check_size),
+            lambda position: cache.read(paths[position], preparation),
             labels=indices,
             indices=indices,
             positions=indices,
@@ -136,5 +132,4 @@ def image_batches(
     reading = Reading(
         batch_size=batch_size, on_bad_image=on_bad_image, threads=threads, cache=cache
     )
-    how = Preparation(image_size, preprocessing, side_multiple)
-    return reading.batches(paths, how, check_size)
+    return reading.batches(paths, Preparation(image_size, preprocessing, side_multiple, check_size))

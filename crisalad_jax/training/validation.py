@@ -109,9 +109,8 @@ class Validator:
         """Compute statistics of the transport on the first queries, without dropout."""
         model = self._config.validation_model
         paths = benchmark.queries[:WATCHED_QUERIES]
-        how = Preparation(model.image_size, model.preprocessing, model.side_multiple)
         reading = Reading(batch_size=len(paths), cache=self._reading.cache)
-        batches = reading.batches(paths, how, model.check_image_size)
+        batches = reading.batches(paths, Preparation.of(model))
         batch = next(iter(batches))  # of the size of the first, where sizes differ
         transport = extract_tokens(params, batch.images[batch.valid], model).transport
         if transport is None:
