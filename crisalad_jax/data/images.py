@@ -256,9 +256,7 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
         InputError: the folder is missing, is a file, or holds no image.
     """
     folder = pathlib.Path(folder)
-    if not folder.is_dir():
-        kind = "a file" if folder.exists() else "nothing"
-        raise InputError(f"{folder}: found {kind}, expected a folder of images")
+    check_folder(folder, "a folder of images")
     found = []
     # Real paths from the top to each folder: a link to one of them would make the walk endless.
     above = {folder: frozenset({real_path(folder)})}
@@ -275,6 +273,13 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
         found += [here / name for name in files if not name.startswith(".")]
     images = only_images(found, folder)
     return sorted(images, key=lambda image: image.relative_to(folder).as_posix())
+
+
+def check_folder(folder: pathlib.Path, expected: str) -> None:
+    """Raise InputError unless there is such a folder; `expected` is what the message calls it."""
+    if not folder.is_dir():
+        kind = "a file" if folder.exists() else "nothing"
+        raise InputError(f"{folder}: found {kind}, expected {expected}")
 
 
 def is_image(path: str | os.PathLike[str]) -> bool:

@@ -71,13 +71,7 @@ def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
     """Return the methods of an augmentation that is a plain function."""
     count = count_arguments(function, "image", "generator")
 
-    def apply(
-        self: Augmentation,
-        image: Image,
-        generator: np.random.Generator,
-        *,
-        of_place: np.random.Generator,
-    ) -> Image:
+    def apply(_: Augmentation, image: Image, generator: np.random.Generator, **__: Any) -> Image:
         return function(*(image, generator)[:count])
 
     return {"apply": apply}
