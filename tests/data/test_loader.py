@@ -177,6 +177,11 @@ def test_batches_of_any_size_are_the_images_one_by_one(places, batch_size, threa
     indices = np.concatenate([batch.indices for batch in batches])
     padding = -47 % batch_size
     np.testing.assert_array_equal(indices, [*range(47), *[-1] * padding])
+    for batch in batches:
+        np.testing.assert_array_equal(batch.labels, batch.indices)
+        np.testing.assert_array_equal(batch.valid, batch.indices >= 0)
+        assert not batch.images[~batch.valid].any()
+    assert list(image_batches([], image_size=SIZE, batch_size=batch_size)) == []
 
 
 def test_augmentation_draws_from_seed_epoch_step_and_slot(places):
@@ -224,19 +229,6 @@ def test_a_bad_training_image(places, content):
     assert (~valid).sum() == 1
     assert not images[~valid].any()
     np.testing.assert_array_equal(images[valid], np.concatenate([b.images for b in whole])[valid])
-
-
-def test_image_batches_keep_the_order_and_pad(places):
-    paths = [places.path(i) for i in (5, 3, 9, 0, 7)]
-    first, second = image_batches(paths, image_size=SIZE, batch_size=3)
-    np.testing.assert_array_equal(first.images, [plain(path) for path in paths[:3]])
-    np.testing.assert_array_equal(second.images[:2], [plain(path) for path in paths[3:]])
-    assert first.indices.tolist() == first.labels.tolist() == [0, 1, 2]
-    assert second.indices.tolist() == second.labels.tolist() == [3, 4, -1]
-    assert first.valid.all()
-    assert second.valid.tolist() == [True, True, False]
-    assert not second.images[2].any()
-    assert list(image_batches([], image_size=SIZE, batch_size=3)) == []
 
 
 def test_a_bad_image_keeps_its_index(places):

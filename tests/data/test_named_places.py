@@ -14,7 +14,7 @@ from crisalad_jax.data.places import epoch_batches, read_places
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.conftest import RECIPE, write_picture, write_video
-from tests.data.benchmarks.trees import touch_all, write_sides
+from tests.data.benchmarks.trees import refused, touch_all, write_sides
 from tests.data.test_sources import write_jpeg
 
 
@@ -33,6 +33,11 @@ def _write_table(path, header, rows):
     return path
 
 
+def _by_radius(root, min_images):
+    """Places of a radius of 10 m."""
+    return read_places(root, place_radius=10, positions=root / "gps.csv", min_images=min_images)
+
+
 def _near(places):
     assert places.near is not None
     return [each.tolist() for each in places.near]
@@ -46,7 +51,9 @@ BY_HAND = {"00.jpg": [0, 1], "03.jpg": [2, 3, 4], "05.jpg": [5], "06.jpg": [6]}
 
 def test_a_radius_makes_places_as_by_hand(tmp_path):
     root = _street(tmp_path / "walk", XS)
-    places = read_places(root, place_radius=10, positions=root / "gps.csv", min_images=1)
+    touch_all(root, ["99.jpg"])
+    with pytest.warns(Note, match=r"left out 1 of 8 images, which have no position"):
+        places = _by_radius(root, 1)
     assert places.names == tuple(BY_HAND)
     groups = [list(group) for group in BY_HAND.values()]
     assert places.files == tuple(f"{image:02d}.jpg" for image in itertools.chain(*groups))
@@ -55,24 +62,18 @@ def test_a_radius_makes_places_as_by_hand(tmp_path):
     # Centres at 0, 11, 30 and 5000: up to 40 m apart they are near.
     assert _near(places) == [[1, 2], [0, 2], [0, 1], []]
     back = _street(tmp_path / "back", (11, 9))
-    places = read_places(back, place_radius=10, positions=back / "gps.csv", min_images=1)
-    assert places.image_counts.tolist() == [2]
+    assert _by_radius(back, 1).image_counts.tolist() == [2]
 
 
 def test_places_with_few_images_are_left_out_and_counted(tmp_path):
     root = _street(tmp_path / "walk", XS)
-    given = {"place_radius": 10, "positions": root / "gps.csv"}
-    words = r"left out 2 of 4 places, with fewer than 2 images$"
-    with pytest.warns(Note, match=words):
-        places = read_places(root, min_images=2, **given)
+    with pytest.warns(Note, match=r"left out 2 of 4 places, with fewer than 2 images$"):
+        places = _by_radius(root, 2)
     assert places.names == ("00.jpg", "03.jpg")
     assert _near(places) == [[1], [0]]  # by their new numbers
-    words = (
-        r"walk: found no place with at least 4 images; the largest has 3, of 4 places "
-        r"\(--place-radius, .*--min-images\)$"
-    )
-    with pytest.raises(InputError, match=words):
-        read_places(root, **given)
+    words = r"largest has 3, of 4 places \(--place-radius, .*--min-images\)$"
+    with refused(f"walk: found no place with at least 4 images; the {words}"):
+        _by_radius(root, 4)
 
 
 @pytest.mark.parametrize(
@@ -158,8 +159,8 @@ def test_negatives_of_a_batch_are_farther_than_its_positives(tmp_path, seed):
 
 
 def test_too_many_places_for_a_batch(tmp_path):
-    root = _street(tmp_path / "walk", range(0, 100, 2))  # 100 m hold at most three 40 m apart
-    places = read_places(root, place_radius=10, positions=root / "gps.csv", min_images=2)
+    # 100 m hold at most three 40 m apart.
+    places = _by_radius(_street(tmp_path / "walk", range(0, 100, 2)), 2)
     draw = {"images_per_place": 2, "order": "shuffled", "seed": 0, "epoch": 0}
     assert len(epoch_batches(places, places_per_batch=2, **draw))
     with pytest.raises(InputError, match=r"expected places_per_batch 5 .* not near each other"):
@@ -236,17 +237,8 @@ def test_a_source_that_has_no_places_says_which_flags_make_them(tmp_path, shared
         read_places(shared / "city", place_radius=5)
 
 
-def test_images_without_a_position_are_left_out_with_a_note(tmp_path):
-    root = _street(tmp_path / "walk", XS)
-    (root / "99.jpg").write_bytes(b"")
-    with pytest.warns(Note, match=r"left out 1 of 8 images, which have no position"):
-        places = read_places(root, place_radius=10, positions=root / "gps.csv", min_images=1)
-    assert places.names == tuple(BY_HAND)
-
-
 def test_classes_of_a_group_are_not_near(tmp_path):
-    root = _street(tmp_path / "walk", range(0, 400, 2))
-    places = read_places(root, place_radius=10, positions=root / "gps.csv", min_images=2)
+    places = _by_radius(_street(tmp_path / "walk", range(0, 400, 2)), 2)
     config = ClassesConfig(kind="places", groups=5)
     groups = class_groups(places, config, min_images=2, places_per_batch=2)
     assert len(groups) == 5

@@ -129,12 +129,6 @@ def test_a_table(root, tmp_path, text, axes, of):
         assert set(of) <= set(source.names)
 
 
-def test_a_table_of_positions_has_the_same_forms(tmp_path):
-    (tmp_path / "p.csv").write_text("name;x;y\na.jpg;1,5;-2.25\n")
-    found = read_positions(tmp_path / "p.csv")
-    assert found == Positions(("x", "y"), {"a.jpg": (1.5, -2.25)})
-
-
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
