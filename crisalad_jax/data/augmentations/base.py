@@ -19,7 +19,7 @@ _CHECK = "check"
 _Number = TypeVar("_Number", int, float)
 
 
-def strength(default: _Number, most: float = math.inf) -> _Number:
+def from_zero(default: _Number, most: float = math.inf) -> _Number:
     """Return a field of an augmentation whose value is from 0 to `most`."""
     return _checked(default, lambda config, name: require_range(config, 0, most, name))
 
@@ -49,7 +49,7 @@ class Augmentation(Part, abc.ABC):
     """
 
     def __post_init__(self) -> None:
-        """Check the fields that `strength` and `fraction` made."""
+        """Check the fields that `from_zero` and `fraction` made."""
         for field in dataclasses.fields(self):
             if check := field.metadata.get(_CHECK):
                 check(self, field.name)

@@ -6,7 +6,7 @@ import math
 import cv2
 import numpy as np
 
-from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Image, fraction, strength
+from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Image, fraction, from_zero
 from crisalad_jax.data.augmentations.light import LightAugmentConfig, light_augment
 
 _QUALITY = (12, 85)
@@ -20,20 +20,20 @@ class CameraAugmentConfig(LightAugmentConfig):
 
     perspective: float = fraction(0.04)
     """Largest shift of a corner, as a share of the side."""
-    texture: float = strength(0.25)
+    texture: float = from_zero(0.25)
     """Largest deviation of a multiplied texture of several scales, which rendered walls lack."""
-    filters: float = strength(0.3, 1)
+    filters: float = from_zero(0.3, 1)
     """Probability of random filters over all colours, which change textures and keep outlines (Xu
     et al., ICLR 2021)."""
-    occlusion: float = strength(0.3, 1)
+    occlusion: float = from_zero(0.3, 1)
     """Probability that something covers a part."""
-    motion: float = strength(0.2, 1)
+    motion: float = from_zero(0.2, 1)
     """Probability of motion blur, of up to a sixteenth of the width."""
-    coarse: float = strength(0.3, 1)
+    coarse: float = from_zero(0.3, 1)
     """Probability of fewer pixels: down to two fifths of the sides."""
-    noise: float = strength(8.0)
+    noise: float = from_zero(8.0)
     """Largest deviation of noise, in grey levels."""
-    jpeg: float = strength(0.4, 1)
+    jpeg: float = from_zero(0.4, 1)
     """Probability of another JPEG."""
 
     def apply(

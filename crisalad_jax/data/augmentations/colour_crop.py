@@ -15,7 +15,7 @@ from crisalad_jax.data.augmentations.base import (
     Augmentation,
     Image,
     fraction,
-    strength,
+    from_zero,
 )
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.utils.shapes import Float32
@@ -34,13 +34,13 @@ _Floats = Float32[np.ndarray, "h w 3"]
 class ColourCropConfig(Augmentation):
     """Changes of colour in random order, then a crop at the size of the image (CosPlace)."""
 
-    brightness: float = strength(0.7)
+    brightness: float = from_zero(0.7)
     """Largest relative change of brightness."""
-    contrast: float = strength(0.7)
+    contrast: float = from_zero(0.7)
     """Largest relative change of contrast."""
-    saturation: float = strength(0.7)
+    saturation: float = from_zero(0.7)
     """Largest relative change of saturation."""
-    hue: float = strength(0.5, 0.5)
+    hue: float = from_zero(0.5, 0.5)
     """Largest turn of the hue, of 1 for a whole circle."""
     crop: float = fraction(0.5)
     """Largest share of the area that a crop removes."""

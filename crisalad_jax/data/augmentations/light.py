@@ -11,7 +11,7 @@ from crisalad_jax.data.augmentations.base import (
     Augmentation,
     Image,
     fraction,
-    strength,
+    from_zero,
 )
 
 # ITU-R BT.601 luma.
@@ -27,19 +27,19 @@ class LightAugmentConfig(Augmentation):
     """Largest share of the side that a crop removes."""
     shift: float = fraction(0.05)
     """Largest shift, as a share of the side."""
-    rotation: float = strength(2.0)
+    rotation: float = from_zero(2.0)
     """Largest rotation in degrees."""
-    flip: float = strength(0.0, 1)
+    flip: float = from_zero(0.0, 1)
     """Probability of a mirror image. All images of one place in a batch are mirrored alike."""
-    blur: float = strength(1.0)
+    blur: float = from_zero(1.0)
     """Largest standard deviation of a Gaussian blur, in pixels."""
     colour: float = fraction(0.2)
     """Largest relative change of brightness, of contrast and of saturation."""
-    grey: float = strength(0.2, 1)
+    grey: float = from_zero(0.2, 1)
     """Probability of dropping the colour."""
-    gamma: float = strength(0.0)
+    gamma: float = from_zero(0.0)
     """Largest change of the logarithm of an exponent on intensities."""
-    illumination: float = strength(0.0)
+    illumination: float = from_zero(0.0)
     """Largest change of log brightness in a smooth field over the image: uneven light."""
 
     def apply(

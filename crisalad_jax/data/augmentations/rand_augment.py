@@ -9,7 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image, strength
+from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image, from_zero
 from crisalad_jax.utils.shapes import Bool, Int64, UInt8
 
 MAGNITUDE_BINS = 31
@@ -25,8 +25,8 @@ _LEVELS = np.arange(256)
 class RandAugmentConfig(Augmentation):
     """RandAugment (Cubuk et al. 2020), torchvision's 14 operations, GSV-Cities' strength."""
 
-    operations: int = strength(3)
-    magnitude: int = strength(9, MAGNITUDE_BINS - 1)
+    operations: int = from_zero(3)
+    magnitude: int = from_zero(9, MAGNITUDE_BINS - 1)
     """Which of 31 bins of strength."""
 
     def apply(
