@@ -8,6 +8,7 @@ from PIL import Image
 from crisalad_jax.data.augmentations import Augmentation, NoAugmentation
 from crisalad_jax.data.augmentations import rand_augment as module
 from crisalad_jax.data.augmentations.camera import CameraAugmentConfig
+from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
 from crisalad_jax.data.augmentations.light import LightAugmentConfig, light_augment
 from crisalad_jax.data.augmentations.rand_augment import (
     OPERATIONS,
@@ -382,14 +383,19 @@ def test_jpeg_is_of_the_qualities_that_are_named():
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("config", "field", "value"),
     [
-        ({"perspective": 1.0}, "CameraAugmentConfig.perspective: found 1.0"),
-        ({"noise": -1.0}, "CameraAugmentConfig.noise: found -1.0"),
-        ({"jpeg": 1.5}, "CameraAugmentConfig.jpeg: found 1.5"),
-        ({"texture": float("nan")}, "CameraAugmentConfig.texture: found nan"),
+        (CameraAugmentConfig, "perspective", 1.0),
+        (CameraAugmentConfig, "noise", -1.0),
+        (CameraAugmentConfig, "jpeg", 1.5),
+        (CameraAugmentConfig, "texture", float("nan")),
+        (ColourCropConfig, "hue", 0.6),
+        (ColourCropConfig, "crop", 1.0),
+        (ColourCropConfig, "brightness", -0.1),
+        (LightAugmentConfig, "grey", 1.1),
+        (RandAugmentConfig, "magnitude", 31),
     ],
 )
-def test_bad_strengths_are_named(changes, words):
-    with pytest.raises(InputError, match=words):
-        CameraAugmentConfig(**changes)
+def test_bad_strengths_are_named(config, field, value):
+    with pytest.raises(InputError, match=rf"^{config.__name__}\.{field}: found {value}, expected"):
+        config(**{field: value})
