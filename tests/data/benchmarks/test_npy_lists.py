@@ -150,7 +150,7 @@ def test_a_folder_of_several_sets(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"gt": ragged([0], [1])}, r"a_gt.npy: found shape \(2,\), expected \(3,\): a row for each"),
+        ({"gt": ragged([0], [1])}, r"a_gt.npy: found shape \(2,\), expected \(3,\): a row"),
         ({"gt": ragged([0], [5], [1])}, "a_gt.npy: row 1: found reference indices 5 to 5"),
         ({"gt": ragged([0], ["x"], [1])}, "a_gt.npy: row 1: found values of type str"),
         ({"gt": np.zeros(3)}, "a_gt.npy: row 0: found values of type float"),
