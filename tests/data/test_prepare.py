@@ -1,5 +1,6 @@
 """Pixels of any depth as 8-bit RGB, by hand."""
 
+import dataclasses
 import threading
 import warnings
 
@@ -11,8 +12,10 @@ from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data import prepare
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.prepare import Preparation, as_rgb
+from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
+from tests.data.benchmarks.trees import refused
 
 
 @pytest.fixture(autouse=True)
@@ -102,6 +105,13 @@ def test_wide_sixteen_bits_and_stretched_ones_are_not_noted():
         as_rgb(wide // 32, "contrast-stretch")
     with pytest.warns(Note, match="become 64 of 256"):
         as_rgb(wide // 4)  # 98 % of 16,383
+
+
+def test_a_size_that_a_model_cannot_describe_is_told_with_the_name_of_the_image():
+    how = dataclasses.replace(Preparation.of(PRESETS["b14"]), image_size=(28, 42))
+    assert how == Preparation((28, 42), side_multiple=14)  # so that caches share images
+    with refused(r"^a\.jpg: image size: found 28 x 42, which is 6 patches for 64 clusters"):
+        how.prepare(np.zeros((30, 40, 3), np.uint8), "a.jpg")
 
 
 def test_the_chain_says_how():
