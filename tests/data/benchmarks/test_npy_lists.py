@@ -199,6 +199,7 @@ def test_vpr_bench_sorts_by_number_without_a_gap(tmp_path):
     (root / "ref" / "1.jpg").unlink()
     with refused(r"ref/2.jpg: found after number 0, expected number 1"):
         read_vpr_bench(root)
+    touch_all(root / "ref", ["1.jpg"])
     shutil.rmtree(root / "query")
     with refused("found ground_truth_new.npy, ref/, expected a folder query"):
         read_vpr_bench(root)
