@@ -102,9 +102,6 @@ class Runtime:
         """Type of the values in rows of tokens."""
         return "float32"
 
-    def check_size(self, size: Size) -> None:
-        """Accept all sizes: `open_runtime` checked that images are prepared for the program."""
-
     def check_groupings(self, groupings: Iterable[str]) -> None:
         """Check that the program can describe images under these groupings.
 

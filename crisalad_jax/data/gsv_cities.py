@@ -68,15 +68,11 @@ def _read_city(
         try:
             place, year, month, north = map(int, numbers)
             view = (float(latitude), float(longitude), float(north))
-            valid = min(place, year, month, north) >= 0
-            valid &= abs(view[0]) <= 90 and abs(view[1]) <= 180
-        except ValueError:
-            valid = False
-        if not valid:
+        except ValueError as error:
             raise InputError(
                 f"{path}: line {line}: found {', '.join(fields(row)[:-1])}, expected whole numbers "
-                "from 0 for place_id, year, month and northdeg, and degrees for lat and lon"
-            )
+                "for place_id, year, month and northdeg, and degrees for lat and lon"
+            ) from error
         place %= IDS_PER_CITY
         stem = (
             f"{city_id}_{place:07d}_{year:04d}_{month:02d}_{north:03d}"

@@ -134,17 +134,15 @@ def decode_image(
     """
     # Check before decoding: OpenCV 4 fills missing parts of a JPEG with grey, and libpng and
     # libjpeg write warnings to stderr that OpenCV's log level does not silence.
-    if (data.startswith(b"\xff\xd8") and not _jpeg_is_whole(data)) or (
+    is_cut = (data.startswith(b"\xff\xd8") and not _jpeg_is_whole(data)) or (
         data.startswith(_PNG_SIGNATURE) and not _png_is_whole(data)
-    ):
-        raise InputError(
-            f"{path}: found an image cut short after {len(data)} bytes, or damaged, expected a "
-            "whole one"
-        )
+    )
     image, found = None, f"{len(data)} bytes that do not decode" if data else "an empty file"
     try:
-        with QUIET:
-            if data:
+        if is_cut:
+            found = f"an image cut short after {len(data)} bytes, or damaged"
+        elif data:
+            with QUIET:
                 image = _decoded(np.frombuffer(data, np.uint8), data[:12], _reduction(data, enough))
     except cv2.error as error:
         found = " ".join(error.err.split())
@@ -258,9 +256,7 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
         InputError: the folder is missing, is a file, or holds no image.
     """
     folder = pathlib.Path(folder)
-    if not folder.is_dir():
-        kind = "a file" if folder.exists() else "nothing"
-        raise InputError(f"{folder}: found {kind}, expected a folder of images")
+    check_folder(folder, "a folder of images")
     found = []
     # Real paths from the top to each folder: a link to one of them would make the walk endless.
     above = {folder: frozenset({real_path(folder)})}
@@ -277,6 +273,13 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
         found += [here / name for name in files if not name.startswith(".")]
     images = only_images(found, folder)
     return sorted(images, key=lambda image: image.relative_to(folder).as_posix())
+
+
+def check_folder(folder: pathlib.Path, expected: str) -> None:
+    """Raise InputError unless there is such a folder; `expected` is what the message calls it."""
+    if not folder.is_dir():
+        kind = "a file" if folder.exists() else "nothing"
+        raise InputError(f"{folder}: found {kind}, expected {expected}")
 
 
 def is_image(path: str | os.PathLike[str]) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.images import SELF_CHECKED, is_image, read_pixels
+from crisalad_jax.data.images import SELF_CHECKED, check_folder, is_image, read_pixels
 from crisalad_jax.data.opencv import QUIET
 from crisalad_jax.data.video import check_rate, frame_name, milliseconds_of
 from crisalad_jax.utils.errors import InputError
@@ -79,9 +79,7 @@ class FolderWatch:
             InputError: there is no such folder.
         """
         self._folder = pathlib.Path(folder)
-        if not self._folder.is_dir():
-            kind = "a file" if self._folder.exists() else "nothing"
-            raise InputError(f"{folder}: found {kind}, expected a folder to watch")
+        check_folder(self._folder, "a folder to watch")
         self._done = set(self._scan())
         self.there = len(self._done)
         """Number of images that were there before."""

@@ -2,18 +2,20 @@
 
 import collections
 import contextlib
+import dataclasses
 import itertools
+import math
 import os
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from crisalad_jax.config.checks import choose, takes
-from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
-from crisalad_jax.config.short_repr import brief
+from crisalad_jax.config.checks import check_count, check_types, require_range, takes
+from crisalad_jax.config.preprocessing import PreprocessingConfig
+from crisalad_jax.config.short_repr import brief, with_field_docs
 from crisalad_jax.data.images import OnBadImage, read_pixels
 from crisalad_jax.data.opencv import ONE_THREAD
 from crisalad_jax.data.places import Order, Places, epoch_batches
@@ -32,6 +34,10 @@ _Result = TypeVar("_Result")
 BATCHES_AHEAD = 2
 THREADS = usable_cores()
 """OpenCV decodes outside of Python's lock: two cores decode some 500 photographs a second."""
+
+
+_SMALL = 16
+"""Largest number of images that is padded to a power of two, so that few sizes are compiled."""
 
 
 @brief
@@ -65,7 +71,6 @@ class ImageCache:
         self,
         path: str | os.PathLike[str],
         how: Preparation,
-        check: Callable[[Size], None] | None = None,
         *,
         quickly: bool = False,
     ) -> Pixels:
@@ -80,7 +85,7 @@ class ImageCache:
         image = self._images.get(key)
         if image is None:
             pixels = read_pixels(path, enough=how.image_size if quickly else None)
-            image = how.prepare(pixels, check, os.fspath(path))
+            image = how.prepare(pixels, os.fspath(path))
             image.setflags(write=False)
             with self._lock:
                 if key not in self._images and image.nbytes <= self._room:
@@ -94,6 +99,118 @@ class ImageCache:
             with contextlib.suppress(InputError):
                 if self.read(path, how, quickly=True).nbytes > self._room:
                     return
+
+
+@with_field_docs
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Reading:
+    """How images are read: how many at a time, and what one that cannot be read does.
+
+    Example:
+        >>> Reading(batch_size=32, on_bad_image="skip").batch_size
+        32
+    """
+
+    batch_size: int = 16
+    """Number of images described together."""
+    on_bad_image: OnBadImage = "stop"
+    """"stop" at an unreadable image, or "skip" it."""
+    threads: int = THREADS
+    """Number of threads that decode ahead; 0 decodes in the caller's thread."""
+    cache: ImageCache | None = None
+    """Cache of decoded images."""
+    quiet: bool = False
+    """Whether to show no progress bars."""
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        check_types(self)
+        check_count("batch size", self.batch_size)
+        require_range(self, 0, math.inf, "threads")
+
+    def fitted(self, images: int) -> Self:
+        """Return a smaller batch size where the batches of so few images would be mostly padding.
+
+        Example:
+            >>> [Reading(batch_size=32).fitted(count).batch_size for count in (1, 3, 12, 20, 50)]
+            [1, 4, 16, 20, 32]
+        """
+        padded = images if images > _SMALL else 1 << max(0, images - 1).bit_length()
+        return dataclasses.replace(self, batch_size=min(self.batch_size, padded))
+
+    def batches(
+        self, paths: Sequence[str | os.PathLike[str]], preparation: Preparation
+    ) -> Iterator[ImageBatch]:
+        """Yield batches of image files, in order; the last one is padded.
+
+        Where a rule gives images sizes of their own, consecutive images of one size make a batch,
+        and every change of size ends and pads one: then a `batch_size` of 1 saves work. Under
+        "skip" an image that cannot be read is not valid but keeps its index.
+
+        Args:
+            paths: the files.
+            preparation: how the model's images are prepared.
+
+        Raises:
+            InputError: while iterating under "stop" for an image that cannot be read.
+        """
+        cache = self.cache or ImageCache(0)
+        indices = np.arange(len(paths))
+        return self.read(
+            lambda position: cache.read(paths[position], preparation),
+            labels=indices,
+            indices=indices,
+            positions=indices,
+            preparation=preparation,
+            one_thread=_has_frames(paths),
+        )
+
+    def read(
+        self,
+        load: Callable[[int], Pixels],
+        *,
+        labels: np.ndarray,
+        indices: np.ndarray,
+        positions: np.ndarray,
+        preparation: Preparation,
+        one_thread: bool = False,
+    ) -> Iterator[ImageBatch]:
+        """Yield batches of what `load` returns for each of `positions`.
+
+        A batch holds the next `batch_size` of them, or fewer where the size changes.
+
+        Args:
+            load: reads the image at a position.
+            labels: label at each position.
+            indices: image index at each position.
+            positions: which to read, in order.
+            preparation: how the images are prepared.
+            one_thread: whether one thread at most reads: more would read a video each, from its
+                beginning.
+        """
+        threads = min(self.threads, 1) if one_thread else self.threads
+
+        def load_or_skip(position: int) -> Pixels | None:
+            try:
+                return load(position)
+            except InputError as error:
+                if self.on_bad_image == "stop":
+                    raise InputError(f"{error} (--on-bad-image skip leaves it out)") from error
+                return None
+
+        ahead = max(BATCHES_AHEAD * self.batch_size, threads)
+        read = read_ahead(load_or_skip, positions.tolist(), ahead=ahead, threads=threads)
+        with ONE_THREAD, contextlib.closing(read):
+            start = 0
+            for run in _same_size_runs(read, self.batch_size):
+                part = positions[start : start + len(run)]
+                start += len(run)
+                yield _batch_of(run, labels[part], indices[part], preparation, self.batch_size)
+
+
+def _has_frames(files: Iterable[str | os.PathLike[str]]) -> bool:
+    """Return whether any name may be that of a frame of a video."""
+    return any("#t=" in os.fspath(file) for file in files)
 
 
 @takes(places=Places)
@@ -232,12 +349,14 @@ def batches_of_groups(
             f"start_step, part: found {start_step} and {part}, expected 0 to {len(chosen)}, and "
             f"the i-th of n equal parts of {batch_size} images"
         )
+    reading = Reading(
+        batch_size=batch_size // parts, on_bad_image=on_bad_image, threads=threads, cache=cache
+    )
     how = Preparation(image_size, preprocessing.for_training())
     from crisalad_jax.data.augmentations.base import AUGMENTATIONS
 
     cache = cache or ImageCache(0)
-    if any("#t=" in file for file in files.files):
-        threads = min(threads, 1)  # more would read a video each, from its beginning
+    if has_frames := _has_frames(files.files):
         # In order: the frames of a batch are far from each other, with all others in between.
         cache.fill(map(files.path, np.unique(chosen)), how)
     indices = chosen.reshape(-1)
@@ -260,57 +379,14 @@ def batches_of_groups(
             )
         return augmented
 
-    return read_batches(
+    return reading.read(
         load,
         labels=labels.reshape(-1),
         indices=indices,
         positions=slots[start_step:, number].reshape(-1),
-        how=how,
-        batch_size=batch_size // parts,
-        on_bad_image=on_bad_image,
-        threads=threads,
+        preparation=how,
+        one_thread=has_frames,
     )
-
-
-def read_batches(
-    load: Callable[[int], Pixels],
-    *,
-    labels: np.ndarray,
-    indices: np.ndarray,
-    positions: np.ndarray,
-    how: Preparation,
-    batch_size: int,
-    on_bad_image: OnBadImage,
-    threads: int,
-) -> Iterator[ImageBatch]:
-    """Check the arguments at once, not at the first batch, and return an iterator of batches.
-
-    A batch holds the results of `load` for the next `batch_size` of `positions`, or fewer where the
-    size changes.
-    """
-    choose("on_bad_image", on_bad_image, {"skip": None, "stop": None})
-    if threads < 0:
-        raise InputError(f"threads: found {threads}, expected at least 0")
-
-    def load_or_skip(position: int) -> Pixels | None:
-        try:
-            return load(position)
-        except InputError as error:
-            if on_bad_image == "stop":
-                raise InputError(f"{error} (--on-bad-image skip leaves it out)") from error
-            return None
-
-    def batches() -> Generator[ImageBatch, None, None]:
-        ahead = max(BATCHES_AHEAD * batch_size, threads)
-        read = read_ahead(load_or_skip, positions.tolist(), ahead=ahead, threads=threads)
-        with ONE_THREAD, contextlib.closing(read):
-            start = 0
-            for run in _same_size_runs(read, batch_size):
-                part = positions[start : start + len(run)]
-                start += len(run)
-                yield _batch_of(run, labels[part], indices[part], how, batch_size)
-
-    return batches()
 
 
 def read_ahead(

@@ -3,7 +3,7 @@
 import dataclasses
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -93,6 +93,18 @@ def _note_narrow(image: UInt16[np.ndarray, "..."], name: str) -> None:
         )
 
 
+class _Model(Protocol):
+    """What a `ModelConfig` says of images."""
+
+    @property
+    def image_size(self) -> Size: ...
+    @property
+    def preprocessing(self) -> PreprocessingConfig: ...
+    @property
+    def side_multiple(self) -> int: ...
+    def check_image_size(self, image_size: Size, /) -> None: ...
+
+
 @dataclasses.dataclass(frozen=True)
 class Preparation:
     """All that decides how photographs are prepared; caches keep images by it."""
@@ -101,6 +113,10 @@ class Preparation:
     preprocessing: PreprocessingConfig = PreprocessingConfig()
     side_multiple: int = 1
     """Number of pixels that sides are rounded to multiples of; see `ModelConfig.side_multiple`."""
+    check_size: Callable[[Size], None] | None = dataclasses.field(
+        default=None, compare=False, repr=False
+    )
+    """Raises InputError for a height and width that the model cannot describe."""
 
     def __post_init__(self) -> None:
         """Check the size."""
@@ -108,6 +124,13 @@ class Preparation:
             raise InputError(
                 f"image_size: found {self.image_size}, expected a height and width of at least 1"
             )
+
+    @classmethod
+    def of(cls, model: _Model) -> Self:
+        """Return how the photographs of a model are prepared."""
+        return cls(
+            model.image_size, model.preprocessing, model.side_multiple, model.check_image_size
+        )
 
     @property
     def dtype(self) -> type[np.generic]:
@@ -119,35 +142,29 @@ class Preparation:
         first = self.preprocessing.target_size(size, self.image_size)
         return self.preprocessing.rounded_size(first, self.side_multiple)
 
-    def prepare(
-        self,
-        image: np.ndarray,
-        check: Callable[[Size], None] | None = None,
-        name: str | None = None,
-    ) -> Pixels:
+    def prepare(self, image: np.ndarray, name: str = "image") -> Pixels:
         """Resize an image, and normalise floats.
 
         Args:
             image: RGB or grey, as `as_rgb` takes it.
-            check: raises InputError for a size that the model cannot describe, before any work.
             name: the image's, for messages.
 
         Returns:
             8-bit pixels, or normalised float32.
 
         Raises:
-            InputError: the image is no array of pixels, or what `check` raises.
+            InputError: the image is no array of pixels, or what `check_size` raises.
         """
         how = self.preprocessing
-        image = as_rgb(image, how.bit_depth, name or "image")
+        image = as_rgb(image, how.bit_depth, name)
         height, width = image.shape[:2]
         first = how.target_size((height, width), self.image_size)
         last = how.rounded_size(first, self.side_multiple)
-        if check is not None:
+        if self.check_size is not None:
             try:
-                check(last)
+                self.check_size(last)
             except InputError as error:
-                raise InputError(f"{name}: {error}" if name else str(error)) from error
+                raise InputError(f"{name}: {error}") from error
         if how.size_rule == "fixed" or first != (height, width):
             image = resize_image(
                 image, first, filter=how.filter, antialias=how.antialias, pixels=how.pixels

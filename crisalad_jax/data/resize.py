@@ -61,16 +61,14 @@ def resize_image(
     choose("filter", filter, {**_KERNELS, "area": None})
     kinds = (np.uint8,) if pixels == "bytes" else (np.uint8, np.float32)
     shape = image.shape if isinstance(image, np.ndarray) else ()
-    if len(shape) != 3 or shape[2] != 3 or 0 in shape or image.dtype not in kinds:
+    is_image = len(shape) == 3 and shape[2] == 3 and 0 not in shape and image.dtype in kinds
+    sides = image_size if isinstance(image_size, tuple | list) else ()
+    is_size = [isinstance(side, int | np.integer) and side >= 1 for side in sides] == [True, True]
+    if not (is_image and is_size):
         found = f"{image.dtype} of shape {shape}" if shape else type(image).__name__
         raise InputError(
-            f"image: found {found}, expected uint8 of shape (height, width, 3) with sides of at "
-            "least 1, as of `read_image`"
-        )
-    sides = image_size if isinstance(image_size, tuple | list) else ()
-    if [isinstance(side, int | np.integer) and side >= 1 for side in sides] != [True, True]:
-        raise InputError(
-            f"image_size: found {image_size!r}, expected two whole numbers of pixels from 1"
+            f"image, image_size: found {found} and {image_size!r}, expected uint8 of shape (height,"
+            " width, 3), as of `read_image`, and two whole numbers; all sides at least 1"
         )
     if filter == "area":
         grows = any(new > old for new, old in zip(image_size, shape, strict=False))

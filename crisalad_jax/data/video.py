@@ -103,15 +103,14 @@ def list_frames(video: str | os.PathLike[str], fps: float = 1.0) -> list[pathlib
 
     Args:
         video: the file.
-        fps: frames for each second; more than the video has are all of them.
+        fps: frames for each second, as `check_rate` takes it; more than the video has are all.
 
     Returns:
         Names of frames, which `read_image` reads.
 
     Raises:
-        InputError: no file, no video, or a rate out of range.
+        InputError: no file, or no video.
     """
-    check_rate(fps)
     chosen: list[pathlib.Path] = []
     due = 0.0
     for time in _frame_times(video):

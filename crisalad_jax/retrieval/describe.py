@@ -46,7 +46,7 @@ class Described(NamedTuple):
         return len(self.indices) + len(self.unreadable)
 
 
-def prepare_image(image: np.ndarray, config: "ModelConfig", name: str | None = None) -> Pixels:
+def prepare_image(image: np.ndarray, config: "ModelConfig", name: str = "image") -> Pixels:
     """Resize an image as a model's configuration says, and normalise floats.
 
     Args:
@@ -69,8 +69,7 @@ def prepare_image(image: np.ndarray, config: "ModelConfig", name: str | None = N
     """
     if not hasattr(config, "side_multiple"):
         raise InputError(f"config: found {type(config).__name__}, expected ModelConfig")
-    how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
-    return how.prepare(image, config.check_image_size, name)
+    return Preparation.of(config).prepare(image, name)
 
 
 def as_list(name: str, given: Any) -> list[Any]:
@@ -158,7 +157,7 @@ def describe_images(
     """
     describer, reading = describer_of(model), Reading(batch_size=batch_size)
     how, given = describer.preparation, as_list("images", images)
-    prepared = [how.prepare(image, describer.check_size) for image in given]
+    prepared = [how.prepare(image) for image in given]
     return describe_prepared(describer, prepared, reading.batch_size)
 
 
@@ -236,7 +235,7 @@ def _tokens(
     describer: Describer, paths: Sequence[pathlib.Path], reading: Reading
 ) -> Iterator[tuple[Rows, ImageBatch, Int64[np.ndarray, " _"]]]:
     """Yield the tokens of each batch, padding included, and which images could not be read."""
-    batches = reading.batches(paths, describer.preparation, describer.check_size)
+    batches = reading.batches(paths, describer.preparation)
     for rows, batch in describer.tokens(batches):
         yield rows, batch, batch.indices[(batch.indices >= 0) & ~batch.valid]
 
@@ -387,7 +386,7 @@ class FrameDescriber:
         Raises:
             InputError: what `prepare_image` raises.
         """
-        one = self._describer.preparation.prepare(image, self._describer.check_size)[None]
+        one = self._describer.preparation.prepare(image)[None]
         number, valid = np.zeros(1, int), np.ones(1, bool)
         ((rows, _),) = self._describer.tokens([ImageBatch(one, number, valid, number)])
         return self.of_tokens(rows)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Protocol, cast
 import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.data.loader import ImageBatch
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.utils.errors import InputError
@@ -36,9 +35,6 @@ class Describer(Protocol):
     """Number of values in the row of an image's tokens."""
     row_dtype: str
     """Type of the values in rows of tokens."""
-
-    def check_size(self, size: Size) -> None:
-        """Raise InputError for a height and width that the model cannot describe."""
 
     def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[Rows, ImageBatch]]:
         """Yield each batch with the tokens of its images, padding included, in order."""

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from crisalad_jax.checkpoints.weights import model_hash
-from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.data.loader import ImageBatch
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.nn.config import ModelConfig
@@ -36,9 +35,7 @@ class JaxDescriber:
         """Check that the parameters are of the configuration, and cast them once."""
         check_params(params, config)
         self.config = config
-        self.preparation = Preparation(
-            config.image_size, config.preprocessing, config.side_multiple
-        )
+        self.preparation = Preparation.of(config)
         self.row_length = config.unprojected_dim
         self.row_dtype = "float64" if config.compute_dtype == "float64" else "float32"
         self._given, self._params = params, cast_params(params, config)
@@ -49,10 +46,6 @@ class JaxDescriber:
     def digest(self) -> str:
         """The `model_hash` of the model."""
         return model_hash(self._given, self.config)
-
-    def check_size(self, size: Size) -> None:
-        """Raise InputError for a height and width that the model cannot describe."""
-        self.config.check_image_size(size)
 
     def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[Rows, ImageBatch]]:
         """Yield each batch with its images' tokens; the devices compute one batch ahead."""

@@ -59,8 +59,7 @@ class Validator:
         if benchmark is not None:
             benchmark.ground_truth()
         self._config, self._benchmark = config, benchmark
-        self._model = model = config.validation_model
-        self._how = Preparation(model.image_size, model.preprocessing, model.side_multiple)
+        self._model = config.validation_model
         self._reading = Reading(on_bad_image=on_bad_image, cache=cache, quiet=True)
 
     @property
@@ -111,7 +110,7 @@ class Validator:
         """Compute statistics of the transport on the first queries, without dropout."""
         paths = benchmark.queries[:WATCHED_QUERIES]
         reading = Reading(batch_size=len(paths), cache=self._reading.cache)
-        batches = reading.batches(paths, self._how, self._model.check_image_size)
+        batches = reading.batches(paths, Preparation.of(self._model))
         batch = next(iter(batches))  # of the size of the first, where sizes differ
         transport = extract_tokens(params, batch.images[batch.valid], self._model).transport
         means = jax.device_get(jax.tree.map(jnp.mean, transport))

@@ -271,14 +271,13 @@ def _read_features(
 ) -> Float32[np.ndarray, "feature dim"]:
     """Read unit features of the images, of `PATCHES` patches of each."""
     config = model.config
-    how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
     devices = devices_for(reading.batch_size)
     params = devices.replicate(cast_params(model.params, config))
     generator = np.random.default_rng(seed)
     parts = [np.empty((0, config.backbone.dim), np.float32)]
     unreadable: list[pathlib.Path] = []
     with progress_bar("vocabulary", len(paths), "images", quiet=quiet) as bar:
-        for batch in reading.batches(paths, how, config.check_image_size):
+        for batch in reading.batches(paths, Preparation.of(config)):
             features = unit_features(params, devices.shard_batch(batch.images), config)
             for image in jax.device_get(features)[batch.valid]:
                 chosen = np.sort(generator.permutation(len(image))[:PATCHES])

@@ -17,7 +17,7 @@ from crisalad_jax.data.class_groups import (
     views_of,
 )
 from crisalad_jax.data.places import Places
-from crisalad_jax.utils.errors import InputError
+from tests.data.benchmarks.trees import refused
 
 COSPLACE = ClassesConfig(kind="cells")
 EIGENPLACES = ClassesConfig(kind="viewpoints", cell=15.0, spacing=3)
@@ -184,6 +184,7 @@ def test_places_are_dealt_to_groups_without_neighbours():
 def test_without_positions_places_are_dealt_by_number():
     places = city_of([(0.0, 0.0)] * 10, [1] * 10)
     assert not views_of(places).known[0]
+    assert not views_of(located((0, 0, 5), (0, 0, 100))).known[0]
     groups = class_groups(places, ClassesConfig(groups=3), min_images=1, places_per_batch=3)
     assert [group.place_id.tolist() for group in groups] == [[0, 3, 6, 9], [1, 4, 7], [2, 5, 8]]
 
@@ -197,11 +198,8 @@ def test_places_with_too_few_images_are_no_classes():
 
 def test_the_groups_with_most_classes_are_taken_and_places_may_be_joined():
     """Two places in one cell become one class; 50 m on is the same group, 10 m on another."""
-    corner = (
-        views_of(city_of([(0.0, 0.0)], [2])).east[0] // 10 * 10
-        - views_of(city_of([(0.0, 0.0)], [2])).east[0]
-    )
-    east = corner + 2
+    start = views_of(city_of([(0.0, 0.0)], [2])).east[0]
+    east = start // 10 * 10 - start + 2
     places = city_of(
         [(east, 0.0), (east + 3, 0.0), (east + 50, 0.0), (east + 10, 0.0)], [2, 2, 3, 4]
     )
@@ -209,12 +207,8 @@ def test_the_groups_with_most_classes_are_taken_and_places_may_be_joined():
     (group,) = class_groups(places, config, min_images=3, places_per_batch=2)
     assert group.image_counts.tolist() == [4, 3]
     assert group.files == places.files[:7]
-    both = class_groups(
-        places,
-        ClassesConfig(kind="cells", groups=9),
-        min_images=3,
-        places_per_batch=1,
-    )
+    config = ClassesConfig(kind="cells", groups=9)
+    both = class_groups(places, config, min_images=3, places_per_batch=1)
     assert [each.image_counts.tolist() for each in both] == [[4, 3], [4]]
 
 
@@ -237,32 +231,6 @@ def test_lateral_and_frontal_groups_take_turns():
             assert tuple(sorted(group.files[a:b])) in possible
 
 
-@pytest.mark.parametrize("kind", ["cells", "viewpoints", "places"])
-def test_no_class_with_enough_images_is_told(kind):
-    places = city_of([(100.0 * i, 0.0) for i in range(6)], [4] * 6)
-    words = "root: found 0 classes of at least 5 images in the smallest of 0 groups, expected"
-    with pytest.raises(InputError, match=words):
-        class_groups(places, ClassesConfig(kind=kind), min_images=5, places_per_batch=1)
-
-
-def test_fewer_classes_than_a_batch_asks_for_are_told():
-    places = city_of([(100.0 * i, 0.0) for i in range(9)], [4] * 9)
-    words = (
-        r"root: found 4 classes of .* in the smallest of 2 groups, expected places_per_batch 5; "
-        r"fewer groups \(--loss.kind.classes.groups\) have more"
-    )
-    with pytest.raises(InputError, match=words):
-        class_groups(places, ClassesConfig(groups=2), min_images=4, places_per_batch=5)
-
-
-@pytest.mark.parametrize("classes", ["cells", "viewpoints"])
-def test_positions_that_are_asked_for_and_missing_are_told(classes):
-    places = city_of([(0.0, 0.0)] * 4, [1] * 4)
-    words = rf"root: found .*one position for all images of a city, .*'{classes}'; --loss"
-    with pytest.raises(InputError, match=words):
-        class_groups(places, ClassesConfig(kind=classes), min_images=1, places_per_batch=1)
-
-
 def located(*views: tuple[float, float, float]) -> Places:
     """One place with an image for each (latitude, longitude, heading)."""
     return places_of(np.array(views), [len(views)])
@@ -276,11 +244,6 @@ def test_views_are_metres_of_utm():
     assert views.known.tolist() == [True]
 
 
-def test_one_position_for_all_stands_for_none():
-    assert not views_of(located((0, 0, 5), (0, 0, 100))).known[0]
-    assert not views_of(located((1.5, 2.5, 5))).known[0]
-
-
 def test_a_city_has_one_zone_even_across_its_edge_and_across_180_degrees():
     """100 m apart on the ground stay so, to the scale's 0.1 %: zones have other eastings."""
     degrees = 100 / 111_319.49  # along the equator
@@ -291,7 +254,41 @@ def test_a_city_has_one_zone_even_across_its_edge_and_across_180_degrees():
         assert views.east[1] - views.east[0] == pytest.approx(100, rel=2e-3)
 
 
-def test_a_city_as_wide_as_the_world_is_refused():
-    places = located((0, -60, 0), (0, 100, 0))
-    with pytest.raises(InputError, match="found the images of city0 over 160 degrees of longitude"):
-        views_of(places)
+ROW = [(100.0 * i, 0.0) for i in range(9)]
+
+
+@pytest.mark.parametrize(
+    ("places", "config", "words"),
+    [
+        *(
+            (
+                city_of(ROW, [3] * 9),
+                {"kind": kind},
+                "found 0 classes of at least 4 images in the smallest of 0 groups, expected",
+            )
+            for kind in ("cells", "viewpoints", "places")
+        ),
+        (
+            city_of(ROW, [4] * 9),
+            {"groups": 2},
+            "found 4 classes of .* in the smallest of 2 groups, expected places_per_batch 5; "
+            r"fewer groups \(--loss.kind.classes.groups\) have more",
+        ),
+        *(
+            (
+                city_of([(0.0, 0.0)] * 4, [1] * 4),
+                {"kind": kind},
+                f"found .*one position for all images of a city, .*'{kind}'; --loss",
+            )
+            for kind in ("cells", "viewpoints")
+        ),
+        (
+            located((0, -60, 0), (0, 100, 0)),
+            {},
+            "found the images of city0 over 160 degrees of longitude",
+        ),
+    ],
+)
+def test_classes_that_cannot_be_made_are_told(places, config, words):
+    with refused(f"root: {words}"):
+        class_groups(places, ClassesConfig(**config), min_images=4, places_per_batch=5)

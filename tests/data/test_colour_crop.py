@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig, _crop
-from crisalad_jax.utils.errors import InputError
 
 NOTHING = {"brightness": 0.0, "contrast": 0.0, "saturation": 0.0, "hue": 0.0, "crop": 0.0}
 IMAGE = np.random.default_rng(0).integers(0, 256, (12, 12, 3), dtype=np.uint8)
@@ -56,11 +55,8 @@ def test_each_change_is_torchvisions_formula(number: int) -> None:
         ]
         expected = np.reshape(turned, pixels.shape)
     else:
-        expected = (
-            1.6 * pixels,
-            0.4 * pixels + 0.6 * grey.mean(),
-            1.5 * pixels - 0.5 * grey,
-        )[number]
+        mean = 0.4 * pixels + 0.6 * grey.mean()
+        expected = (1.6 * pixels, mean, 1.5 * pixels - 0.5 * grey)[number]
     found = changed(*strengths)
     # In float32 a value may round to the other side of a half.
     assert np.abs(found.astype(int) - as_bytes(expected)).max() <= 1
@@ -72,10 +68,8 @@ def test_crops_have_the_shares_and_aspects_that_are_drawn() -> None:
     generator = np.random.default_rng(2)
     crops = np.array([_crop(240, 300, 0.5, generator) for _ in range(500)])
     top, left, height, width = crops.T
-    assert (top >= 0).all()
-    assert (left >= 0).all()
-    assert (top + height <= 240).all()
-    assert (left + width <= 300).all()
+    assert min(top.min(), left.min()) >= 0
+    assert ((top + height <= 240) & (left + width <= 300)).all()
     # Sides are rounded to whole pixels of 120 and more.
     share, aspect = height * width / 72_000, width / height
     assert 0.495 < share.min() < 0.52
@@ -100,11 +94,3 @@ def test_a_crop_fills_the_image_again() -> None:
 def test_an_image_too_long_for_any_crop_is_cut_in_the_middle() -> None:
     assert _crop(100, 400, 0.0, np.random.default_rng(4)) == (0, 133, 100, 133)
     assert _crop(400, 100, 0.0, np.random.default_rng(4)) == (133, 0, 133, 100)
-
-
-@pytest.mark.parametrize(
-    ("field", "value"), [("hue", 0.6), ("crop", 1.0), ("brightness", -0.1), ("contrast", -1.0)]
-)
-def test_strengths_out_of_range_are_refused(field: str, value: float) -> None:
-    with pytest.raises(InputError, match=rf"^ColourCropConfig\.{field}: found {value}, expected"):
-        ColourCropConfig(**{field: value})

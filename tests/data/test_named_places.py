@@ -14,18 +14,28 @@ from crisalad_jax.data.places import epoch_batches, read_places
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.conftest import RECIPE, write_picture, write_video
+from tests.data.benchmarks.trees import refused, touch_all, write_sides
 from tests.data.test_sources import write_jpeg
 
 
-def _street(folder, xs, *, table="gps.csv", name="{:02d}.jpg"):
+def _street(folder, xs):
     """Images along a line, without a picture in them, and a table of their positions."""
-    folder.mkdir(parents=True, exist_ok=True)
-    lines = ["name,x,y"]
-    for number, x in enumerate(xs):
-        (folder / name.format(number)).write_bytes(b"")
-        lines.append(f"{name.format(number)},{x},0")
-    (folder / table).write_text("\n".join(lines))
+    names = [f"{number:02d}.jpg" for number in range(len(xs))]
+    _write_table(touch_all(folder, names) / "gps.csv", "name,x,y", zip(names, xs, strict=True))
     return folder
+
+
+def _write_table(path, header, rows):
+    """A table; of a row that is shorter than the header the rest is 0."""
+    columns = header.count(",") + 1
+    lines = [",".join(map(str, [*row, *[0] * (columns - len(row))])) for row in rows]
+    path.write_text("\n".join([header, *lines]), encoding="utf-8")
+    return path
+
+
+def _by_radius(root, min_images):
+    """Places of a radius of 10 m."""
+    return read_places(root, place_radius=10, positions=root / "gps.csv", min_images=min_images)
 
 
 def _near(places):
@@ -41,7 +51,9 @@ BY_HAND = {"00.jpg": [0, 1], "03.jpg": [2, 3, 4], "05.jpg": [5], "06.jpg": [6]}
 
 def test_a_radius_makes_places_as_by_hand(tmp_path):
     root = _street(tmp_path / "walk", XS)
-    places = read_places(root, place_radius=10, positions=root / "gps.csv", min_images=1)
+    touch_all(root, ["99.jpg"])
+    with pytest.warns(Note, match=r"left out 1 of 8 images, which have no position"):
+        places = _by_radius(root, 1)
     assert places.names == tuple(BY_HAND)
     groups = [list(group) for group in BY_HAND.values()]
     assert places.files == tuple(f"{image:02d}.jpg" for image in itertools.chain(*groups))
@@ -50,70 +62,56 @@ def test_a_radius_makes_places_as_by_hand(tmp_path):
     # Centres at 0, 11, 30 and 5000: up to 40 m apart they are near.
     assert _near(places) == [[1, 2], [0, 2], [0, 1], []]
     back = _street(tmp_path / "back", (11, 9))
-    places = read_places(back, place_radius=10, positions=back / "gps.csv", min_images=1)
-    assert places.image_counts.tolist() == [2]
+    assert _by_radius(back, 1).image_counts.tolist() == [2]
 
 
 def test_places_with_few_images_are_left_out_and_counted(tmp_path):
     root = _street(tmp_path / "walk", XS)
-    given = {"place_radius": 10, "positions": root / "gps.csv"}
-    words = r"left out 2 of 4 places, with fewer than 2 images$"
-    with pytest.warns(Note, match=words):
-        places = read_places(root, min_images=2, **given)
+    with pytest.warns(Note, match=r"left out 2 of 4 places, with fewer than 2 images$"):
+        places = _by_radius(root, 2)
     assert places.names == ("00.jpg", "03.jpg")
     assert _near(places) == [[1], [0]]  # by their new numbers
-    words = (
-        r"walk: found no place with at least 4 images; the largest has 3, of 4 places "
-        r"\(--place-radius, .*--min-images\)$"
-    )
-    with pytest.raises(InputError, match=words):
-        read_places(root, **given)
+    words = r"largest has 3, of 4 places \(--place-radius, .*--min-images\)$"
+    with refused(f"walk: found no place with at least 4 images; the {words}"):
+        _by_radius(root, 4)
 
 
-def test_degrees_are_metres_of_utm(tmp_path):
-    # One degree of latitude is 110.6 km at the equator, and 111.7 km at the poles.
-    root = tmp_path / "walk"
-    root.mkdir()
-    lines = ["name,lat,lon"]
-    for number, metres in enumerate((0, 9, 12, 100)):
-        (root / f"{number}.jpg").write_bytes(b"")
-        lines.append(f"{number}.jpg,{47 + metres / 111_170:.8f},8.5")
-    (root / "t.csv").write_text("\n".join(lines))
-    places = read_places(root / "t.csv", place_radius=10, min_images=1)  # a table is a source
-    assert places.names == ("0.jpg", "2.jpg", "3.jpg")
-    assert places.image_counts.tolist() == [1, 2, 1]  # 9 is nearer 12 than 0
-    assert _near(places) == [[1], [0], []]
-
-
-def test_degrees_of_two_zones_of_utm(tmp_path):
-    # At 50 degrees 0.0002 of longitude are 111,320 m x cos 50 x 0.0002 = 14.3 m; zone 32 begins
-    # at 6 degrees east.
-    for name in "ab":
-        (tmp_path / f"{name}.jpg").write_bytes(b"")
-    (tmp_path / "t.csv").write_text("name,lat,lon\na.jpg,50,5.9999\nb.jpg,50,6.0001\n")
-    counts = [
-        read_places(tmp_path / "t.csv", place_radius=radius, min_images=1).image_counts.tolist()
-        for radius in (14, 15)
-    ]
-    assert counts == [[1, 1], [2]]
+@pytest.mark.parametrize(
+    ("degrees", "radius", "counts"),
+    [
+        # One degree of latitude is 110.6 km at the equator, and 111.7 km at the poles. 9 is nearer
+        # 12 than 0.
+        ([(f"{47 + metres / 111_170:.8f}", 8.5) for metres in (0, 9, 12, 100)], 10, [1, 2, 1]),
+        # At 50 degrees 0.0002 of longitude are 111,320 m x cos 50 x 0.0002 = 14.3 m; zone 32
+        # begins at 6 degrees east.
+        ([(50, 5.9999), (50, 6.0001)], 14, [1, 1]),
+        ([(50, 5.9999), (50, 6.0001)], 15, [2]),
+    ],
+)
+def test_degrees_are_metres_of_utm(tmp_path, degrees, radius, counts):
+    rows = [(f"{number}.jpg", *point) for number, point in enumerate(degrees)]
+    touch_all(tmp_path, [row[0] for row in rows])
+    table = _write_table(tmp_path / "t.csv", "name,lat,lon", rows)  # a table is a source
+    places = read_places(table, place_radius=radius, min_images=1)
+    assert places.image_counts.tolist() == counts
+    if len(counts) == 3:
+        assert places.names == ("0.jpg", "2.jpg", "3.jpg")
+        assert _near(places) == [[1], [0], []]
 
 
 def test_places_across_zones_and_across_the_world(tmp_path):
     """14 m apart across the edge of zones 31 and 32 is one place; equal numbers are two."""
     names = ("@0720065.35@5415121.13@31@U@.jpg", "@0279934.65@5415121.13@32@U@.jpg")
     far = "@0720065.35@5415121.13@10@U@.jpg"
-    for name in (*names, far):
-        (tmp_path / name).write_bytes(b"")
+    touch_all(tmp_path, [*names, far])
     places = read_places(tmp_path, place_radius=20, min_images=1)
-    found = {places.names[place]: [] for place in range(2)}
-    for file, place in zip(places.files, places.image_place, strict=True):
-        found[places.names[place]].append(file)
-    assert sorted(map(sorted, found.values())) == sorted([[far], sorted(names)])
+    assert places.names == (names[1], far)
+    assert places.files == (*names[::-1], far)
 
 
 def test_names_say_where(tmp_path):
-    for east in (500_000, 500_003, 500_500):
-        write_picture(tmp_path / f"@{east}.00@5000000.00@10@T@@@@@@@@@@@.jpg", 0)
+    names = [f"@{x}.00@5000000.00@10@T@@@@@@@@@@@.jpg" for x in (500_000, 500_003, 500_500)]
+    touch_all(tmp_path, names)
     places = read_places(tmp_path, place_radius=5, min_images=1)
     assert places.image_counts.tolist() == [2, 1]
 
@@ -127,44 +125,30 @@ def test_exif_data_says_where(tmp_path):
         assert places.image_counts.tolist() == counts
 
 
-def _near_pairs(places, batch, points):
-    """The smallest distance of two images of different places, and the largest of one place's."""
-    place = places.image_place[batch.ravel()]
-    where = points[[places.files[image] for image in batch.ravel()]]
-    distance = np.linalg.norm(where[:, None] - where[None], axis=-1)
-    same = place[:, None] == place[None]
-    return distance[~same].min(), distance[same].max()
-
-
-class _Points(dict):
-    def __getitem__(self, names):
-        return np.array([dict.__getitem__(self, name) for name in names])
-
-
 @pytest.mark.parametrize("seed", [0, 1])
 def test_negatives_of_a_batch_are_farther_than_its_positives(tmp_path, seed):
     # Two loops through the same square of streets, at random steps.
     rng = np.random.default_rng(seed)
     corners = [(0, 0), (300, 0), (300, 200), (0, 200), (0, 0)]
-    points, lines = _Points(), ["name,x,y"]
+    points = {}
     for loop in range(2):
         along = np.sort(rng.uniform(0, 4, 300))
         for number, t in enumerate(along):
             (x0, y0), (x1, y1) = corners[int(t)], corners[int(t) + 1]
             part = t - int(t)
             x, y = x0 + part * (x1 - x0), y0 + part * (y1 - y0) + rng.uniform(-2, 2)
-            name = f"{loop}/{number:03d}.jpg"
-            points[name] = (x, y)
-            lines.append(f"{name},{x},{y}")
-            (tmp_path / str(loop)).mkdir(exist_ok=True)
-            (tmp_path / name).write_bytes(b"")
-    (tmp_path / "t.csv").write_text("\n".join(lines))
-    places = read_places(tmp_path / "t.csv", place_radius=10, min_images=4)
+            points[f"{loop}/{number:03d}.jpg"] = (x, y)
+    rows = [(name, *point) for name, point in points.items()]
+    table = _write_table(touch_all(tmp_path, points) / "t.csv", "name,x,y", rows)
+    places = read_places(table, place_radius=10, min_images=4)
+    where = np.array([points[file] for file in places.files])
     draw = {"places_per_batch": 8, "images_per_place": 4, "order": "shuffled", "seed": seed}
     batches = epoch_batches(places, epoch=0, **draw)
     for batch in batches:
-        apart, together = _near_pairs(places, batch, points)
-        assert together <= 20 < apart  # two radii
+        place, at = places.image_place[batch.ravel()], where[batch.ravel()]
+        distance = np.linalg.norm(at[:, None] - at, axis=-1)
+        same = place[:, None] == place
+        assert distance[same].max() <= 20 < distance[~same].min()  # two radii
     # An epoch uses nearly all places: of 100 m of street there are some nine.
     assert len(batches) * 8 >= 0.7 * len(places.place_id)
     assert len(np.unique(places.image_place[batches[..., 0]])) == len(batches) * 8  # each once
@@ -175,8 +159,8 @@ def test_negatives_of_a_batch_are_farther_than_its_positives(tmp_path, seed):
 
 
 def test_too_many_places_for_a_batch(tmp_path):
-    root = _street(tmp_path / "walk", range(0, 100, 2))  # 100 m hold at most three 40 m apart
-    places = read_places(root, place_radius=10, positions=root / "gps.csv", min_images=2)
+    # 100 m hold at most three 40 m apart.
+    places = _by_radius(_street(tmp_path / "walk", range(0, 100, 2)), 2)
     draw = {"images_per_place": 2, "order": "shuffled", "seed": 0, "epoch": 0}
     assert len(epoch_batches(places, places_per_batch=2, **draw))
     with pytest.raises(InputError, match=r"expected places_per_batch 5 .* not near each other"):
@@ -184,9 +168,7 @@ def test_too_many_places_for_a_batch(tmp_path):
 
 
 def test_every_n_frames_in_order(tmp_path):
-    for name in ("a/1.jpg", "a/2.jpg", "a/3.jpg", "a/4.jpg", "a/5.jpg", "b/1.jpg", "b/2.jpg"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(b"")
+    touch_all(tmp_path, [*(f"a/{number}.jpg" for number in range(1, 6)), "b/1.jpg", "b/2.jpg"])
     places = read_places(tmp_path, place_frames=2, min_images=1)
     assert places.names == ("a/1.jpg", "a/3.jpg", "a/5.jpg", "b/1.jpg")
     assert places.image_counts.tolist() == [2, 2, 1, 2]
@@ -255,17 +237,8 @@ def test_a_source_that_has_no_places_says_which_flags_make_them(tmp_path, shared
         read_places(shared / "city", place_radius=5)
 
 
-def test_images_without_a_position_are_left_out_with_a_note(tmp_path):
-    root = _street(tmp_path / "walk", XS)
-    (root / "99.jpg").write_bytes(b"")
-    with pytest.warns(Note, match=r"left out 1 of 8 images, which have no position"):
-        places = read_places(root, place_radius=10, positions=root / "gps.csv", min_images=1)
-    assert places.names == tuple(BY_HAND)
-
-
 def test_classes_of_a_group_are_not_near(tmp_path):
-    root = _street(tmp_path / "walk", range(0, 400, 2))
-    places = read_places(root, place_radius=10, positions=root / "gps.csv", min_images=2)
+    places = _by_radius(_street(tmp_path / "walk", range(0, 400, 2)), 2)
     config = ClassesConfig(kind="places", groups=5)
     groups = class_groups(places, config, min_images=2, places_per_batch=2)
     assert len(groups) == 5
@@ -276,35 +249,20 @@ def test_classes_of_a_group_are_not_near(tmp_path):
 
 
 def test_training_takes_a_folder_and_a_table(tmp_path):
-    lines = ["name,x,y"]
+    rows = []
     for place, view in itertools.product(range(6), range(3)):
-        name = f"{place}-{view}.jpg"
-        write_picture(tmp_path / "walk" / name, place, noise=10.0 * (1 + view))
-        lines.append(f"{name},{100 * place + view},0")
-    (tmp_path / "gps.csv").write_text("\n".join(lines))
-    given = {"place_radius": 10, "positions": tmp_path / "gps.csv", "quiet": True}
+        rows.append((f"{place}-{view}.jpg", 100 * place + view))
+        write_picture(tmp_path / "walk" / rows[-1][0], place, noise=10.0 * (1 + view))
+    table = _write_table(tmp_path / "gps.csv", "name,x,y", rows)
+    given = {"place_radius": 10, "positions": table, "quiet": True}
     result = cj.train(RECIPE, tmp_path / "walk", tmp_path / "run", **given)
     assert result.steps == 3 * 2  # six places, three a batch, three epochs
 
 
-def _touch(root, *names):
-    for name in names:
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_bytes(b"")  # reading places opens no image
-
-
 @pytest.fixture
 def folders(tmp_path):
-    root = tmp_path / "mine"
-    _touch(root, "bridge/2.jpg", "bridge/1.JPG", "north/park/a.png", "north/park/b.png")
-    _touch(root, "lone/1.jpg", ".hidden/1.jpg", "bridge/notes.txt")
-    return root
-
-
-def _table(root, text):
-    root.mkdir(exist_ok=True)
-    (root / "places.csv").write_text(text, encoding="utf-8")
-    return root / "places.csv"
+    names = ("bridge/2.jpg", "bridge/1.JPG", "north/park/a.png", "north/park/b.png", "lone/1.jpg")
+    return touch_all(tmp_path / "mine", [*names, ".hidden/1.jpg", "bridge/notes.txt"])
 
 
 def test_each_folder_with_images_is_a_place(folders):
@@ -323,10 +281,9 @@ def test_each_folder_with_images_is_a_place(folders):
 
 @pytest.mark.parametrize("by_file", [False, True])
 def test_a_table_names_places(folders, by_file):
-    table = _table(
-        folders,
-        "\ufeffplace,name,sky\n7,bridge/1.JPG,sun\nold town,lone/1.jpg,\n\n7,bridge/2.jpg,\n",
-    )
+    text = "\ufeffplace,name,sky\n7,bridge/1.JPG,sun\nold town,lone/1.jpg,\n\n7,bridge/2.jpg,\n"
+    table = folders / "places.csv"
+    table.write_text(text, encoding="utf-8")
     places = read_places(table if by_file else folders, min_images=1)
     assert places.names == ("7", "old town")
     assert places.cities == ("mine",)
@@ -338,8 +295,8 @@ def test_a_table_names_places(folders, by_file):
 def test_a_table_with_positions_makes_classes(folders):
     names = ("bridge/1.JPG", "bridge/2.jpg", "north/park/a.png", "north/park/b.png")
     # 0.001 degrees of latitude are 111 m: two cells of 10 m that are no neighbours.
-    rows = [f"{name},{i % 2},{0.001 * (i // 2)},3.00001,{90}" for i, name in enumerate(names)]
-    table = _table(folders, "\n".join(["name,place,lat,lon,heading", *rows]))
+    rows = [(name, i % 2, 0.001 * (i // 2), 3.00001, 90) for i, name in enumerate(names)]
+    table = _write_table(folders / "places.csv", "name,place,lat,lon,heading", rows)
     places = read_places(table, min_images=1)
     views = views_of(places)
     # The central meridian of zone 31 is 3 degrees, whose east is 500 km.
@@ -358,7 +315,7 @@ def test_a_table_with_positions_makes_classes(folders):
 )
 def test_classes_by_position_say_what_they_lack(folders, table):
     if table:
-        _table(folders, table)
+        (folders / "places.csv").write_text(table)
     places = read_places(folders, min_images=1)
     message = r"^.*mine: found no headings, or no positions, .*'cells'; --loss[^\n]*$"
     with pytest.raises(InputError, match=message):
@@ -386,29 +343,29 @@ def test_classes_by_position_say_what_they_lack(folders, table):
     ],
 )
 def test_bad_tables(folders, text, message):
-    _table(folders, text)
+    (folders / "places.csv").write_text(text)
     with pytest.raises(InputError, match=message):
         read_places(folders)
 
 
 def test_what_is_no_layout(tmp_path, folders):
-    _touch(folders, "1.jpg")
+    touch_all(folders, ["1.jpg"])
     words = "mine: found .*, expected the layout of GSV.*, without an image next to the folders"
     with pytest.raises(InputError, match=words):
         read_places(folders)
-    _touch(tmp_path / "set", "database/1.jpg", "queries/1.jpg")
+    write_sides(tmp_path / "set", ["1.jpg"], ["1.jpg"])
     with pytest.raises(InputError, match="set: found database/, queries/, expected the layout of"):
         read_places(tmp_path / "set")
 
 
 def test_missing_images_of_a_table_are_left_out_with_a_note(folders):
-    text = "name,place\nbridge/1.JPG,a\nbridge/3.jpg,a\nbridge/2.jpg,a\nnone.jpg,b\n"
-    table = _table(folders, text)
+    table = folders / "places.csv"
+    table.write_text("name,place\nbridge/1.JPG,a\nbridge/3.jpg,a\nbridge/2.jpg,a\nnone.jpg,b\n")
     with pytest.raises(InputError, match="found 2 of 4 images missing"):
         read_places(table, min_images=1)
     with pytest.warns(Note, match=r"places.csv: left out 2 of 4 images, which are missing"):
         places = read_places(table, min_images=1, on_bad_image="skip")
     assert places.files == ("bridge/1.JPG", "bridge/2.jpg")
-    _table(folders, "name,place\nnone.jpg,b\n")
+    table.write_text("name,place\nnone.jpg,b\n")
     with pytest.raises(InputError, match="found 1 of 1 images missing"):
         read_places(table, min_images=1, on_bad_image="skip")

@@ -1,5 +1,6 @@
 """Pixels of any depth as 8-bit RGB, by hand."""
 
+import dataclasses
 import threading
 import warnings
 
@@ -11,8 +12,10 @@ from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data import prepare
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.prepare import Preparation, as_rgb
+from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
+from tests.data.benchmarks.trees import refused
 
 
 @pytest.fixture(autouse=True)
@@ -80,14 +83,15 @@ def test_flat_values_and_eight_bits():
 
 def test_narrow_sixteen_bits_are_noted_once(tmp_path):
     values = np.linspace(7200, 8900, 6000).astype(np.uint16).reshape(60, 100)
-    for name in ("thermal.png", "another.png"):
-        Image.fromarray(values).save(tmp_path / name)
+    paths = [tmp_path / "thermal.png", tmp_path / "another.png"]
+    for path in paths:
+        Image.fromarray(values).save(path)
     with pytest.warns(Note) as notes:
-        found = [read_image(tmp_path / name) for name in ("thermal.png", "another.png")]
+        found = [read_image(path) for path in paths]
     # The 1st and 99th percentile, and the high bytes between them: 28 to 34.
     assert [str(note.message) for note in notes] == [
-        f"{tmp_path / 'thermal.png'}: 16-bit values from 7,216 to 8,882 of 65,535 become 7 of 256 "
-        "grey levels; --resize contrast-stretch spreads them over all"
+        f"{paths[0]}: 16-bit values from 7,216 to 8,882 of 65,535 become 7 of 256 grey levels; "
+        "--resize contrast-stretch spreads them over all"
     ]
     for image in found:
         np.testing.assert_array_equal(image[..., 0], values >> 8)
@@ -95,13 +99,19 @@ def test_narrow_sixteen_bits_are_noted_once(tmp_path):
 
 def test_wide_sixteen_bits_and_stretched_ones_are_not_noted():
     wide = np.linspace(0, 65535, 6000).astype(np.uint16).reshape(60, 100)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         as_rgb(wide)
         as_rgb(wide // 4 + wide // 128)  # 98 % of 16,894 is 16,556, and 64 of 256 levels are 16,384
         as_rgb(wide // 32, "contrast-stretch")
     with pytest.warns(Note, match="become 64 of 256"):
         as_rgb(wide // 4)  # 98 % of 16,383
+
+
+def test_a_size_that_a_model_cannot_describe_is_told_with_the_name_of_the_image():
+    how = dataclasses.replace(Preparation.of(PRESETS["b14"]), image_size=(28, 42))
+    assert how == Preparation((28, 42), side_multiple=14)  # so that caches share images
+    with refused(r"^a\.jpg: image size: found 28 x 42, which is 6 patches for 64 clusters"):
+        how.prepare(np.zeros((30, 40, 3), np.uint8), "a.jpg")
 
 
 def test_the_chain_says_how():

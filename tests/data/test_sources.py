@@ -18,6 +18,7 @@ from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import file_of, frame_time, list_frames
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import write_picture, write_video
+from tests.data.benchmarks.trees import refused
 
 LEVELS = 3
 """Largest difference from the grey that was written, of 256: MJPG is lossy, and flat frames
@@ -128,12 +129,6 @@ def test_a_table(root, tmp_path, text, axes, of):
         assert set(of) <= set(source.names)
 
 
-def test_a_table_of_positions_has_the_same_forms(tmp_path):
-    (tmp_path / "p.csv").write_text("name;x;y\na.jpg;1,5;-2.25\n")
-    found = read_positions(tmp_path / "p.csv")
-    assert found == Positions(("x", "y"), {"a.jpg": (1.5, -2.25)})
-
-
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
@@ -143,22 +138,14 @@ def test_a_table_of_positions_has_the_same_forms(tmp_path):
         ("run/*.md", None, "found no image among 1 file"),
         ("a.txt", "\n\n", "a.txt: found no image, expected images"),
         ("a.txt", "b.png\n", "a.txt: .*b.png: found no such file, expected an image file"),
-        (
-            "a.txt",
-            "\n{run}/left/0.png\n{run}/right/../left/0.png",
-            "a.txt: found .*0.png' twice, exp",
-        ),
+        ("a.txt", "\n{run}/left/0.png\n{run}/right/../left/0.png", "a.txt: found .*0.png' twice"),
         ("a.txt", "{run}\n", "a.txt: .*run: found a folder, expected an image file"),
         ("a.csv", "file,lat,lon\n", "found columns file, lat, lon; missing name"),
         ("a.csv", "name\n", "a.csv: found no image, expected images"),
         ("a.csv", "name,year\n,1\n", "line 2: found no name, expected one"),
         ("a.csv", "name;lat;lon\n{run}/left/0.png;1.000,5;2\n", "lat: found '1.000,5', expected"),
         ("a.csv", "name,x,x,y\n", "found columns name, x, x, y, expected each once"),
-        (
-            "a.csv",
-            "name,x,y\n{run}/walk.avi,1,2\n",
-            "found the video .*walk.avi, expected images",
-        ),
+        ("a.csv", "name,x,y\n{run}/walk.avi,1,2\n", "found the video .*walk.avi, expected images"),
         ("a.mp4", "text", "a.mp4: found no frame, expected a video"),
         ("a.mp4#t=1.000", None, "a.mp4: found no such file"),
     ],
@@ -169,9 +156,8 @@ def test_a_bad_source_is_one_line(root, tmp_path, name, text, words, capfd):
         source.write_text(text.format(run=root / "run"))
     elif name.startswith("run"):
         source = root / name
-    with pytest.raises(InputError, match=words) as error:
+    with refused(words):
         open_source(source)
-    assert "\n" not in str(error.value)
     assert capfd.readouterr() == ("", "")
 
 
@@ -186,7 +172,11 @@ def test_a_rate_out_of_range_is_refused(root, fps):
 
 @pytest.mark.parametrize(
     ("fps", "frames"),
-    [(1, [0, 10, 20]), (2, [0, 5, 10, 15, 20]), (4, [0, 3, 5, 8, 10, 13, 15, 18, 20, 23])],
+    [
+        (1, [0, 10, 20]),
+        (4, [0, 3, 5, 8, 10, 13, 15, 18, 20, 23]),
+        (1000, [*range(25)]),
+    ],
 )
 def test_frames_are_the_first_after_each_step(root, fps, frames):
     """Frame i of 10 a second is at 0.1 i seconds, and is grey of level 10 i."""
@@ -196,17 +186,11 @@ def test_frames_are_the_first_after_each_step(root, fps, frames):
     np.testing.assert_allclose([grey(path) for path in found], np.multiply(10, frames), atol=LEVELS)
 
 
-def test_more_frames_than_there_are_is_all(root):
-    assert len(list_frames(root / "run" / "walk.avi", 1000)) == 25
-
-
 def test_frames_in_any_order_and_times_between_them(root):
     video = root / "run" / "walk.avi"
     for time, level in ((2.4, 240), (0.0, 0), (1.5, 150), (1.5, 150), (1.41, 150), (0.05, 10)):
         assert grey(pathlib.Path(f"{video}#t={time}")) == pytest.approx(level, abs=LEVELS)
-    with pytest.raises(
-        InputError, match=r"walk\.avi#t=2\.5: found no frame there, expected a time"
-    ):
+    with refused(r"walk\.avi#t=2\.5: found no frame there, expected a time"):
         read_image(f"{video}#t=2.5")
     with pytest.raises(InputError, match=r"none\.avi: found no such file, expected a video"):
         read_image(f"{video.with_name('none.avi')}#t=0")

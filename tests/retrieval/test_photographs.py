@@ -53,7 +53,7 @@ def folder(tmp_path: pathlib.Path) -> pathlib.Path:
 def batches_of(config, paths, **options):
     """Batches of files as a model of this configuration takes them."""
     describer = describer_of(Model(random_params(config), config))
-    return Reading(**options).batches(paths, describer.preparation, describer.check_size)
+    return Reading(**options).batches(paths, describer.preparation)
 
 
 def paths_in(folder: pathlib.Path) -> list[pathlib.Path]:

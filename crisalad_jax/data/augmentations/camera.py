@@ -6,8 +6,7 @@ import math
 import cv2
 import numpy as np
 
-from crisalad_jax.config.checks import require_fraction, require_range
-from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Image
+from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Image, fraction, from_zero
 from crisalad_jax.data.augmentations.light import LightAugmentConfig, light_augment
 
 _QUALITY = (12, 85)
@@ -19,30 +18,23 @@ _QUALITY = (12, 85)
 class CameraAugmentConfig(LightAugmentConfig):
     """The light augmentation, and then a cheap camera: for rendered pictures, which lack one."""
 
-    perspective: float = 0.04
+    perspective: float = fraction(0.04)
     """Largest shift of a corner, as a share of the side."""
-    texture: float = 0.25
+    texture: float = from_zero(0.25)
     """Largest deviation of a multiplied texture of several scales, which rendered walls lack."""
-    filters: float = 0.3
+    filters: float = from_zero(0.3, 1)
     """Probability of random filters over all colours, which change textures and keep outlines (Xu
     et al., ICLR 2021)."""
-    occlusion: float = 0.3
+    occlusion: float = from_zero(0.3, 1)
     """Probability that something covers a part."""
-    motion: float = 0.2
+    motion: float = from_zero(0.2, 1)
     """Probability of motion blur, of up to a sixteenth of the width."""
-    coarse: float = 0.3
+    coarse: float = from_zero(0.3, 1)
     """Probability of fewer pixels: down to two fifths of the sides."""
-    noise: float = 8.0
+    noise: float = from_zero(8.0)
     """Largest deviation of noise, in grey levels."""
-    jpeg: float = 0.4
+    jpeg: float = from_zero(0.4, 1)
     """Probability of another JPEG."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        super().__post_init__()
-        require_fraction(self, "perspective")
-        require_range(self, 0, math.inf, "texture", "noise")
-        require_range(self, 0, 1, "filters", "occlusion", "motion", "coarse", "jpeg")
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator

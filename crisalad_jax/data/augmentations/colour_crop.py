@@ -10,8 +10,13 @@ import math
 import cv2
 import numpy as np
 
-from crisalad_jax.config.checks import require_fraction, require_range
-from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
+from crisalad_jax.data.augmentations.base import (
+    AUGMENTATIONS,
+    Augmentation,
+    Image,
+    fraction,
+    from_zero,
+)
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.utils.shapes import Float32
 
@@ -29,22 +34,16 @@ _Floats = Float32[np.ndarray, "h w 3"]
 class ColourCropConfig(Augmentation):
     """Changes of colour in random order, then a crop at the size of the image (CosPlace)."""
 
-    brightness: float = 0.7
+    brightness: float = from_zero(0.7)
     """Largest relative change of brightness."""
-    contrast: float = 0.7
+    contrast: float = from_zero(0.7)
     """Largest relative change of contrast."""
-    saturation: float = 0.7
+    saturation: float = from_zero(0.7)
     """Largest relative change of saturation."""
-    hue: float = 0.5
+    hue: float = from_zero(0.5, 0.5)
     """Largest turn of the hue, of 1 for a whole circle."""
-    crop: float = 0.5
+    crop: float = fraction(0.5)
     """Largest share of the area that a crop removes."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_range(self, 0, math.inf, "brightness", "contrast", "saturation")
-        require_range(self, 0, 0.5, "hue")
-        require_fraction(self, "crop")
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator

@@ -6,8 +6,13 @@ import math
 import cv2
 import numpy as np
 
-from crisalad_jax.config.checks import require_fraction, require_range
-from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
+from crisalad_jax.data.augmentations.base import (
+    AUGMENTATIONS,
+    Augmentation,
+    Image,
+    fraction,
+    from_zero,
+)
 
 # ITU-R BT.601 luma.
 _LUMA = np.array([0.299, 0.587, 0.114])
@@ -18,30 +23,24 @@ _LUMA = np.array([0.299, 0.587, 0.114])
 class LightAugmentConfig(Augmentation):
     """One small warp and mild changes of light, for training from scratch on fixed cameras."""
 
-    crop: float = 0.1
+    crop: float = fraction(0.1)
     """Largest share of the side that a crop removes."""
-    shift: float = 0.05
+    shift: float = fraction(0.05)
     """Largest shift, as a share of the side."""
-    rotation: float = 2.0
+    rotation: float = from_zero(2.0)
     """Largest rotation in degrees."""
-    flip: float = 0.0
+    flip: float = from_zero(0.0, 1)
     """Probability of a mirror image. All images of one place in a batch are mirrored alike."""
-    blur: float = 1.0
+    blur: float = from_zero(1.0)
     """Largest standard deviation of a Gaussian blur, in pixels."""
-    colour: float = 0.2
+    colour: float = fraction(0.2)
     """Largest relative change of brightness, of contrast and of saturation."""
-    grey: float = 0.2
+    grey: float = from_zero(0.2, 1)
     """Probability of dropping the colour."""
-    gamma: float = 0.0
+    gamma: float = from_zero(0.0)
     """Largest change of the logarithm of an exponent on intensities."""
-    illumination: float = 0.0
+    illumination: float = from_zero(0.0)
     """Largest change of log brightness in a smooth field over the image: uneven light."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_fraction(self, "crop", "shift", "colour")
-        require_range(self, 0, math.inf, "rotation", "blur", "gamma", "illumination")
-        require_range(self, 0, 1, "flip", "grey")
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from crisalad_jax.config.checks import require_range
-from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
+from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image, from_zero
 from crisalad_jax.utils.shapes import Bool, Int64, UInt8
 
 MAGNITUDE_BINS = 31
@@ -26,14 +25,9 @@ _LEVELS = np.arange(256)
 class RandAugmentConfig(Augmentation):
     """RandAugment (Cubuk et al. 2020), torchvision's 14 operations, GSV-Cities' strength."""
 
-    operations: int = 3
-    magnitude: int = 9
+    operations: int = from_zero(3)
+    magnitude: int = from_zero(9, MAGNITUDE_BINS - 1)
     """Which of 31 bins of strength."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_range(self, 0, math.inf, "operations")
-        require_range(self, 0, MAGNITUDE_BINS - 1, "magnitude")
 
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator

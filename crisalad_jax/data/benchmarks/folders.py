@@ -122,23 +122,20 @@ def _by_table(
     """Read the matches of each query from a table, which may have a header."""
     path = folder / TRUTH
     table = read_table(path)
-    if len(table.columns) != 2:
-        found = ", ".join(table.columns) or "nothing"
-        raise InputError(f"{path}: found {found} in the first line, expected query,database")
     rows = [] if table.columns == _HEADER else [(1, table.columns)]
     rows += [(line, [field.strip() for field in fields]) for line, fields in table.lines]
     number = {name: image for image, name in enumerate(_names(folder / "database", database))}
     number[""] = _NO_MATCH
     matches: dict[str, set[int]] = {name: set() for name in _names(folder / "queries", queries)}
-    asked = matched((query for _, (query, _) in rows), matches)
-    there = matched((match for _, (_, match) in rows), number)
-    for line, (query, match) in rows:
-        if query not in asked or match not in there:
+    asked = matched((fields[0] for _, fields in rows if fields), matches)
+    there = matched((fields[-1] for _, fields in rows if fields), number)
+    for line, fields in rows:
+        if len(fields) != 2 or fields[0] not in asked or fields[1] not in there:
             raise InputError(
-                f"{path}: line {line}: found {query!r},{match!r}, expected the paths of images "
-                "below queries/ and database/"
+                f"{path}: line {line}: found {','.join(map(repr, fields))}, expected query,database"
+                ": the paths of images below queries/ and database/"
             )
-        matches[asked[query]].add(number[there[match]])
+        matches[asked[fields[0]]].add(number[there[fields[1]]])
     wrong = [name for name, of in matches.items() if not of or (_NO_MATCH in of and len(of) > 1)]
     if wrong:
         raise InputError(
@@ -153,27 +150,26 @@ def _read_positions(
 ) -> tuple[Float64[np.ndarray, "images axis"], Float64[np.ndarray, "q axis"]] | tuple[None, None]:
     """Read where the images of two folders were taken, as points whose distances are metres."""
     both = folder / "positions.csv"
-    tables = [folder / "database.csv", folder / "queries.csv"]
-    if both.exists():
-        tables = [both, both]
-    elif not any(table.exists() for table in tables):
+    sides = [(both, folder, database), (both, folder, queries)]
+    if not both.exists():
+        sides = [
+            (folder / "database.csv", folder / "database", database),
+            (folder / "queries.csv", folder / "queries", queries),
+        ]
+    if not any(table.exists() for table, _, _ in sides):
         return None, None
-    axes, points = [], []
-    for table, images in zip(tables, (database, queries), strict=True):
-        names = _names(folder if table == both else folder / table.stem, images)
-        found = positions_of(table, names, folder)
-        missing = [name for name in names if name not in found.of]
-        if missing:
+    found, points = [], []
+    for table, names_from, images in sides:
+        names = _names(names_from, images)
+        found.append(positions_of(table, names, folder))
+        missing = [name for name in names if name not in found[-1].of]
+        if missing or found[-1].axes != found[0].axes:
             raise InputError(
-                f"{table}: found {len(missing)} of {len(names)} images without a line, expected "
-                f"all; the first is {missing[0]}"
+                f"{table}: found columns {','.join(found[-1].axes)}, and {len(missing)} of "
+                f"{len(names)} images without a line ({''.join(missing[:1])}), expected "
+                f"{','.join(found[0].axes)}, and all images"
             )
-        axes.append(found.axes)
-        points.append(np.array([found.of[name] for name in names], np.float64))
-    if axes[0] != axes[1]:
-        raise InputError(
-            f"{tables[0]}: found columns {axes[0]}, expected {axes[1]} as in the other"
-        )
-    if axes[0] == AXES[1]:
+        points.append(np.array([found[-1].of[name] for name in names], np.float64))
+    if found[0].axes == AXES[1]:
         points = np.split(comparable(*np.concatenate(points).T), [len(database)])
     return points[0], points[1]

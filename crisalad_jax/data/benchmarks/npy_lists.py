@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from crisalad_jax.config.checks import fits
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.msls import msls_title
 from crisalad_jax.data.benchmarks.on_disk import find_images, list_part
@@ -57,12 +58,7 @@ def read_vpr_bench(root: str | os.PathLike[str]) -> Benchmark:
     root = pathlib.Path(root)
     database, queries = (_numbered(list_part(root / part)) for part in ("ref", "query"))
     path = root / VPR_BENCH_TRUTH
-    rows = read_npy(path)
-    if rows.shape != (len(queries), 2):
-        raise InputError(
-            f"{path}: found shape {rows.shape}, expected ({len(queries)}, 2): one row for each "
-            "query"
-        )
+    rows = _read_rows(path, len(queries), 2)
     asked = _chosen(path, rows[:, 0], len(queries))
     truth = _read_matches(path, rows[:, 1], len(database), windows=True)
     positives = tuple(truth[row] for row in np.argsort(asked))
@@ -120,12 +116,7 @@ def read_salad_lists(
     truth = files.get("gt", files.get("pIdx"))
     positives, rule = None, "none: there is no ground truth beside the lists"
     if truth is not None:
-        rows = np.atleast_1d(read_npy(truth))
-        if len(rows) != asked:
-            raise InputError(
-                f"{truth}: found shape {rows.shape}, expected a row for each of {asked} queries"
-            )
-        positives = _read_matches(truth, rows, count)
+        positives = _read_matches(truth, _read_rows(truth, asked), count)
         rule = f"the database images that {truth.name} lists"
     database, queries = (
         find_images(files[kind], names[kind], images, on_bad_image, folders)
@@ -181,6 +172,17 @@ def _names(path: pathlib.Path) -> list[str]:
     return names
 
 
+def _read_rows(path: pathlib.Path, queries: int, *columns: int) -> np.ndarray:
+    """Read a row for each query, of so many columns where that is given."""
+    rows = np.atleast_1d(read_npy(path))
+    if len(rows) != queries or (columns and rows.shape[1:] != columns):
+        raise InputError(
+            f"{path}: found shape {rows.shape}, expected {(queries, *columns)}: a row for each of "
+            f"{queries} queries"
+        )
+    return rows
+
+
 def _chosen(path: pathlib.Path, rows: np.ndarray, queries: int) -> Int64[np.ndarray, " _"]:
     """Return the indices of queries in some rows, of which each may be there once."""
     indices = [index for row in _rows(path, np.atleast_1d(rows)) for index in row.tolist()]
@@ -202,13 +204,12 @@ def _rows(path: pathlib.Path, rows: Iterable[Any]) -> _Matches:
     for number, row in enumerate(rows):
         items = row.reshape(-1).tolist() if isinstance(row, np.ndarray) else row
         items = items if isinstance(items, list | tuple) else [items]
-        for item in items:
-            whole = isinstance(item, int | np.integer) and not isinstance(item, bool)
-            if not whole or not -_MOST < item < _MOST:
-                raise InputError(
-                    f"{path}: row {number}: found values of type {type(item).__name__}, expected "
-                    "whole numbers of 64 bits"
-                )
+        wrong = [item for item in items if not fits(int, item) or not -_MOST < item < _MOST]
+        if wrong:
+            raise InputError(
+                f"{path}: row {number}: found values of type {type(wrong[0]).__name__}, expected "
+                "whole numbers of 64 bits"
+            )
         found.append(np.array(items, np.int64))
     return tuple(found)
 

@@ -1,6 +1,7 @@
 """Find the layout of an evaluation set, and read it with the layout's options."""
 
 import functools
+import inspect
 import os
 import pathlib
 from collections.abc import Callable
@@ -28,26 +29,21 @@ class Layout(NamedTuple):
 
     words: str
     read: Callable[..., Benchmark]
-    options: tuple[str, ...] = ()
-    """Names of the options that the reader takes after the path."""
-    names_images: bool = False
-    """Whether files name images, which may be missing."""
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Names of what the reader takes after the path."""
+        return tuple(inspect.signature(self.read).parameters)[1:]
 
 
-_ALL = ("split", "radius")
-_MSLS = (*_ALL, "max_heading_difference")
 LAYOUTS = {
-    "utm": Layout("a folder of @UTM names", read_utm, (*_ALL, "queries", "ignore_zones")),
+    "utm": Layout("a folder of @UTM names", read_utm),
     "vpr-bench": Layout("a VPR-Bench folder", read_vpr_bench),
-    "netvlad": Layout("a .mat file of NetVLAD", read_netvlad, ("radius", "images"), True),
-    "salad": Layout(
-        ".npy lists of GSV-Cities or SALAD", read_salad_lists, ("split", "images"), True
-    ),
-    "msls": Layout("raw MSLS", read_msls, _MSLS, True),
-    "msls-subtask": Layout(
-        "raw MSLS, subtask all", functools.partial(read_msls, subtask=True), _MSLS, True
-    ),
-    "folders": Layout("two plain folders", read_folders, (*_ALL, "frames")),
+    "netvlad": Layout("a .mat file of NetVLAD", read_netvlad),
+    "salad": Layout(".npy lists of GSV-Cities or SALAD", read_salad_lists),
+    "msls": Layout("raw MSLS", read_msls),
+    "msls-subtask": Layout("raw MSLS, subtask all", functools.partial(read_msls, subtask=True)),
+    "folders": Layout("two plain folders", read_folders),
 }
 """Layouts by the name that `open_benchmark` takes."""
 
@@ -111,12 +107,13 @@ def open_benchmark(
         "ignore_zones": ignore_zones or None,
     }
     given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
-    if unknown := given.keys() - {*chosen.options}:
-        known = ", ".join(chosen.options) or "no option"
+    known = [name for name in chosen.options if name in options]
+    if unknown := given.keys() - {*known}:
         raise InputError(
-            f"{root}: found {', '.join(sorted(unknown))} for {chosen.words}, which takes {known}"
+            f"{root}: found {', '.join(sorted(unknown))} for {chosen.words}, which takes "
+            f"{', '.join(known) or 'no option'}"
         )
-    if chosen.names_images:
+    if "on_bad_image" in chosen.options:
         given["on_bad_image"] = on_bad_image
     return chosen.read(root, **given)
 
@@ -130,13 +127,12 @@ def _find_layout(root: pathlib.Path, split: str | None, queries: str | None) -> 
         folder, _ = find_split(root, split)
         plain = (folder / TRUTH).exists() or not has_utm_names(folder, queries or QUERIES)
         return "folders" if plain else "utm"
+    has_lists = bool(find_lists(root))
     is_bench = (root / "ref").is_dir() and (root / "query").is_dir()
-    if is_bench and (root / VPR_BENCH_TRUTH).exists():
+    if is_bench and ((root / VPR_BENCH_TRUTH).exists() or not has_lists):
         return "vpr-bench"
-    if find_lists(root):
+    if has_lists:
         return "salad"
-    if is_bench:
-        return "vpr-bench"
     raise InputError(
         f"{root}: found {listing(root)}; expected images/{{test,val,train}}/, or database/ and "
         "queries/, or ref/, query/ and ground_truth_new.npy, or train_val/ (MSLS), or "

@@ -132,17 +132,14 @@ def _across_zones(
     """
     degrees = utm_degrees(names, zones, np.concatenate([places, asked]))
     there, here = np.split(on_ellipsoid(*degrees.T), [len(places)])
-    numbers = {zone: number for number, zone in enumerate(dict.fromkeys(zones))}
-    of_each = np.array([numbers[zone] for zone in zones])
-    of_places, of_asked = np.split(of_each, [len(places)])
-    positives = [
-        near[of_places[near] != zone]
-        for near, zone in zip(within(there, here, radius), of_asked, strict=True)
-    ]
-    for zone in numbers.values():
-        of, by = np.flatnonzero(of_places == zone), np.flatnonzero(of_asked == zone)
-        for query, near in zip(by, within(places[of], asked[by], radius), strict=True):
-            positives[query] = np.sort(np.concatenate([positives[query], of[near]]))
+    zone_there, zone_here = np.split(np.array(zones), [len(places)])
+    positives = []
+    # A zone's scale is at least 0.9996: what is near in its plane is about as near on the ground.
+    for query, near in enumerate(within(there, here, 1.001 * radius)):
+        in_zone = (zone_there[near] == zone_here[query]).all(axis=1)
+        plane = np.linalg.norm(places[near] - asked[query], axis=1)
+        ground = np.linalg.norm(there[near] - here[query], axis=1)
+        positives.append(near[np.where(in_zone, plane, ground) <= radius])
     return tuple(positives), there, here
 
 

@@ -236,9 +236,8 @@ class Reranker:
                 f"{needed / 2**30:.1f} GiB for the local features of {len(missing)} images"
             )
         config, paths = self._config, [side.paths[i] for i in missing]
-        how = Preparation(config.image_size, config.preprocessing, config.side_multiple)
         with self._bar(name, len(missing), "images") as bar:
-            for batch in self._reading.batches(paths, how, config.check_image_size):
+            for batch in self._reading.batches(paths, Preparation.of(config)):
                 sharded = self._devices.shard_batch(batch.images)
                 found = np.asarray(self._method.describe(self._params, sharded, config))
                 rows = missing[batch.indices[batch.valid]]

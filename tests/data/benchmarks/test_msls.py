@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from crisalad_jax.data.benchmarks import open_benchmark, read_msls
 from crisalad_jax.data.benchmarks.msls import heading_difference
-from crisalad_jax.utils.errors import InputError
-from tests.data.benchmarks.trees import lists_of, touch
+from tests.data.benchmarks.trees import lists_of, refused, touch_all
 
 
 class Image(NamedTuple):
@@ -44,8 +43,7 @@ def earth_of(city: str, image: Image) -> tuple[float, ...]:
 
 
 def write_side(folder: Path, images: list[Image]) -> None:
-    for image in images:
-        touch(folder / "images" / f"{image.key}.jpg")
+    touch_all(folder / "images", [f"{image.key}.jpg" for image in images])
     columns = ["key", "lon", "lat", "ca", "captured_at", "pano"]
     zone = f"EPSG:326{ZONES[folder.parent.name]}"
     into = pyproj.Transformer.from_crs(zone, "EPSG:4326", always_xy=True)
@@ -56,8 +54,6 @@ def write_side(folder: Path, images: list[Image]) -> None:
     columns = ["key", "easting", "northing", "unique_cluster", "control_panel", "night"]
     rows = [[i.key, i.east, i.north, 3, False, False, "Forward"] for i in images]
     write_table(folder / "postprocessed.csv", [*columns, "view_direction"], rows)
-    rows = [[i.key, "seq", number] for number, i in enumerate(images)]
-    write_table(folder / "seq_info.csv", ["key", "sequence_key", "frame_number"], rows)
     columns = ["key", "all", "s2w", "w2s", "o2n", "n2o", "d2n", "n2d"]
     rows = [[i.key, i.all, *[False] * 6] for i in images]
     write_table(folder / "subtask_index.csv", columns, rows)
@@ -183,14 +179,6 @@ def test_headings_wrap_around(first, second):
     assert 0 <= found[0] <= 180
 
 
-@pytest.mark.parametrize(
-    ("first", "second", "expected"),
-    [(359, 1, 2), (1, 359, 2), (0, 180, 180), (350, -10, 0), (10, 370, 0), (90, 271, 179)],
-)
-def test_heading_differences_by_hand(first, second, expected):
-    assert heading_difference(np.array([first]), second).tolist() == [expected]
-
-
 def test_the_heading_limit_is_inclusive(tmp_path):
     images = [Image(f"d{i}", 0, 0, angle) for i, angle in enumerate((40, 320, 41, 319.5))]
     sides = {"database": images, "query": [Image("q", 0, 0, 0)]}
@@ -205,22 +193,10 @@ def test_other_splits(tmp_path):
     root = write_msls(tmp_path, {"tokyo": images, "goa": images})
     assert read_msls(root, "train").name == "MSLS of goa, tokyo, raw, 2 queries, 25 m"
     assert lists_of(read_msls(root / "train_val", "train").positives) == [[0], [1]]
-    with pytest.raises(InputError, match="found goa/, tokyo/, expected some of cph/, sf/ for val"):
+    with refused("found goa/, tokyo/, expected some of cph/, sf/ for val"):
         read_msls(root)
-    with pytest.raises(InputError, match="split: found 'test', expected one of train, val"):
+    with refused("split: found 'test', expected one of train, val"):
         read_msls(root, "test")
-
-
-def edit(path: Path, old: str, new: str, count: int = 1) -> None:
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, count))
-
-
-@pytest.mark.parametrize("degrees", [-1.0, 181.0, float("nan")])
-def test_bad_angles(tmp_path, degrees):
-    with pytest.raises(InputError, match=f"max heading difference: found {degrees}, expected"):
-        read_msls(write_msls(tmp_path), max_heading_difference=degrees)
 
 
 SIDE = {"database": [Image("a", 1.5, 2.5, 30), Image("b", 1, 2, 3)], "query": [Image("q", 1, 2, 3)]}
@@ -239,27 +215,29 @@ SIDE = {"database": [Image("a", 1.5, 2.5, 30), Image("b", 1, 2, 3)], "query": [I
 )
 def test_bad_tables(tmp_path, table, old, new, message):
     root = write_msls(tmp_path, {"cph": SIDE})
-    edit(root / "train_val" / "cph" / "database" / table, old, new)
-    with pytest.raises(InputError, match=message) as caught:
+    path = root / "train_val" / "cph" / "database" / table
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with refused(message):
         read_msls(root, max_heading_difference=40, subtask=True)
-    assert "\n" not in str(caught.value)
 
 
 def test_tables_of_other_lengths_and_missing_files(tmp_path):
     root = write_msls(tmp_path, {"cph": SIDE})
     folder = root / "train_val" / "cph" / "database"
     (folder / "images" / "b.jpg").unlink()
-    with pytest.raises(InputError, match=r"raw.csv: found 1 of 2 images missing.*b.jpg"):
+    with refused(r"raw.csv: found 1 of 2 images missing.*b.jpg"):
         read_msls(root)
     for layout in ("msls", "msls-subtask"):
         found = open_benchmark(root, layout=layout, on_bad_image="skip").database
         assert folder / "images" / "b.jpg" in found
     table = folder / "postprocessed.csv"
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:2]))
-    with pytest.raises(InputError, match=r"postprocessed.csv: found 1 rows, expected the same 2"):
+    with refused(r"postprocessed.csv: found 1 rows, expected the same 2"):
         read_msls(root)
     table.unlink()
-    with pytest.raises(InputError, match=r"postprocessed.csv: found no such file"):
+    with refused(r"postprocessed.csv: found no such file"):
         read_msls(root)
 
 
@@ -270,15 +248,18 @@ def test_a_subtask_without_keys_goes_by_its_rows(tmp_path):
     assert keys(read_msls(root, subtask=True).database) == ["b"]
 
 
-def test_panoramas_alone_are_nothing(tmp_path):
-    side = SIDE | {"query": [Image("q", 1, 2, 3, pano=True)]}
-    with pytest.raises(InputError, match="query: found 1 images, expected some that are no pano"):
-        read_msls(write_msls(tmp_path, {"cph": side}))
-
-
-def test_a_subtask_without_matches_is_nothing(tmp_path):
-    side = SIDE | {"query": [Image("q", 100, 2, 3)]}
-    root = write_msls(tmp_path, {"cph": side})
-    assert lists_of(read_msls(root).positives) == [[]]
-    with pytest.raises(InputError, match="found no query within 25 m of the database"):
-        read_msls(root, subtask=True)
+@pytest.mark.parametrize(
+    ("query", "given", "words"),
+    [
+        ([Image("q", 1, 2, 3, pano=True)], {}, "query: found 1 images, expected some that are no"),
+        ([Image("q", 100, 2, 3)], {"subtask": True}, "found no query within 25 m of the database"),
+        *(
+            (SIDE["query"], {"max_heading_difference": degrees}, f"difference: found {degrees}, ex")
+            for degrees in (-1.0, 181.0, math.nan)
+        ),
+    ],
+)
+def test_what_cannot_be_read(tmp_path, query, given, words):
+    root = write_msls(tmp_path, {"cph": SIDE | {"query": query}})
+    with refused(words):
+        read_msls(root, **given)

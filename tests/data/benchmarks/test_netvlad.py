@@ -7,8 +7,7 @@ import pytest
 import scipy.io
 
 from crisalad_jax.data.benchmarks import open_benchmark, read_netvlad
-from crisalad_jax.utils.errors import InputError
-from tests.data.benchmarks.trees import lists_of, touch
+from tests.data.benchmarks.trees import lists_of, refused, touch_all
 
 GENERATOR = np.random.default_rng(0)
 # Millimetres, so that none lies on the edge of the radius but those that are put there.
@@ -49,9 +48,8 @@ def write(path: Path, **changes: object) -> Path:
 
 
 def write_images(root: Path, database: str = ".", queries: str = "queries_real") -> None:
-    for folder, names in ((database, DATABASE_NAMES), (queries, QUERY_NAMES)):
-        for name in names:
-            touch(root / folder / name)
+    touch_all(root / database, DATABASE_NAMES)
+    touch_all(root / queries, QUERY_NAMES)
 
 
 def brute_force(radius: float) -> list[list[int]]:
@@ -71,7 +69,6 @@ def test_positives_equal_brute_force(tmp_path):
     names = [path.relative_to(tmp_path / "queries_real").as_posix() for path in benchmark.queries]
     assert names == QUERY_NAMES
     assert lists_of(benchmark.positives) == brute_force(25)
-    assert len({len(found) for found in brute_force(25)}) > 2
     np.testing.assert_array_equal(benchmark.database_positions, DATABASE)
     np.testing.assert_array_equal(benchmark.query_positions, QUERIES)
 
@@ -92,22 +89,16 @@ def test_images_are_found_where_the_tools_have_them(tmp_path, database, queries)
     path = write(tmp_path / "specs" / "a.mat", dbImage=cells(DATABASE_NAMES, row=True))
     write_images(tmp_path / "far" / "away", database, queries)
     benchmark = read_netvlad(path, images=tmp_path / "far" / "away")
-    for image in (*benchmark.database, *benchmark.queries):
-        assert image.is_file()
-    expected = tmp_path / "far" / "away" / queries / QUERY_NAMES[3]
-    assert benchmark.queries[3] == expected
-    with pytest.raises(
-        InputError,
-        match=r"30 of 30 images missing, .* \(--images\); the first is 000/",
-    ):
+    assert all(image.is_file() for image in (*benchmark.database, *benchmark.queries))
+    assert benchmark.queries[3] == tmp_path / "far" / "away" / queries / QUERY_NAMES[3]
+    with refused(r"30 of 30 images missing, .* \(--images\); the first is 000/"):
         read_netvlad(path)
 
 
 def test_queries_with_the_names_of_database_images_are_not_taken_for_these(tmp_path):
     write_images(tmp_path)
     path = write(tmp_path / "a.mat", qImage=cells(DATABASE_NAMES[:9]))
-    for name in DATABASE_NAMES[:9]:
-        touch(tmp_path / "queries_real" / name)
+    touch_all(tmp_path / "queries_real", DATABASE_NAMES[:9])
     expected = tuple(tmp_path / "queries_real" / name for name in DATABASE_NAMES[:9])
     assert read_netvlad(path).queries == expected
 
@@ -117,7 +108,7 @@ def test_missing_images_are_counted(tmp_path):
     path = write(tmp_path / "a.mat")
     for name in DATABASE_NAMES[4:7]:
         (tmp_path / name).unlink()
-    with pytest.raises(InputError, match=rf"found 3 of 30 images missing.*{DATABASE_NAMES[4]}"):
+    with refused(rf"found 3 of 30 images missing.*{DATABASE_NAMES[4]}"):
         read_netvlad(path)
     # Under "skip" they stay in the set, for the reader of images; also the first, by which the
     # folder is found.
@@ -132,10 +123,9 @@ def test_missing_images_are_counted(tmp_path):
     ("changes", "message"),
     [
         (
-            {"numDb": 31.0},
-            "found 30 names, a count of 31 and positions of shape .2, 30., expected",
+            {"numDb": 30.5},
+            "found 30 names, a count of 30.5 and positions of shape .2, 30., expected",
         ),
-        ({"numDb": 30.5}, "found 30 names, a count of 30.5"),
         ({"numDb": np.nan}, "found 30 names, a count of nan"),
         ({"posDistThr": np.nan}, "radius: found nan"),
         ({"numQ": 8.0}, "found 9 names, a count of 8"),
@@ -151,26 +141,25 @@ def test_missing_images_are_counted(tmp_path):
 def test_bad_structs(tmp_path, changes, message):
     write_images(tmp_path)
     path = write(tmp_path / "a.mat", **changes)
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message):
         read_netvlad(path)
-    assert "\n" not in str(caught.value)
 
 
 def test_bad_files(tmp_path):
     path = tmp_path / "a.mat"
-    with pytest.raises(InputError, match=r"a.mat: found no such file, expected a .mat file"):
+    with refused(r"a.mat: found no such file, expected a .mat file"):
         read_netvlad(path)
     path.write_bytes(b"not a mat file at all" * 20)
-    with pytest.raises(InputError, match=r"a.mat: cannot be read as a .mat file"):
+    with refused(r"a.mat: cannot be read as a .mat file"):
         read_netvlad(path)
     scipy.io.savemat(path, {"other": np.zeros(3)})
-    with pytest.raises(InputError, match=r"a.mat: found .*other.*, expected a struct dbStruct"):
+    with refused(r"a.mat: found .*other.*, expected a struct dbStruct"):
         read_netvlad(path)
     scipy.io.savemat(path, {"dbStruct": {"whichSet": "val", "numDb": 3.0}})
-    with pytest.raises(InputError, match=r"a.mat: found .*posDistThr.*, expected a struct"):
+    with refused(r"a.mat: found .*posDistThr.*, expected a struct"):
         read_netvlad(path)
     # What such a file begins with; the rest is HDF5.
     header = b"MATLAB 7.3 MAT-file".ljust(124) + bytes([0, 2]) + b"IM"
     path.write_bytes(header + bytes(512))
-    with pytest.raises(InputError, match=r"a.mat: found MATLAB's format 7.3, expected 7"):
+    with refused(r"a.mat: found MATLAB's format 7.3, expected 7"):
         read_netvlad(path)

@@ -1,18 +1,19 @@
 """Sets with .npy files: VPR-Bench's folders, and the lists of GSV-Cities and SALAD."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from crisalad_jax.data.benchmarks import read_salad_lists, read_vpr_bench
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.data.benchmarks.trees import (
     every_tenth,
     lists_of,
     ragged,
-    touch,
+    refused,
+    touch_all,
     truth_rows,
     write_vpr_bench,
 )
@@ -30,10 +31,11 @@ def write_lists(folder: Path, prefix: str, **arrays: object) -> Path:
     return folder
 
 
-def write_images(root: Path, names: list[str]) -> Path:
-    for name in names:
-        touch(root / name)
-    return root
+def write_set(root: Path, prefix: str = "a_", **changes: object) -> Path:
+    """Images, and the lists of them beside these."""
+    touch_all(root, DATABASE + QUERIES)
+    arrays = {"dbImages": DATABASE, "qImages": QUERIES, "gt": TRUTH} | changes
+    return write_lists(root, prefix, **arrays)
 
 
 @pytest.mark.parametrize("queries_in", ["", "queries_real/"])
@@ -45,9 +47,9 @@ def test_pittsburgh(tmp_path, queries_in, named_in):
         tmp_path / "lists", "pitts30k_test_", dbImages=DATABASE, qImages=names, gt=TRUTH
     )
     stored = [queries_in + name for name in QUERIES]
-    images = write_images(tmp_path / "photos", DATABASE + stored)
+    images = touch_all(tmp_path / "photos", DATABASE + stored)
     if named_in and not queries_in:
-        with pytest.raises(InputError, match=r"3 of 3 images missing, .* first is queries_real/"):
+        with refused(r"3 of 3 images missing, .* first is queries_real/"):
             read_salad_lists(lists, images=images)
         return
     benchmark = read_salad_lists(lists, images=images)
@@ -60,8 +62,8 @@ def test_pittsburgh(tmp_path, queries_in, named_in):
 
 
 def test_queries_with_the_names_of_database_images_are_not_taken_for_these(tmp_path):
-    write_images(tmp_path, DATABASE + [f"queries_real/{name}" for name in DATABASE[:3]])
-    write_lists(tmp_path, "a_", dbImages=DATABASE, qImages=DATABASE[:3], gt=TRUTH)
+    touch_all(tmp_path / "queries_real", DATABASE[:3])
+    write_set(tmp_path, qImages=DATABASE[:3])
     expected = tuple(tmp_path / "queries_real" / name for name in DATABASE[:3])
     assert read_salad_lists(tmp_path).queries == expected
 
@@ -74,7 +76,7 @@ def msls_names(part: str, count: int) -> list[str]:
 
 
 def test_msls_asks_the_queries_of_its_index(tmp_path):
-    images = write_images(tmp_path, msls_names("database", 6) + msls_names("query", 8))
+    images = touch_all(tmp_path, msls_names("database", 6) + msls_names("query", 8))
     lists = write_lists(
         tmp_path / "msls_val",
         "msls_val_",
@@ -93,40 +95,36 @@ def test_msls_asks_the_queries_of_its_index(tmp_path):
 
 def test_msls_of_one_city_is_called_so(tmp_path):
     names = [f"train_val/cph/{part}/images/a.jpg" for part in ("database", "query")]
-    write_images(tmp_path, names)
+    touch_all(tmp_path, names)
     write_lists(tmp_path, "", dbImages=names[:1], qImages=names[1:], gt=ragged([0]))
     assert read_salad_lists(tmp_path).name == "MSLS of cph, 1 queries (SALAD's list)"
 
 
 def test_without_a_prefix_the_folder_gives_the_name(tmp_path):
-    write_images(tmp_path / "hall", DATABASE + QUERIES)
-    lists = write_lists(tmp_path / "hall", "", dbImages=DATABASE, qImages=QUERIES, gt=TRUTH)
+    lists = write_set(tmp_path / "hall", "")
     assert read_salad_lists(lists).name == "hall (SALAD's lists)"
     assert lists_of(read_salad_lists(lists / "gt.npy").positives) == POSITIVES
 
 
 def test_ground_truths_of_one_match_each_are_plain_arrays(tmp_path):
     """What numpy makes of lists of the same length."""
-    write_images(tmp_path, DATABASE + QUERIES)
     for truth in (np.array([[4], [0], [-1]]), np.array([4, 0, -1])):
-        write_lists(tmp_path, "SPED_", dbImages=DATABASE, qImages=QUERIES, gt=truth)
+        write_set(tmp_path, gt=truth)
         assert lists_of(read_salad_lists(tmp_path).positives) == [[4], [0], []]
 
 
 def test_without_ground_truth_there_is_none(tmp_path):
-    write_images(tmp_path, DATABASE + QUERIES)
-    write_lists(tmp_path, "msls_test_", dbImages=DATABASE, qImages=QUERIES)
+    write_set(tmp_path)
+    (tmp_path / "a_gt.npy").unlink()
     benchmark = read_salad_lists(tmp_path)
     assert benchmark.positives is None
     assert "no ground truth" in benchmark.rule
-    with pytest.raises(InputError, match="no ground truth, nothing to score; see `crisalad query`"):
-        benchmark.ground_truth()
 
 
 def test_nordland_star(tmp_path):
     database = [f"ref/{i:07d}.jpg" for i in range(42)]
     queries = [f"query/{i:07d}.jpg" for i in range(5)]
-    write_images(tmp_path, database + queries)
+    touch_all(tmp_path, database + queries)
     truth = ragged(*(np.array(found) for found in every_tenth(5, 42)))
     write_lists(tmp_path, "Nordland_", dbImages=database, qImages=queries, gt=truth)
     benchmark = read_salad_lists(tmp_path)
@@ -135,32 +133,31 @@ def test_nordland_star(tmp_path):
 
 
 def test_a_folder_of_several_sets(tmp_path):
-    write_images(tmp_path, DATABASE + QUERIES)
     for prefix in ("pitts30k_val_", "pitts30k_test_"):
-        write_lists(tmp_path, prefix, dbImages=DATABASE, qImages=QUERIES, gt=TRUTH)
+        write_set(tmp_path, prefix)
     # As in SALAD's repository, queries alone.
     write_lists(tmp_path, "pitts250k_test_", qImages=QUERIES)
-    with pytest.raises(InputError, match="found lists of pitts30k_test, pitts30k_val, expected"):
+    with refused("found lists of pitts30k_test, pitts30k_val, expected"):
         read_salad_lists(tmp_path)
     assert read_salad_lists(tmp_path, "val").name == "pitts30k_val (SALAD's lists)"
     chosen = read_salad_lists(tmp_path / "pitts30k_test_dbImages.npy")
     assert chosen.name == "pitts30k_test (SALAD's lists)"
-    with pytest.raises(InputError, match=r"expected those of one: .*, unlike train"):
+    with refused(r"expected those of one: .*, unlike train"):
         read_salad_lists(tmp_path, "train")
-    with pytest.raises(InputError, match=r"Images\.npy: found lists of no set, expected"):
+    with refused(r"Images\.npy: found lists of no set, expected"):
         read_salad_lists(tmp_path / "pitts250k_test_qImages.npy")
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"gt": ragged([0], [1])}, r"a_gt.npy: found shape \(2,\), expected a row for each of 3"),
+        ({"gt": ragged([0], [1])}, r"a_gt.npy: found shape \(2,\), expected \(3,\): a row"),
         ({"gt": ragged([0], [5], [1])}, "a_gt.npy: row 1: found reference indices 5 to 5"),
         ({"gt": ragged([0], ["x"], [1])}, "a_gt.npy: row 1: found values of type str"),
         ({"gt": np.zeros(3)}, "a_gt.npy: row 0: found values of type float"),
         (
             {"qIdx": np.array([0, 3, 1])},
-            "a_qIdx.npy: found queries .0, 3, 1.*, expected some from 0 to 2",
+            "a_qIdx.npy: found queries .0, 3, 1.*, expected some",
         ),
         ({"qIdx": np.array([0, 0, 1])}, "a_qIdx.npy: found queries .*0, 0, 1"),
         ({"qIdx": np.array([], int)}, "a_qIdx.npy: found queries"),
@@ -171,45 +168,40 @@ def test_a_folder_of_several_sets(tmp_path):
     ],
 )
 def test_bad_lists(tmp_path, changes, message):
-    write_images(tmp_path, DATABASE + QUERIES)
-    arrays = {"dbImages": DATABASE, "qImages": QUERIES, "gt": TRUTH} | changes
-    write_lists(tmp_path, "a_", **arrays)
-    with pytest.raises(InputError, match=message) as caught:
+    write_set(tmp_path, **changes)
+    with refused(message):
         read_salad_lists(tmp_path)
-    assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("as_array", [False, True])
-def test_vpr_bench(tmp_path, as_array):
-    wrap = np.array if as_array else list
-    truth = truth_rows((2, wrap([3, 1])), (0, wrap([-1])), (1, wrap([0])))
+@pytest.mark.parametrize(
+    "truth",
+    [
+        truth_rows((2, [3, 1]), (0, [-1]), (1, [0])),
+        truth_rows(*((i, np.array(found)) for i, found in ((2, [3, 1]), (0, [-1]), (1, [0])))),
+        np.array([[2, 3], [0, -1], [1, 0]]),  # plain integers
+    ],
+)
+def test_vpr_bench(tmp_path, truth):
     benchmark = read_vpr_bench(write_vpr_bench(tmp_path / "hall", truth))
     assert benchmark.name == "hall (VPR-Bench)"
     assert [path.name for path in benchmark.queries] == [f"{i:07d}.jpg" for i in range(3)]
-    assert lists_of(benchmark.positives) == [[], [0], [1, 3]]
+    last = [3] if truth.dtype != object else [1, 3]
+    assert lists_of(benchmark.positives) == [[], [0], last]
 
 
-def test_vpr_bench_reads_plain_integers(tmp_path):
-    root = write_vpr_bench(tmp_path, np.array([[0, 3], [1, -1], [2, 0]]))
-    assert lists_of(read_vpr_bench(root).positives) == [[3], [], [0]]
-
-
-def test_vpr_bench_sorts_by_number(tmp_path):
+def test_vpr_bench_sorts_by_number_without_a_gap(tmp_path):
     truth = truth_rows((0, [10]), (1, [9]), (2, [2]))
     root = write_vpr_bench(tmp_path, truth, references=0)
-    for i in range(12):
-        touch(root / "ref" / f"{i}.jpg")
+    touch_all(root / "ref", [f"{i}.jpg" for i in range(12)])
     benchmark = read_vpr_bench(root)
     matched = [benchmark.database[p[0]].name for p in benchmark.ground_truth()]
     assert matched == ["10.jpg", "9.jpg", "2.jpg"]
-
-
-def test_vpr_bench_refuses_a_gap_in_the_numbers(tmp_path):
-    root = write_vpr_bench(tmp_path, truth_rows((0, [0]), (1, [1]), (2, [2])))
-    (root / "ref" / "0000001.jpg").unlink()
-    with pytest.raises(
-        InputError, match=r"ref/0000002.jpg: found after number 0, expected number 1"
-    ):
+    (root / "ref" / "1.jpg").unlink()
+    with refused(r"ref/2.jpg: found after number 0, expected number 1"):
+        read_vpr_bench(root)
+    touch_all(root / "ref", ["1.jpg"])
+    shutil.rmtree(root / "query")
+    with refused("found ground_truth_new.npy, ref/, expected a folder query"):
         read_vpr_bench(root)
 
 
@@ -227,10 +219,7 @@ def test_vpr_bench_leaves_out_references_after_the_last_image(tmp_path):
     [
         ([(0, [0]), (1, [4]), (2, [0])], "row 1: found reference indices 4 to 4, expected 0 to 3"),
         ([(0, [-2]), (1, [1]), (2, [0])], "row 0: found reference indices -2 to -2"),
-        (
-            [(0, [0]), (3, [1]), (2, [0])],
-            r"found queries \[0, 3, 2\].*, expected some from 0 to 2",
-        ),
+        ([(0, [0]), (3, [1]), (2, [0])], r"found queries \[0, 3, 2\].*, expected some from 0 to 2"),
         ([(0, [0]), (0, [1]), (2, [0])], r"found queries \[0, 0, 2\]"),
         ([(0, [0]), (1, [1])], r"found shape \(2, 2\), expected \(3, 2\)"),
         ([(0, [0]), (1, ["a"]), (2, [0])], "row 1: .*expected whole numbers"),
@@ -243,16 +232,8 @@ def test_vpr_bench_leaves_out_references_after_the_last_image(tmp_path):
 )
 def test_vpr_bench_bad_indices(tmp_path, rows, message):
     root = write_vpr_bench(tmp_path, truth_rows(*rows))
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(f"ground_truth_new.npy: .*{message}"):
         read_vpr_bench(root)
-    assert "ground_truth_new.npy" in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_vpr_bench_missing_folder(tmp_path):
-    touch(tmp_path / "ref" / "0000000.jpg")
-    with pytest.raises(InputError, match="found ref/, expected a folder query"):
-        read_vpr_bench(tmp_path)
 
 
 @pytest.mark.parametrize(("queries", "database"), [(3, 22), (3, 21), (12, 120)])
@@ -282,5 +263,5 @@ def test_vpr_bench_flattens_no_lists_in_lists(tmp_path):
         bomb = [bomb, bomb]
     root = write_vpr_bench(tmp_path, truth_rows((0, bomb)), queries=1)
     assert (root / "ground_truth_new.npy").stat().st_size < 1000
-    with pytest.raises(InputError, match="row 0: found values of type list, expected"):
+    with refused("row 0: found values of type list, expected"):
         read_vpr_bench(root)

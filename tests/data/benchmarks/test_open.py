@@ -6,22 +6,17 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.benchmarks import LAYOUTS, open_benchmark
-from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.test_msls import write_msls
 from tests.data.benchmarks.test_netvlad import write as write_mat
 from tests.data.benchmarks.test_netvlad import write_images as write_mat_images
-from tests.data.benchmarks.test_npy_lists import (
-    DATABASE,
-    QUERIES,
-    TRUTH,
-    write_images,
-    write_lists,
-)
+from tests.data.benchmarks.test_npy_lists import write_lists, write_set
 from tests.data.benchmarks.trees import (
     lists_of,
     ragged,
+    refused,
     touch,
     truth_rows,
+    write_sides,
     write_utm,
     write_vpr_bench,
 )
@@ -36,7 +31,7 @@ def test_open_benchmark_finds_the_layout(tmp_path):
     assert open_benchmark(tmp_path / "b").name == "b (@UTM, 25 m)"
     write_vpr_bench(tmp_path / "c", truth_rows((0, [0]), (1, [1]), (2, [2])))
     assert open_benchmark(tmp_path / "c").name == "c (VPR-Bench)"
-    with pytest.raises(InputError, match="c: found split for a VPR-Bench folder"):
+    with refused("c: found split for a VPR-Bench folder"):
         open_benchmark(tmp_path / "c", "val")
 
 
@@ -56,30 +51,29 @@ def test_svox_is_found_with_the_queries_that_are_asked(tmp_path):
         assert night.queries == (folder / "queries_night" / "@0100.00@0007.00@.jpg",)
         assert night.database == benchmark.database
         there = "gallery/, queries/, queries_night/, queries_rain/"
-        with pytest.raises(InputError, match=f"found {there}, expected a folder queries_fog"):
+        with refused(f"found {there}, expected a folder queries_fog"):
             open_benchmark(root, queries="queries_fog")
         for unknown in ("gallery", ""):
-            with pytest.raises(InputError, match=f"queries: found '{unknown}', expected"):
+            with refused(f"queries: found '{unknown}', expected"):
                 open_benchmark(root, queries=unknown)
 
 
 def test_open_benchmark_says_what_it_found(tmp_path):
     (tmp_path / "pictures").mkdir()
     (tmp_path / "notes.txt").write_text("")
-    with pytest.raises(InputError, match=r"found notes.txt, pictures/; expected images/.* ref/"):
+    with refused(r"found notes.txt, pictures/; expected images/.* ref/"):
         open_benchmark(tmp_path)
-    with pytest.raises(InputError, match="nowhere: found no such folder"):
+    with refused("nowhere: found no such folder"):
         open_benchmark(tmp_path / "nowhere")
 
 
 def test_two_folders_are_plain_without_utm_names(tmp_path):
-    for part in ("database", "queries"):
-        touch(tmp_path / "hall" / part / "1.jpg")
+    write_sides(tmp_path / "hall", ["1.jpg"], ["1.jpg"])
     assert open_benchmark(tmp_path / "hall").name == "hall (two folders, no ground truth)"
     assert open_benchmark(tmp_path / "hall", frames=1).name == "hall (two folders, +-1 frame)"
     # One @ name says that the others should have one.
     touch(tmp_path / "hall" / "queries" / "@1@2@.jpg")
-    with pytest.raises(InputError, match=r"hall/database/1.jpg: found no coordinates"):
+    with refused(r"hall/database/1.jpg: found no coordinates"):
         open_benchmark(tmp_path / "hall")
     named = open_benchmark(tmp_path / "hall", layout="folders")
     assert named.name == "hall (two folders, no ground truth)"
@@ -92,17 +86,16 @@ def test_files_of_netvlad_and_salad_are_found(tmp_path):
     write_mat(tmp_path / "a.mat")
     write_mat_images(tmp_path)
     assert open_benchmark(tmp_path / "a.mat").name.startswith("a (NetVLAD .mat, test set")
-    with pytest.raises(InputError, match=r"30 of 30 images missing, .*elsewhere.* \(--images\)"):
+    with refused(r"30 of 30 images missing, .*elsewhere.* \(--images\)"):
         open_benchmark(tmp_path / "a.mat", images=tmp_path / "elsewhere")
-    write_images(tmp_path / "lists", DATABASE + QUERIES)
-    write_lists(tmp_path / "lists", "hall_", dbImages=DATABASE, qImages=QUERIES, gt=TRUTH)
+    write_set(tmp_path / "lists", "hall_")
     assert open_benchmark(tmp_path / "lists").name == "hall (SALAD's lists)"
     # A folder images/ is not yet one of splits.
     touch(tmp_path / "lists" / "images" / "a.jpg")
     assert open_benchmark(tmp_path / "lists").name == "hall (SALAD's lists)"
     name = open_benchmark(tmp_path / "lists" / "hall_dbImages.npy").name
     assert name == "hall (SALAD's lists)"
-    with pytest.raises(InputError, match=r"notes.txt: found a file; expected .* a .mat file"):
+    with refused(r"notes.txt: found a file; expected .* a .mat file"):
         open_benchmark(touch(tmp_path / "notes.txt"))
 
 
@@ -129,6 +122,15 @@ def test_raw_msls_is_found(tmp_path):
     assert len(named.queries) < count
 
 
+OF_LAYOUTS = {
+    "utm": ["split", "radius", "queries", "ignore_zones"],
+    "vpr-bench": [],
+    "netvlad": ["radius", "images"],
+    "salad": ["split", "images"],
+    "msls": ["split", "radius", "max_heading_difference"],
+    "msls-subtask": ["split", "radius", "max_heading_difference"],
+    "folders": ["split", "radius", "frames"],
+}
 OPTIONS = {
     "split": "val",
     "radius": 10.0,
@@ -142,18 +144,15 @@ OPTIONS = {
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_options_that_a_layout_lacks_are_refused(tmp_path, layout):
-    options = LAYOUTS[layout].options
-    assert set(options) <= OPTIONS.keys()
+    options = OF_LAYOUTS[layout]
     for option in OPTIONS.keys() - set(options):
-        with pytest.raises(InputError) as caught:
-            open_benchmark(tmp_path, layout=layout, **{option: OPTIONS[option]})
         known = ", ".join(options) or "no option"
-        words = f"{tmp_path}: found {option} for {LAYOUTS[layout].words}, which takes {known}"
-        assert str(caught.value) == words
+        with refused(f"^{tmp_path}: found {option} for .*, which takes {known}$"):
+            open_benchmark(tmp_path, layout=layout, **{option: OPTIONS[option]})
 
 
 def test_an_unknown_layout_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"layout: found 'gsv', expected one of .*vpr-bench"):
+    with refused(r"layout: found 'gsv', expected one of .*vpr-bench"):
         open_benchmark(tmp_path, layout="gsv")
 
 

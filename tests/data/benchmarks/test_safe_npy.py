@@ -16,8 +16,7 @@ from hypothesis.extra import numpy as arrays
 
 from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.retrieval.descriptor_files import open_npy, read_descriptors
-from crisalad_jax.utils.errors import InputError
-from tests.data.benchmarks.trees import ragged
+from tests.data.benchmarks.trees import ragged, refused
 
 
 def write_object_array(path: Path, pickled: bytes, shape: tuple[int, ...] = (1,)) -> Path:
@@ -57,16 +56,14 @@ RAGGED = ragged(
 
 
 def assert_same(found: object, expected: object) -> None:
-    assert isinstance(found, type(expected)) or isinstance(expected, np.ndarray)
+    assert isinstance(found, type(expected))
     if isinstance(expected, np.ndarray):
-        assert isinstance(found, np.ndarray)
         assert found.shape == expected.shape
         # numpy turns the bytes of what it has read around, to the machine's order.
         assert found.dtype.newbyteorder("=") == expected.dtype.newbyteorder("=")
         for a, b in zip(found.ravel(), expected.ravel(), strict=True):
             assert_same(a, b)
     elif isinstance(expected, list | tuple):
-        assert isinstance(found, type(expected))
         for a, b in zip(found, expected, strict=True):
             assert_same(a, b)
     else:
@@ -134,7 +131,7 @@ class Call:
 )
 def test_no_other_name_is_looked_up(tmp_path, call, name, protocol):
     path = write_object_array(tmp_path / "a.npy", pickle.dumps(call, protocol=protocol))
-    with pytest.raises(InputError, match=f"the file asks for {name}"):
+    with refused(f"the file asks for {name}"):
         read_npy(path)
 
 
@@ -142,7 +139,7 @@ def test_a_payload_does_not_run(tmp_path):
     target = tmp_path / "ran"
     path = tmp_path / "a.npy"
     np.save(path, ragged([0], Call(os.mkdir, str(target))), allow_pickle=True)
-    with pytest.raises(InputError, match=r"a.npy: cannot be read .* asks for (posix|nt)\.mkdir"):
+    with refused(r"a.npy: cannot be read .* asks for (posix|nt)\.mkdir"):
         read_npy(path)
     assert not target.exists()
     # The payload is a real one: an ordinary load runs it.
@@ -157,47 +154,34 @@ def test_a_header_is_not_believed(tmp_path, shape, descr):
     with (tmp_path / "a.npy").open("wb") as file:
         header = {"descr": descr, "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)
-    with pytest.raises(InputError, match=r"a\.npy: cannot be read as an array: "):
+    with refused(r"a\.npy: cannot be read as an array: "):
         read_npy(tmp_path / "a.npy")
 
 
-NDARRAY = b"cnumpy\nndarray\n"
-CLAIMS = {
+BAD = {
     "a place in the memo": b"K\x00r\xff\xff\xff\x7f",
     "bytes": b"\x8e" + struct.pack("<Q", 10**13),
     "text": b"X" + struct.pack("<I", 2**32 - 1),
+    "a code of the registry": b"\x82\x01",
+    "something outside": b"Pid\n",
+    "a buffer outside": b"\x97",
+    "a changed class": b"cnumpy\nndarray\nN}X\x01\x00\x00\x00xK\x01s\x86b",
+    "a dictionary": b"}",
 }
 
 
-@pytest.mark.parametrize("claim", CLAIMS)
-def test_claims_take_no_memory(tmp_path, claim):
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_no_array_is_refused_and_takes_no_memory(tmp_path, case):
     """Six bytes would make the unpickler in C allocate 32 GB."""
-    path = write_object_array(tmp_path / "a.npy", b"\x80\x04" + CLAIMS[claim] + b".")
+    path = write_object_array(tmp_path / "a.npy", b"\x80\x04" + BAD[case] + b".")
     tracemalloc.start()
     try:
-        with pytest.raises(InputError, match=r"a\.npy: cannot be read") as caught:
+        with refused(r"a\.npy: cannot be read as an array: "):
             read_npy(path)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
     assert peak < 2**20
-    assert "\n" not in str(caught.value)
-
-
-REFUSED = {
-    "a code of the registry": b"\x82\x01",
-    "something outside": b"Pid\n",
-    "a buffer outside": b"\x97",
-    "a changed class": NDARRAY + b"N}X\x01\x00\x00\x00xK\x01s\x86b",
-    "a dictionary": b"}",
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_is_no_array_is_refused(tmp_path, case):
-    path = write_object_array(tmp_path / "a.npy", b"\x80\x04" + REFUSED[case] + b".")
-    with pytest.raises(InputError, match=r"a\.npy: cannot be read as an array: "):
-        read_npy(path)
     assert not hasattr(np.ndarray, "x")
 
 
@@ -217,9 +201,8 @@ def test_damaged_files(tmp_path, damage):
         }
         path.write_bytes(replacement[damage])
     words = "found no such file" if damage == "missing" else "cannot be read"
-    with pytest.raises(InputError, match=rf"a\.npy: {words}") as caught:
+    with refused(rf"a\.npy: {words}"):
         read_npy(path)
-    assert "\n" not in str(caught.value)
 
 
 def test_an_archive_of_arrays_is_told(tmp_path):
@@ -230,15 +213,14 @@ def test_an_archive_of_arrays_is_told(tmp_path):
         r"gt\.npz: found an \.npz archive of matches, other, expected one array: "
         r"numpy\.save\('gt\.npy', numpy\.load\('gt\.npz'\)\['matches'\]\) writes it"
     )
-    for path in (tmp_path / "gt.npz", tmp_path / "gt.npy"):
-        with pytest.raises(InputError, match=words):
-            read_npy(path)
-    with pytest.raises(InputError, match=words):
-        read_descriptors(tmp_path / "gt.npz")
-    with pytest.raises(InputError, match=words):
-        open_npy(tmp_path / "gt.npz")
+    for read, name in (
+        *((read_npy, "gt.npz"), (read_npy, "gt.npy")),
+        *((read_descriptors, "gt.npz"), (open_npy, "gt.npz")),
+    ):
+        with refused(words):
+            read(tmp_path / name)
     (tmp_path / "gt.npz").rename(tmp_path / "gt.npy")
-    with pytest.raises(InputError, match=r"gt\.npy: found an \.npz archive of matches, other"):
+    with refused(r"gt\.npy: found an \.npz archive of matches, other"):
         read_npy(tmp_path / "gt.npy")
     # What the message says works, also next to the archive.
     np.save(tmp_path / "one.npy", np.load(tmp_path / "gt.npy")["matches"])

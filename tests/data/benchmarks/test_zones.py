@@ -7,8 +7,7 @@ import pytest
 from crisalad_jax.data.benchmarks import open_benchmark, read_utm
 from crisalad_jax.data.query_set import read_query_set
 from crisalad_jax.evaluation.leakage import near
-from crisalad_jax.utils.errors import InputError
-from tests.data.benchmarks.trees import lists_of, touch
+from tests.data.benchmarks.trees import lists_of, refused, touch, write_sides
 
 GEOD = pyproj.Geod(ellps="WGS84")
 BANDS = "CDEFGHJKLMNPQRSTUVWX"
@@ -22,13 +21,6 @@ def name_of(latitude: float, longitude: float, zone: int | None = None) -> str:
     into = pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:{code}", always_xy=True)
     east, north = into.transform(longitude, latitude)
     return f"@{east:.2f}@{north:.2f}@{number:02d}@{letter}@{latitude}@{longitude}@@@@@@@@@.jpg"
-
-
-def write(root, database, queries):
-    for part, names in (("database", database), ("queries", queries)):
-        for name in names:
-            touch(root / part / name)
-    return root
 
 
 def metres_between(first: str, second: str) -> float:
@@ -46,7 +38,7 @@ def test_neighbours_in_two_planes_match(tmp_path, pair):
     there, asked = pair
     assert metres_between(there, asked) == pytest.approx(14, abs=0.05)
     assert there.split("@")[3:5] != asked.split("@")[3:5]
-    write(tmp_path, [there, name_of(48.9, 5.9)], [asked])
+    write_sides(tmp_path, [there, name_of(48.9, 5.9)], [asked])
     benchmark = read_utm(tmp_path)
     index = [path.name for path in benchmark.database].index(there)
     assert lists_of(benchmark.positives) == [[index]]
@@ -62,7 +54,7 @@ def test_neighbours_in_two_planes_match(tmp_path, pair):
 def test_equal_numbers_of_two_zones_are_far_apart(tmp_path):
     """They are 430 km apart, and a match to a tool that ignores the zones."""
     first, second = (f"@500000.00@5411000.00@{zone}@U@@@@@@@@@@@.jpg" for zone in (31, 32))
-    write(tmp_path, [first], [second])
+    write_sides(tmp_path, [first], [second])
     assert lists_of(read_utm(tmp_path).positives) == [[]]
     into = [pyproj.Transformer.from_crs(f"EPSG:{z}", "EPSG:4326") for z in (32631, 32632)]
     (a, b), (c, d) = (each.transform(500000, 5411000) for each in into)
@@ -80,7 +72,7 @@ def test_the_letter_s_is_a_band_or_the_south(tmp_path):
     """San Francisco is in band S of the north; H and a bare S are of the south."""
     francisco = "@551550.00@4182401.73@10@S@@@@@@@@@@@.jpg"
     sydney = ["@334900.00@6252300.00@56@H@@@@@@@@@@@.jpg"]
-    write(tmp_path, [*sydney, francisco], [sydney[0].replace("@H@", "@S@")])
+    write_sides(tmp_path, [*sydney, francisco], [sydney[0].replace("@H@", "@S@")])
     benchmark = read_utm(tmp_path)
     assert lists_of(benchmark.positives) == [[0]]
     assert "10 north, 56 south" in benchmark.rule
@@ -101,7 +93,7 @@ def test_positives_across_zones_equal_brute_force(tmp_path):
             name_of(float(a), float(b))
             for a, b in zip(latitude + metres[1] / 110_600, around, strict=True)
         ]
-    write(tmp_path, names[::2], names[1::2])
+    write_sides(tmp_path, names[::2], names[1::2])
     benchmark = read_utm(tmp_path)
     matches = across = 0
     for query, positives in zip(benchmark.queries, benchmark.ground_truth(), strict=True):
@@ -129,14 +121,14 @@ def test_images_of_one_zone_match_by_its_metres_beside_others(tmp_path):
     400 km west of a meridian 25.00 m in the plane are 24.96 m on the ground.
     """
     pair = [f"@{east}.00@6000000.00@33@U@@@@@@@@@@@.jpg" for east in (100_000, 100_025)]
-    write(tmp_path, [pair[0], "@500000.00@4000000.00@10@S@@@@@@@@@@@.jpg"], [pair[1]])
+    write_sides(tmp_path, [pair[0], "@500000.00@4000000.00@10@S@@@@@@@@@@@.jpg"], [pair[1]])
     assert lists_of(read_utm(tmp_path).positives) == [[0]]
     assert lists_of(read_utm(tmp_path, radius=24.97).positives) == [[]]
 
 
 def test_training_finds_positives_across_an_edge(tmp_path):
     far = [name_of(48.85, 5.9), name_of(48.85, 6.1)]
-    write(tmp_path, [EDGE[0], *far], [EDGE[1]])
+    write_sides(tmp_path, [EDGE[0], *far], [EDGE[1]])
     found = read_query_set(tmp_path, positive_radius=15)
     (positives,) = found.positives
     assert [found.path(image).name for image in positives] == [EDGE[0]]
@@ -152,12 +144,12 @@ def test_training_finds_positives_across_an_edge(tmp_path):
     ],
 )
 def test_a_name_without_its_zone_among_several_is_refused(tmp_path, name, words):
-    write(tmp_path, [EDGE[0], name], [EDGE[1]])
-    with pytest.raises(InputError, match=words):
+    write_sides(tmp_path, [EDGE[0], name], [EDGE[1]])
+    with refused(words):
         read_utm(tmp_path)
     assert read_utm(tmp_path, ignore_zones=True).positives is not None
 
 
 def test_a_latitude_says_the_hemisphere_where_no_letter_does(tmp_path):
-    write(tmp_path, [EQUATOR[0].replace("@N@", "@@")], [EQUATOR[1].replace("@M@", "@@")])
+    write_sides(tmp_path, [EQUATOR[0].replace("@N@", "@@")], [EQUATOR[1].replace("@M@", "@@")])
     assert lists_of(read_utm(tmp_path).positives) == [[0]]

@@ -1,23 +1,44 @@
 """Small evaluation sets on disk. Readers look at names alone, so the images are empty files."""
 
+import contextlib
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import pytest
+
+from crisalad_jax.utils.errors import InputError
 
 
 def touch(path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.touch()
+    touch_all(path.parent, [path.name])
     return path
 
 
-def touch_all(folder: Path, names: Iterable[str]) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
+def touch_all(folder: Path, names: Iterable[str]) -> Path:
+    """Make empty files, which readers take for images, and return the folder."""
+    names = list(names)
+    for parent in {folder, *(folder / os.path.dirname(name) for name in names)}:
+        parent.mkdir(parents=True, exist_ok=True)
     for name in names:
         # Thousands of them, in a third of pathlib's time.
         os.close(os.open(f"{folder}/{name}", os.O_CREAT))
+    return folder
+
+
+def write_sides(root: Path, database: Iterable[str], queries: Iterable[str]) -> Path:
+    touch_all(root / "database", database)
+    touch_all(root / "queries", queries)
+    return root
+
+
+@contextlib.contextmanager
+def refused(words: str) -> Iterator[None]:
+    """Expect an error for the user: one line with these words."""
+    with pytest.raises(InputError, match=words) as caught:
+        yield
+    assert "\n" not in str(caught.value)
 
 
 def utm_name(east: str, north: str, pano: str = "", note: str = "") -> str:
@@ -26,13 +47,14 @@ def utm_name(east: str, north: str, pano: str = "", note: str = "") -> str:
 
 
 def write_utm(folder: Path, database: np.ndarray, queries: np.ndarray) -> None:
-    for part, points in (("database", database), ("queries", queries)):
-        names = (utm_name(f"{e:.2f}", f"{n:.2f}", f"{part}{i:04d}") for i, (e, n) in pairs(points))
-        touch_all(folder / part, names)
-
-
-def pairs(points: np.ndarray) -> list[tuple[int, np.ndarray]]:
-    return list(enumerate(np.reshape(points, (-1, 2))))
+    sides = [
+        [
+            utm_name(f"{east:.2f}", f"{north:.2f}", f"{part}{number:04d}")
+            for number, (east, north) in enumerate(np.reshape(points, (-1, 2)))
+        ]
+        for part, points in (("database", database), ("queries", queries))
+    ]
+    write_sides(folder, *sides)
 
 
 def truth_rows(*rows: Sequence[object]) -> np.ndarray:
