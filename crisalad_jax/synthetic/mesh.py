@@ -32,6 +32,8 @@ GROUND_LAYER = 1e6
 UP: Vector = (0.0, 1.0, 0.0)
 DOWN: Vector = (0.0, -1.0, 0.0)
 TO_CAMERA: Vector = (0.0, 0.0, -1.0)
+SLANTED: Vector = (0.0, 0.5, -0.85)
+"""Direction of what is round or slopes towards the camera."""
 
 
 class Kind(enum.IntEnum):
@@ -89,9 +91,17 @@ def rects(
     return polygons((x0, y0, z), (x1, y0, z), (x1, y1, top_z), (x0, y1, top_z))
 
 
-def bars(x: Number, half: Number, y0: Number, y1: Number, z: Number = 0.0) -> Polygons:
-    """Make upright rectangles that reach `half` metres to either side of x."""
-    return rects(x - half, y0, x + half, y1, z)
+def bars(
+    x: Number, half: Number, y0: Number, y1: Number, z: Number = 0.0, top: Number | None = None
+) -> Polygons:
+    """Make upright bars, `half` metres to either side of x; they may taper to `top` metres."""
+    top = half if top is None else top
+    return polygons((x - half, y0, z), (x + half, y0, z), (x + top, y1, z), (x - top, y1, z))
+
+
+def triangles(x0: Number, x1: Number, y: Number, tip_x: Number, tip_y: Number) -> Polygons:
+    """Make upright triangles over level edges."""
+    return polygons((x0, y, 0), (x1, y, 0), (tip_x, tip_y, 0))
 
 
 def flat(x0: Number, z0: Number, x1: Number, z1: Number, y: float = 0.0) -> Polygons:
@@ -106,7 +116,7 @@ def sheets(
     return polygons((x0, low, z0), (x1, low, z1), (x1 + lean, high, z1), (x0 + lean, high, z0))
 
 
-def discs(x: Number, y: Number, radius: Number, z: float) -> Polygons:
+def discs(x: Number, y: Number, radius: Number, z: float = 0.0) -> Polygons:
     """Make round polygons that face the camera."""
     angles = np.arange(10) * (2 * np.pi / 10)
     return polygons(*((x + radius * np.cos(a), y + radius * np.sin(a), z) for a in angles))
@@ -140,6 +150,13 @@ class Mesh:
         self.end_normal: Vector = UP
         self._origin, self._axes = np.zeros(3), np.eye(3)
         self._parts: list[tuple[np.ndarray, Colour, Vector, int, float]] = []
+
+    def at(self, x: float, z: float) -> "Mesh":
+        """Return the same mesh with its origin at (x, z), in the layer of that distance."""
+        here = copy.copy(self)
+        here._origin = np.array((x, 0.0, z))
+        here.layer = float(z)
+        return here
 
     def front(self, x: float, z: float, side: float) -> "Mesh":
         """Return the same mesh in other axes: those of a vertical plane, in the present layer.
@@ -180,7 +197,8 @@ class Mesh:
     def block(self, low: Vector, high: Vector, albedo: Colour) -> None:
         """Add an upright box: its top, its side towards the middle of the street, its front."""
         (x0, y0, z0), (x1, y1, z1) = low, high
-        x, outwards = (x1, 1.0) if x0 + x1 < 0 else (x0, -1.0)
+        is_left = self._origin[0] + (x0 + x1) / 2 < 0
+        x, outwards = (x1, 1.0) if is_left else (x0, -1.0)
         self.add(flat(x0, z0, x1, z1, y1), albedo, Kind.ROOF, UP)
         self.add(sheets(x, z0, x, z1, y0, y1), albedo, normal=(outwards, 0.0, 0.0))
         self.add(rects(x0, y0, x1, y1, z0), albedo)
