@@ -22,6 +22,7 @@ from crisalad_jax.synthetic.mesh import (
     rects,
     scaled,
     sheets,
+    triangles,
 )
 
 _TRIMS = palette("88 87 84, 30 27 25, 70 66 58, 24 33 30")
@@ -94,9 +95,7 @@ def _arches(
 ) -> None:
     """Add openings with a rounded head, `half` metres to either side of u."""
     front.add(bars(u, half, v0, v1), albedo, kind)
-    head, tip = v1 + 0.8 * half, 0.5 * half
-    arch = polygons((u - half, v1, 0), (u + half, v1, 0), (u + tip, head, 0), (u - tip, head, 0))
-    front.add(arch, albedo, kind)
+    front.add(bars(u, half, v1, v1 + 0.8 * half, top=0.5 * half), albedo, kind)
 
 
 def _roof(rng: Rng, front: Mesh, width: float, height: float, wall: Colour) -> None:
@@ -117,8 +116,7 @@ def _roof(rng: Rng, front: Mesh, width: float, height: float, wall: Colour) -> N
     elif shape == "gable":
         rise, steps = width * rng.uniform(0.3, 0.55), int(rng.integers(1, 5))
         if steps == 1:
-            gable = polygons((0, height, 0), (width, height, 0), (width / 2, height + rise, 0))
-            front.add(gable, wall)
+            front.add(triangles(0, width, height, width / 2, height + rise), wall)
         else:
             v = height + rise * np.arange(steps) / steps
             inset = width / 2 * np.arange(steps) / steps
@@ -174,9 +172,8 @@ def _windows(
         low, high = low[:1], high[-1:]
     elif len(levels) > 2 and rng.random() < 0.35:
         high[-1] = low[-1] + tall * 0.6
-    u, half = np.tile(axis, len(low)), np.tile(halves, len(low))
-    v0, v1 = np.repeat(low, len(axis)), np.repeat(high, len(axis))
-    left, right = u - half, u + half
+    left, right = axis - halves, axis + halves
+    v0, v1 = low[:, None], high[:, None]
 
     if rng.random() < 0.6:
         front.add(rects(left - 0.22, v0 - 0.22, right + 0.22, v1 + 0.22), trim)
@@ -184,27 +181,24 @@ def _windows(
     if style != "grid":
         front.add(panes, GLASS, Kind.GLASS)
         if style == "shafts":
-            left, right = (np.tile(axis + sign * halves, len(levels) - 1) for sign in (-1, 1))
-            v = np.repeat(levels[1:], len(axis))
+            v = levels[1:, None]
             front.add(rects(left, v, right, v + 0.3), trim)
         return
     if rng.random() < 0.2:
         shutter = pick(rng, _TRIMS)
-        front.add(rects(left - half * 0.75, v0, left, v1), shutter)
-        front.add(rects(right, v0, right + half * 0.75, v1), shutter)
+        front.add(rects(left - halves * 0.75, v0, left, v1), shutter)
+        front.add(rects(right, v0, right + halves * 0.75, v1), shutter)
     if rng.random() < 0.22:
-        _arches(front, u, half, v0, v1, GLASS, Kind.GLASS)
+        _arches(front, axis, halves, v0, v1, GLASS, Kind.GLASS)
     else:
         front.add(panes, GLASS, Kind.GLASS)
     if rng.random() < 0.45:
-        front.add(bars(u, 0.06, v0, v1), trim)
+        front.add(bars(axis, 0.06, v0, v1), trim)
     if rng.random() < 0.5:
         front.add(rects(left - 0.15, v0 - 0.22, right + 0.15, v0), trim, Kind.LEDGE)
     if rng.random() < 0.32:
-        on = np.tile(rng.random(len(axis)) < rng.choice((0.4, 1.0)), len(low))
-        if on.any():
-            rect = (left[on] - 0.25, v0[on] - 0.45, right[on] + 0.25, v0[on] + 0.6)
-            front.boxes(rect, 0.9, trim)
+        on = rng.random(len(axis)) < rng.choice((0.4, 1.0))
+        front.boxes((left[on] - 0.25, v0 - 0.45, right[on] + 0.25, v0 + 0.6), 0.9, trim)
 
 
 def _shops(rng: Rng, front: Mesh, width: float, lintel: float) -> None:

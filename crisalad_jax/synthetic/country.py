@@ -6,6 +6,7 @@ from crisalad_jax.synthetic.buildings import Habit, building
 from crisalad_jax.synthetic.mesh import (
     GROUND_LAYER,
     SIGNS,
+    SLANTED,
     UP,
     WALLS,
     Body,
@@ -20,7 +21,6 @@ from crisalad_jax.synthetic.mesh import (
     palette,
     pick,
     polygons,
-    rects,
     scaled,
     sheets,
 )
@@ -153,11 +153,10 @@ def _masts(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
     side, gap = float(rng.choice((-1, 1))), rng.uniform(28.0, 50.0)
     steel = (0.36, 0.37, 0.36)
     for z in np.arange(rng.uniform(4.0, gap), _FAR, gap)[::-1]:
-        mesh.layer = float(z)
-        x = float(way.at(z)) + side * half
-        reach = x - side * (half + 0.4)
-        mesh.add(bars(x, 0.12, 0, 6.8, z), steel)
-        mesh.add(rects(min(x, reach), 6.2, max(x, reach), 6.3, z), steel)
+        mast = mesh.at(float(way.at(z)) + side * half, z)
+        mast.add(bars(0, 0.12, 0, 6.8), steel)
+        arm = half / 2 + 0.2
+        mast.add(bars(-side * arm, arm, 6.2, 6.3), steel)
     z = np.arange(1.0, _FAR, 12.0)
     for y in (5.4, 6.4):
         wire = sheets(way.at(z), z, way.at(z + 12.0), z + 12, y, y + 0.03)
@@ -223,7 +222,7 @@ def _woods(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
                 colour, kind = scaled((0.14, 0.26, 0.17), shade), Kind.NEEDLE
             tips = (x[1:], top[1:], z), (x[:-1], top[:-1], z)
             band = polygons((x[:-1], 0, z), (x[1:], 0, z), *tips)
-            mesh.add(band, colour, kind, (0.0, 0.5, -0.85), layer=float(z))
+            mesh.add(band, colour, kind, SLANTED, layer=float(z))
     row = rng.random() < 0.3
     count = int(rng.integers(0, 7))
     if row:
@@ -243,8 +242,7 @@ def _houses(mesh: Mesh, rng: Rng, way: _Way, half: float) -> list[Body]:
     for z in sorted(rng.uniform(16, 110, int(rng.integers(0, 4))), reverse=True):
         side, wide = float(rng.choice((-1, 1))), rng.uniform(7, 14)
         x = float(way.at(z)) + side * (half + rng.uniform(3, 30))
-        mesh.layer = float(z)
-        front = mesh.front(x - wide if side < 0 else x, z, 0)
+        front = mesh.front(x - wide if side < 0 else x, z, 0, layer=z)
         bodies.append(building(rng, front, wide, habit))
     return bodies
 
@@ -252,11 +250,11 @@ def _houses(mesh: Mesh, rng: Rng, way: _Way, half: float) -> list[Body]:
 def _roadside(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
     """Add a sign or a rock."""
     for z in rng.uniform(5, 40, int(rng.integers(0, 3))):
-        mesh.layer = float(z)
         x = float(way.at(z)) + float(rng.choice((-1, 1))) * (half + rng.uniform(0.5, 1.5))
+        foot = mesh.at(x, z)
         if rng.random() < 0.6:
-            mesh.add(bars(x, 0.04, 0, 2.6, z), (0.45, 0.45, 0.45))
-            mesh.add(bars(x, 0.35, 1.7, 2.0 + rng.uniform(0.2, 0.7), z), pick(rng, SIGNS))
+            foot.add(bars(0, 0.04, 0, 2.6), (0.45, 0.45, 0.45))
+            foot.add(bars(0, 0.35, 1.7, 2.0 + rng.uniform(0.2, 0.7)), pick(rng, SIGNS))
         else:
             size = rng.uniform(0.4, 1.5)
-            mesh.block((x - size, 0, z), (x + size, size, z + size), pick(rng, _STONES))
+            foot.block((-size, 0, 0), (size, size, size), pick(rng, _STONES))

@@ -74,13 +74,12 @@ def pick(rng: np.random.Generator, colours: tuple[Colour, ...], spread: float = 
 
 
 def polygons(*corners: tuple[Number, Number, Number]) -> Polygons:
-    """Make as many polygons as a coordinate's array has numbers; single numbers are repeated."""
+    """Make a polygon of each element of the coordinates, which are broadcast to one shape."""
     numbers = [number for corner in corners for number in corner]
-    count = next((len(n) for n in numbers if isinstance(n, np.ndarray)), 1)
-    table = np.empty((count, len(numbers)))
+    table = np.empty((*np.broadcast(*numbers).shape, len(numbers)))
     for column, number in enumerate(numbers):
-        table[:, column] = number
-    return table.reshape(count, len(corners), 3)
+        table[..., column] = number
+    return table.reshape(-1, len(corners), 3)
 
 
 def rects(
@@ -151,25 +150,25 @@ class Mesh:
         self._origin, self._axes = np.zeros(3), np.eye(3)
         self._parts: list[tuple[np.ndarray, Colour, Vector, int, float]] = []
 
-    def at(self, x: float, z: float) -> "Mesh":
-        """Return the same mesh with its origin at (x, z), in the layer of that distance."""
+    def at(self, x: float, z: float, layer: float | None = None) -> "Mesh":
+        """Return the same mesh with its origin at (x, z), in a layer, or that of distance z."""
         here = copy.copy(self)
-        here._origin = np.array((x, 0.0, z))
-        here.layer = float(z)
+        here._origin = self.world(np.array((x, 0.0, z)))
+        here.layer = float(z if layer is None else layer)
         return here
 
-    def front(self, x: float, z: float, side: float) -> "Mesh":
-        """Return the same mesh in other axes: those of a vertical plane, in the present layer.
+    def front(self, x: float, z: float, side: float, layer: float | None = None) -> "Mesh":
+        """Return the same mesh in other axes: those of a vertical plane, in the layer given.
 
         u runs along the plane, v up, d out of it. The plane stands on (x, z), on a side of the
         street, which is -1 or 1, or across the street where that is 0.
         """
-        front = copy.copy(self)
+        front = self.at(x, z, self.layer if layer is None else layer)
         along = (0.0, 0.0, 1.0) if side else (1.0, 0.0, 0.0)
         front.normal = (-side, 0.0, 0.0) if side else TO_CAMERA
         front.sees_start = side != 0 or x > 0
         front.end_normal = scaled(along, -1.0 if front.sees_start else 1.0)
-        front._origin, front._axes = np.array((x, 0.0, z)), np.array((along, UP, front.normal))
+        front._axes = np.array((along, UP, front.normal))
         return front
 
     def world(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:

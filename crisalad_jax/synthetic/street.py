@@ -19,9 +19,9 @@ from crisalad_jax.synthetic.mesh import (
     flat,
     palette,
     pick,
-    polygons,
     rects,
     scaled,
+    triangles,
 )
 from crisalad_jax.synthetic.things import lamp, monument, tree, wires
 
@@ -100,28 +100,25 @@ def _skyline(mesh: Mesh, rng: Rng, length: float) -> None:
     """Add distant towers, and at times a steeple: landmarks that barely move."""
     for _ in range(int(rng.integers(0, 6))):
         z = length + rng.uniform(90, 320)
-        x = rng.uniform(-0.9, 0.9) * z
+        tower = mesh.at(rng.uniform(-0.9, 0.9) * z, z, layer=3000 + z)
         width, height = rng.uniform(14, 34), z * rng.uniform(0.18, 0.5)
-        mesh.layer = 3000 + z
         colour = pick(rng, WALLS[6:])
-        mesh.add(rects(x, 0, x + width, height, z), colour)
+        tower.add(rects(0, 0, width, height), colour)
         if rng.random() < 0.5:
-            mesh.add(rects(x + width * 0.25, height, x + width * 0.75, height * 1.12, z), colour)
+            tower.add(rects(width * 0.25, height, width * 0.75, height * 1.12), colour)
         columns, rows = int(rng.integers(3, 7)), int(rng.integers(6, 14))
-        u = np.tile(x + (np.arange(columns) + 0.2) * width / columns, rows)
-        v = np.repeat((np.arange(rows) + 0.3) * height / rows, columns)
-        panes = rects(u, v, u + 0.6 * width / columns, v + 0.5 * height / rows, z)
-        mesh.add(panes, scaled(GLASS, 1.6), Kind.GLASS)
+        u = (np.arange(columns) + 0.2) * width / columns
+        v = ((np.arange(rows) + 0.3) * height / rows)[:, None]
+        panes = rects(u, v, u + 0.6 * width / columns, v + 0.5 * height / rows)
+        tower.add(panes, scaled(GLASS, 1.6), Kind.GLASS)
     if rng.random() < 0.4:
         z = length + rng.uniform(30, 90)
-        x = rng.uniform(-0.5, 0.5) * z
+        steeple = mesh.at(rng.uniform(-0.5, 0.5) * z, z, layer=2000 + z)
         half, height = rng.uniform(2.5, 4), z * rng.uniform(0.28, 0.45)
-        mesh.layer = 2000 + z
-        mesh.add(bars(x, half, 0, height, z), pick(rng, WALLS[:6]))
-        eaves, tip = half + 0.4, height * rng.uniform(1.2, 1.7)
-        spire = polygons((x - eaves, height, z), (x + eaves, height, z), (x, tip, z))
-        mesh.add(spire, pick(rng, ROOFS), Kind.ROOF, (0.0, 0.6, -0.8))
-        mesh.add(bars(x, half * 0.3, height * 0.82, height * 0.93, z), (0.12, 0.12, 0.13))
+        steeple.add(bars(0, half, 0, height), pick(rng, WALLS[:6]))
+        spire = triangles(-half - 0.4, half + 0.4, height, 0, height * rng.uniform(1.2, 1.7))
+        steeple.add(spire, pick(rng, ROOFS), Kind.ROOF, (0.0, 0.6, -0.8))
+        steeple.add(bars(0, half * 0.3, height * 0.82, height * 0.93), (0.12, 0.12, 0.13))
 
 
 def _far_row(mesh: Mesh, rng: Rng, length: float, habit: Habit) -> list[Body]:
@@ -136,8 +133,7 @@ def _far_row(mesh: Mesh, rng: Rng, length: float, habit: Habit) -> list[Body]:
         x += width
     bodies = []
     for z, x, width in sorted(stands, reverse=True):
-        mesh.layer = 1000 + z
-        bodies.append(building(rng, mesh.front(x, z, 0), width, habit))
+        bodies.append(building(rng, mesh.front(x, z, 0, layer=1000 + z), width, habit))
     return bodies
 
 
@@ -151,8 +147,8 @@ def _row(mesh: Mesh, rng: Rng, x: float, side: float, length: float, habit: Habi
             z += width * 0.6
             continue
         face = x + side * rng.choice((0.0, 0.0, 0.0, 0.8, 2.5))
-        mesh.layer = z + width
-        bodies.append(building(rng, mesh.front(face, z, side), width, habit))
+        front = mesh.front(face, z, side, layer=z + width)
+        bodies.append(building(rng, front, width, habit))
         z += width
     return bodies
 
@@ -166,7 +162,6 @@ def _park(mesh: Mesh, rng: Rng, x: float, side: float, length: float) -> None:
     # The wall is in pieces, each with its own layer: a tree may stand in front of one and behind
     # the next.
     for z in np.arange(-3.0, length, 3.0):
-        mesh.layer = float(z)
-        front = mesh.front(x, float(z), side)
+        front = mesh.front(x, float(z), side, layer=float(z))
         front.add(rects(0, 0, 3, height), colour)
         front.add(rects(0, height, 3, height + 0.12), colour, Kind.LEDGE)

@@ -145,7 +145,7 @@ def _vehicle(mesh: Mesh, rng: Rng, x: float, z: float, *, bus: bool, away: bool)
     mesh.add(rects(near, 0, near + 0.3, 0.5, 0.1), _TYRE)
     mesh.block((-half, 0.3, 0), (half, height, length), paint)
     side = -1.0 if x < 0 else 1.0
-    flank = mesh.front(x - side * half, z, side)
+    flank = mesh.front(-side * half, 0, side)
     if bus:
         u = 0.5 + 2.0 * np.arange(5)
         flank.add(rects(u, 1.4, u + 1.7, 2.5), _TINTED, Kind.SHOP)
