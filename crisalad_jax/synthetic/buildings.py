@@ -9,7 +9,6 @@ from crisalad_jax.synthetic.mesh import (
     ROOFS,
     SIGNS,
     WALLS,
-    Body,
     Colour,
     Kind,
     Mesh,
@@ -43,7 +42,7 @@ DEPTH = 11.0
 """Metres from a building's front to its back."""
 
 
-def building(rng: Rng, front: Mesh, width: float, habit: Habit) -> Body:
+def building(rng: Rng, front: Mesh, width: float, habit: Habit) -> None:
     """Add a building from u = 0 to `width`."""
     wall, trim = pick(rng, habit.walls), pick(rng, _TRIMS)
     floors = max(1, habit.floors + int(rng.integers(-2, 3)))
@@ -81,7 +80,7 @@ def building(rng: Rng, front: Mesh, width: float, habit: Habit) -> Body:
         front.boxes(sign, rng.uniform(0.9, 1.5), pick(rng, SIGNS))
     corners = front.world(np.array(((0, 0, 0), (width, 0, -DEPTH))))
     (x0, _, z0), (x1, _, z1) = np.sort(corners, axis=0)
-    return x0, x1, z0, z1, height
+    front.bodies.append((x0, x1, z0, z1, height))
 
 
 def _axes(width: float, spacing: float) -> tuple[np.ndarray, float]:

@@ -9,7 +9,6 @@ from crisalad_jax.synthetic.mesh import (
     SLANTED,
     UP,
     WALLS,
-    Body,
     Kind,
     Mesh,
     Place,
@@ -65,7 +64,7 @@ def country(rng: Rng) -> Place:
     for side in (-1.0, 1.0):
         _border(mesh, rng, way, side, half)
         _woods(mesh, rng, way, side, half)
-    bodies = _houses(mesh, rng, way, half)
+    _houses(mesh, rng, way, half)
     _roadside(mesh, rng, way, half)
     if rng.random() < 0.4:
         wires(mesh, rng, float(rng.choice((-1, 1))) * (half + rng.uniform(1.0, 4.0)), 90.0)
@@ -76,7 +75,7 @@ def country(rng: Rng) -> Place:
     lanes = (-half - 1.0, -half, half, half + 1.0)
     reach = Reach(height=(1.2, 3.2), lateral=1.2, forward=2.5, step=10.0)
     scene, road = mesh.scene(), kind == "road"
-    return Place(scene, heading, lanes, reach, bearing, hills, bodies, traffic=road)
+    return Place(scene, heading, lanes, reach, bearing, hills, mesh.bodies, traffic=road)
 
 
 def _fields(mesh: Mesh, rng: Rng) -> None:
@@ -234,17 +233,15 @@ def _woods(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
         tree(mesh, rng, float(way.at(z)) + side * off, float(z))
 
 
-def _houses(mesh: Mesh, rng: Rng, way: _Way, half: float) -> list[Body]:
+def _houses(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
     """Add a few houses or barns."""
-    bodies = []
     walls = tuple(WALLS[i] for i in rng.choice(len(WALLS), 3, replace=False))
     habit = Habit(walls, 1, rng.uniform(2.6, 3.2), rng.uniform(2.0, 3.5))
     for z in sorted(rng.uniform(16, 110, int(rng.integers(0, 4))), reverse=True):
         side, wide = float(rng.choice((-1, 1))), rng.uniform(7, 14)
         x = float(way.at(z)) + side * (half + rng.uniform(3, 30))
         front = mesh.front(x - wide if side < 0 else x, z, 0, layer=z)
-        bodies.append(building(rng, front, wide, habit))
-    return bodies
+        building(rng, front, wide, habit)
 
 
 def _roadside(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:

@@ -148,6 +148,10 @@ class Mesh:
         """Whether the camera sees the ends towards small u of a front, or those towards large u."""
         self.end_normal: Vector = UP
         self._origin, self._axes = np.zeros(3), np.eye(3)
+        self.bodies: list[Body] = []
+        """The buildings, which cast shadows."""
+        self.lamps: list[Vector] = []
+        """Positions of the street lamps' lights."""
         self._parts: list[tuple[np.ndarray, Colour, Vector, int, float]] = []
 
     def at(self, x: float, z: float, layer: float | None = None) -> "Mesh":

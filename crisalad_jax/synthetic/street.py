@@ -7,13 +7,11 @@ from crisalad_jax.synthetic.mesh import (
     GLASS,
     ROOFS,
     WALLS,
-    Body,
     Kind,
     Mesh,
     Place,
     Reach,
     Rng,
-    Vector,
     bars,
     draw_hills,
     flat,
@@ -41,23 +39,22 @@ def street(rng: Rng) -> Place:
 
     _ground(mesh, rng, kerbs, length)
     _skyline(mesh, rng, length)
-    bodies = _far_row(mesh, rng, length, habit)
+    _far_row(mesh, rng, length, habit)
     park = rng.choice(3, p=(0.7, 0.15, 0.15))
     for number, x, side in ((1, left, -1.0), (2, right, 1.0)):
         if park == number:
             _park(mesh, rng, x, side, length)
         else:
-            bodies += _row(mesh, rng, x, side, length, habit)
-    lamps: list[Vector] = []
+            _row(mesh, rng, x, side, length, habit)
     for x in (kerbs[0] - 0.6, kerbs[1] + 0.6):
         if rng.random() < 0.55:
             for z in np.arange(rng.uniform(7.0, 16.0), length - 2, rng.uniform(7.0, 14.0)):
                 if rng.random() < 0.8:
                     tree(mesh, rng, x + rng.uniform(-0.3, 0.3), z + rng.uniform(-1, 1))
-        if rng.random() < 0.6 or (x > 0 and not lamps):
+        if rng.random() < 0.6 or (x > 0 and not mesh.lamps):
             height = rng.uniform(5.0, 8.0)
-            stations = np.arange(rng.uniform(6.0, 16.0), length + 4, rng.uniform(14.0, 24.0))
-            lamps += [lamp(mesh, x, float(z), height) for z in stations]
+            for z in np.arange(rng.uniform(6.0, 16.0), length + 4, rng.uniform(14.0, 24.0)):
+                lamp(mesh, x, float(z), height)
     if rng.random() < 0.4:
         wires(mesh, rng, float(rng.choice(kerbs)), length)
     if rng.random() < 0.25:
@@ -67,7 +64,8 @@ def street(rng: Rng) -> Place:
     bearing, heading = float(rng.uniform(0, 360)), float(rng.uniform(-20, 20))
     lanes = (left, *kerbs, right)
     reach = Reach(height=(1.2, 3.0), lateral=1.2, forward=2.5, step=9.0)
-    return Place(mesh.scene(), heading, lanes, reach, bearing, hills, bodies, np.array(lamps))
+    scene, bodies, lamps = mesh.scene(), mesh.bodies, np.array(mesh.lamps)
+    return Place(scene, heading, lanes, reach, bearing, hills, bodies, lamps)
 
 
 def _ground(mesh: Mesh, rng: Rng, kerbs: tuple[float, float], length: float) -> None:
@@ -121,7 +119,7 @@ def _skyline(mesh: Mesh, rng: Rng, length: float) -> None:
         steeple.add(bars(0, half * 0.3, height * 0.82, height * 0.93), (0.12, 0.12, 0.13))
 
 
-def _far_row(mesh: Mesh, rng: Rng, length: float, habit: Habit) -> list[Body]:
+def _far_row(mesh: Mesh, rng: Rng, length: float, habit: Habit) -> None:
     """Add the row that closes the street, at varying distances and at times with a gap."""
     reach = 14 + length * 0.7
     stands: list[tuple[float, float, float]] = []
@@ -131,15 +129,12 @@ def _far_row(mesh: Mesh, rng: Rng, length: float, habit: Habit) -> list[Body]:
         if rng.random() < 0.86:
             stands.append((length + 11 + rng.choice((0.0, 0.0, 3.0, 7.0)), x, width))
         x += width
-    bodies = []
     for z, x, width in sorted(stands, reverse=True):
-        bodies.append(building(rng, mesh.front(x, z, 0, layer=1000 + z), width, habit))
-    return bodies
+        building(rng, mesh.front(x, z, 0, layer=1000 + z), width, habit)
 
 
-def _row(mesh: Mesh, rng: Rng, x: float, side: float, length: float, habit: Habit) -> list[Body]:
+def _row(mesh: Mesh, rng: Rng, x: float, side: float, length: float, habit: Habit) -> None:
     """Add one side of the street, from the camera to the crossing, with gaps and setbacks."""
-    bodies = []
     z = rng.uniform(-9.0, -2.0)
     while z < length - 5:
         width = min(rng.uniform(7.0, 17.0), length - z)
@@ -148,9 +143,8 @@ def _row(mesh: Mesh, rng: Rng, x: float, side: float, length: float, habit: Habi
             continue
         face = x + side * rng.choice((0.0, 0.0, 0.0, 0.8, 2.5))
         front = mesh.front(face, z, side, layer=z + width)
-        bodies.append(building(rng, front, width, habit))
+        building(rng, front, width, habit)
         z += width
-    return bodies
 
 
 def _park(mesh: Mesh, rng: Rng, x: float, side: float, length: float) -> None:

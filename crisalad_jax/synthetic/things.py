@@ -15,7 +15,6 @@ from crisalad_jax.synthetic.mesh import (
     Mesh,
     Rng,
     Scene,
-    Vector,
     bars,
     discs,
     flat,
@@ -63,14 +62,14 @@ def tree(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
             mesh.add(disc[None], (hue, shade, 0.0), Kind.LEAF, (0.0, 0.6, -0.8))
 
 
-def lamp(mesh: Mesh, x: float, z: float, height: float) -> Vector:
-    """Add a street lamp with an arm over the street; return the position of its light."""
+def lamp(mesh: Mesh, x: float, z: float, height: float) -> None:
+    """Add a street lamp with an arm over the street."""
     mesh = mesh.at(x, z)
     tip = 1.3 if x < 0 else -1.3
     arm = bars(tip / 2, 0.65, height - 0.12, height)
     mesh.add(np.concatenate((bars(0, 0.09, 0, height), arm)), (0.20, 0.22, 0.22))
     mesh.add(bars(tip, 0.35, height - 0.32, height - 0.08), (0.75, 0.74, 0.68), Kind.LAMP)
-    return (x + tip, height - 0.2, z)
+    mesh.lamps.append((x + tip, height - 0.2, z))
 
 
 def wires(mesh: Mesh, rng: Rng, x: float, length: float) -> None:
