@@ -15,11 +15,11 @@ from crisalad_jax.synthetic.mesh import (
     Number,
     Rng,
     bars,
+    draw_kind,
     palette,
     pick,
     polygons,
     rects,
-    scaled,
     sheets,
     triangles,
 )
@@ -51,20 +51,20 @@ def building(rng: Rng, front: Mesh, width: float, habit: Habit) -> None:
     height = ground + storey * floors + rng.uniform(0.2, 1.0)
 
     end = 0.0 if front.sees_start else width
-    front.add(sheets(end, 0, end, -DEPTH, 0, height), scaled(wall, 0.85), normal=front.end_normal)
+    front.add(sheets(end, 0, end, -DEPTH, 0, height), 0.85 * wall, normal=front.end_normal)
     _roof(rng, front, width, height, wall)
     front.add(rects(0, 0, width, height), wall)
-    base = scaled(wall, 0.72) if rng.random() < 0.5 else pick(rng, WALLS)
+    base = 0.72 * wall if rng.random() < 0.5 else pick(rng, WALLS)
     front.add(rects(0, 0, width, ground - 0.3), base)
     if rng.random() < 0.3:
         u = np.linspace(0.35, width - 0.35, int(rng.integers(2, 5)))
-        front.add(bars(u, 0.3, ground, height), scaled(wall, 1.16))
+        front.add(bars(u, 0.3, ground, height), 1.16 * wall)
     levels = ground + storey * np.arange(floors)
     if rng.random() < 0.4:
-        front.add(rects(0, levels - 0.15, width, levels + 0.12), scaled(wall, 1.18), Kind.LEDGE)
+        front.add(rects(0, levels - 0.15, width, levels + 0.12), 1.18 * wall, Kind.LEDGE)
 
     _windows(rng, front, width, levels, storey, habit, trim)
-    use = rng.choice(("shop", "arcade", "door"), p=(0.42, 0.16, 0.42))
+    use = draw_kind(rng, shop=0.42, arcade=0.16, door=0.42)
     if use == "shop":
         _shops(rng, front, width, ground - 1.1)
     elif use == "arcade":
@@ -100,18 +100,17 @@ def _arches(
 def _roof(rng: Rng, front: Mesh, width: float, height: float, wall: Colour) -> None:
     """Add a pitched, gabled, mansard or flat roof, with dormers, chimneys or tanks."""
     tiles = pick(rng, ROOFS)
-    shape = rng.choice(("pitched", "gable", "mansard", "flat"), p=(0.3, 0.17, 0.15, 0.38))
+    shape = draw_kind(rng, pitched=0.3, gable=0.17, mansard=0.15, flat=0.38)
     x, _, z = front.normal
     uphill = (x * 0.6, 0.8, z * 0.6)
     if shape == "pitched":
         back, ridge = -DEPTH / 2, height + rng.uniform(1.8, 4.0)
         end = 0.0 if front.sees_start else width
         gable = polygons((end, height, 0), (end, height, -DEPTH), (end, ridge, back))
-        front.add(gable, scaled(wall, 0.85), normal=front.end_normal)
+        front.add(gable, 0.85 * wall, normal=front.end_normal)
         front.add(rects(0, height, width, ridge, 0.3, back), tiles, Kind.ROOF, uphill)
         u = rng.uniform(0.1, 0.8) * width
-        chimney = rects(u, (height + ridge) / 2, u + 0.9, ridge + 1.2, back * 0.7)
-        front.add(chimney, scaled(wall, 0.8))
+        front.add(rects(u, (height + ridge) / 2, u + 0.9, ridge + 1.2, back * 0.7), 0.8 * wall)
     elif shape == "gable":
         rise, steps = width * rng.uniform(0.3, 0.55), int(rng.integers(1, 5))
         if steps == 1:
@@ -126,15 +125,15 @@ def _roof(rng: Rng, front: Mesh, width: float, height: float, wall: Colour) -> N
         top = height + rng.uniform(2.4, 3.4)
         front.add(rects(0, height, width, top, 0, -1), tiles, Kind.ROOF, uphill)
         u, _ = _axes(width, rng.uniform(2.6, 4.5))
-        front.add(bars(u, 0.75, height + 0.4, top - 0.3, -0.1), scaled(wall, 1.1))
+        front.add(bars(u, 0.75, height + 0.4, top - 0.3, -0.1), 1.1 * wall)
         front.add(bars(u, 0.45, height + 0.6, top - 0.6, -0.1), GLASS, Kind.GLASS)
     else:
-        parapet = rects(0, height, width, height + rng.uniform(0.3, 0.9))
-        front.add(parapet, scaled(wall, 0.9), Kind.LEDGE)
+        parapet = height + rng.uniform(0.3, 0.9)
+        front.add(rects(0, height, width, parapet), 0.9 * wall, Kind.LEDGE)
         if rng.random() < 0.5:
             u, size = rng.uniform(0.1, 0.6) * width, rng.uniform(1.5, 4.0)
             tank = rects(u, height, u + size, height + size * rng.uniform(0.6, 1.3), -3.0)
-            front.add(tank, scaled(wall, 0.7))
+            front.add(tank, 0.7 * wall)
         if rng.random() < 0.4:
             u, top = rng.uniform(0.1, 0.9) * width, height + rng.uniform(2.5, 6.0)
             mast = np.array((u, u - 0.9)), np.array((height, top - 0.9))
@@ -152,7 +151,7 @@ def _windows(
     tall = rise * rng.uniform(0.45, 0.72)
     low = levels + (rise - tall) * rng.uniform(0.4, 0.7)
     high = low + tall
-    style = rng.choice(("grid", "bands", "shafts"), p=(0.76, 0.14, 0.10))
+    style = draw_kind(rng, grid=0.76, bands=0.14, shafts=0.10)
     # The rhythm of the columns identifies the building in every season and light.
     rhythm = rng.integers(6)
     present = np.ones(columns, bool)
@@ -205,8 +204,8 @@ def _shops(rng: Rng, front: Mesh, width: float, lintel: float) -> None:
     middle, span = _axes(width, rng.uniform(4.0, 8.0))
     start = middle - span / 2
     end = start + span * rng.uniform(0.5, 0.8)
-    front.add(rects(start + 0.4, 0.5, end, lintel), scaled(GLASS, 1.2), Kind.SHOP)
-    front.add(rects(end + 0.35, 0, end + 1.3, lintel), scaled(GLASS, 1.2), Kind.SHOP)
+    front.add(rects(start + 0.4, 0.5, end, lintel), 1.2 * GLASS, Kind.SHOP)
+    front.add(rects(end + 0.35, 0, end + 1.3, lintel), 1.2 * GLASS, Kind.SHOP)
     for u0, u1 in zip(start, end, strict=True):
         front.add(rects(u0 + 0.3, lintel + 0.1, u0 + span - 0.3, lintel + 0.8), pick(rng, SIGNS))
         if rng.random() < 0.4:

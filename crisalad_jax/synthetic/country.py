@@ -16,11 +16,11 @@ from crisalad_jax.synthetic.mesh import (
     Rng,
     bars,
     draw_hills,
+    draw_kind,
     flat,
     palette,
     pick,
     polygons,
-    scaled,
     sheets,
 )
 from crisalad_jax.synthetic.things import tree, wires
@@ -58,7 +58,7 @@ def country(rng: Rng) -> Place:
     """Build a place in the country."""
     mesh = Mesh()
     way = _Way(rng)
-    kind = str(rng.choice(("road", "railway", "path", "meadow"), p=(0.4, 0.3, 0.2, 0.1)))
+    kind = draw_kind(rng, road=0.4, railway=0.3, path=0.2, meadow=0.1)
     _fields(mesh, rng)
     half = _lay(mesh, rng, way, kind)
     for side in (-1.0, 1.0):
@@ -164,8 +164,7 @@ def _masts(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
 
 def _border(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
     """Add a hedge, a wall, a fence, a crash barrier or a cutting along one side of the way."""
-    kinds = ("none", "hedge", "wall", "fence", "barrier", "bank")
-    kind = rng.choice(kinds, p=(0.3, 0.16, 0.1, 0.2, 0.08, 0.16))
+    kind = draw_kind(rng, none=0.3, hedge=0.16, wall=0.1, fence=0.2, barrier=0.08, bank=0.16)
     if kind == "none":
         return
     off, step = half + rng.uniform(0.4, 3.0), 4.0
@@ -190,7 +189,7 @@ def _border(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
             height = max(0.5, min(9.0, height + rng.normal(0, 0.6)))
             colour, cover = (0.4, 0.45, 0.3), Kind.GRASS
             if rng.random() < 0.4:
-                colour, cover = scaled(stone, rng.uniform(0.8, 1.2)), Kind.SOLID
+                colour, cover = rng.uniform(0.8, 1.2) * stone, Kind.SOLID
             face = sheets(*line, 0, height, side * height * slope)
             mesh.add(face, colour, cover, (-side * 0.6, 0.8, 0.0))
         else:
@@ -218,7 +217,7 @@ def _woods(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
             top, colour, kind = tall * part, (hue, shade * 0.9, 0.0), Kind.BUSH
             if spikes:
                 top[1::2] *= 0.7
-                colour, kind = scaled((0.14, 0.26, 0.17), shade), Kind.NEEDLE
+                colour, kind = shade * np.array((0.14, 0.26, 0.17)), Kind.NEEDLE
             tips = (x[1:], top[1:], z), (x[:-1], top[:-1], z)
             band = polygons((x[:-1], 0, z), (x[1:], 0, z), *tips)
             mesh.add(band, colour, kind, SLANTED, layer=float(z))

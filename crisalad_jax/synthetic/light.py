@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from crisalad_jax.synthetic.mesh import Colour, Kind, Place, Rng, Scene, palette
+from crisalad_jax.synthetic.mesh import Kind, Place, Rng, Scene, Vector, palette
 from crisalad_jax.synthetic.view import SEASONS, Season, Time, View, Weather
 
 
@@ -74,7 +74,7 @@ _SNOW: dict[int, float] = {
 """Share of a surface that snow covers, by kind."""
 GRASS = dict(zip(SEASONS, palette("40 54 24, 38 46 22, 50 44 25, 40 46 34"), strict=True))
 SNOW_COLOUR = np.array((0.90, 0.92, 0.96))
-GLOW: dict[int, tuple[float, Colour]] = {
+GLOW: dict[int, tuple[float, Vector]] = {
     Kind.GLASS: (0.34, (1.0, 0.78, 0.42)),
     Kind.SHOP: (0.8, (0.92, 0.82, 0.60)),
     Kind.LAMP: (1.0, (1.0, 0.88, 0.62)),

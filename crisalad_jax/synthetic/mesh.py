@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from crisalad_jax.synthetic.view import EYE
 
-Colour = tuple[float, float, float]
+Colour = np.ndarray
 """Red, green and blue, 0 to 1."""
 Vector = tuple[float, float, float]
 Number = int | float | np.ndarray
@@ -49,8 +49,7 @@ class Kind(enum.IntEnum):
 
 def palette(percents: str) -> tuple[Colour, ...]:
     """Read colours from text: red, green and blue in percent, a comma between colours."""
-    rows = (map(int, colour.split()) for colour in percents.split(","))
-    return tuple((red / 100, green / 100, blue / 100) for red, green, blue in rows)
+    return tuple(np.array(colour.split(), float) / 100 for colour in percents.split(","))
 
 
 WALLS = palette(
@@ -59,18 +58,17 @@ WALLS = palette(
 )
 ROOFS = palette("52 27 20, 33 33 36, 42 34 29, 30 42 38")
 SIGNS = palette("70 16 14, 13 28 52, 12 40 24, 85 66 14, 20 18 20, 82 80 76")
-GLASS: Colour = (0.16, 0.20, 0.25)
+GLASS = np.array((0.16, 0.20, 0.25))
 
 
-def scaled(colour: Colour, gain: float) -> Colour:
-    """Multiply a colour, or any other vector, by a number."""
-    return (colour[0] * gain, colour[1] * gain, colour[2] * gain)
+def draw_kind(rng: Rng, **shares: float) -> str:
+    """Draw one of the names, by their shares, which sum to 1."""
+    return str(rng.choice(tuple(shares), p=tuple(shares.values())))
 
 
-def pick(rng: np.random.Generator, colours: tuple[Colour, ...], spread: float = 0.06) -> Colour:
+def pick(rng: Rng, colours: tuple[Colour, ...], spread: float = 0.06) -> Colour:
     """Draw one of the colours, up to a share `spread` lighter or darker."""
-    colour = colours[rng.integers(len(colours))]
-    return scaled(colour, 1 + rng.uniform(-spread, spread))
+    return colours[rng.integers(len(colours))] * (1 + rng.uniform(-spread, spread))
 
 
 def polygons(*corners: tuple[Number, Number, Number]) -> Polygons:
@@ -152,7 +150,7 @@ class Mesh:
         """The buildings, which cast shadows."""
         self.lamps: list[Vector] = []
         """Positions of the street lamps' lights."""
-        self._parts: list[tuple[np.ndarray, Colour, Vector, int, float]] = []
+        self._parts: list[tuple[np.ndarray, Colour | Vector, Vector, int, float]] = []
 
     def at(self, x: float, z: float, layer: float | None = None) -> "Mesh":
         """Return the same mesh with its origin at (x, z), in a layer, or that of distance z."""
@@ -168,10 +166,10 @@ class Mesh:
         street, which is -1 or 1, or across the street where that is 0.
         """
         front = self.at(x, z, self.layer if layer is None else layer)
-        along = (0.0, 0.0, 1.0) if side else (1.0, 0.0, 0.0)
+        along = np.array((0.0, 0.0, 1.0) if side else (1.0, 0.0, 0.0))
         front.normal = (-side, 0.0, 0.0) if side else TO_CAMERA
         front.sees_start = side != 0 or x > 0
-        front.end_normal = scaled(along, -1.0 if front.sees_start else 1.0)
+        front.end_normal = tuple(-along if front.sees_start else along)
         front._axes = np.array((along, UP, front.normal))
         return front
 
@@ -182,7 +180,7 @@ class Mesh:
     def add(
         self,
         polygons: Polygons,
-        albedo: Colour,
+        albedo: Colour | Vector,
         kind: Kind = Kind.SOLID,
         normal: Vector | None = None,
         layer: float | None = None,
@@ -193,11 +191,11 @@ class Mesh:
             part = self.world(polygons), albedo, normal or self.normal, int(kind), layer
             self._parts.append(part)
 
-    def ground(self, polygons: Polygons, albedo: Colour, kind: Kind = Kind.SOLID) -> None:
+    def ground(self, polygons: Polygons, albedo: Colour | Vector, kind: Kind = Kind.SOLID) -> None:
         """Add a part of the ground, over those before it."""
         self.add(polygons, albedo, kind, UP, GROUND_LAYER + 1)
 
-    def block(self, low: Vector, high: Vector, albedo: Colour) -> None:
+    def block(self, low: Vector, high: Vector, albedo: Colour | Vector) -> None:
         """Add an upright box: its top, its side towards the middle of the street, its front."""
         (x0, y0, z0), (x1, y1, z1) = low, high
         is_left = self._origin[0] + (x0 + x1) / 2 < 0
@@ -206,7 +204,9 @@ class Mesh:
         self.add(sheets(x, z0, x, z1, y0, y1), albedo, normal=(outwards, 0.0, 0.0))
         self.add(rects(x0, y0, x1, y1, z0), albedo)
 
-    def boxes(self, rect: Rect, out: float, albedo: Colour, kind: Kind = Kind.SOLID) -> None:
+    def boxes(
+        self, rect: Rect, out: float, albedo: Colour | Vector, kind: Kind = Kind.SOLID
+    ) -> None:
         """Add boxes that protrude from a front: the visible end, the top or underside, the face."""
         u0, v0, u1, v1 = rect
         end = u0 if self.sees_start else u1

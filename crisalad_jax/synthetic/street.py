@@ -18,7 +18,6 @@ from crisalad_jax.synthetic.mesh import (
     palette,
     pick,
     rects,
-    scaled,
     triangles,
 )
 from crisalad_jax.synthetic.things import lamp, monument, tree, wires
@@ -77,7 +76,7 @@ def _ground(mesh: Mesh, rng: Rng, kerbs: tuple[float, float], length: float) -> 
     street, crossing = flat(left, -20, right, length + 1), flat(-120, length + 1, 120, length + 8)
     mesh.ground(np.concatenate((street, crossing)), asphalt, Kind.ROAD)
     edge = np.array(kerbs)
-    mesh.ground(flat(edge - 0.12, -5, edge + 0.12, length + 1), scaled(paving, 1.25), Kind.PAVEMENT)
+    mesh.ground(flat(edge - 0.12, -5, edge + 0.12, length + 1), 1.25 * paving, Kind.PAVEMENT)
     white, middle = (0.78, 0.78, 0.74), (left + right) / 2
     if rng.random() < 0.7:
         dash = rng.uniform(1.5, 3.5)
@@ -108,7 +107,7 @@ def _skyline(mesh: Mesh, rng: Rng, length: float) -> None:
         u = (np.arange(columns) + 0.2) * width / columns
         v = ((np.arange(rows) + 0.3) * height / rows)[:, None]
         panes = rects(u, v, u + 0.6 * width / columns, v + 0.5 * height / rows)
-        tower.add(panes, scaled(GLASS, 1.6), Kind.GLASS)
+        tower.add(panes, 1.6 * GLASS, Kind.GLASS)
     if rng.random() < 0.4:
         z = length + rng.uniform(30, 90)
         steeple = mesh.at(rng.uniform(-0.5, 0.5) * z, z, layer=2000 + z)
@@ -142,8 +141,7 @@ def _row(mesh: Mesh, rng: Rng, x: float, side: float, length: float, habit: Habi
             z += width * 0.6
             continue
         face = x + side * rng.choice((0.0, 0.0, 0.0, 0.8, 2.5))
-        front = mesh.front(face, z, side, layer=z + width)
-        building(rng, front, width, habit)
+        building(rng, mesh.front(face, z, side, layer=z + width), width, habit)
         z += width
 
 

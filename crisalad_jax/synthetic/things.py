@@ -22,7 +22,6 @@ from crisalad_jax.synthetic.mesh import (
     pick,
     polygons,
     rects,
-    scaled,
     sheets,
     triangles,
 )
@@ -94,7 +93,7 @@ def monument(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
     stone = pick(rng, WALLS[2:9])
     mesh.block((-1.5, 0.0, 0.0), (1.5, 0.9, 3.0), stone)
     height, half = rng.uniform(3.0, 9.0), rng.uniform(0.35, 0.9)
-    stone = scaled(stone, 0.9)
+    stone = 0.9 * stone
     if rng.random() < 0.5:
         mesh.block((-half, 0.9, 1), (half, height, 1 + 2 * half), stone)
         mesh.add(discs(0, height + 0.7, 0.8, 1), (0.35, 0.40, 0.36), normal=SLANTED)
