@@ -17,6 +17,8 @@ from crisalad_jax.synthetic.view import EYE
 Colour = np.ndarray
 """Red, green and blue, 0 to 1."""
 Vector = tuple[float, float, float]
+Paint = Colour | Vector
+"""A part's colour, or in `Kind.LEAF` and `Kind.BUSH` its share of the second hue and its shade."""
 Number = int | float | np.ndarray
 Polygons = Float[np.ndarray, "polygon corner 3"]
 Rect = tuple[Number, Number, Number, Number]
@@ -150,7 +152,7 @@ class Mesh:
         """The buildings, which cast shadows."""
         self.lamps: list[Vector] = []
         """Positions of the street lamps' lights."""
-        self._parts: list[tuple[np.ndarray, Colour | Vector, Vector, int, float]] = []
+        self._parts: list[tuple[np.ndarray, Paint, Vector, int, float]] = []
 
     def at(self, x: float, z: float, layer: float | None = None) -> "Mesh":
         """Return the same mesh with its origin at (x, z), in a layer, or that of distance z."""
@@ -168,7 +170,7 @@ class Mesh:
         front = self.at(x, z, self.layer if layer is None else layer)
         along = np.array((0.0, 0.0, 1.0) if side else (1.0, 0.0, 0.0))
         front.normal = (-side, 0.0, 0.0) if side else TO_CAMERA
-        front.sees_start = side != 0 or x > 0
+        front.sees_start = side != 0 or front._origin[0] > 0
         front.end_normal = tuple(-along if front.sees_start else along)
         front._axes = np.array((along, UP, front.normal))
         return front
@@ -180,7 +182,7 @@ class Mesh:
     def add(
         self,
         polygons: Polygons,
-        albedo: Colour | Vector,
+        albedo: Paint,
         kind: Kind = Kind.SOLID,
         normal: Vector | None = None,
         layer: float | None = None,
@@ -191,11 +193,11 @@ class Mesh:
             part = self.world(polygons), albedo, normal or self.normal, int(kind), layer
             self._parts.append(part)
 
-    def ground(self, polygons: Polygons, albedo: Colour | Vector, kind: Kind = Kind.SOLID) -> None:
+    def ground(self, polygons: Polygons, albedo: Paint, kind: Kind = Kind.SOLID) -> None:
         """Add a part of the ground, over those before it."""
         self.add(polygons, albedo, kind, UP, GROUND_LAYER + 1)
 
-    def block(self, low: Vector, high: Vector, albedo: Colour | Vector) -> None:
+    def block(self, low: Vector, high: Vector, albedo: Paint) -> None:
         """Add an upright box: its top, its side towards the middle of the street, its front."""
         (x0, y0, z0), (x1, y1, z1) = low, high
         is_left = self._origin[0] + (x0 + x1) / 2 < 0
@@ -204,9 +206,7 @@ class Mesh:
         self.add(sheets(x, z0, x, z1, y0, y1), albedo, normal=(outwards, 0.0, 0.0))
         self.add(rects(x0, y0, x1, y1, z0), albedo)
 
-    def boxes(
-        self, rect: Rect, out: float, albedo: Colour | Vector, kind: Kind = Kind.SOLID
-    ) -> None:
+    def boxes(self, rect: Rect, out: float, albedo: Paint, kind: Kind = Kind.SOLID) -> None:
         """Add boxes that protrude from a front: the visible end, the top or underside, the face."""
         u0, v0, u1, v1 = rect
         end = u0 if self.sees_start else u1
