@@ -12,6 +12,7 @@ from crisalad_jax.synthetic.layouts import (
     Files,
     Progress,
     Shot,
+    derive_seed,
     gsv_city,
     jpeg,
     utm_images,
@@ -95,7 +96,7 @@ def _shots(config: SyntheticCityConfig, split: int, indices: range) -> Iterator[
     """Take the pictures of some places, which stand on a square grid with small offsets."""
     columns = math.isqrt((config.train_places, config.test_places)[split] - 1) + 1
     for number, index in enumerate(indices, start=1):
-        seed = place_seed(config, split, index)
+        seed = derive_seed(config.seed, split, index)
         place, rng = build_place(seed), np.random.default_rng((seed, 4))
         row, column = divmod(index, columns)
         position = np.array((column, row)) * _SPACING + rng.uniform(-3, 3, 2)
@@ -126,21 +127,16 @@ def _pose(place: Place, position: np.ndarray, view: View) -> tuple[float, float,
     return float(east), float(north), round(place.bearing + place.heading + view.heading) % 360
 
 
-def place_seed(config: SyntheticCityConfig, split: int, index: int) -> int:
-    """Derive the seed of a place, different for every place of either split."""
-    return int(np.random.SeedSequence((config.seed, split, index)).generate_state(1, np.uint64)[0])
-
-
 def _draw_view(rng: Rng, season: Season, time: Time) -> View:
     return View(
-        lateral=float(rng.uniform(-1.2, 1.2)),
-        forward=float(rng.uniform(-2.5, 2.5)),
-        heading=float(rng.uniform(-6, 6)),
+        lateral=rng.uniform(-1.2, 1.2),
+        forward=rng.uniform(-2.5, 2.5),
+        heading=rng.uniform(-6, 6),
         season=season,
         time=time,
         weather=WEATHERS[rng.choice(4, p=(0.5, 0.25, 0.12, 0.13))],
         occluders=int(rng.integers(2**31)),
-        exposure=float(rng.uniform(-0.3, 0.35)),
-        noise=float(rng.uniform(1, 4) + 2 * (time == "night")),
+        exposure=rng.uniform(-0.3, 0.35),
+        noise=rng.uniform(1, 4) + 2 * (time == "night"),
         seed=int(rng.integers(2**31)),
     )

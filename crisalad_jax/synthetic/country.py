@@ -1,5 +1,7 @@
 """One place in the country: a road, railway or path through fields, woods and hills."""
 
+from typing import Any
+
 import numpy as np
 
 from crisalad_jax.synthetic.buildings import Habit, building
@@ -39,7 +41,8 @@ class _Way:
         self._bend = rng.normal(0.0, 0.0022)
         self._drift = rng.normal(0.0, 0.05)
 
-    def at(self, z: np.ndarray | float) -> np.ndarray | float:
+    def at(self, z: Any) -> Any:
+        """Return x at one distance or at each of an array."""
         return self._drift * z + self._bend * np.square(z)
 
     def band(self, z0: np.ndarray, z1: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -152,7 +155,7 @@ def _masts(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
     side, gap = float(rng.choice((-1, 1))), rng.uniform(28.0, 50.0)
     steel = (0.36, 0.37, 0.36)
     for z in np.arange(rng.uniform(4.0, gap), _FAR, gap)[::-1]:
-        mast = mesh.at(float(way.at(z)) + side * half, z)
+        mast = mesh.at(way.at(z) + side * half, z)
         mast.add(bars(0, 0.12, 0, 6.8), steel)
         arm = half / 2 + 0.2
         mast.add(bars(-side * arm, arm, 6.2, 6.3), steel)
@@ -175,7 +178,7 @@ def _border(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
         if rng.random() < 0.06:
             continue
         mesh.layer = float(z)
-        x0, x1 = (float(way.at(each)) + side * off for each in (z, z + step))
+        x0, x1 = way.at(np.array((z, z + step))) + side * off
         line = x0, z, x1, z + step
         if kind == "hedge":
             height = low * rng.uniform(0.7, 1.5)
@@ -206,7 +209,7 @@ def _woods(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
         if rng.random() < 0.3:
             continue
         wide = rng.uniform(20, 120) * (0.5 + z / 150)
-        near = float(way.at(z)) * side + half + rng.uniform(3, 25)
+        near = way.at(z) * side + half + rng.uniform(3, 25)
         n = int(np.clip(wide, 12, 40))
         x = side * (near + np.linspace(0, wide, n))
         tall = rng.uniform(5, 15) * (1 + 0.25 * rng.standard_normal(n))
@@ -229,7 +232,7 @@ def _woods(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
         depths = rng.uniform(6, 70, count)
     for z in sorted(depths, reverse=True):
         off = half + (2.5 if row else rng.uniform(1.5, 18.0))
-        tree(mesh, rng, float(way.at(z)) + side * off, float(z))
+        tree(mesh, rng, way.at(z) + side * off, float(z))
 
 
 def _houses(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
@@ -238,7 +241,7 @@ def _houses(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
     habit = Habit(walls, 1, rng.uniform(2.6, 3.2), rng.uniform(2.0, 3.5))
     for z in sorted(rng.uniform(16, 110, int(rng.integers(0, 4))), reverse=True):
         side, wide = float(rng.choice((-1, 1))), rng.uniform(7, 14)
-        x = float(way.at(z)) + side * (half + rng.uniform(3, 30))
+        x = way.at(z) + side * (half + rng.uniform(3, 30))
         front = mesh.front(x - wide if side < 0 else x, z, 0, layer=z)
         building(rng, front, wide, habit)
 
@@ -246,7 +249,7 @@ def _houses(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
 def _roadside(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
     """Add a sign or a rock."""
     for z in rng.uniform(5, 40, int(rng.integers(0, 3))):
-        x = float(way.at(z)) + float(rng.choice((-1, 1))) * (half + rng.uniform(0.5, 1.5))
+        x = way.at(z) + float(rng.choice((-1, 1))) * (half + rng.uniform(0.5, 1.5))
         foot = mesh.at(x, z)
         if rng.random() < 0.6:
             foot.add(bars(0, 0.04, 0, 2.6), (0.45, 0.45, 0.45))

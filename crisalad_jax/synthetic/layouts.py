@@ -149,6 +149,11 @@ def utm_images(shots: Iterable[Shot], scenery: str = "", *, camera: bool = False
         yield f"test/images/test/{side}/@{'@'.join(fields)}@.jpg", shot.picture
 
 
+def derive_seed(*numbers: int) -> int:
+    """Derive the seed of a place: of a set's seed, a split and a number, it is one of its own."""
+    return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0])
+
+
 def jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
     """Compress a picture with quality 92."""
     _, data = cv2.imencode(".jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, 92))

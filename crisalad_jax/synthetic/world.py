@@ -13,6 +13,7 @@ from crisalad_jax.synthetic.layouts import (
     Files,
     Progress,
     Shot,
+    derive_seed,
     gsv_city,
     holds,
     jpeg,
@@ -136,8 +137,7 @@ def _shots(
 ) -> Iterator[Shot]:
     """Take the pictures of some scenes."""
     for scene in scenes:
-        entropy = (config.seed, 2 + split, scene)
-        seed = int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0])
+        seed = derive_seed(config.seed, 2 + split, scene)
         for station in range(config.stations):
             # Training places are counted from 1.
             place = scene * config.stations + station + (1 - split)
@@ -167,18 +167,18 @@ def _draw_view(plain: View, reach: Reach, repaint: float, rng: Rng) -> View:
     """Draw a view near the plain one."""
     time = TIMES[rng.choice(3, p=(0.6, 0.25, 0.15))]
     return View(
-        lateral=float(rng.uniform(-1, 1) * reach.lateral),
-        forward=float(plain.forward + rng.uniform(-1, 1) * reach.forward),
-        heading=float(rng.uniform(-5, 5)),
-        height=float(plain.height * rng.uniform(0.93, 1.07)),
-        pitch=float(plain.pitch + rng.uniform(-1.5, 1.5)),
-        field=float(plain.field * rng.uniform(0.95, 1.05)),
-        repaint=float(rng.uniform(0, repaint)),
+        lateral=rng.uniform(-1, 1) * reach.lateral,
+        forward=plain.forward + rng.uniform(-1, 1) * reach.forward,
+        heading=rng.uniform(-5, 5),
+        height=plain.height * rng.uniform(0.93, 1.07),
+        pitch=plain.pitch + rng.uniform(-1.5, 1.5),
+        field=plain.field * rng.uniform(0.95, 1.05),
+        repaint=rng.uniform(0, repaint),
         season=SEASONS[rng.integers(4)],
         time=time,
         weather=WEATHERS[rng.choice(4, p=(0.45, 0.3, 0.13, 0.12))],
         occluders=int(rng.integers(2**31)) if rng.random() < 0.6 else None,
-        exposure=float(rng.uniform(-0.5, 0.6)),
-        noise=float(rng.uniform(1, 5) + 2 * (time == "night")),
+        exposure=rng.uniform(-0.5, 0.6),
+        noise=rng.uniform(1, 5) + 2 * (time == "night"),
         seed=int(rng.integers(2**31)),
     )
