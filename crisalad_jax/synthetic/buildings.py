@@ -13,6 +13,7 @@ from crisalad_jax.synthetic.mesh import (
     Kind,
     Mesh,
     Number,
+    Paint,
     Rng,
     bars,
     draw_kind,
@@ -90,7 +91,7 @@ def _axes(width: float, spacing: float) -> tuple[np.ndarray, float]:
 
 
 def _arches(
-    front: Mesh, u: Number, half: Number, v0: Number, v1: Number, albedo: Colour, kind: Kind
+    front: Mesh, u: Number, half: Number, v0: Number, v1: Number, albedo: Paint, kind: Kind
 ) -> None:
     """Add openings with a rounded head, `half` metres to either side of u."""
     front.add(bars(u, half, v0, v1), albedo, kind)

@@ -9,7 +9,6 @@ from crisalad_jax.synthetic.mesh import (
     SLANTED,
     UP,
     WALLS,
-    Colour,
     Kind,
     Lanes,
     Mesh,
@@ -27,8 +26,8 @@ from crisalad_jax.synthetic.mesh import (
 )
 
 _PAINT = palette("75 75 76, 16 17 19, 55 12 11, 15 25 45, 84 83 80, 40 42 44, 24 36 28")
-_TYRE: Colour = (0.05, 0.05, 0.05)
-_TINTED: Colour = (0.10, 0.12, 0.14)
+_TYRE = (0.05, 0.05, 0.05)
+_TINTED = (0.10, 0.12, 0.14)
 
 
 def tree(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
@@ -49,8 +48,8 @@ def tree(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
     length = height * rng.uniform(0.28, 0.46, n)
     tip_x, tip_y = np.sin(angle) * length, fork + np.cos(angle) * length
     mesh.add(triangles(0, 0.12, fork, tip_x, tip_y), bark)
-    x, y = tip_x / 2, (fork + tip_y) / 2
-    mesh.add(triangles(x, x + 0.08, y, x + np.sin(angle * 0.3) * 0.9, y + 1.0), bark)
+    u, v = tip_x / 2, (fork + tip_y) / 2
+    mesh.add(triangles(u, u + 0.08, v, u + np.sin(angle * 0.3) * 0.9, v + 1.0), bark)
     hue = float(rng.random())
     for shade, lift, count in ((0.62, -0.25, 6), (0.85, 0.1, 6), (1.08, 0.45, 5)):
         across = height * 0.21 * (rng.normal(0, 0.62, count) - lift * 0.5)

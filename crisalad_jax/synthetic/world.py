@@ -157,7 +157,7 @@ def views(config: WorldConfig, seed: int, scenery: Scenery, station: int, rng: R
         field=camera.uniform(55.0, 95.0),
         pitch=camera.uniform(-4.0, 9.0),
     )
-    still = [each for each in VARIATIONS if each not in config.varied]
+    still = set(VARIATIONS) - set(config.varied)
     fixed = {name: getattr(plain, name) for each in still for name in _FIELDS.get(each, (each,))}
     drawn = [_draw_view(plain, reach, config.repaint, rng) for _ in range(config.images_per_place)]
     return [dataclasses.replace(view, **fixed) for view in drawn]
