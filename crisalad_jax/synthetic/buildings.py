@@ -9,19 +9,20 @@ from crisalad_jax.synthetic.mesh import (
     ROOFS,
     SIGNS,
     WALLS,
-    Body,
     Colour,
     Kind,
     Mesh,
     Number,
+    Paint,
     Rng,
     bars,
+    draw_kind,
     palette,
     pick,
     polygons,
     rects,
-    scaled,
     sheets,
+    triangles,
 )
 
 _TRIMS = palette("88 87 84, 30 27 25, 70 66 58, 24 33 30")
@@ -42,7 +43,7 @@ DEPTH = 11.0
 """Metres from a building's front to its back."""
 
 
-def building(rng: Rng, front: Mesh, width: float, habit: Habit) -> Body:
+def building(rng: Rng, front: Mesh, width: float, habit: Habit) -> None:
     """Add a building from u = 0 to `width`."""
     wall, trim = pick(rng, habit.walls), pick(rng, _TRIMS)
     floors = max(1, habit.floors + int(rng.integers(-2, 3)))
@@ -51,20 +52,20 @@ def building(rng: Rng, front: Mesh, width: float, habit: Habit) -> Body:
     height = ground + storey * floors + rng.uniform(0.2, 1.0)
 
     end = 0.0 if front.sees_start else width
-    front.add(sheets(end, 0, end, -DEPTH, 0, height), scaled(wall, 0.85), normal=front.end_normal)
+    front.add(sheets(end, 0, end, -DEPTH, 0, height), 0.85 * wall, normal=front.end_normal)
     _roof(rng, front, width, height, wall)
     front.add(rects(0, 0, width, height), wall)
-    base = scaled(wall, 0.72) if rng.random() < 0.5 else pick(rng, WALLS)
+    base = 0.72 * wall if rng.random() < 0.5 else pick(rng, WALLS)
     front.add(rects(0, 0, width, ground - 0.3), base)
     if rng.random() < 0.3:
         u = np.linspace(0.35, width - 0.35, int(rng.integers(2, 5)))
-        front.add(bars(u, 0.3, ground, height), scaled(wall, 1.16))
+        front.add(bars(u, 0.3, ground, height), 1.16 * wall)
     levels = ground + storey * np.arange(floors)
     if rng.random() < 0.4:
-        front.add(rects(0, levels - 0.15, width, levels + 0.12), scaled(wall, 1.18), Kind.LEDGE)
+        front.add(rects(0, levels - 0.15, width, levels + 0.12), 1.18 * wall, Kind.LEDGE)
 
     _windows(rng, front, width, levels, storey, habit, trim)
-    use = rng.choice(("shop", "arcade", "door"), p=(0.42, 0.16, 0.42))
+    use = draw_kind(rng, shop=0.42, arcade=0.16, door=0.42)
     if use == "shop":
         _shops(rng, front, width, ground - 1.1)
     elif use == "arcade":
@@ -80,7 +81,7 @@ def building(rng: Rng, front: Mesh, width: float, habit: Habit) -> Body:
         front.boxes(sign, rng.uniform(0.9, 1.5), pick(rng, SIGNS))
     corners = front.world(np.array(((0, 0, 0), (width, 0, -DEPTH))))
     (x0, _, z0), (x1, _, z1) = np.sort(corners, axis=0)
-    return x0, x1, z0, z1, height
+    front.bodies.append((x0, x1, z0, z1, height))
 
 
 def _axes(width: float, spacing: float) -> tuple[np.ndarray, float]:
@@ -90,35 +91,31 @@ def _axes(width: float, spacing: float) -> tuple[np.ndarray, float]:
 
 
 def _arches(
-    front: Mesh, u: Number, half: Number, v0: Number, v1: Number, albedo: Colour, kind: Kind
+    front: Mesh, u: Number, half: Number, v0: Number, v1: Number, albedo: Paint, kind: Kind
 ) -> None:
     """Add openings with a rounded head, `half` metres to either side of u."""
     front.add(bars(u, half, v0, v1), albedo, kind)
-    head, tip = v1 + 0.8 * half, 0.5 * half
-    arch = polygons((u - half, v1, 0), (u + half, v1, 0), (u + tip, head, 0), (u - tip, head, 0))
-    front.add(arch, albedo, kind)
+    front.add(bars(u, half, v1, v1 + 0.8 * half, top=0.5 * half), albedo, kind)
 
 
 def _roof(rng: Rng, front: Mesh, width: float, height: float, wall: Colour) -> None:
     """Add a pitched, gabled, mansard or flat roof, with dormers, chimneys or tanks."""
     tiles = pick(rng, ROOFS)
-    shape = rng.choice(("pitched", "gable", "mansard", "flat"), p=(0.3, 0.17, 0.15, 0.38))
+    shape = draw_kind(rng, pitched=0.3, gable=0.17, mansard=0.15, flat=0.38)
     x, _, z = front.normal
     uphill = (x * 0.6, 0.8, z * 0.6)
     if shape == "pitched":
         back, ridge = -DEPTH / 2, height + rng.uniform(1.8, 4.0)
         end = 0.0 if front.sees_start else width
         gable = polygons((end, height, 0), (end, height, -DEPTH), (end, ridge, back))
-        front.add(gable, scaled(wall, 0.85), normal=front.end_normal)
+        front.add(gable, 0.85 * wall, normal=front.end_normal)
         front.add(rects(0, height, width, ridge, 0.3, back), tiles, Kind.ROOF, uphill)
         u = rng.uniform(0.1, 0.8) * width
-        chimney = rects(u, (height + ridge) / 2, u + 0.9, ridge + 1.2, back * 0.7)
-        front.add(chimney, scaled(wall, 0.8))
+        front.add(rects(u, (height + ridge) / 2, u + 0.9, ridge + 1.2, back * 0.7), 0.8 * wall)
     elif shape == "gable":
         rise, steps = width * rng.uniform(0.3, 0.55), int(rng.integers(1, 5))
         if steps == 1:
-            gable = polygons((0, height, 0), (width, height, 0), (width / 2, height + rise, 0))
-            front.add(gable, wall)
+            front.add(triangles(0, width, height, width / 2, height + rise), wall)
         else:
             v = height + rise * np.arange(steps) / steps
             inset = width / 2 * np.arange(steps) / steps
@@ -129,15 +126,15 @@ def _roof(rng: Rng, front: Mesh, width: float, height: float, wall: Colour) -> N
         top = height + rng.uniform(2.4, 3.4)
         front.add(rects(0, height, width, top, 0, -1), tiles, Kind.ROOF, uphill)
         u, _ = _axes(width, rng.uniform(2.6, 4.5))
-        front.add(bars(u, 0.75, height + 0.4, top - 0.3, -0.1), scaled(wall, 1.1))
+        front.add(bars(u, 0.75, height + 0.4, top - 0.3, -0.1), 1.1 * wall)
         front.add(bars(u, 0.45, height + 0.6, top - 0.6, -0.1), GLASS, Kind.GLASS)
     else:
-        parapet = rects(0, height, width, height + rng.uniform(0.3, 0.9))
-        front.add(parapet, scaled(wall, 0.9), Kind.LEDGE)
+        parapet = height + rng.uniform(0.3, 0.9)
+        front.add(rects(0, height, width, parapet), 0.9 * wall, Kind.LEDGE)
         if rng.random() < 0.5:
             u, size = rng.uniform(0.1, 0.6) * width, rng.uniform(1.5, 4.0)
             tank = rects(u, height, u + size, height + size * rng.uniform(0.6, 1.3), -3.0)
-            front.add(tank, scaled(wall, 0.7))
+            front.add(tank, 0.7 * wall)
         if rng.random() < 0.4:
             u, top = rng.uniform(0.1, 0.9) * width, height + rng.uniform(2.5, 6.0)
             mast = np.array((u, u - 0.9)), np.array((height, top - 0.9))
@@ -155,7 +152,7 @@ def _windows(
     tall = rise * rng.uniform(0.45, 0.72)
     low = levels + (rise - tall) * rng.uniform(0.4, 0.7)
     high = low + tall
-    style = rng.choice(("grid", "bands", "shafts"), p=(0.76, 0.14, 0.10))
+    style = draw_kind(rng, grid=0.76, bands=0.14, shafts=0.10)
     # The rhythm of the columns identifies the building in every season and light.
     rhythm = rng.integers(6)
     present = np.ones(columns, bool)
@@ -174,9 +171,8 @@ def _windows(
         low, high = low[:1], high[-1:]
     elif len(levels) > 2 and rng.random() < 0.35:
         high[-1] = low[-1] + tall * 0.6
-    u, half = np.tile(axis, len(low)), np.tile(halves, len(low))
-    v0, v1 = np.repeat(low, len(axis)), np.repeat(high, len(axis))
-    left, right = u - half, u + half
+    left, right = axis - halves, axis + halves
+    v0, v1 = low[:, None], high[:, None]
 
     if rng.random() < 0.6:
         front.add(rects(left - 0.22, v0 - 0.22, right + 0.22, v1 + 0.22), trim)
@@ -184,27 +180,24 @@ def _windows(
     if style != "grid":
         front.add(panes, GLASS, Kind.GLASS)
         if style == "shafts":
-            left, right = (np.tile(axis + sign * halves, len(levels) - 1) for sign in (-1, 1))
-            v = np.repeat(levels[1:], len(axis))
+            v = levels[1:, None]
             front.add(rects(left, v, right, v + 0.3), trim)
         return
     if rng.random() < 0.2:
         shutter = pick(rng, _TRIMS)
-        front.add(rects(left - half * 0.75, v0, left, v1), shutter)
-        front.add(rects(right, v0, right + half * 0.75, v1), shutter)
+        front.add(rects(left - halves * 0.75, v0, left, v1), shutter)
+        front.add(rects(right, v0, right + halves * 0.75, v1), shutter)
     if rng.random() < 0.22:
-        _arches(front, u, half, v0, v1, GLASS, Kind.GLASS)
+        _arches(front, axis, halves, v0, v1, GLASS, Kind.GLASS)
     else:
         front.add(panes, GLASS, Kind.GLASS)
     if rng.random() < 0.45:
-        front.add(bars(u, 0.06, v0, v1), trim)
+        front.add(bars(axis, 0.06, v0, v1), trim)
     if rng.random() < 0.5:
         front.add(rects(left - 0.15, v0 - 0.22, right + 0.15, v0), trim, Kind.LEDGE)
     if rng.random() < 0.32:
-        on = np.tile(rng.random(len(axis)) < rng.choice((0.4, 1.0)), len(low))
-        if on.any():
-            rect = (left[on] - 0.25, v0[on] - 0.45, right[on] + 0.25, v0[on] + 0.6)
-            front.boxes(rect, 0.9, trim)
+        on = rng.random(len(axis)) < rng.choice((0.4, 1.0))
+        front.boxes((left[on] - 0.25, v0 - 0.45, right[on] + 0.25, v0 + 0.6), 0.9, trim)
 
 
 def _shops(rng: Rng, front: Mesh, width: float, lintel: float) -> None:
@@ -212,8 +205,8 @@ def _shops(rng: Rng, front: Mesh, width: float, lintel: float) -> None:
     middle, span = _axes(width, rng.uniform(4.0, 8.0))
     start = middle - span / 2
     end = start + span * rng.uniform(0.5, 0.8)
-    front.add(rects(start + 0.4, 0.5, end, lintel), scaled(GLASS, 1.2), Kind.SHOP)
-    front.add(rects(end + 0.35, 0, end + 1.3, lintel), scaled(GLASS, 1.2), Kind.SHOP)
+    front.add(rects(start + 0.4, 0.5, end, lintel), 1.2 * GLASS, Kind.SHOP)
+    front.add(rects(end + 0.35, 0, end + 1.3, lintel), 1.2 * GLASS, Kind.SHOP)
     for u0, u1 in zip(start, end, strict=True):
         front.add(rects(u0 + 0.3, lintel + 0.1, u0 + span - 0.3, lintel + 0.8), pick(rng, SIGNS))
         if rng.random() < 0.4:

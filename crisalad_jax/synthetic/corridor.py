@@ -18,11 +18,11 @@ from crisalad_jax.synthetic.mesh import (
     Rng,
     bars,
     discs,
+    draw_kind,
     flat,
     palette,
     pick,
     rects,
-    scaled,
 )
 
 _EYE = 1.2
@@ -56,7 +56,7 @@ def corridor(rng: Rng) -> Place:
     if rng.random() < 0.7:
         walls[1] = walls[0]
     band = rng.uniform(0.8, 1.4) if rng.random() < 0.4 else 0.0
-    dado, skirting = pick(rng, WALLS), scaled(pick(rng, _WOOD), 0.8)
+    dado, skirting = pick(rng, WALLS), 0.8 * pick(rng, _WOOD)
 
     _floor(mesh, rng, box)
     _ceiling(mesh, rng, box)
@@ -85,10 +85,10 @@ def _floor(mesh: Mesh, rng: Rng, box: _Box) -> None:
     left, right, _, length = box
     colour = pick(rng, _FLOORS)
     mesh.add(flat(left, _START, right, length), colour, normal=UP, layer=GROUND_LAYER + 2)
-    kind = rng.choice(("plain", "tiles", "carpet", "boards", "checks"), p=(0.2, 0.3, 0.2, 0.1, 0.2))
+    kind = draw_kind(rng, plain=0.2, tiles=0.3, carpet=0.2, boards=0.1, checks=0.2)
     if kind == "tiles":
         size, line = rng.uniform(0.3, 1.2), rng.uniform(0.01, 0.03)
-        shade = scaled(colour, rng.choice((0.75, 1.25)))
+        shade = rng.choice((0.75, 1.25)) * colour
         z, x = np.arange(_START, length, size), np.arange(left, right, size)
         mesh.ground(flat(left, z - line, right, z + line), shade)
         mesh.ground(flat(x - line, _START, x + line, length), shade)
@@ -100,19 +100,19 @@ def _floor(mesh: Mesh, rng: Rng, box: _Box) -> None:
             mesh.ground(flat(edge, _START, edge + 0.08, length), pick(rng, SIGNS, 0.3))
     elif kind == "boards":
         x = np.arange(left, right, rng.uniform(0.15, 0.4))[::2]
-        mesh.ground(flat(x, _START, x + 0.1, length), scaled(colour, 0.88))
+        mesh.ground(flat(x, _START, x + 0.1, length), 0.88 * colour)
     elif kind == "checks":
         size = rng.uniform(0.3, 1.0)
         x, z = np.meshgrid(np.arange(left, right, size), np.arange(_START, length, size))
         odd = (np.indices(x.shape).sum(0) % 2).astype(bool)
         x, z = x[odd], z[odd]
         checks = flat(x, z, np.minimum(x + size, right), z + size)
-        mesh.ground(checks, scaled(colour, rng.uniform(0.5, 0.9)))
+        mesh.ground(checks, rng.uniform(0.5, 0.9) * colour)
     count = int(rng.integers(0, 14))
     x, z = rng.uniform(left, right - 0.3, count), rng.uniform(0, length, count)
     size = rng.uniform(0.1, 0.6, count)
     spots = flat(x, z, np.minimum(x + size, right), z + size * rng.uniform(0.5, 2.0))
-    mesh.ground(spots, scaled(colour, rng.uniform(0.6, 1.3)))
+    mesh.ground(spots, rng.uniform(0.6, 1.3) * colour)
 
 
 def _ceiling(mesh: Mesh, rng: Rng, box: _Box) -> None:
@@ -124,10 +124,10 @@ def _ceiling(mesh: Mesh, rng: Rng, box: _Box) -> None:
     if rng.random() < 0.45:
         size = rng.uniform(0.5, 1.3)
         z, x = np.arange(_START, length, size), np.arange(left, right, size)
-        shade = scaled(colour, rng.uniform(0.7, 0.9))
+        shade = rng.uniform(0.7, 0.9) * colour
         mesh.add(flat(left, z - 0.015, right, z + 0.015, height), shade, normal=DOWN)
         mesh.add(flat(x - 0.015, _START, x + 0.015, length, height), shade, normal=DOWN)
-    kind = rng.choice(("panels", "strip", "points", "none"), p=(0.45, 0.2, 0.2, 0.15))
+    kind = draw_kind(rng, panels=0.45, strip=0.2, points=0.2, none=0.15)
     gap, start = rng.uniform(1.8, 5.0), rng.uniform(0.0, 3.0)
     z = np.arange(start, length, gap)
     middle = (left + right) / 2
@@ -145,9 +145,9 @@ def _ceiling(mesh: Mesh, rng: Rng, box: _Box) -> None:
     if rng.random() < 0.25:
         depth = rng.uniform(0.15, 0.6)
         for at in np.arange(length - rng.uniform(0.5, 2), 0, -rng.uniform(2.0, 5.0)):
-            mesh.add(rects(left, height - depth, right, height, at), scaled(colour, 0.8), layer=at)
+            mesh.add(rects(left, height - depth, right, height, at), 0.8 * colour, layer=at)
             under = flat(left, at, right, at + 0.3, height - depth)
-            mesh.add(under, scaled(colour, 0.9), normal=DOWN, layer=at)
+            mesh.add(under, 0.9 * colour, normal=DOWN, layer=at)
     if rng.random() < 0.3:
         for _ in range(int(rng.integers(1, 4))):
             x, r = rng.uniform(left + 0.1, right - 0.2), rng.uniform(0.04, 0.15)
@@ -158,55 +158,53 @@ def _ceiling(mesh: Mesh, rng: Rng, box: _Box) -> None:
 def _end(mesh: Mesh, rng: Rng, box: _Box) -> None:
     """Add what closes the corridor: a wall, a door, a window, or a way on."""
     left, right, height, length = box
-    wall = pick(rng, WALLS)
-    mesh.add(rects(left, 0, right, height, length), wall)
+    wall, end = pick(rng, WALLS), mesh.front(0.0, length, 0)
+    end.add(rects(left, 0, right, height), wall)
     middle, half = rng.uniform(0.3, 0.7) * (right - left) + left, rng.uniform(0.2, 0.45)
     half *= min(right - left, 3.0)
-    kind = rng.choice(("wall", "door", "window", "way"), p=(0.2, 0.35, 0.2, 0.25))
+    kind = draw_kind(rng, wall=0.2, door=0.35, window=0.2, way=0.25)
     low, high = max(left, middle - half), min(right, middle + half)
     if kind == "door":
         door, top = pick(rng, _WOOD), min(2.1, height - 0.1)
-        mesh.add(rects(low - 0.08, 0, high + 0.08, top + 0.08, length), scaled(door, 0.7))
-        mesh.add(rects(low, 0, high, top, length), door)
+        end.add(rects(low - 0.08, 0, high + 0.08, top + 0.08), 0.7 * door)
+        end.add(rects(low, 0, high, top), door)
         if rng.random() < 0.5:
-            pane = rects(low + 0.15, 1.1, high - 0.15, top - 0.15, length)
-            mesh.add(pane, (0.8, 0.85, 0.9), Kind.WINDOW)
+            end.add(rects(low + 0.15, 1.1, high - 0.15, top - 0.15), (0.8, 0.85, 0.9), Kind.WINDOW)
     elif kind == "window":
         sill, top = rng.uniform(0.0, 1.2), height - rng.uniform(0.1, 0.6)
-        mesh.add(rects(low, sill, high, top, length), (1.0, 1.0, 1.0), Kind.WINDOW)
-        panes = np.linspace(low, high, int(rng.integers(2, 6)))
-        mesh.add(bars(panes, 0.03, sill, top, length), wall)
+        end.add(rects(low, sill, high, top), (1.0, 1.0, 1.0), Kind.WINDOW)
+        end.add(bars(np.linspace(low, high, int(rng.integers(2, 6))), 0.03, sill, top), wall)
     elif kind == "way":
         shade = rng.uniform(0.15, 1.2)
-        mesh.add(rects(low, 0, high, height * 0.9, length), scaled(wall, shade))
-        inner = rects(low + 0.2 * half, 0, high - 0.3 * half, height * 0.75, length)
-        mesh.add(inner, scaled(wall, shade * rng.uniform(0.5, 1.5)))
+        end.add(rects(low, 0, high, height * 0.9), shade * wall)
+        inner = rects(low + 0.2 * half, 0, high - 0.3 * half, height * 0.75)
+        end.add(inner, shade * rng.uniform(0.5, 1.5) * wall)
 
 
 def _stains(front: Mesh, rng: Rng, wall: Colour, box: _Box) -> None:
     """Add bricks, panels or spots to a wall."""
     height, length = box.height, box.length
-    kind = rng.choice(("none", "bricks", "panels", "spots"), p=(0.4, 0.15, 0.2, 0.25))
+    kind = draw_kind(rng, none=0.4, bricks=0.15, panels=0.2, spots=0.25)
     if kind == "bricks":
         n = 260
         u, v = rng.uniform(_START, length, n), rng.integers(0, int(height / 0.2), n) * 0.2
         bricks = rects(u, v, u + rng.uniform(0.3, 0.5), np.minimum(v + 0.18, height))
-        front.add(bricks[: n // 2], scaled(wall, 0.82))
-        front.add(bricks[n // 2 :], scaled(wall, 1.15))
+        front.add(bricks[: n // 2], 0.82 * wall)
+        front.add(bricks[n // 2 :], 1.15 * wall)
     elif kind == "panels":
         u = np.arange(_START, length, rng.uniform(0.8, 2.5))
-        front.add(bars(u, 0.02, 0, height), scaled(wall, 0.7))
+        front.add(bars(u, 0.02, 0, height), 0.7 * wall)
     elif kind == "spots":
         n = 30
         u, v = rng.uniform(_START, length, n), rng.uniform(0, height * 0.9, n)
         size = rng.uniform(0.1, 0.7, n)
         spots = rects(u, v, u + size, np.minimum(v + size * rng.uniform(0.3, 2), height))
-        front.add(spots, scaled(wall, rng.uniform(0.75, 1.2)))
+        front.add(spots, rng.uniform(0.75, 1.2) * wall)
 
 
 def _along_wall(front: Mesh, rng: Rng, box: _Box) -> None:
     """Add doors, windows, boards and furniture along one wall, each at its place."""
-    doors, trim = pick(rng, _WOOD), scaled(pick(rng, _WOOD), 0.9)
+    doors, trim = pick(rng, _WOOD), 0.9 * pick(rng, _WOOD)
     # What recurs in this corridor; the distances, and what comes between, make the place.
     kinds = ("door", "recess", "window", "board", "pillar", "cupboard", "bench", "box")
     kinds += ("opening", "pipe")
@@ -215,78 +213,73 @@ def _along_wall(front: Mesh, rng: Rng, box: _Box) -> None:
     z = _START + rng.uniform(0.0, 2.0)
     while z < box.length - 1.2:
         kind = rng.choice(kinds, p=weights)
-        front.layer = GROUND_LAYER - 1 - z * 1e-3  # after both walls
+        here = front.at(z, 0.0, layer=GROUND_LAYER - 1 - z * 1e-3)  # after both walls
         wide = rng.uniform(0.75, 1.1)
         if kind == "door":
-            _door(front, rng, z, wide, top, doors, trim)
+            _door(here, rng, wide, top, doors, trim)
         elif kind == "recess":
-            front.add(rects(z, 0, z + wide * 1.4, top), scaled(trim, 0.5))
-            front.add(rects(z + 0.35, 0, z + wide * 1.4, top), doors)
+            here.add(rects(0, 0, wide * 1.4, top), 0.5 * trim)
+            here.add(rects(0.35, 0, wide * 1.4, top), doors)
         elif kind == "opening":
             wide *= 1.8
-            front.add(rects(z, 0, z + wide, top * 1.05), (0.12, 0.12, 0.13))
-            inner = scaled((0.8, 0.8, 0.76), rng.uniform(0.2, 0.9))
-            front.add(rects(z + wide * 0.5, 0, z + wide, top * 1.05), inner)
+            here.add(rects(0, 0, wide, top * 1.05), (0.12, 0.12, 0.13))
+            inner = rng.uniform(0.2, 0.9) * np.array((0.8, 0.8, 0.76))
+            here.add(rects(wide * 0.5, 0, wide, top * 1.05), inner)
         elif kind == "window":
             wide *= rng.uniform(1.0, 2.0)
             sill, high = rng.uniform(0.5, 1.2), box.height - rng.uniform(0.2, 0.7)
-            front.add(rects(z - 0.08, sill - 0.1, z + wide + 0.08, high + 0.08), trim)
-            front.add(rects(z, sill, z + wide, high), (1.0, 1.0, 1.0), Kind.WINDOW)
-            panes = np.linspace(z, z + wide, int(rng.integers(1, 4)) + 1)[1:-1]
-            front.add(bars(panes, 0.03, sill, high), trim)
+            here.add(rects(-0.08, sill - 0.1, wide + 0.08, high + 0.08), trim)
+            here.add(rects(0, sill, wide, high), (1.0, 1.0, 1.0), Kind.WINDOW)
+            panes = np.linspace(0, wide, int(rng.integers(1, 4)) + 1)[1:-1]
+            here.add(bars(panes, 0.03, sill, high), trim)
         elif kind == "board":
             v, tall = rng.uniform(1.0, 1.5), rng.uniform(0.3, 0.9)
             wide *= rng.uniform(0.5, 1.8)
-            front.add(rects(z, v, z + wide, v + tall), pick(rng, SIGNS + WALLS, 0.2))
+            here.add(rects(0, v, wide, v + tall), pick(rng, SIGNS + WALLS, 0.2))
             n = int(rng.integers(0, 9))
-            u, w = z + rng.uniform(0, 0.7, n) * wide, v + rng.uniform(0, 0.7, n) * tall
+            u, w = rng.uniform(0, 0.7, n) * wide, v + rng.uniform(0, 0.7, n) * tall
             notes = rects(u, w, u + 0.25 * wide, w + 0.25 * tall)
-            front.add(notes[: n // 2], pick(rng, SIGNS, 0.3))
-            front.add(notes[n // 2 :], (0.9, 0.9, 0.88))
+            here.add(notes[: n // 2], pick(rng, SIGNS, 0.3))
+            here.add(notes[n // 2 :], (0.9, 0.9, 0.88))
         else:
-            _furniture(front, rng, kind, z, wide, box.height)
+            _furniture(front.at(z, 0.0, layer=z), rng, kind, wide, box.height)
         z += wide + rng.exponential(1.6) + 0.15
 
 
-def _door(
-    front: Mesh, rng: Rng, z: float, wide: float, top: float, doors: Colour, trim: Colour
-) -> None:
+def _door(here: Mesh, rng: Rng, wide: float, top: float, doors: Colour, trim: Colour) -> None:
     """Add a door in its frame, at times with a pane or a panel, and with a sign."""
-    end = z + wide
-    front.add(rects(z - 0.08, 0, end + 0.08, top + 0.08), trim)
+    here.add(rects(-0.08, 0, wide + 0.08, top + 0.08), trim)
     colour = doors if rng.random() < 0.8 else pick(rng, _WOOD)
-    front.add(rects(z, 0, end, top), colour)
+    here.add(rects(0, 0, wide, top), colour)
     look = rng.integers(3)
     if look == 1:
-        front.add(rects(z + 0.2, 1.2, end - 0.2, top - 0.2), (0.25, 0.3, 0.33))
+        here.add(rects(0.2, 1.2, wide - 0.2, top - 0.2), (0.25, 0.3, 0.33))
     elif look == 2:
-        front.add(rects(z + 0.1, 0.1, end - 0.1, 0.9), scaled(colour, 0.8))
-    front.add(rects(end - 0.15, 0.95, end - 0.05, 1.05), (0.8, 0.8, 0.75))
+        here.add(rects(0.1, 0.1, wide - 0.1, 0.9), 0.8 * colour)
+    here.add(rects(wide - 0.15, 0.95, wide - 0.05, 1.05), (0.8, 0.8, 0.75))
     if rng.random() < 0.4:
-        front.add(rects(end + 0.15, 1.4, end + 0.4, 1.6), pick(rng, SIGNS))
+        here.add(rects(wide + 0.15, 1.4, wide + 0.4, 1.6), pick(rng, SIGNS))
 
 
-def _furniture(front: Mesh, rng: Rng, kind: str, z: float, wide: float, height: float) -> None:
+def _furniture(here: Mesh, rng: Rng, kind: str, wide: float, height: float) -> None:
     """Add what stands out of the wall: a pillar, a cupboard, a bench, a pipe or a box."""
-    front.layer = z
     colour = pick(rng, _WOOD + WALLS)
     if kind == "pillar":
-        rect, out = (z, 0.0, z + rng.uniform(0.3, 0.7), height), rng.uniform(0.1, 0.5)
+        rect, out = (0, 0, rng.uniform(0.3, 0.7), height), rng.uniform(0.1, 0.5)
     elif kind == "cupboard":
-        rect = (z, 0.0, z + wide, rng.uniform(0.9, min(2.2, height - 0.1)))
-        out = rng.uniform(0.3, 0.5)
+        tall = rng.uniform(0.9, min(2.2, height - 0.1))
+        rect, out = (0, 0, wide, tall), rng.uniform(0.3, 0.5)
     elif kind == "bench":
-        rect, out = (z, 0.35, z + wide * 1.4, 0.5), 0.45
+        rect, out = (0, 0.35, wide * 1.4, 0.5), 0.45
     elif kind == "pipe":
-        rect, out = (z, 0.0, z + 0.12, height), 0.12
+        rect, out = (0, 0, 0.12, height), 0.12
     else:
         v = rng.uniform(0.2, 1.4)
-        rect = (z, v, z + rng.uniform(0.2, 0.6), v + rng.uniform(0.2, 0.7))
+        rect = (0, v, rng.uniform(0.2, 0.6), v + rng.uniform(0.2, 0.7))
         out, colour = rng.uniform(0.08, 0.25), pick(rng, SIGNS, 0.2)
-    front.boxes(rect, out, colour)
+    here.boxes(rect, out, colour)
     if kind == "cupboard":
-        middle = z + wide / 2
-        front.add(bars(middle, 0.02, 0.05, rect[3] - 0.05, 0.45), scaled(colour, 0.6))
+        here.add(bars(wide / 2, 0.02, 0.05, rect[3] - 0.05, 0.45), 0.6 * colour)
 
 
 def _columns(mesh: Mesh, rng: Rng, box: _Box) -> None:
@@ -294,27 +287,25 @@ def _columns(mesh: Mesh, rng: Rng, box: _Box) -> None:
     stone, half = pick(rng, WALLS), rng.uniform(0.15, 0.45)
     rows = (box.left * 0.6, box.right * 0.6) if rng.random() < 0.7 else (box.right * 0.5,)
     for z in np.arange(box.length - 1, 3.0, -rng.uniform(2.5, 6.0)):
-        mesh.layer = float(z)
         for x in rows:
-            mesh.block((x - half, 0, z), (x + half, box.height, z + 2 * half), stone)
+            mesh.at(x, z).block((-half, 0, 0), (half, box.height, 2 * half), stone)
 
 
 def _hanging(mesh: Mesh, rng: Rng, box: _Box) -> None:
     """Add signs under the ceiling, and things that stand about on the floor."""
     left, right, height, length = box
     for z in rng.uniform(4.0, length, int(rng.integers(0, 4))):
-        mesh.layer = float(z)
         x, wide = rng.uniform(left, right - 0.5), rng.uniform(0.3, 1.2)
         v = height - rng.uniform(0.4, 0.7)
-        sign = rects(x, v, min(x + wide, right), v + rng.uniform(0.15, 0.35), z)
-        mesh.add(sign, pick(rng, SIGNS), Kind.LAMP if rng.random() < 0.3 else Kind.SOLID)
+        sign = rects(0, v, min(wide, right - x), v + rng.uniform(0.15, 0.35))
+        colour, kind = pick(rng, SIGNS), Kind.LAMP if rng.random() < 0.3 else Kind.SOLID
+        mesh.at(x, z).add(sign, colour, kind)
     for z in rng.uniform(3.0, length, int(rng.integers(0, 5))):
-        mesh.layer = float(z)
         edge = rng.uniform(0.1, 0.3) * (right - left)
-        x = left + edge if rng.random() < 0.5 else right - edge
+        foot = mesh.at(left + edge if rng.random() < 0.5 else right - edge, z)
         colour = pick(rng, _WOOD + SIGNS)
         if rng.random() < 0.4:
-            mesh.add(discs(x, 0.8, rng.uniform(0.2, 0.4), z), (0.18, 0.34, 0.16), Kind.NEEDLE)
+            foot.add(discs(0, 0.8, rng.uniform(0.2, 0.4)), (0.18, 0.34, 0.16), Kind.NEEDLE)
         else:
             half, tall = rng.uniform(0.1, 0.35), rng.uniform(0.3, 1.1)
-            mesh.block((x - half, 0, z), (x + half, tall, z + 2 * half), colour)
+            foot.block((-half, 0, 0), (half, tall, 2 * half), colour)

@@ -1,14 +1,16 @@
 """One place in the country: a road, railway or path through fields, woods and hills."""
 
+from typing import Any
+
 import numpy as np
 
 from crisalad_jax.synthetic.buildings import Habit, building
 from crisalad_jax.synthetic.mesh import (
     GROUND_LAYER,
     SIGNS,
+    SLANTED,
     UP,
     WALLS,
-    Body,
     Kind,
     Mesh,
     Place,
@@ -16,12 +18,11 @@ from crisalad_jax.synthetic.mesh import (
     Rng,
     bars,
     draw_hills,
+    draw_kind,
     flat,
     palette,
     pick,
     polygons,
-    rects,
-    scaled,
     sheets,
 )
 from crisalad_jax.synthetic.things import tree, wires
@@ -40,7 +41,8 @@ class _Way:
         self._bend = rng.normal(0.0, 0.0022)
         self._drift = rng.normal(0.0, 0.05)
 
-    def at(self, z: np.ndarray | float) -> np.ndarray | float:
+    def at(self, z: Any) -> Any:
+        """Return x at one distance or at each of an array."""
         return self._drift * z + self._bend * np.square(z)
 
     def band(self, z0: np.ndarray, z1: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -59,13 +61,13 @@ def country(rng: Rng) -> Place:
     """Build a place in the country."""
     mesh = Mesh()
     way = _Way(rng)
-    kind = str(rng.choice(("road", "railway", "path", "meadow"), p=(0.4, 0.3, 0.2, 0.1)))
+    kind = draw_kind(rng, road=0.4, railway=0.3, path=0.2, meadow=0.1)
     _fields(mesh, rng)
     half = _lay(mesh, rng, way, kind)
     for side in (-1.0, 1.0):
         _border(mesh, rng, way, side, half)
         _woods(mesh, rng, way, side, half)
-    bodies = _houses(mesh, rng, way, half)
+    _houses(mesh, rng, way, half)
     _roadside(mesh, rng, way, half)
     if rng.random() < 0.4:
         wires(mesh, rng, float(rng.choice((-1, 1))) * (half + rng.uniform(1.0, 4.0)), 90.0)
@@ -76,7 +78,7 @@ def country(rng: Rng) -> Place:
     lanes = (-half - 1.0, -half, half, half + 1.0)
     reach = Reach(height=(1.2, 3.2), lateral=1.2, forward=2.5, step=10.0)
     scene, road = mesh.scene(), kind == "road"
-    return Place(scene, heading, lanes, reach, bearing, hills, bodies, traffic=road)
+    return Place(scene, heading, lanes, reach, bearing, hills, mesh.bodies, traffic=road)
 
 
 def _fields(mesh: Mesh, rng: Rng) -> None:
@@ -153,11 +155,10 @@ def _masts(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
     side, gap = float(rng.choice((-1, 1))), rng.uniform(28.0, 50.0)
     steel = (0.36, 0.37, 0.36)
     for z in np.arange(rng.uniform(4.0, gap), _FAR, gap)[::-1]:
-        mesh.layer = float(z)
-        x = float(way.at(z)) + side * half
-        reach = x - side * (half + 0.4)
-        mesh.add(bars(x, 0.12, 0, 6.8, z), steel)
-        mesh.add(rects(min(x, reach), 6.2, max(x, reach), 6.3, z), steel)
+        mast = mesh.at(way.at(z) + side * half, z)
+        mast.add(bars(0, 0.12, 0, 6.8), steel)
+        arm = half / 2 + 0.2
+        mast.add(bars(-side * arm, arm, 6.2, 6.3), steel)
     z = np.arange(1.0, _FAR, 12.0)
     for y in (5.4, 6.4):
         wire = sheets(way.at(z), z, way.at(z + 12.0), z + 12, y, y + 0.03)
@@ -166,8 +167,7 @@ def _masts(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
 
 def _border(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
     """Add a hedge, a wall, a fence, a crash barrier or a cutting along one side of the way."""
-    kinds = ("none", "hedge", "wall", "fence", "barrier", "bank")
-    kind = rng.choice(kinds, p=(0.3, 0.16, 0.1, 0.2, 0.08, 0.16))
+    kind = draw_kind(rng, none=0.3, hedge=0.16, wall=0.1, fence=0.2, barrier=0.08, bank=0.16)
     if kind == "none":
         return
     off, step = half + rng.uniform(0.4, 3.0), 4.0
@@ -178,7 +178,7 @@ def _border(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
         if rng.random() < 0.06:
             continue
         mesh.layer = float(z)
-        x0, x1 = (float(way.at(each)) + side * off for each in (z, z + step))
+        x0, x1 = way.at(np.array((z, z + step))) + side * off
         line = x0, z, x1, z + step
         if kind == "hedge":
             height = low * rng.uniform(0.7, 1.5)
@@ -192,7 +192,7 @@ def _border(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
             height = max(0.5, min(9.0, height + rng.normal(0, 0.6)))
             colour, cover = (0.4, 0.45, 0.3), Kind.GRASS
             if rng.random() < 0.4:
-                colour, cover = scaled(stone, rng.uniform(0.8, 1.2)), Kind.SOLID
+                colour, cover = rng.uniform(0.8, 1.2) * stone, Kind.SOLID
             face = sheets(*line, 0, height, side * height * slope)
             mesh.add(face, colour, cover, (-side * 0.6, 0.8, 0.0))
         else:
@@ -209,7 +209,7 @@ def _woods(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
         if rng.random() < 0.3:
             continue
         wide = rng.uniform(20, 120) * (0.5 + z / 150)
-        near = float(way.at(z)) * side + half + rng.uniform(3, 25)
+        near = way.at(z) * side + half + rng.uniform(3, 25)
         n = int(np.clip(wide, 12, 40))
         x = side * (near + np.linspace(0, wide, n))
         tall = rng.uniform(5, 15) * (1 + 0.25 * rng.standard_normal(n))
@@ -220,10 +220,10 @@ def _woods(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
             top, colour, kind = tall * part, (hue, shade * 0.9, 0.0), Kind.BUSH
             if spikes:
                 top[1::2] *= 0.7
-                colour, kind = scaled((0.14, 0.26, 0.17), shade), Kind.NEEDLE
+                colour, kind = shade * np.array((0.14, 0.26, 0.17)), Kind.NEEDLE
             tips = (x[1:], top[1:], z), (x[:-1], top[:-1], z)
             band = polygons((x[:-1], 0, z), (x[1:], 0, z), *tips)
-            mesh.add(band, colour, kind, (0.0, 0.5, -0.85), layer=float(z))
+            mesh.add(band, colour, kind, SLANTED, layer=float(z))
     row = rng.random() < 0.3
     count = int(rng.integers(0, 7))
     if row:
@@ -232,31 +232,28 @@ def _woods(mesh: Mesh, rng: Rng, way: _Way, side: float, half: float) -> None:
         depths = rng.uniform(6, 70, count)
     for z in sorted(depths, reverse=True):
         off = half + (2.5 if row else rng.uniform(1.5, 18.0))
-        tree(mesh, rng, float(way.at(z)) + side * off, float(z))
+        tree(mesh, rng, way.at(z) + side * off, float(z))
 
 
-def _houses(mesh: Mesh, rng: Rng, way: _Way, half: float) -> list[Body]:
+def _houses(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
     """Add a few houses or barns."""
-    bodies = []
     walls = tuple(WALLS[i] for i in rng.choice(len(WALLS), 3, replace=False))
     habit = Habit(walls, 1, rng.uniform(2.6, 3.2), rng.uniform(2.0, 3.5))
     for z in sorted(rng.uniform(16, 110, int(rng.integers(0, 4))), reverse=True):
         side, wide = float(rng.choice((-1, 1))), rng.uniform(7, 14)
-        x = float(way.at(z)) + side * (half + rng.uniform(3, 30))
-        mesh.layer = float(z)
-        front = mesh.front(x - wide if side < 0 else x, z, 0)
-        bodies.append(building(rng, front, wide, habit))
-    return bodies
+        x = way.at(z) + side * (half + rng.uniform(3, 30))
+        front = mesh.front(x - wide if side < 0 else x, z, 0, layer=z)
+        building(rng, front, wide, habit)
 
 
 def _roadside(mesh: Mesh, rng: Rng, way: _Way, half: float) -> None:
     """Add a sign or a rock."""
     for z in rng.uniform(5, 40, int(rng.integers(0, 3))):
-        mesh.layer = float(z)
-        x = float(way.at(z)) + float(rng.choice((-1, 1))) * (half + rng.uniform(0.5, 1.5))
+        x = way.at(z) + float(rng.choice((-1, 1))) * (half + rng.uniform(0.5, 1.5))
+        foot = mesh.at(x, z)
         if rng.random() < 0.6:
-            mesh.add(bars(x, 0.04, 0, 2.6, z), (0.45, 0.45, 0.45))
-            mesh.add(bars(x, 0.35, 1.7, 2.0 + rng.uniform(0.2, 0.7), z), pick(rng, SIGNS))
+            foot.add(bars(0, 0.04, 0, 2.6), (0.45, 0.45, 0.45))
+            foot.add(bars(0, 0.35, 1.7, 2.0 + rng.uniform(0.2, 0.7)), pick(rng, SIGNS))
         else:
             size = rng.uniform(0.4, 1.5)
-            mesh.block((x - size, 0, z), (x + size, size, z + size), pick(rng, _STONES))
+            foot.block((-size, 0, 0), (size, size, size), pick(rng, _STONES))

@@ -4,10 +4,11 @@ A set is written from a stream of files, each its path within the set's folder a
 """
 
 import dataclasses
+import itertools
 import json
 import os
 import pathlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import cv2
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from crisalad_jax.synthetic.mesh import Rng
-from crisalad_jax.synthetic.view import Season
+from crisalad_jax.synthetic.view import EYE, PITCH, Season, View
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_folder, check_new_folder, read_json, write_json
 
@@ -24,11 +25,13 @@ Progress = Callable[[int], object] | None
 
 RENDERER = 1
 """Version of the renderer: increase it if pictures change, and sets on disk no longer match."""
-METRES_PER_DEGREE = 111_195.0
+_METRES_PER_DEGREE = 111_195.0
 """Metres in a degree of latitude, on a sphere of radius 6371 km."""
-UTM_ORIGIN = (500_000.0, 5_000_000.0)
+_LONGITUDE = -40.0
+"""Degrees east of all training cities, which lie in an ocean."""
+_UTM_ORIGIN = (500_000.0, 5_000_000.0)
 """East and north in zone 32T of a test set's south-west corner."""
-MONTHS: dict[Season, int] = {"spring": 4, "summer": 7, "autumn": 10, "winter": 1}
+_MONTHS: dict[Season, int] = {"spring": 4, "summer": 7, "autumn": 10, "winter": 1}
 
 
 def holds(root: str | os.PathLike[str], file: str, config: Any) -> bool:
@@ -88,52 +91,67 @@ def write_set(
         write_json(folder / file, _identity(config))
 
 
-class TrainImage(NamedTuple):
-    """An image of a training city."""
+class Shot(NamedTuple):
+    """A picture of a set, and where and how it was taken."""
 
     place: int
+    view: View
     picture: bytes
-    lat: str
-    lon: str
-    northdeg: int
-    season: Season
     rng: Rng
     """Draws the year and the panorama's name."""
+    east: float = 0.0
+    """Metres from the set's south-west corner, as `north` is."""
+    north: float = 0.0
+    northdeg: int = 0
+    """Degrees of the camera from north."""
+
+    def draw_date(self) -> tuple[int, int]:
+        """Draw the year, and take the month of the season."""
+        return int(self.rng.integers(2012, 2022)), _MONTHS[self.view.season]
+
+    def draw_panoid(self) -> str:
+        """Draw the panorama's name."""
+        return self.rng.bytes(8).hex()
 
 
-def gsv_city(city: str, images: Iterable[TrainImage]) -> Files:
+def gsv_city(city: str, latitude: float, shots: Iterable[Shot]) -> Files:
     """Lay out a city as GSV-Cities does: its images, and a table of them."""
+    per_degree = _METRES_PER_DEGREE * np.cos(np.deg2rad(latitude))
     rows = ["place_id,year,month,northdeg,city_id,lat,lon,panoid"]
-    for place, picture, lat, lon, northdeg, season, rng in images:
-        year, month = int(rng.integers(2012, 2022)), MONTHS[season]
-        key = panoid(rng)
-        rows.append(f"{place},{year},{month},{northdeg},{city},{lat},{lon},{key}")
-        date = f"{year:04d}_{month:02d}"
-        name = f"{city}_{place:07d}_{date}_{northdeg:03d}_{lat}_{lon}_{key}.jpg"
-        yield f"train/Images/{city}/{name}", picture
+    for shot in shots:
+        lat = f"{latitude + shot.north / _METRES_PER_DEGREE:.7f}"
+        lon = f"{_LONGITUDE + shot.east / per_degree:.7f}"
+        (year, month), key = shot.draw_date(), shot.draw_panoid()
+        rows.append(f"{shot.place},{year},{month},{shot.northdeg},{city},{lat},{lon},{key}")
+        where = f"{year:04d}_{month:02d}_{shot.northdeg:03d}_{lat}_{lon}"
+        name = f"{city}_{shot.place:07d}_{where}_{key}.jpg"
+        yield f"train/Images/{city}/{name}", shot.picture
     yield f"train/Dataframes/{city}.csv", "".join(f"{row}\n" for row in rows).encode()
 
 
-def utm_path(
-    side: str, east: float, north: float, key: str, note: str, camera: Sequence[str] = ("",) * 5
-) -> str:
-    """Name a test image as VPR-datasets-downloader does, which has its position in metres.
+def utm_images(shots: Iterable[Shot], scenery: str = "", *, camera: bool = False) -> Files:
+    """Lay out test images as VPR-datasets-downloader does: names with positions in metres.
 
     Args:
-        side: "database" or "queries".
-        east: metres east in zone 32T.
-        north: metres north.
-        key: the panorama's name.
-        note: what else is known.
-        camera: degrees from north, of pitch and of roll; metres from the ground; year and month.
+        shots: a database image and a query in turn.
+        scenery: what the names call the places.
+        camera: whether names have the direction and height of the camera, and the date.
     """
-    fields = f"{east:.2f}", f"{north:.2f}", "32", "T", "", "", key, "", *camera, note
-    return f"test/images/test/{side}/@{'@'.join(fields)}@.jpg"
+    for side, shot in zip(itertools.cycle(("database", "queries")), shots, strict=False):
+        east, north = _UTM_ORIGIN[0] + shot.east, _UTM_ORIGIN[1] + shot.north
+        pose = ("",) * 5
+        if camera:
+            year, month = shot.draw_date()
+            pose = f"{shot.northdeg}", f"{PITCH:.0f}", "0", f"{EYE}", f"{year:04d}{month:02d}"
+        note = "_".join(filter(None, (scenery, shot.view.season, shot.view.time)))
+        position = f"{east:.2f}", f"{north:.2f}", "32", "T"
+        fields = *position, "", "", shot.draw_panoid(), "", *pose, note
+        yield f"test/images/test/{side}/@{'@'.join(fields)}@.jpg", shot.picture
 
 
-def panoid(rng: Rng) -> str:
-    """Draw the name of a panorama."""
-    return rng.bytes(8).hex()
+def derive_seed(*numbers: int) -> int:
+    """Derive the seed of a place: of a set's seed, a split and a number, it is one of its own."""
+    return int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0])
 
 
 def jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:

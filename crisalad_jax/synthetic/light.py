@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from crisalad_jax.synthetic.mesh import Colour, Kind, Place, Rng, Scene, palette
+from crisalad_jax.synthetic.mesh import Colour, Kind, Place, Rng, Scene, Vector, palette
 from crisalad_jax.synthetic.view import SEASONS, Season, Time, View, Weather
 
 
@@ -28,21 +28,15 @@ class Light(NamedTuple):
     """Direction of the sun in the place."""
 
 
-def _light(percents: str, elevation: float, lit: float) -> Light:
-    """Make a light of the colours of its surroundings, its sun, its zenith and its horizon."""
-    ambient, sun, zenith, horizon = np.array(palette(percents))
-    return Light(ambient, sun, zenith, horizon, elevation, lit)
-
-
 _OUTDOORS: dict[Time, Light] = {
-    "noon": _light("58 62 68, 66 61 52, 28 48 80, 76 85 93", elevation=48.0, lit=0.0),
-    "dusk": _light("45 40 46, 52 33 18, 24 27 47, 93 64 45", elevation=11.0, lit=0.5),
-    "night": _light("25 26 36, 0 0 0, 3 4 10, 13 13 20", elevation=40.0, lit=1.0),
+    "noon": Light(*palette("58 62 68, 66 61 52, 28 48 80, 76 85 93"), elevation=48.0, lit=0.0),
+    "dusk": Light(*palette("45 40 46, 52 33 18, 24 27 47, 93 64 45"), elevation=11.0, lit=0.5),
+    "night": Light(*palette("25 26 36, 0 0 0, 3 4 10, 13 13 20"), elevation=40.0, lit=1.0),
 }
 _INDOORS: dict[Time, Light] = {
-    "noon": _light("72 71 69, 22 22 21, 92 95 100, 92 95 100", elevation=65.0, lit=0.25),
-    "dusk": _light("72 71 69, 22 22 21, 55 50 52, 55 50 52", elevation=65.0, lit=0.6),
-    "night": _light("72 71 69, 22 22 21, 6 6 10, 6 6 10", elevation=65.0, lit=0.8),
+    "noon": Light(*palette("72 71 69, 22 22 21, 92 95 100, 92 95 100"), elevation=65.0, lit=0.25),
+    "dusk": Light(*palette("72 71 69, 22 22 21, 55 50 52, 55 50 52"), elevation=65.0, lit=0.6),
+    "night": Light(*palette("72 71 69, 22 22 21, 6 6 10, 6 6 10"), elevation=65.0, lit=0.8),
 }
 """Light indoors; the sky is what windows show."""
 _AIRS: dict[Weather, tuple[float, ...]] = {
@@ -54,11 +48,11 @@ _AIRS: dict[Weather, tuple[float, ...]] = {
 """By weather: shares of the sunlight and the ambient light that come through, share of grey in the
 sky's colours, brightness of that grey relative to the clear horizon, and visibility in metres."""
 _SUN_HEIGHT: dict[Season, float] = {"spring": 0.85, "summer": 1.2, "autumn": 0.85, "winter": 0.5}
-_LEAVES: dict[Season, np.ndarray] = {
-    "spring": np.array(palette("44 56 22, 74 60 62")),
-    "summer": np.array(palette("20 37 13, 30 43 16")),
-    "autumn": np.array(palette("70 46 12, 60 23 10")),
-    "winter": np.array(palette("40 34 29, 40 34 29")),
+_LEAVES: dict[Season, tuple[Colour, ...]] = {
+    "spring": palette("44 56 22, 74 60 62"),
+    "summer": palette("20 37 13, 30 43 16"),
+    "autumn": palette("70 46 12, 60 23 10"),
+    "winter": palette("40 34 29, 40 34 29"),
 }
 """Two hues by season, between which leaves lie; in winter a tree has none, and a bush twigs."""
 _SNOW: dict[int, float] = {
@@ -74,7 +68,7 @@ _SNOW: dict[int, float] = {
 """Share of a surface that snow covers, by kind."""
 GRASS = dict(zip(SEASONS, palette("40 54 24, 38 46 22, 50 44 25, 40 46 34"), strict=True))
 SNOW_COLOUR = np.array((0.90, 0.92, 0.96))
-GLOW: dict[int, tuple[float, Colour]] = {
+GLOW: dict[int, tuple[float, Vector]] = {
     Kind.GLASS: (0.34, (1.0, 0.78, 0.42)),
     Kind.SHOP: (0.8, (0.92, 0.82, 0.60)),
     Kind.LAMP: (1.0, (1.0, 0.88, 0.62)),

@@ -14,9 +14,11 @@ from jaxtyping import Float, Int
 
 from crisalad_jax.synthetic.view import EYE
 
-Colour = tuple[float, float, float]
+Colour = np.ndarray
 """Red, green and blue, 0 to 1."""
 Vector = tuple[float, float, float]
+Paint = Colour | Vector
+"""A part's colour, or in `Kind.LEAF` and `Kind.BUSH` its share of the second hue and its shade."""
 Number = int | float | np.ndarray
 Polygons = Float[np.ndarray, "polygon corner 3"]
 Rect = tuple[Number, Number, Number, Number]
@@ -32,6 +34,8 @@ GROUND_LAYER = 1e6
 UP: Vector = (0.0, 1.0, 0.0)
 DOWN: Vector = (0.0, -1.0, 0.0)
 TO_CAMERA: Vector = (0.0, 0.0, -1.0)
+SLANTED: Vector = (0.0, 0.5, -0.85)
+"""Direction of what is round or slopes towards the camera."""
 
 
 class Kind(enum.IntEnum):
@@ -47,8 +51,7 @@ class Kind(enum.IntEnum):
 
 def palette(percents: str) -> tuple[Colour, ...]:
     """Read colours from text: red, green and blue in percent, a comma between colours."""
-    rows = (map(int, colour.split()) for colour in percents.split(","))
-    return tuple((red / 100, green / 100, blue / 100) for red, green, blue in rows)
+    return tuple(np.array(colour.split(), float) / 100 for colour in percents.split(","))
 
 
 WALLS = palette(
@@ -57,28 +60,26 @@ WALLS = palette(
 )
 ROOFS = palette("52 27 20, 33 33 36, 42 34 29, 30 42 38")
 SIGNS = palette("70 16 14, 13 28 52, 12 40 24, 85 66 14, 20 18 20, 82 80 76")
-GLASS: Colour = (0.16, 0.20, 0.25)
+GLASS = np.array((0.16, 0.20, 0.25))
 
 
-def scaled(colour: Colour, gain: float) -> Colour:
-    """Multiply a colour, or any other vector, by a number."""
-    return (colour[0] * gain, colour[1] * gain, colour[2] * gain)
+def draw_kind(rng: Rng, **shares: float) -> str:
+    """Draw one of the names, by their shares, which sum to 1."""
+    return str(rng.choice(tuple(shares), p=tuple(shares.values())))
 
 
-def pick(rng: np.random.Generator, colours: tuple[Colour, ...], spread: float = 0.06) -> Colour:
+def pick(rng: Rng, colours: tuple[Colour, ...], spread: float = 0.06) -> Colour:
     """Draw one of the colours, up to a share `spread` lighter or darker."""
-    colour = colours[rng.integers(len(colours))]
-    return scaled(colour, 1 + rng.uniform(-spread, spread))
+    return colours[rng.integers(len(colours))] * (1 + rng.uniform(-spread, spread))
 
 
 def polygons(*corners: tuple[Number, Number, Number]) -> Polygons:
-    """Make as many polygons as a coordinate's array has numbers; single numbers are repeated."""
+    """Make a polygon of each element of the coordinates, which are broadcast to one shape."""
     numbers = [number for corner in corners for number in corner]
-    count = next((len(n) for n in numbers if isinstance(n, np.ndarray)), 1)
-    table = np.empty((count, len(numbers)))
+    table = np.empty((*np.broadcast(*numbers).shape, len(numbers)))
     for column, number in enumerate(numbers):
-        table[:, column] = number
-    return table.reshape(count, len(corners), 3)
+        table[..., column] = number
+    return table.reshape(-1, len(corners), 3)
 
 
 def rects(
@@ -89,9 +90,17 @@ def rects(
     return polygons((x0, y0, z), (x1, y0, z), (x1, y1, top_z), (x0, y1, top_z))
 
 
-def bars(x: Number, half: Number, y0: Number, y1: Number, z: Number = 0.0) -> Polygons:
-    """Make upright rectangles that reach `half` metres to either side of x."""
-    return rects(x - half, y0, x + half, y1, z)
+def bars(
+    x: Number, half: Number, y0: Number, y1: Number, z: Number = 0.0, top: Number | None = None
+) -> Polygons:
+    """Make upright bars, `half` metres to either side of x; they may taper to `top` metres."""
+    top = half if top is None else top
+    return polygons((x - half, y0, z), (x + half, y0, z), (x + top, y1, z), (x - top, y1, z))
+
+
+def triangles(x0: Number, x1: Number, y: Number, tip_x: Number, tip_y: Number) -> Polygons:
+    """Make upright triangles over level edges."""
+    return polygons((x0, y, 0), (x1, y, 0), (tip_x, tip_y, 0))
 
 
 def flat(x0: Number, z0: Number, x1: Number, z1: Number, y: float = 0.0) -> Polygons:
@@ -106,7 +115,7 @@ def sheets(
     return polygons((x0, low, z0), (x1, low, z1), (x1 + lean, high, z1), (x0 + lean, high, z0))
 
 
-def discs(x: Number, y: Number, radius: Number, z: float) -> Polygons:
+def discs(x: Number, y: Number, radius: Number, z: float = 0.0) -> Polygons:
     """Make round polygons that face the camera."""
     angles = np.arange(10) * (2 * np.pi / 10)
     return polygons(*((x + radius * np.cos(a), y + radius * np.sin(a), z) for a in angles))
@@ -139,20 +148,31 @@ class Mesh:
         """Whether the camera sees the ends towards small u of a front, or those towards large u."""
         self.end_normal: Vector = UP
         self._origin, self._axes = np.zeros(3), np.eye(3)
-        self._parts: list[tuple[np.ndarray, Colour, Vector, int, float]] = []
+        self.bodies: list[Body] = []
+        """The buildings, which cast shadows."""
+        self.lamps: list[Vector] = []
+        """Positions of the street lamps' lights."""
+        self._parts: list[tuple[np.ndarray, Paint, Vector, int, float]] = []
 
-    def front(self, x: float, z: float, side: float) -> "Mesh":
-        """Return the same mesh in other axes: those of a vertical plane, in the present layer.
+    def at(self, x: float, z: float, layer: float | None = None) -> "Mesh":
+        """Return the same mesh with its origin at (x, z), in a layer, or that of distance z."""
+        here = copy.copy(self)
+        here._origin = self.world(np.array((x, 0.0, z)))
+        here.layer = float(z if layer is None else layer)
+        return here
+
+    def front(self, x: float, z: float, side: float, layer: float | None = None) -> "Mesh":
+        """Return the same mesh in other axes: those of a vertical plane, in the layer given.
 
         u runs along the plane, v up, d out of it. The plane stands on (x, z), on a side of the
         street, which is -1 or 1, or across the street where that is 0.
         """
-        front = copy.copy(self)
-        along = (0.0, 0.0, 1.0) if side else (1.0, 0.0, 0.0)
+        front = self.at(x, z, self.layer if layer is None else layer)
+        along = np.array((0.0, 0.0, 1.0) if side else (1.0, 0.0, 0.0))
         front.normal = (-side, 0.0, 0.0) if side else TO_CAMERA
-        front.sees_start = side != 0 or x > 0
-        front.end_normal = scaled(along, -1.0 if front.sees_start else 1.0)
-        front._origin, front._axes = np.array((x, 0.0, z)), np.array((along, UP, front.normal))
+        front.sees_start = side != 0 or front._origin[0] > 0
+        front.end_normal = tuple(-along if front.sees_start else along)
+        front._axes = np.array((along, UP, front.normal))
         return front
 
     def world(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
@@ -162,7 +182,7 @@ class Mesh:
     def add(
         self,
         polygons: Polygons,
-        albedo: Colour,
+        albedo: Paint,
         kind: Kind = Kind.SOLID,
         normal: Vector | None = None,
         layer: float | None = None,
@@ -173,19 +193,20 @@ class Mesh:
             part = self.world(polygons), albedo, normal or self.normal, int(kind), layer
             self._parts.append(part)
 
-    def ground(self, polygons: Polygons, albedo: Colour, kind: Kind = Kind.SOLID) -> None:
+    def ground(self, polygons: Polygons, albedo: Paint, kind: Kind = Kind.SOLID) -> None:
         """Add a part of the ground, over those before it."""
         self.add(polygons, albedo, kind, UP, GROUND_LAYER + 1)
 
-    def block(self, low: Vector, high: Vector, albedo: Colour) -> None:
+    def block(self, low: Vector, high: Vector, albedo: Paint) -> None:
         """Add an upright box: its top, its side towards the middle of the street, its front."""
         (x0, y0, z0), (x1, y1, z1) = low, high
-        x, outwards = (x1, 1.0) if x0 + x1 < 0 else (x0, -1.0)
+        is_left = self._origin[0] + (x0 + x1) / 2 < 0
+        x, outwards = (x1, 1.0) if is_left else (x0, -1.0)
         self.add(flat(x0, z0, x1, z1, y1), albedo, Kind.ROOF, UP)
         self.add(sheets(x, z0, x, z1, y0, y1), albedo, normal=(outwards, 0.0, 0.0))
         self.add(rects(x0, y0, x1, y1, z0), albedo)
 
-    def boxes(self, rect: Rect, out: float, albedo: Colour, kind: Kind = Kind.SOLID) -> None:
+    def boxes(self, rect: Rect, out: float, albedo: Paint, kind: Kind = Kind.SOLID) -> None:
         """Add boxes that protrude from a front: the visible end, the top or underside, the face."""
         u0, v0, u1, v1 = rect
         end = u0 if self.sees_start else u1

@@ -114,7 +114,7 @@ class _Picture:
         tangent = np.interp(compass, bearings, hills, period=360)
         ridge = np.stack((width / 2 * (1 + across), horizon_row - camera.focal * tangent), -1)
         outline = np.concatenate((ridge, [(width, horizon_row + 2), (0, horizon_row + 2)]))
-        hill = np.array(SNOW_COLOUR * 0.75 if view.season == "winter" else GRASS[view.season])
+        hill = SNOW_COLOUR * 0.75 if view.season == "winter" else GRASS[view.season]
         haze = 0.85 if view.weather in ("haze", "rain") else 0.45
         colour = hill * light.ambient * (1 - haze) + light.horizon * haze
         cv2.fillPoly(self.canvas, [np.round(outline).astype(np.int32)], _bytes(colour))

@@ -7,21 +7,18 @@ from crisalad_jax.synthetic.mesh import (
     GLASS,
     ROOFS,
     WALLS,
-    Body,
     Kind,
     Mesh,
     Place,
     Reach,
     Rng,
-    Vector,
     bars,
     draw_hills,
     flat,
     palette,
     pick,
-    polygons,
     rects,
-    scaled,
+    triangles,
 )
 from crisalad_jax.synthetic.things import lamp, monument, tree, wires
 
@@ -41,23 +38,22 @@ def street(rng: Rng) -> Place:
 
     _ground(mesh, rng, kerbs, length)
     _skyline(mesh, rng, length)
-    bodies = _far_row(mesh, rng, length, habit)
+    _far_row(mesh, rng, length, habit)
     park = rng.choice(3, p=(0.7, 0.15, 0.15))
     for number, x, side in ((1, left, -1.0), (2, right, 1.0)):
         if park == number:
             _park(mesh, rng, x, side, length)
         else:
-            bodies += _row(mesh, rng, x, side, length, habit)
-    lamps: list[Vector] = []
+            _row(mesh, rng, x, side, length, habit)
     for x in (kerbs[0] - 0.6, kerbs[1] + 0.6):
         if rng.random() < 0.55:
             for z in np.arange(rng.uniform(7.0, 16.0), length - 2, rng.uniform(7.0, 14.0)):
                 if rng.random() < 0.8:
                     tree(mesh, rng, x + rng.uniform(-0.3, 0.3), z + rng.uniform(-1, 1))
-        if rng.random() < 0.6 or (x > 0 and not lamps):
+        if rng.random() < 0.6 or (x > 0 and not mesh.lamps):
             height = rng.uniform(5.0, 8.0)
-            stations = np.arange(rng.uniform(6.0, 16.0), length + 4, rng.uniform(14.0, 24.0))
-            lamps += [lamp(mesh, x, float(z), height) for z in stations]
+            for z in np.arange(rng.uniform(6.0, 16.0), length + 4, rng.uniform(14.0, 24.0)):
+                lamp(mesh, x, float(z), height)
     if rng.random() < 0.4:
         wires(mesh, rng, float(rng.choice(kerbs)), length)
     if rng.random() < 0.25:
@@ -67,7 +63,8 @@ def street(rng: Rng) -> Place:
     bearing, heading = float(rng.uniform(0, 360)), float(rng.uniform(-20, 20))
     lanes = (left, *kerbs, right)
     reach = Reach(height=(1.2, 3.0), lateral=1.2, forward=2.5, step=9.0)
-    return Place(mesh.scene(), heading, lanes, reach, bearing, hills, bodies, np.array(lamps))
+    scene, bodies, lamps = mesh.scene(), mesh.bodies, np.array(mesh.lamps)
+    return Place(scene, heading, lanes, reach, bearing, hills, bodies, lamps)
 
 
 def _ground(mesh: Mesh, rng: Rng, kerbs: tuple[float, float], length: float) -> None:
@@ -79,7 +76,7 @@ def _ground(mesh: Mesh, rng: Rng, kerbs: tuple[float, float], length: float) -> 
     street, crossing = flat(left, -20, right, length + 1), flat(-120, length + 1, 120, length + 8)
     mesh.ground(np.concatenate((street, crossing)), asphalt, Kind.ROAD)
     edge = np.array(kerbs)
-    mesh.ground(flat(edge - 0.12, -5, edge + 0.12, length + 1), scaled(paving, 1.25), Kind.PAVEMENT)
+    mesh.ground(flat(edge - 0.12, -5, edge + 0.12, length + 1), 1.25 * paving, Kind.PAVEMENT)
     white, middle = (0.78, 0.78, 0.74), (left + right) / 2
     if rng.random() < 0.7:
         dash = rng.uniform(1.5, 3.5)
@@ -100,31 +97,28 @@ def _skyline(mesh: Mesh, rng: Rng, length: float) -> None:
     """Add distant towers, and at times a steeple: landmarks that barely move."""
     for _ in range(int(rng.integers(0, 6))):
         z = length + rng.uniform(90, 320)
-        x = rng.uniform(-0.9, 0.9) * z
+        tower = mesh.at(rng.uniform(-0.9, 0.9) * z, z, layer=3000 + z)
         width, height = rng.uniform(14, 34), z * rng.uniform(0.18, 0.5)
-        mesh.layer = 3000 + z
         colour = pick(rng, WALLS[6:])
-        mesh.add(rects(x, 0, x + width, height, z), colour)
+        tower.add(rects(0, 0, width, height), colour)
         if rng.random() < 0.5:
-            mesh.add(rects(x + width * 0.25, height, x + width * 0.75, height * 1.12, z), colour)
+            tower.add(rects(width * 0.25, height, width * 0.75, height * 1.12), colour)
         columns, rows = int(rng.integers(3, 7)), int(rng.integers(6, 14))
-        u = np.tile(x + (np.arange(columns) + 0.2) * width / columns, rows)
-        v = np.repeat((np.arange(rows) + 0.3) * height / rows, columns)
-        panes = rects(u, v, u + 0.6 * width / columns, v + 0.5 * height / rows, z)
-        mesh.add(panes, scaled(GLASS, 1.6), Kind.GLASS)
+        u = (np.arange(columns) + 0.2) * width / columns
+        v = ((np.arange(rows) + 0.3) * height / rows)[:, None]
+        panes = rects(u, v, u + 0.6 * width / columns, v + 0.5 * height / rows)
+        tower.add(panes, 1.6 * GLASS, Kind.GLASS)
     if rng.random() < 0.4:
         z = length + rng.uniform(30, 90)
-        x = rng.uniform(-0.5, 0.5) * z
+        steeple = mesh.at(rng.uniform(-0.5, 0.5) * z, z, layer=2000 + z)
         half, height = rng.uniform(2.5, 4), z * rng.uniform(0.28, 0.45)
-        mesh.layer = 2000 + z
-        mesh.add(bars(x, half, 0, height, z), pick(rng, WALLS[:6]))
-        eaves, tip = half + 0.4, height * rng.uniform(1.2, 1.7)
-        spire = polygons((x - eaves, height, z), (x + eaves, height, z), (x, tip, z))
-        mesh.add(spire, pick(rng, ROOFS), Kind.ROOF, (0.0, 0.6, -0.8))
-        mesh.add(bars(x, half * 0.3, height * 0.82, height * 0.93, z), (0.12, 0.12, 0.13))
+        steeple.add(bars(0, half, 0, height), pick(rng, WALLS[:6]))
+        spire = triangles(-half - 0.4, half + 0.4, height, 0, height * rng.uniform(1.2, 1.7))
+        steeple.add(spire, pick(rng, ROOFS), Kind.ROOF, (0.0, 0.6, -0.8))
+        steeple.add(bars(0, half * 0.3, height * 0.82, height * 0.93), (0.12, 0.12, 0.13))
 
 
-def _far_row(mesh: Mesh, rng: Rng, length: float, habit: Habit) -> list[Body]:
+def _far_row(mesh: Mesh, rng: Rng, length: float, habit: Habit) -> None:
     """Add the row that closes the street, at varying distances and at times with a gap."""
     reach = 14 + length * 0.7
     stands: list[tuple[float, float, float]] = []
@@ -134,16 +128,12 @@ def _far_row(mesh: Mesh, rng: Rng, length: float, habit: Habit) -> list[Body]:
         if rng.random() < 0.86:
             stands.append((length + 11 + rng.choice((0.0, 0.0, 3.0, 7.0)), x, width))
         x += width
-    bodies = []
     for z, x, width in sorted(stands, reverse=True):
-        mesh.layer = 1000 + z
-        bodies.append(building(rng, mesh.front(x, z, 0), width, habit))
-    return bodies
+        building(rng, mesh.front(x, z, 0, layer=1000 + z), width, habit)
 
 
-def _row(mesh: Mesh, rng: Rng, x: float, side: float, length: float, habit: Habit) -> list[Body]:
+def _row(mesh: Mesh, rng: Rng, x: float, side: float, length: float, habit: Habit) -> None:
     """Add one side of the street, from the camera to the crossing, with gaps and setbacks."""
-    bodies = []
     z = rng.uniform(-9.0, -2.0)
     while z < length - 5:
         width = min(rng.uniform(7.0, 17.0), length - z)
@@ -151,10 +141,8 @@ def _row(mesh: Mesh, rng: Rng, x: float, side: float, length: float, habit: Habi
             z += width * 0.6
             continue
         face = x + side * rng.choice((0.0, 0.0, 0.0, 0.8, 2.5))
-        mesh.layer = z + width
-        bodies.append(building(rng, mesh.front(face, z, side), width, habit))
+        building(rng, mesh.front(face, z, side, layer=z + width), width, habit)
         z += width
-    return bodies
 
 
 def _park(mesh: Mesh, rng: Rng, x: float, side: float, length: float) -> None:
@@ -166,7 +154,6 @@ def _park(mesh: Mesh, rng: Rng, x: float, side: float, length: float) -> None:
     # The wall is in pieces, each with its own layer: a tree may stand in front of one and behind
     # the next.
     for z in np.arange(-3.0, length, 3.0):
-        mesh.layer = float(z)
-        front = mesh.front(x, float(z), side)
+        front = mesh.front(x, float(z), side, layer=float(z))
         front.add(rects(0, 0, 3, height), colour)
         front.add(rects(0, height, 3, height + 0.12), colour, Kind.LEDGE)

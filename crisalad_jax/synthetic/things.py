@@ -6,15 +6,14 @@ import numpy as np
 
 from crisalad_jax.synthetic.mesh import (
     SIGNS,
+    SLANTED,
     UP,
     WALLS,
-    Colour,
     Kind,
     Lanes,
     Mesh,
     Rng,
     Scene,
-    Vector,
     bars,
     discs,
     flat,
@@ -22,55 +21,53 @@ from crisalad_jax.synthetic.mesh import (
     pick,
     polygons,
     rects,
-    scaled,
+    sheets,
+    triangles,
 )
 
 _PAINT = palette("75 75 76, 16 17 19, 55 12 11, 15 25 45, 84 83 80, 40 42 44, 24 36 28")
-_TYRE: Colour = (0.05, 0.05, 0.05)
-_TINTED: Colour = (0.10, 0.12, 0.14)
+_TYRE = (0.05, 0.05, 0.05)
+_TINTED = (0.10, 0.12, 0.14)
 
 
 def tree(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
     """Add a broad-leaved tree, bare in winter, or an evergreen conifer."""
-    mesh.layer = z
+    mesh = mesh.at(x, z)
     height = rng.uniform(4.5, 8.5)
     bark = (0.26, 0.21, 0.17)
-    mesh.add(bars(x, 0.16, 0, height * 0.6, z), bark)
+    mesh.add(bars(0, 0.16, 0, height * 0.6), bark)
     if rng.random() < 0.2:
         for low, reach in ((0.2, 1.9), (0.44, 1.4), (0.68, 0.9)):
             y = height * low
-            tier = polygons((x - reach, y, z), (x + reach, y, z), (x, y + height * 0.42, z))
-            mesh.add(tier, (0.13, 0.26, 0.17), Kind.NEEDLE, (0.0, 0.5, -0.85))
+            tier = triangles(-reach, reach, y, 0, y + height * 0.42)
+            mesh.add(tier, (0.13, 0.26, 0.17), Kind.NEEDLE, SLANTED)
         return
     n = 9
     angle = np.linspace(-1.1, 1.1, n) + rng.uniform(-0.12, 0.12, n)
     fork = height * rng.uniform(0.34, 0.6, n)
     length = height * rng.uniform(0.28, 0.46, n)
-    tip_x, tip_y = x + np.sin(angle) * length, fork + np.cos(angle) * length
-    mesh.add(polygons((x, fork, z), (x + 0.12, fork, z), (tip_x, tip_y, z)), bark)
-    middle_x, middle_y = (x + tip_x) / 2, (fork + tip_y) / 2
-    twig_x, twig_y = middle_x + np.sin(angle * 0.3) * 0.9, middle_y + 1.0
-    twigs = polygons((middle_x, middle_y, z), (middle_x + 0.08, middle_y, z), (twig_x, twig_y, z))
-    mesh.add(twigs, bark)
+    tip_x, tip_y = np.sin(angle) * length, fork + np.cos(angle) * length
+    mesh.add(triangles(0, 0.12, fork, tip_x, tip_y), bark)
+    u, v = tip_x / 2, (fork + tip_y) / 2
+    mesh.add(triangles(u, u + 0.08, v, u + np.sin(angle * 0.3) * 0.9, v + 1.0), bark)
     hue = float(rng.random())
     for shade, lift, count in ((0.62, -0.25, 6), (0.85, 0.1, 6), (1.08, 0.45, 5)):
         across = height * 0.21 * (rng.normal(0, 0.62, count) - lift * 0.5)
         up = height * (0.72 + 0.21 * (rng.normal(0, 0.62, count) + lift))
-        crown = discs(x + across, up, height * 0.21 * rng.uniform(0.5, 0.85, count), z)
+        crown = discs(across, up, height * 0.21 * rng.uniform(0.5, 0.85, count))
         # Each disc is a part: inside a part, an even number of overlapping polygons leaves a hole.
         for disc in crown:
             mesh.add(disc[None], (hue, shade, 0.0), Kind.LEAF, (0.0, 0.6, -0.8))
 
 
-def lamp(mesh: Mesh, x: float, z: float, height: float) -> Vector:
-    """Add a street lamp with an arm over the street; return the position of its light."""
-    mesh.layer = z
-    tip = x + 1.3 if x < 0 else x - 1.3
-    post = bars(x, 0.09, 0, height, z)
-    arm = rects(min(x, tip), height - 0.12, max(x, tip), height, z)
-    mesh.add(np.concatenate((post, arm)), (0.20, 0.22, 0.22))
-    mesh.add(bars(tip, 0.35, height - 0.32, height - 0.08, z), (0.75, 0.74, 0.68), Kind.LAMP)
-    return (tip, height - 0.2, z)
+def lamp(mesh: Mesh, x: float, z: float, height: float) -> None:
+    """Add a street lamp with an arm over the street."""
+    mesh = mesh.at(x, z)
+    tip = 1.3 if x < 0 else -1.3
+    arm = bars(tip / 2, 0.65, height - 0.12, height)
+    mesh.add(np.concatenate((bars(0, 0.09, 0, height), arm)), (0.20, 0.22, 0.22))
+    mesh.add(bars(tip, 0.35, height - 0.32, height - 0.08), (0.75, 0.74, 0.68), Kind.LAMP)
+    mesh.lamps.append((x + tip, height - 0.2, z))
 
 
 def wires(mesh: Mesh, rng: Rng, x: float, length: float) -> None:
@@ -79,30 +76,28 @@ def wires(mesh: Mesh, rng: Rng, x: float, length: float) -> None:
     t = np.linspace(0, 1, 7)
     sag = height - 0.6 - 3.2 * t * (1 - t)
     y0, y1 = sag[:-1], sag[1:]
+    z0, z1 = t[:-1] * gap, t[1:] * gap
     for z in np.arange(rng.uniform(4.0, 12.0), length, gap):
-        mesh.layer = float(z)
-        pole = bars(x, 0.13, 0, height, z)
-        bar = bars(x, 0.9, height - 0.8, height - 0.65, z)
-        mesh.add(np.concatenate((pole, bar)), (0.30, 0.25, 0.21))
-        z0, z1 = z + t[:-1] * gap, z + t[1:] * gap
-        for u in (x - 0.8, x + 0.8):
+        pole = mesh.at(x, z)
+        bar = bars(0, 0.9, height - 0.8, height - 0.65)
+        pole.add(np.concatenate((bars(0, 0.13, 0, height), bar)), (0.30, 0.25, 0.21))
+        for u in (-0.8, 0.8):
             wire = polygons((u, y0, z0), (u, y1, z1), (u, y1 + 0.04, z1), (u, y0 + 0.04, z0))
-            mesh.add(wire, (0.12, 0.12, 0.13))
+            pole.add(wire, (0.12, 0.12, 0.13))
 
 
 def monument(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
     """Add a column with a ball, or an obelisk, on a plinth in the street."""
-    mesh.layer = z
+    mesh = mesh.at(x, z)
     stone = pick(rng, WALLS[2:9])
-    mesh.block((x - 1.5, 0.0, z), (x + 1.5, 0.9, z + 3.0), stone)
+    mesh.block((-1.5, 0.0, 0.0), (1.5, 0.9, 3.0), stone)
     height, half = rng.uniform(3.0, 9.0), rng.uniform(0.35, 0.9)
-    stone = scaled(stone, 0.9)
+    stone = 0.9 * stone
     if rng.random() < 0.5:
-        mesh.block((x - half, 0.9, z + 1), (x + half, height, z + 1 + 2 * half), stone)
-        mesh.add(discs(x, height + 0.7, 0.8, z + 1), (0.35, 0.40, 0.36), normal=(0.0, 0.5, -0.85))
+        mesh.block((-half, 0.9, 1), (half, height, 1 + 2 * half), stone)
+        mesh.add(discs(0, height + 0.7, 0.8, 1), (0.35, 0.40, 0.36), normal=SLANTED)
     else:
-        tip = (x + 0.15, height, z), (x - 0.15, height, z)
-        mesh.add(polygons((x - half, 0.9, z), (x + half, 0.9, z), *tip), stone)
+        mesh.add(bars(0, half, 0.9, height, top=0.15), stone)
 
 
 @functools.lru_cache(maxsize=8)
@@ -140,34 +135,32 @@ def _vehicle(mesh: Mesh, rng: Rng, x: float, z: float, *, bus: bool, away: bool)
     """Add a car or a bus in its lane; the camera sees its rear if it drives away."""
     paint = pick(rng, SIGNS if bus else _PAINT)
     half, length, height = (1.25, 10.5, 3.0) if bus else (0.9, 4.3, 0.95)
-    mesh.layer = z + 0.01
-    mesh.add(flat(x - half - 0.2, z - 0.2, x + half + 0.2, z + length), (0.1, 0.1, 0.1), normal=UP)
-    near = np.array((x - half, x + half - 0.3))
-    mesh.add(rects(near, 0, near + 0.3, 0.5, z + 0.1), _TYRE)
-    mesh.block((x - half, 0.3, z), (x + half, height, z + length), paint)
+    mesh = mesh.at(x, z)
+    mesh.layer += 0.01
+    mesh.add(flat(-half - 0.2, -0.2, half + 0.2, length), (0.1, 0.1, 0.1), normal=UP)
+    near = np.array((-half, half - 0.3))
+    mesh.add(rects(near, 0, near + 0.3, 0.5, 0.1), _TYRE)
+    mesh.block((-half, 0.3, 0), (half, height, length), paint)
     side = -1.0 if x < 0 else 1.0
-    flank = mesh.front(x - side * half, z, side)
+    flank = mesh.front(-side * half, 0, side)
     if bus:
         u = 0.5 + 2.0 * np.arange(5)
         flank.add(rects(u, 1.4, u + 1.7, 2.5), _TINTED, Kind.SHOP)
-        mesh.add(bars(x, 1.05, 1.3, 2.6, z), _TINTED, Kind.SHOP)
+        mesh.add(bars(0, 1.05, 1.3, 2.6), _TINTED, Kind.SHOP)
     else:
-        mesh.block((x - 0.74, 0.95, z + 0.7), (x + 0.74, 1.5, z + 3.2), paint)
-        mesh.add(bars(x, 0.65, 1.0, 1.42, z + 0.7), _TINTED)
+        mesh.block((-0.74, 0.95, 0.7), (0.74, 1.5, 3.2), paint)
+        mesh.add(bars(0, 0.65, 1.0, 1.42, 0.7), _TINTED)
         u = np.array((0.5, 3.1))
         flank.add(rects(u, 0, u + 0.6, 0.6), _TYRE)
-    lights = rects(near + 0.02, 0.6, near + 0.28, 0.85, z)
-    if away:
-        mesh.add(lights, (0.55, 0.08, 0.06), Kind.TAILLIGHT)
-    else:
-        mesh.add(lights, (0.90, 0.90, 0.82), Kind.HEADLIGHT)
+    red, white = ((0.55, 0.08, 0.06), Kind.TAILLIGHT), ((0.90, 0.90, 0.82), Kind.HEADLIGHT)
+    mesh.add(rects(near + 0.02, 0.6, near + 0.28, 0.85), *(red if away else white))
 
 
 def _person(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
-    mesh.layer = z
+    mesh = mesh.at(x, z)
     tall, stride = rng.uniform(0.9, 1.08), rng.uniform(0.05, 0.3)
-    hip, foot = np.array((-0.1, 0.1)) + x, np.array((-stride, stride)) + x
-    hips = (hip + 0.08, 0.85 * tall, z), (hip - 0.08, 0.85 * tall, z)
-    mesh.add(polygons(*hips, (foot - 0.08, 0.0, z), (foot + 0.08, 0.0, z)), pick(rng, _PAINT[1:4]))
-    mesh.add(bars(x, 0.26, 0.8 * tall, 1.48 * tall, z), pick(rng, SIGNS, 0.3))
-    mesh.add(discs(x, 1.63 * tall, 0.13, z), (0.62, 0.47, 0.38))
+    hip, foot = np.array((-0.1, 0.1)), np.array((-stride, stride))
+    legs = sheets(foot - 0.08, 0, foot + 0.08, 0, 0, 0.85 * tall, hip - foot)
+    mesh.add(legs, pick(rng, _PAINT[1:4]))
+    mesh.add(bars(0, 0.26, 0.8 * tall, 1.48 * tall), pick(rng, SIGNS, 0.3))
+    mesh.add(discs(0, 1.63 * tall, 0.13), (0.62, 0.47, 0.38))

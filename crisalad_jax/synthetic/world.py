@@ -1,7 +1,6 @@
 """A world to learn from: streets, corridors and country, in the layouts of real sets."""
 
 import dataclasses
-import itertools
 import math
 import os
 from collections.abc import Iterator, Sequence
@@ -11,16 +10,14 @@ import numpy as np
 
 from crisalad_jax.config.checks import check_seed, check_types, require, require_range
 from crisalad_jax.synthetic.layouts import (
-    METRES_PER_DEGREE,
-    UTM_ORIGIN,
     Files,
     Progress,
-    TrainImage,
+    Shot,
+    derive_seed,
     gsv_city,
     holds,
     jpeg,
-    panoid,
-    utm_path,
+    utm_images,
     write_set,
 )
 from crisalad_jax.synthetic.mesh import Reach, Rng
@@ -128,37 +125,26 @@ def _files(config: WorldConfig) -> Files:
     for city, first in enumerate(range(0, config.scenes, _SCENES_PER_CITY)):
         scenes = range(first, min(first + _SCENES_PER_CITY, config.scenes))
         scenery = config.sceneries[city % len(config.sceneries)]
-        yield from gsv_city(f"{scenery}{city:04d}", _train_images(config, scenery, scenes))
+        yield from gsv_city(f"{scenery}{city:04d}", 10.0, _shots(config, 0, scenes, scenery))
     config = dataclasses.replace(config, varied=VARIATIONS, images_per_place=2)
     for scene in range(config.test_scenes):
         scenery = config.sceneries[scene % len(config.sceneries)]
-        sides = itertools.cycle(("database", "queries"))
-        for place, view, picture, rng in _images(config, 1, scene, scenery):
-            north = UTM_ORIGIN[1] + place * _SPACING
-            note = f"{scenery}_{view.season}_{view.time}"
-            yield utm_path(next(sides), UTM_ORIGIN[0], north, panoid(rng), note), picture
+        yield from utm_images(_shots(config, 1, [scene], scenery), scenery)
 
 
-def _train_images(
-    config: WorldConfig, scenery: Scenery, scenes: Sequence[int]
-) -> Iterator[TrainImage]:
+def _shots(
+    config: WorldConfig, split: int, scenes: Sequence[int], scenery: Scenery
+) -> Iterator[Shot]:
+    """Take the pictures of some scenes."""
     for scene in scenes:
-        for place, view, picture, rng in _images(config, 0, scene, scenery):
-            lat = f"{10 + (place + 1) * _SPACING / METRES_PER_DEGREE:.7f}"
-            yield TrainImage(place + 1, picture, lat, "-40.0000000", 0, view.season, rng)
-
-
-def _images(
-    config: WorldConfig, split: int, scene: int, scenery: Scenery
-) -> Iterator[tuple[int, View, bytes, Rng]]:
-    """Render a scene: each image's place, view, picture, and what drew the views of the place."""
-    entropy = (config.seed, 2 + split, scene)
-    seed = int(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0])
-    for station in range(config.stations):
-        rng = np.random.default_rng((config.seed, split, scene, station))
-        for view in views(config, seed, scenery, station, rng):
-            picture = jpeg(render(seed, view, config.image_size, scenery))
-            yield scene * config.stations + station, view, picture, rng
+        seed = derive_seed(config.seed, 2 + split, scene)
+        for station in range(config.stations):
+            # Training places are counted from 1.
+            place = scene * config.stations + station + (1 - split)
+            rng = np.random.default_rng((config.seed, split, scene, station))
+            for view in views(config, seed, scenery, station, rng):
+                picture = jpeg(render(seed, view, config.image_size, scenery))
+                yield Shot(place, view, picture, rng, north=place * _SPACING)
 
 
 def views(config: WorldConfig, seed: int, scenery: Scenery, station: int, rng: Rng) -> list[View]:
@@ -171,7 +157,7 @@ def views(config: WorldConfig, seed: int, scenery: Scenery, station: int, rng: R
         field=camera.uniform(55.0, 95.0),
         pitch=camera.uniform(-4.0, 9.0),
     )
-    still = [each for each in VARIATIONS if each not in config.varied]
+    still = set(VARIATIONS) - set(config.varied)
     fixed = {name: getattr(plain, name) for each in still for name in _FIELDS.get(each, (each,))}
     drawn = [_draw_view(plain, reach, config.repaint, rng) for _ in range(config.images_per_place)]
     return [dataclasses.replace(view, **fixed) for view in drawn]
@@ -181,18 +167,18 @@ def _draw_view(plain: View, reach: Reach, repaint: float, rng: Rng) -> View:
     """Draw a view near the plain one."""
     time = TIMES[rng.choice(3, p=(0.6, 0.25, 0.15))]
     return View(
-        lateral=float(rng.uniform(-1, 1) * reach.lateral),
-        forward=float(plain.forward + rng.uniform(-1, 1) * reach.forward),
-        heading=float(rng.uniform(-5, 5)),
-        height=float(plain.height * rng.uniform(0.93, 1.07)),
-        pitch=float(plain.pitch + rng.uniform(-1.5, 1.5)),
-        field=float(plain.field * rng.uniform(0.95, 1.05)),
-        repaint=float(rng.uniform(0, repaint)),
+        lateral=rng.uniform(-1, 1) * reach.lateral,
+        forward=plain.forward + rng.uniform(-1, 1) * reach.forward,
+        heading=rng.uniform(-5, 5),
+        height=plain.height * rng.uniform(0.93, 1.07),
+        pitch=plain.pitch + rng.uniform(-1.5, 1.5),
+        field=plain.field * rng.uniform(0.95, 1.05),
+        repaint=rng.uniform(0, repaint),
         season=SEASONS[rng.integers(4)],
         time=time,
         weather=WEATHERS[rng.choice(4, p=(0.45, 0.3, 0.13, 0.12))],
         occluders=int(rng.integers(2**31)) if rng.random() < 0.6 else None,
-        exposure=float(rng.uniform(-0.5, 0.6)),
-        noise=float(rng.uniform(1, 5) + 2 * (time == "night")),
+        exposure=rng.uniform(-0.5, 0.6),
+        noise=rng.uniform(1, 5) + 2 * (time == "night"),
         seed=int(rng.integers(2**31)),
     )

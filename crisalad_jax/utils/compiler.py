@@ -28,18 +28,12 @@ _TESTED = ((0, 10), (0, 12))
 """Versions of JAX that the tests run with: those that pyproject.toml requires."""
 
 
-def warn_if_untested() -> None:
-    """Warn in one line if the tests do not run with this version of JAX."""
-    if jax.__version_info__[:2] not in _TESTED:
-        tested = " and ".join(".".join(map(str, version)) for version in _TESTED)
-        warn(
-            f"found jax {jax.__version__}, tested are {tested}: results are not checked, and 0.11 "
-            "crashes on several devices; pip install --upgrade 'jax>=0.12,<0.13'"
-        )
-
-
-# Where the first program is made: before a crash, whichever way the package is used.
-warn_if_untested()
+if jax.__version_info__[:2] not in _TESTED:  # before a crash, whichever way the package is used
+    tested = " and ".join(".".join(map(str, version)) for version in _TESTED)
+    warn(
+        f"found jax {jax.__version__}, tested are {tested}: results are not checked, and 0.11 "
+        "crashes on several devices; pip install --upgrade 'jax>=0.12,<0.13'"
+    )
 
 
 def compiler_options(*, runs_long: bool = False) -> dict[str, bool | str]:

@@ -34,7 +34,7 @@ class Devices(NamedTuple):
 
         Each process gives the rows of its own devices, in the order of the processes.
         """
-        sharding = NamedSharding(self.mesh, PartitionSpec("image"))
+        sharding = NamedSharding(self.mesh, PartitionSpec(IMAGE))
         return jax.make_array_from_process_local_data(sharding, rows)
 
     def replicate(self, tree: _Tree) -> _Tree:
@@ -42,7 +42,7 @@ class Devices(NamedTuple):
 
         The virtual devices of a CPU share one buffer with a numpy array, which must not be changed.
         """
-        here = Mesh(np.array(self.mesh.local_devices), ("image",))
+        here = Mesh(np.array(self.mesh.local_devices), (IMAGE,))
 
         def put(leaf: Any) -> jax.Array:
             host = np.asarray(leaf) if machine().platform == "cpu" else leaf
@@ -109,7 +109,7 @@ def devices_for(count: int, *, processes: bool = False) -> Devices:
     each = count // len(groups)
     fewest = min(map(len, groups))
     most = max(n for n in range(1, fewest + 1) if each % n == 0)
-    return Devices(Mesh(np.array([group[:most] for group in groups]).ravel(), ("image",)))
+    return Devices(Mesh(np.array([group[:most] for group in groups]).ravel(), (IMAGE,)))
 
 
 def parts_for_caches(images: int, at_once: int) -> int:

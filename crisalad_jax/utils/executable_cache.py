@@ -196,8 +196,6 @@ def _processor() -> list[str]:
 
 def _is_ones_own(path: pathlib.Path) -> bool:
     """Return whether only this user can write to a file or folder."""
-    if not hasattr(os, "getuid"):
-        return True
     status = path.stat()
     return status.st_uid == os.getuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 

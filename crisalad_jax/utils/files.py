@@ -57,13 +57,7 @@ def check_source(
         raise InputError(f"{path}: found {found}, expected {expected}")
 
 
-_KINDS = (
-    (stat.S_ISDIR, "a folder"),
-    (stat.S_ISFIFO, "a pipe"),
-    (stat.S_ISCHR, "a device"),
-    (stat.S_ISBLK, "a device"),
-    (stat.S_ISSOCK, "a socket"),
-)
+_KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
 _NOTHING = "no such file"
 
 
@@ -75,7 +69,7 @@ def _found_instead(path: str | os.PathLike[str]) -> str | None:
         return _NOTHING
     except (OSError, ValueError) as error:  # links in a circle, a NUL in the name
         return f"a name that cannot be made or read ({getattr(error, 'strerror', error)})"
-    return next((words for is_kind, words in _KINDS if is_kind(mode)), None)
+    return None if stat.S_ISREG(mode) else _KINDS.get(stat.S_IFMT(mode), "a device")
 
 
 CACHE = "CRISALAD_CACHE"

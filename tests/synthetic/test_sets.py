@@ -25,7 +25,7 @@ from crisalad_jax.synthetic import (
     write_synthetic_city,
     write_world,
 )
-from crisalad_jax.synthetic.city import place_seed
+from crisalad_jax.synthetic.layouts import derive_seed
 from crisalad_jax.synthetic.world import views
 from crisalad_jax.utils.errors import InputError
 
@@ -192,8 +192,8 @@ def test_the_city_s_evaluation_reads_as_utm_layout(city):
 
 def test_no_place_is_in_both_splits_or_twice():
     config = SyntheticCityConfig()
-    seeds = [place_seed(config, 0, i) for i in range(config.train_places)]
-    seeds += [place_seed(config, 1, i) for i in range(config.test_places)]
+    seeds = [derive_seed(config.seed, 0, i) for i in range(config.train_places)]
+    seeds += [derive_seed(config.seed, 1, i) for i in range(config.test_places)]
     assert len(set(seeds)) == config.train_places + config.test_places
     # And another seed is another place: the same view of each is another picture.
     assert len({render(seed, View(), (42, 56)).tobytes() for seed in seeds[::10]}) == 39

@@ -118,7 +118,6 @@ def test_a_damaged_program_is_compiled_anew(folder, monkeypatch, damage):
     assert path.stat().st_size == len(whole)
 
 
-@pytest.mark.skipif(not hasattr(os, "getuid"), reason="no modes of files")
 def test_what_others_may_write_is_not_run(folder, monkeypatch):
     function, _ = counting()
     function(TREE, factor=3)
