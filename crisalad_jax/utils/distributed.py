@@ -8,7 +8,7 @@ import json
 import os
 import re
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -199,17 +199,19 @@ def all_max(*numbers: int) -> tuple[int, ...]:
     return tuple(_gather(*numbers).max(axis=0).tolist())
 
 
-def check_same(name: str, number: int) -> None:
-    """Check that all processes give the same number for `name`.
+def check_same(numbers: Mapping[str, int]) -> None:
+    """Check that all processes give the same numbers, named for messages.
 
     Raises:
         InputError: they do not, in every process.
     """
-    numbers = _gather(number)[:, 0]
-    others = np.flatnonzero(numbers != numbers[0])
-    if others.size:
+    gathered = _gather(*numbers.values())
+    others = np.argwhere(gathered != gathered[0])
+    if len(others):
+        process, position = others[0]
         raise InputError(
-            f"processes: found other {name} in process {others[0]} than in 0, expected the same"
+            f"processes: found other {list(numbers)[position]} in process {process} than in 0, "
+            "expected the same"
         )
 
 

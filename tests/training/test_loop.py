@@ -90,7 +90,7 @@ def save_steps(config, places, out, params, steps: tuple[int, ...] = (0,)) -> No
     files = RunFiles(out, config, record)
     state = files.load(RunState(state, None))
     for files.record.step in steps:
-        files.save(state, params)
+        files.save(state, lambda: params)
     files.close()
 
 
