@@ -38,6 +38,7 @@ from crisalad_jax.training.optimiser import (
 from crisalad_jax.training.trainable import split_params
 from crisalad_jax.utils import compiler, devices, distributed
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import named_leaves
 
 WHOLE_LOSS = 1024
 """Most images whose loss every device computes whole, at most a hundredth of a step's work
@@ -81,13 +82,7 @@ class Metrics(NamedTuple):
 
 def named_scalars(values: Metrics | TransportStatistics) -> dict[str, float]:
     """List scalars by name, those of the transport among them; None is left out."""
-    numbers: dict[str, float] = {}
-    for name, value in values._asdict().items():
-        if isinstance(value, TransportStatistics):
-            numbers |= named_scalars(value)
-        elif value is not None:
-            numbers[name] = float(value)
-    return numbers
+    return {name.rpartition(".")[2]: float(leaf) for name, leaf in named_leaves(values).items()}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,7 +21,7 @@ from crisalad_jax.training.loop import fit
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.training.step import StepConfig, init_train_state, train_step
-from crisalad_jax.training.trainable import count_trainable, merge_params
+from crisalad_jax.training.trainable import count_trainable, merge_params, split_params
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import MODEL as TESTS_MODEL
 from tests.conftest import RECIPE, assert_equal, random_params
@@ -73,6 +73,10 @@ def test_the_state_holds_the_statistics_and_no_moments_of_them() -> None:
     assert statistics(state.trainable)
     assert not statistics(frozen)
     assert not statistics(state.optimiser)
+    for trainable in ("adapters+head", "last-1-blocks+head", "all"):
+        chosen, _ = split_params(PARAMS, MODEL, trainable)
+        assert not statistics(chosen)
+        assert any(".adapter.branch1.norm.weight" in name for name in named_leaves(chosen))
     # What counts as trained are the parameters that a gradient moves.
     sizes = sum(x.size for x in jax.tree.leaves(state.trainable))
     measured = sum(x.size for x in statistics(state.trainable).values())

@@ -29,7 +29,8 @@ from crisalad_jax.training.mining import Mined, Miner
 from crisalad_jax.training.optimiser import learning_rate_schedule
 from crisalad_jax.training.run_files import checksum_of_places
 from crisalad_jax.utils.errors import InputError
-from tests.conftest import RECIPE, assert_equal, write_picture
+from tests.conftest import RECIPE, assert_equal
+from tests.data.test_query_set import write_street
 from tests.training.test_loop import Interrupted, assert_same_params, fail_at, metrics_of
 
 ROLES = np.array([[0, 1, 2, 2, 2], [0, 1, 2, 3, 3], [0, 1, 3, 3, 3]])
@@ -376,17 +377,6 @@ def test_learning_rates_are_torchs(name, steps_first):
         assert float(ours(step)) == pytest.approx(expected[step // 7], rel=1e-6)
 
 
-def write_street(root: pathlib.Path) -> pathlib.Path:
-    """Ten places, 100 m apart, of two database images and a query each, with @UTM names."""
-    for part, offsets in (("database", (0, 6)), ("queries", (3,))):
-        for place in range(10):
-            for offset in offsets:
-                name = f"@{500_000 + 100 * place + offset:09.2f}@5000000.00@{part}@.jpg"
-                seed = 900 + place
-                write_picture(root / "images" / "train" / part / name, seed, noise=20.0)
-    return root
-
-
 @pytest.fixture(scope="module")
 def street(tmp_path_factory) -> pathlib.Path:
     return write_street(tmp_path_factory.mktemp("street"))
@@ -403,22 +393,6 @@ CONFIG = dataclasses.replace(
     epochs=2,
 )
 """Two rounds an epoch, of two batches of two tuples."""
-
-
-def test_query_sets_are_read_by_positions(street):
-    found = read_query_set(street)
-    assert (found.database, len(found.files)) == (20, 30)
-    assert found.queries.tolist() == list(range(20, 30))
-    assert [each.tolist() for each in found.positives] == [[2 * n, 2 * n + 1] for n in range(10)]
-    assert [each.tolist() for each in found.near] == [[2 * n, 2 * n + 1] for n in range(10)]
-    # 3.5 m reach both of a place's images; 103 m the first or both of the next as well.
-    wide = read_query_set(street, positive_radius=3.5, negative_radius=97)
-    assert wide.near[1].tolist() == [1, 2, 3, 4]
-    assert wide.positives[1].tolist() == [2, 3]
-    with pytest.raises(InputError, match="found 0 of 10 queries with a database image within 2 m"):
-        read_query_set(street, positive_radius=2)
-    with pytest.raises(InputError, match="and none of them with one farther than 5000 m"):
-        read_query_set(street, negative_radius=5000)
 
 
 def test_training_reads_the_set_as_configured(street, tmp_path, monkeypatch):
@@ -452,30 +426,6 @@ def test_unreadable_images_are_told_in_mining(tmp_path, capfd):
     config = dataclasses.replace(CONFIG, epochs=1)
     fit(config, read_query_set(root), tmp_path / "run", on_bad_image="skip")
     assert "; 3 unreadable images left out" in " ".join(capfd.readouterr().err.split())
-
-
-def test_images_of_other_cities_are_no_positives(tmp_path):
-    """Two cities of MSLS whose positions are alike, in other zones of UTM."""
-    for city in ("boston", "paris"):
-        for side, norths in (("query", (0, 500)), ("database", (3, 503, 900))):
-            folder = tmp_path / "train_val" / city / side
-            keys = [f"{city}{side}{number}" for number in range(len(norths))]
-            for number, key in enumerate(keys):
-                write_picture(folder / "images" / f"{key}.jpg", number)
-            raw = [f"{n},{key},0,0,0,2020-01-01,False" for n, key in enumerate(keys)]
-            (folder / "raw.csv").write_text(
-                "\n".join([",key,lon,lat,ca,captured_at,pano", *raw]) + "\n"
-            )
-            rows = [
-                f"{n},{key},500000,{4e6 + north}"
-                for n, (key, north) in enumerate(zip(keys, norths, strict=True))
-            ]
-            (folder / "postprocessed.csv").write_text(
-                "\n".join([",key,easting,northing", *rows]) + "\n"
-            )
-    found = read_query_set(tmp_path)
-    assert [each.tolist() for each in found.positives] == [[0], [1], [3], [4]]
-    assert [each.tolist() for each in found.near] == [[0], [1], [3], [4]]
 
 
 def test_checksums_tell_other_positives(street):
@@ -612,19 +562,6 @@ def test_the_wrong_kind_of_set_is_refused(street, shared, tmp_path):
     assert not out.exists()
 
 
-def test_a_set_without_positions_goes_by_its_ground_truth(tmp_path):
-    for side in ("database", "queries"):
-        for number in range(3):
-            write_picture(tmp_path / side / f"{number}.jpg", number)
-    with pytest.raises(InputError, match="no ground truth, nothing to score"):
-        read_query_set(tmp_path)
-    table = "query,database\n0.jpg,1.jpg\n0.jpg,2.jpg\n1.jpg,\n2.jpg,0.jpg\n"
-    (tmp_path / "ground_truth.csv").write_text(table)
-    found = read_query_set(tmp_path)
-    assert found.queries.tolist() == [3, 5]
-    assert [each.tolist() for each in found.near] == [[1, 2], [0]]
-
-
 WHOLE = MiningConfig(kind="whole")
 
 
@@ -632,31 +569,18 @@ WHOLE = MiningConfig(kind="whole")
     ("config", "changes", "message"),
     [
         (WHOLE, {"negatives": 0}, r"MiningConfig\.negatives: found 0"),
-        (
-            WHOLE,
-            {"candidates": 9},
-            r"MiningConfig\.candidates: found 9, expected at l",
-        ),
+        (WHOLE, {"candidates": 9}, r"MiningConfig\.candidates: found 9, expected at l"),
         (WHOLE, {"positive_radius": 30.0}, r"positive_radius: found 30.0, expected metres above 0"),
         (WHOLE, {"margin": -1.0}, r"MiningConfig\.margin: found -1.0"),
+        (CONFIG, {"images_per_place": 5}, "images_per_place: found 5, expected 4 with mined tup"),
+        (CONFIG, {"mining": MiningConfig()}, "kind: found 'none', expected 'whole' or 'sample'"),
         (
-            CONFIG,
-            {"images_per_place": 5},
-            r"images_per_place: found 5, expected 4 with mined tuples",
-        ),
-        (
-            CONFIG,
-            {"mining": MiningConfig()},
-            "kind: found 'none', expected 'whole' or 'sample'",
+            dataclasses.replace(CONFIG, loss=recipe("tiny", "crisalad").loss),
+            {"loss": recipe("tiny", "cosplace").loss},
+            "kind: found 'whole', expected 'none' for loss large-m",
         ),
     ],
 )
 def test_a_configuration_that_does_not_fit_is_refused(config, changes, message):
     with pytest.raises(InputError, match=message):
         dataclasses.replace(config, **changes)
-
-
-def test_a_loss_of_classes_takes_no_tuples():
-    classes = recipe("tiny", "cosplace").loss
-    with pytest.raises(InputError, match="kind: found 'whole', expected 'none' for loss large-m"):
-        TrainConfig(loss=classes, mining=MiningConfig(kind="whole"), images_per_place=12)
