@@ -227,12 +227,6 @@ class TrainConfig:
         return self.mining.kind != "none"
 
     @property
-    def validation_model(self) -> ModelConfig:
-        """The model as validations describe with it."""
-        size = self.validation_size
-        return self.model if size is None else dataclasses.replace(self.model, image_size=size)
-
-    @property
     def min_images_of_place(self) -> int:
         """Smallest number of images of a place; 1 where images are regrouped to classes."""
         grouping = self.loss.kind.grouping

@@ -24,6 +24,7 @@ from crisalad_jax.data.loader import THREADS, ImageCache
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad, init_crisalad
+from crisalad_jax.training import distributed
 from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.mining import Miner
@@ -38,7 +39,6 @@ from crisalad_jax.training.run_files import (
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.training.trainer import LossNotFiniteError, Trainer, run_keys
 from crisalad_jax.training.validation import Validator
-from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError, Interrupted
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import Bar, progress_bar

@@ -20,11 +20,11 @@ from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad, Model
+from crisalad_jax.training import distributed
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog
 from crisalad_jax.training.mining import Mined
 from crisalad_jax.training.step import TrainState
-from crisalad_jax.utils import distributed
 from crisalad_jax.utils.files import read_json, wrap_os_errors, write_json
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remove_temporaries

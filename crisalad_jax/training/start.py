@@ -12,9 +12,9 @@ from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
+from crisalad_jax.training import distributed
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.vocabulary import with_vocabulary
-from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 

@@ -25,6 +25,7 @@ from crisalad_jax.nn.model import (
 )
 from crisalad_jax.nn.pixels import check_pixels
 from crisalad_jax.nn.tokens import TransportStatistics
+from crisalad_jax.training import distributed
 from crisalad_jax.training.classifier import Classifiers, init_classifiers, update_classifiers
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig, LossResult, metric_loss, tuple_pairs
@@ -36,7 +37,7 @@ from crisalad_jax.training.optimiser import (
     warn_of_long_warmup,
 )
 from crisalad_jax.training.trainable import split_params
-from crisalad_jax.utils import compiler, devices, distributed
+from crisalad_jax.utils import compiler, devices
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 

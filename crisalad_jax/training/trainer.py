@@ -13,6 +13,7 @@ from jaxtyping import PRNGKeyArray, PyTree
 
 from crisalad_jax.data.loader import ImageBatch, one_ahead
 from crisalad_jax.nn.model import Crisalad, cast_params
+from crisalad_jax.training import distributed
 from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.mining import Miner
@@ -25,7 +26,6 @@ from crisalad_jax.training.step import (
     train_step,
 )
 from crisalad_jax.training.trainable import merge_params, shards_batch
-from crisalad_jax.utils import distributed
 from crisalad_jax.utils.devices import Devices, devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
