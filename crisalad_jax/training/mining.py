@@ -108,11 +108,11 @@ class Miner:
             if candidates is None:
                 candidates = np.union1d(drawn(), last[last >= 0])
             candidates = np.setdiff1d(candidates, queries.near[query], assume_unique=True)
-            distances = (
+            to_positives, to_candidates = (
                 _distances(descriptor, database[np.searchsorted(described, images)])
                 for images in (queries.positives[query], candidates)
             )
-            images, role = self._tuple(int(query), candidates, *distances)
+            images, role = self._tuple(int(query), candidates, to_positives, to_candidates)
             if (role == Role.NEGATIVE).any():
                 hardest[query] = np.where(role == Role.NEGATIVE, images, -1)[2:]
             tuples.append(images)
