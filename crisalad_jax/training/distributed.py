@@ -140,11 +140,6 @@ def _check_port(address: str) -> None:
         ) from error
 
 
-def are_several() -> bool:
-    """Return whether the run has several processes."""
-    return jax.process_count() > 1
-
-
 def is_primary() -> bool:
     """Return whether this process is the one that reads and writes the run's folder."""
     return jax.process_index() == 0

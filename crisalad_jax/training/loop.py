@@ -267,7 +267,7 @@ class _Loop:
         images until all know it.
         """
         step, per_round = self.files.record.step, self.data.steps_per_round
-        every = STATUS_STEPS if distributed.are_several() else 1
+        every = STATUS_STEPS if jax.process_count() > 1 else 1
         error: Exception | None = None
 
         def attempt(work: Callable[[], _T]) -> _T | None:

@@ -48,7 +48,7 @@ def conv_ap(model: ModelConfig, preset: str) -> TrainConfig:
             *(model, preset, ResNetConfig(), "conv-ap"),
             image_size=(320, 320),
             compute_dtype="bfloat16",
-            filter="bicubic",
+            filter="bilinear" if preset == "tiny" else "bicubic",
         ),
         optimiser=OptimiserConfig(
             learning_rate=2e-4,
