@@ -117,8 +117,9 @@ class Miner:
                 hardest[query] = np.where(role == Role.NEGATIVE, images, -1)[2:]
             tuples.append(images)
             roles.append(role)
-        arrays = (np.array(each, np.int32) for each in (step, tuples, roles))
-        self.mined = Mined(*arrays, hardest)
+        self.mined = Mined(
+            np.array(step, np.int32), np.array(tuples, np.int32), np.array(roles, np.int32), hardest
+        )
         hard = (self.mined.roles == Role.NEGATIVE).sum(axis=1)
         unreadable = sum(int(np.isnan(rows).any(axis=1).sum()) for rows in (database, asked))
         left_out = f"; {unreadable} unreadable images left out" if unreadable else ""
