@@ -162,7 +162,7 @@ def defaults(arguments: Sequence[str]) -> TrainConfig:
 def run(arguments: Train) -> dict[str, Any] | None:
     """Train the model, and print how the run ended."""
     from crisalad_jax.experiments.train import train
-    from crisalad_jax.utils import distributed
+    from crisalad_jax.training import distributed
 
     which = arguments.num_processes, arguments.process_id, arguments.local_device_ids
     if arguments.coordinator_address is not None:

@@ -219,4 +219,5 @@ def _require_each(
     for name in names:
         value = getattr(config, name)
         where = f"{type(config).__name__}.{name}"
-        require(is_fit(value), f"{where}: found {value}, expected {expected}")
+        # Where None is a value, it stands for no limit.
+        require(value is None or is_fit(value), f"{where}: found {value}, expected {expected}")

@@ -42,8 +42,7 @@ class ClassesConfig:
         check_types(self)
         require_positive(self, "groups", "cell", "sector", "spacing", "sector_spacing")
         require_positive(self, "focal_distance", "view_angle")
-        if self.steps is not None:
-            require_positive(self, "steps")
+        require_positive(self, "steps")
         turn = self.sector * self.sector_spacing
         require(
             360 % turn == 0,

@@ -11,12 +11,12 @@ from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.data.query_set import QuerySet, read_query_set
 from crisalad_jax.experiments.report import save, training_curves
+from crisalad_jax.training import distributed
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import FitResult, check_learns, fit
 from crisalad_jax.training.run_files import check_run
 from crisalad_jax.training.start import read_start, with_vocabulary_of
-from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError
 
 Path = str | os.PathLike[str]

@@ -72,9 +72,7 @@ class OptimiserConfig:
         """Check the ranges of the fields."""
         check_types(self)
         require_positive(self, "learning_rate", "step_epochs", "step_gamma", "accumulate")
-        for name in ("decay_steps", "clip_norm", "clip_value"):
-            if getattr(self, name) is not None:
-                require_positive(self, name)
+        require_positive(self, "decay_steps", "clip_norm", "clip_value")
         names = "end_lr_fraction", "warmup_steps", "warmup_epochs", "weight_decay"
         require_range(self, 0, math.inf, *names)
         require_fraction(self, "b1", "b2", "momentum")
@@ -127,9 +125,7 @@ class MiningConfig:
         if self.kind == "none":
             return
         require_positive(self, "negatives", "candidates", "queries_per_round")
-        for name in ("queries_per_epoch", "margin"):
-            if getattr(self, name) is not None:
-                require_positive(self, name)
+        require_positive(self, "queries_per_epoch", "margin")
         require_range(self, self.negatives, math.inf, "candidates")
         fits = 0 < self.positive_radius <= self.negative_radius < math.inf
         most = f"negative_radius ({self.negative_radius})"
@@ -198,9 +194,8 @@ class TrainConfig:
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
         resolve_names(self)
-        require_positive(
-            self, "places_per_batch", "images_per_place", "epochs", "validate_every", "save_top_k"
-        )
+        require_positive(self, "places_per_batch", "images_per_place", "epochs")
+        require_positive(self, "validate_every", "save_top_k", "patience")
         loss, images, accumulate = self.loss.kind, self.images_per_place, self.optimiser.accumulate
         batch, size = self.places_per_batch * images, 2 + self.mining.negatives
         is_tuple = images == size or not self.mines
@@ -222,8 +217,6 @@ class TrainConfig:
             (self, "trainable", adapts, "head, last-N-blocks+head or all without adapters"),
         ):
             require_field(config, name, fits, expected)
-        if self.patience is not None:
-            require_positive(self, "patience")
         if self.validation_size is not None:
             self.model.check_image_size(self.validation_size)
         check_seed("TrainConfig.seed", self.seed)
@@ -232,12 +225,6 @@ class TrainConfig:
     def mines(self) -> bool:
         """Whether it trains on tuples that are mined, and not on places."""
         return self.mining.kind != "none"
-
-    @property
-    def validation_model(self) -> ModelConfig:
-        """The model as validations describe with it."""
-        size = self.validation_size
-        return self.model if size is None else dataclasses.replace(self.model, image_size=size)
 
     @property
     def min_images_of_place(self) -> int:

@@ -23,7 +23,8 @@ from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.loader import THREADS, ImageCache
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Crisalad, init_crisalad
+from crisalad_jax.training import distributed
 from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.mining import Miner
@@ -31,13 +32,13 @@ from crisalad_jax.training.run_files import (
     RunFiles,
     RunRecord,
     RunState,
+    checksum,
     checksum_of_benchmark,
     checksum_of_places,
 )
 from crisalad_jax.training.trainable import count_trainable
-from crisalad_jax.training.trainer import LossNotFiniteError, Trainer
+from crisalad_jax.training.trainer import LossNotFiniteError, Trainer, run_keys
 from crisalad_jax.training.validation import Validator
-from crisalad_jax.utils import distributed
 from crisalad_jax.utils.errors import InputError, Interrupted
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import Bar, progress_bar
@@ -120,22 +121,24 @@ def fit(
     check_learns(config)
     threads = THREADS if num_threads is None else num_threads
     require(threads >= 0, f"num_threads: found {threads}, expected at least 0")
-    # What does not fit raises in all processes, before the first file is written.
+    if initial is None:
+        initial = init_crisalad(run_keys(config.seed)[0], config.model)
     checksums = {
         "places": checksum_of_places(places),
         "validation": 0 if validation is None else checksum_of_benchmark(validation),
+        "weights": checksum(jax.tree.leaves(initial)),
     }
+    # What does not fit raises in all processes, before the first file is written.
     configuration = zlib.crc32(json.dumps(to_plain(config)).encode())
-    arguments = {"configuration": configuration, "--shard-state": int(shard_state)}
-    for what, number in (checksums | arguments).items():
-        distributed.check_same(what, number)
+    distributed.check_same(
+        {"configuration": configuration, "--shard-state": shard_state, **checksums}
+    )
     cache = ImageCache()
     part = jax.process_index(), jax.process_count()
     reading = {"part": part, "on_bad_image": on_bad_image, "threads": threads, "cache": cache}
     data = _open_data(config, places, **reading)
     trainer = Trainer(config, data, initial, shard_state=shard_state)
-    checksums["weights"] = trainer.initial_checksum
-    distributed.check_same("weights", checksums["weights"])
+    del initial  # the trainer has copied what it needs
     record = RunRecord(checksums, {name: [*source] for name, source in sources_of(config).items()})
     files = RunFiles(pathlib.Path(out), config, record)
     validator = Validator(config, validation, on_bad_image=on_bad_image, cache=cache)
@@ -264,7 +267,7 @@ class _Loop:
         images until all know it.
         """
         step, per_round = self.files.record.step, self.data.steps_per_round
-        every = STATUS_STEPS if distributed.are_several() else 1
+        every = STATUS_STEPS if jax.process_count() > 1 else 1
         error: Exception | None = None
 
         def attempt(work: Callable[[], _T]) -> _T | None:
@@ -358,6 +361,6 @@ class _Loop:
 
         def save() -> None:
             state = RunState(self.trainer.gather(), self.data.mined)
-            self.files.save(state, self.trainer.params())
+            self.files.save(state, self.trainer.params)
 
         distributed.raise_together(save)

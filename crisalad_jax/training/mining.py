@@ -10,17 +10,17 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int, Int32, Int64
+from jaxtyping import Float, Int, Int32
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.data.loader import ImageBatch, batches_of_groups
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.training.batches import prepared_as
-from crisalad_jax.training.config import MiningConfig, TrainConfig
+from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.losses.pairs import Role, tuple_labels
-from crisalad_jax.utils.errors import InputError
 
-Describe = Callable[[Int[np.ndarray, " n"]], Float[np.ndarray, "n descriptor"]]
-"""Takes image numbers; returns their descriptors, NaN for images that cannot be read."""
+Describe = Callable[[Sequence[pathlib.Path]], Float[np.ndarray, "n descriptor"]]
+"""Takes image files; returns their descriptors, NaN for images that cannot be read."""
 
 
 class Mined(NamedTuple):
@@ -41,64 +41,112 @@ class Miner:
     classes: tuple[int, ...] = ()
 
     def __init__(self, config: TrainConfig, queries: QuerySet, **reading: Any) -> None:
-        """Divide an epoch into rounds; raises as `rounds_of`.
+        """Divide an epoch into rounds of whole batches.
 
         Args:
             config: the run's.
             queries: the training set.
             **reading: how images are read; see `batches_of_groups`.
+
+        Raises:
+            InputError: the queries make no batch.
         """
         self._config, self._queries = config, queries
         self._reading = prepared_as(config) | reading
-        rounds, self.steps_per_round = rounds_of(config, queries)
+        mining, count = config.mining, len(queries.queries)
+        queries_per_epoch = mining.queries_per_epoch or count
+        rounds = math.ceil(queries_per_epoch / mining.queries_per_round)
+        size = min(queries_per_epoch // rounds, count)
+        self.steps_per_round = size // config.places_per_batch
         self.steps_per_epoch = rounds * self.steps_per_round
-        self.mined = no_tuples(
-            config.mining, queries, self.steps_per_round * config.places_per_batch
+        require(
+            self.steps_per_round > 0,
+            f"{queries.root}: found rounds of {size} queries, of {count} with positives, "
+            f"mining.queries_per_epoch {mining.queries_per_epoch} and queries_per_round "
+            f"{mining.queries_per_round}, expected at least places_per_batch "
+            f"{config.places_per_batch}",
         )
+        tuples = self.steps_per_round * config.places_per_batch
+        none = np.zeros((tuples, config.images_per_place), np.int32)
+        hardest = np.full((count, mining.negatives), -1, np.int32)
+        self.mined = Mined(np.array(-1, np.int32), none, none, hardest)
         """Tuples of the round that trains now, which a run saves with its state."""
 
     def is_due(self, step: int) -> bool:
         """Return whether a round begins with this step, whose tuples are not mined yet."""
         return step % self.steps_per_round == 0 and int(self.mined.step) != step
 
-    def mine(self, step: int, describe: Callable[[Sequence[pathlib.Path]], np.ndarray]) -> str:
-        """Mine the tuples of the round that begins with a step.
+    def mine(self, step: int, describe: Describe) -> str:
+        """Mine a tuple for each query of the round that begins with a step.
 
         Args:
-            step: the first step of the round.
-            describe: takes image files; returns their descriptors by the model as it is, NaN for
-                those that cannot be read.
+            step: the first step of the round; with the seed it draws candidates.
+            describe: describes images by the model as it is.
 
         Returns:
             How hard the tuples are, for the user.
         """
-        config, unreadable = self._config, 0
-        epoch, first = divmod(step, self.steps_per_epoch)
-        chosen = draw_queries(
-            config.mining,
-            len(self._queries.queries),
-            len(self.mined.images),
-            seed=config.seed,
-            epoch=epoch,
-            number=first // self.steps_per_round,
-        )
+        mining, queries = self._config.mining, self._queries
+        chosen = self._draw_queries(step)
+        generator = self._generator(step, key=3)
 
-        def described(images: np.ndarray) -> np.ndarray:
-            nonlocal unreadable
-            rows = describe([self._queries.path(image) for image in images])
-            unreadable += int(np.isnan(rows).any(axis=1).sum())
-            return rows
+        def drawn() -> np.ndarray:
+            count = min(mining.candidates, queries.database)
+            return generator.choice(queries.database, count, replace=False)
 
-        hardest, seed = self.mined.hardest, config.seed
-        self.mined = mine_tuples(
-            config.mining, self._queries, chosen, hardest, described, seed=seed, step=step
+        described, sampled = np.arange(queries.database), None
+        if mining.kind == "sample":
+            sampled = np.sort(drawn())
+            described = np.union1d(sampled, np.concatenate([queries.positives[q] for q in chosen]))
+        database, asked = (
+            describe([queries.path(image) for image in images])
+            for images in (described, queries.queries[chosen])
         )
-        negatives = (self.mined.roles == Role.NEGATIVE).sum(axis=1)
+        tuples, roles, hardest = [], [], self.mined.hardest.copy()
+        for query, descriptor in zip(chosen, asked, strict=True):
+            candidates, last = sampled, hardest[query]
+            if candidates is None:
+                candidates = np.union1d(drawn(), last[last >= 0])
+            candidates = np.setdiff1d(candidates, queries.near[query], assume_unique=True)
+            to_positives, to_candidates = (
+                _distances(descriptor, database[np.searchsorted(described, images)])
+                for images in (queries.positives[query], candidates)
+            )
+            images, role = self._tuple(int(query), candidates, to_positives, to_candidates)
+            if (role == Role.NEGATIVE).any():
+                hardest[query] = np.where(role == Role.NEGATIVE, images, -1)[2:]
+            tuples.append(images)
+            roles.append(role)
+        self.mined = Mined(
+            np.array(step, np.int32), np.array(tuples, np.int32), np.array(roles, np.int32), hardest
+        )
+        hard = (self.mined.roles == Role.NEGATIVE).sum(axis=1)
+        unreadable = sum(int(np.isnan(rows).any(axis=1).sum()) for rows in (database, asked))
         left_out = f"; {unreadable} unreadable images left out" if unreadable else ""
         return (
-            f"mined {len(negatives)} tuples: {100 * (negatives > 0).mean():.0f} % have hard "
-            f"negatives, {negatives.mean():.1f} in the mean{left_out}"
+            f"mined {len(hard)} tuples: {100 * (hard > 0).mean():.0f} % have hard negatives, "
+            f"{hard.mean():.1f} in the mean{left_out}"
         )
+
+    def _tuple(
+        self,
+        query: int,
+        candidates: Int[np.ndarray, " candidate"],
+        to_positives: Float[np.ndarray, " positive"],
+        to_candidates: Float[np.ndarray, " candidate"],
+    ) -> tuple[Int[np.ndarray, " image"], Int[np.ndarray, " image"]]:
+        """Make a query's tuple by its distances; return its images and their roles."""
+        mining, queries = self._config.mining, self._queries
+        nearest = to_positives.argmin()
+        positive = queries.positives[query][nearest]
+        farthest = np.inf if mining.margin is None else to_positives[nearest] + mining.margin
+        order = np.argsort(to_candidates, kind="stable")[: mining.negatives]
+        images = np.full(2 + mining.negatives, positive)  # which fills what candidates do not
+        roles = np.full(len(images), Role.SPARE)
+        images[0], roles[:2] = queries.queries[query], (Role.QUERY, Role.POSITIVE)
+        images[2:][: len(order)] = candidates[order]
+        roles[2:][: len(order)][to_candidates[order] < farthest] = Role.NEGATIVE
+        return images, roles
 
     def batches(self, step: int) -> Iterator[ImageBatch]:
         """Yield the batches from `step` to the end of its round; see `batches_of_groups`."""
@@ -113,126 +161,19 @@ class Miner:
             **self._reading,
         )
 
+    def _draw_queries(self, step: int) -> Int[np.ndarray, " tuple"]:
+        """Draw positions of a round's queries: those whose turn it is, or any of all."""
+        count, size = len(self._queries.queries), len(self.mined.images)
+        epoch, first = divmod(step, self.steps_per_epoch)
+        number = first // self.steps_per_round
+        if self._config.mining.queries_per_epoch is not None:
+            return self._generator(epoch, number).choice(count, size, replace=False)
+        return self._generator(epoch).permutation(count)[number * size :][:size]
 
-def rounds_of(config: TrainConfig, queries: QuerySet) -> tuple[int, int]:
-    """Divide an epoch into rounds of whole batches.
-
-    Returns:
-        (rounds, steps of each).
-
-    Raises:
-        InputError: the queries make no batch.
-    """
-    mining = config.mining
-    queries_per_epoch = mining.queries_per_epoch or len(queries.queries)
-    rounds = math.ceil(queries_per_epoch / mining.queries_per_round)
-    size = min(queries_per_epoch // rounds, len(queries.queries))
-    steps = size // config.places_per_batch
-    if not steps:
-        raise InputError(
-            f"{queries.root}: found rounds of {size} queries, of {len(queries.queries)} with "
-            f"positives, mining.queries_per_epoch {mining.queries_per_epoch} and queries_per_round "
-            f"{mining.queries_per_round}, expected at least places_per_batch "
-            f"{config.places_per_batch}"
-        )
-    return rounds, steps
-
-
-def no_tuples(config: MiningConfig, queries: QuerySet, size: int) -> Mined:
-    """Return what a run has before its first round, in the shapes of a round of `size` tuples."""
-    none = np.zeros((size, 2 + config.negatives), np.int32)
-    hardest = np.full((len(queries.queries), config.negatives), -1, np.int32)
-    return Mined(np.array(-1, np.int32), none, none, hardest)
-
-
-def draw_queries(
-    config: MiningConfig,
-    queries: int,
-    size: int,
-    *,
-    seed: int,
-    epoch: int,
-    number: int,
-) -> Int64[np.ndarray, " tuple"]:
-    """Draw the queries of a round: those that are its turn, or `size` of all.
-
-    Args:
-        config: the mining's.
-        queries: how many there are.
-        size: number of tuples of a round.
-        seed: draws them, with the epoch and the round.
-        epoch: from 0.
-        number: of the round in its epoch, from 0.
-
-    Returns:
-        Positions of the queries.
-    """
-    if config.queries_per_epoch is not None:
-        return _generator(seed, epoch, number).choice(queries, size, replace=False)
-    start = number * size
-    return _generator(seed, epoch).permutation(queries)[start : start + size]
-
-
-def mine_tuples(
-    config: MiningConfig,
-    queries: QuerySet,
-    chosen: Int64[np.ndarray, " tuple"],
-    hardest: Int32[np.ndarray, "query negative"],
-    describe: Describe,
-    *,
-    seed: int,
-    step: int,
-) -> Mined:
-    """Mine a tuple for each chosen query.
-
-    Args:
-        config: the mining's.
-        queries: the training set.
-        chosen: positions of the queries.
-        hardest: last negatives of each query.
-        describe: makes descriptors.
-        seed: draws candidates, with the step.
-        step: first step of the round.
-
-    Returns:
-        The tuples, and the last negatives after them.
-    """
-    generator = _generator(seed, step, key=3)
-    count = min(config.candidates, queries.database)
-    if config.kind == "sample":
-        sampled = np.sort(generator.choice(queries.database, count, replace=False))
-        of_queries = np.concatenate([queries.positives[query] for query in chosen])
-        described = np.union1d(sampled, of_queries)
-    else:
-        sampled, described = None, np.arange(queries.database)
-    database, asked = describe(described), describe(queries.queries[chosen])
-    tuples, roles, hardest = [], [], hardest.copy()
-    for query, descriptor in zip(chosen, asked, strict=True):
-        candidates = sampled
-        if candidates is None:
-            drawn = generator.choice(queries.database, count, replace=False)
-            candidates = np.union1d(drawn, hardest[query][hardest[query] >= 0])
-        candidates = np.setdiff1d(candidates, queries.near[query], assume_unique=True)
-        positives = queries.positives[query]
-        to_positive, to_negative = (
-            _distances(descriptor, database[np.searchsorted(described, images)])
-            for images in (positives, candidates)
-        )
-        nearest = to_positive.argmin()
-        order = np.argsort(to_negative, kind="stable")[: config.negatives]
-        farthest = np.inf if config.margin is None else to_positive[nearest] + config.margin
-        used = to_negative[order] < farthest
-        negatives = np.full(config.negatives, positives[nearest])
-        negatives[: len(order)] = candidates[order]
-        role = np.full(config.negatives, Role.SPARE)
-        role[: len(order)][used] = Role.NEGATIVE
-        if used.any():
-            hardest[query] = np.where(role == Role.NEGATIVE, negatives, -1)
-        tuples.append((queries.queries[query], positives[nearest], *negatives))
-        roles.append((Role.QUERY, Role.POSITIVE, *role))
-    return Mined(
-        np.array(step, np.int32), np.array(tuples, np.int32), np.array(roles, np.int32), hardest
-    )
+    def _generator(self, *numbers: int, key: int = 2) -> np.random.Generator:
+        # The spawn key makes these streams independent of the loader's from the same numbers.
+        numbers = self._config.seed, *numbers
+        return np.random.default_rng(np.random.SeedSequence(numbers, spawn_key=(key,)))
 
 
 def _distances(
@@ -241,8 +182,3 @@ def _distances(
     """Compute Euclidean distances; infinite to images that cannot be read."""
     squares = (others * others).sum(axis=1) + descriptor @ descriptor - 2 * (others @ descriptor)
     return np.nan_to_num(np.sqrt(np.maximum(squares, 0)), nan=np.inf)
-
-
-def _generator(*numbers: int, key: int = 2) -> np.random.Generator:
-    # The spawn key makes these streams independent of the loader's from the same numbers.
-    return np.random.default_rng(np.random.SeedSequence(numbers, spawn_key=(key,)))

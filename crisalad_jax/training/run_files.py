@@ -6,7 +6,7 @@ import dataclasses
 import pathlib
 import time
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,11 +20,11 @@ from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad, Model
+from crisalad_jax.training import distributed
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog
 from crisalad_jax.training.mining import Mined
 from crisalad_jax.training.step import TrainState
-from crisalad_jax.utils import distributed
 from crisalad_jax.utils.files import read_json, wrap_os_errors, write_json
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remove_temporaries
@@ -157,14 +157,14 @@ class RunFiles:
         """Return whether the last saved state is old, by the primary process's clock."""
         return distributed.is_primary() and time.monotonic() - self._saved_at > SAVE_SECONDS
 
-    def save(self, state: RunState, params: Crisalad) -> None:
+    def save(self, state: RunState, params: Callable[[], Crisalad]) -> None:
         """Write the weights and the state, unless they are saved already.
 
-        The state is written while training goes on.
+        The state is written while training goes on. Only what is written asks for `params`.
         """
         if distributed.is_primary() and self._saved != self.record:
             with wrap_os_errors(self.out):
-                save_weights(self.out / "last.safetensors", Model(params, self._config.model))
+                save_weights(self.out / "last.safetensors", Model(params(), self._config.model))
                 self._states.save(self.record.step, state, dataclasses.asdict(self.record))
                 self._drop_old_best()
             self._saved = copy.deepcopy(self.record)

@@ -12,9 +12,9 @@ from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
+from crisalad_jax.training import distributed
 from crisalad_jax.training.config import TrainConfig
-from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
-from crisalad_jax.utils import distributed
+from crisalad_jax.training.vocabulary import with_vocabulary
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 
@@ -86,7 +86,7 @@ def with_vocabulary_of(
     Raises:
         InputError: what `with_vocabulary` raises.
     """
-    if not needs_vocabulary(config.model):
+    if not config.model.aggregator.starts_from_centroids:
         return initial
     if initial is None:
         initial = init_crisalad(jax.random.key(config.seed), config.model)

@@ -25,6 +25,7 @@ from crisalad_jax.nn.model import (
 )
 from crisalad_jax.nn.pixels import check_pixels
 from crisalad_jax.nn.tokens import TransportStatistics
+from crisalad_jax.training import distributed
 from crisalad_jax.training.classifier import Classifiers, init_classifiers, update_classifiers
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig, LossResult, metric_loss, tuple_pairs
@@ -36,8 +37,9 @@ from crisalad_jax.training.optimiser import (
     warn_of_long_warmup,
 )
 from crisalad_jax.training.trainable import split_params
-from crisalad_jax.utils import compiler, devices, distributed
+from crisalad_jax.utils import compiler, devices
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.pytree import named_leaves
 
 WHOLE_LOSS = 1024
 """Most images whose loss every device computes whole, at most a hundredth of a step's work
@@ -81,13 +83,7 @@ class Metrics(NamedTuple):
 
 def named_scalars(values: Metrics | TransportStatistics) -> dict[str, float]:
     """List scalars by name, those of the transport among them; None is left out."""
-    numbers: dict[str, float] = {}
-    for name, value in values._asdict().items():
-        if isinstance(value, TransportStatistics):
-            numbers |= named_scalars(value)
-        elif value is not None:
-            numbers[name] = float(value)
-    return numbers
+    return {name.rpartition(".")[2]: float(leaf) for name, leaf in named_leaves(values).items()}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,14 +9,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import PRNGKeyArray, PyTree
 
 from crisalad_jax.data.loader import ImageBatch, one_ahead
-from crisalad_jax.nn.model import Crisalad, cast_params, init_crisalad
+from crisalad_jax.nn.model import Crisalad, cast_params
+from crisalad_jax.training import distributed
 from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.mining import Miner
-from crisalad_jax.training.run_files import checksum
 from crisalad_jax.training.step import (
     Metrics,
     TrainState,
@@ -26,7 +26,6 @@ from crisalad_jax.training.step import (
     train_step,
 )
 from crisalad_jax.training.trainable import merge_params, shards_batch
-from crisalad_jax.utils import distributed
 from crisalad_jax.utils.devices import Devices, devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
@@ -46,7 +45,7 @@ class Trainer:
         self,
         config: TrainConfig,
         data: PlaceBatches | Miner,
-        initial: Crisalad | None,
+        initial: Crisalad,
         *,
         shard_state: bool,
     ) -> None:
@@ -69,13 +68,9 @@ class Trainer:
             classes=data.classes,
             shard_over=mesh if shard_state else None,
         )
-        init_key, self._step_key = jax.random.split(jax.random.key(config.seed))
-        # Folds in 2, because folding in 0 or 1 may repeat the keys of the split above.
-        classifiers_key = jax.random.fold_in(jax.random.key(config.seed), 2)
-        params = init_crisalad(init_key, config.model) if initial is None else initial
-        self.initial_checksum = checksum(jax.tree.leaves(params))
+        _, self._step_key, classifiers_key = run_keys(config.seed)
         self.state, frozen = init_train_state(
-            params, config.trainable, self._step_config, key=classifiers_key
+            initial, config.trainable, self._step_config, key=classifiers_key
         )
         self._frozen: PyTree = jax.device_get(frozen)
         self._frozen_on_devices = self._devices.replicate(cast_params(self._frozen, config.model))
@@ -85,13 +80,13 @@ class Trainer:
         """Metrics of the steps that the devices may still be computing, number of their images, and
         seconds of waiting for these."""
         self._finished_at = 0.0
-        self._params: Crisalad | None = None
+        self._gathered: TrainState | None = None
         distributed.raise_together(self._check_memory)
 
     def resume(self, state: TrainState) -> None:
         """Go on from a state, which has to be the same in all processes."""
         # Copied, because a step donates the buffers of its state.
-        self.state, self._params = _copied(self._place(state)), None
+        self.state, self._gathered = _copied(self._place(state)), None
 
     def on_devices(self, batches: Iterator[ImageBatch]) -> Generator[Batch, None, None]:
         """Yield batches on the devices, each copied while they compute the one before."""
@@ -110,7 +105,7 @@ class Trainer:
         """
         if not self._running:
             self._finished_at = time.monotonic() - waited
-        batch, self._params = batch or self._no_images(), None
+        batch, self._gathered = batch or self._no_images(), None
         arguments = self.state, self._frozen_on_devices, *batch, self._step_key, self._step_config
         self.state, metrics = train_step(*arguments, self._proceed)
         self._proceed = metrics.updated
@@ -153,16 +148,15 @@ class Trainer:
             }
 
     def gather(self) -> TrainState:
-        """Gather the state; all processes call it together."""
-        return self._devices.gather(self.state)
+        """Gather the state; all processes call it together, and then any may call it again."""
+        if self._gathered is None:
+            self._gathered = self._devices.gather(self.state)
+        return self._gathered
 
     def params(self) -> Crisalad:
-        """Join the whole model in float32; all processes call it together."""
-        if self._params is None:
-            trainable = self._devices.gather(self.state.trainable)
-            frozen = jax.tree.map(jnp.asarray, self._frozen)
-            self._params = merge_params(trainable, frozen, self._config.model)
-        return self._params
+        """Join the whole model in float32; without a `gather` before, all processes call it."""
+        frozen = jax.tree.map(jnp.asarray, self._frozen)
+        return merge_params(self.gather().trainable, frozen, self._config.model)
 
     def _batch(self, *parts: np.ndarray) -> Batch:
         images, labels, valid = map(self._devices.shard_batch, parts)
@@ -198,6 +192,13 @@ class Trainer:
                 f"{self._config.micro_batch}), --model.compute-dtype bfloat16, --model.remat full, "
                 "--shard-state, a smaller image or model, or more devices"
             )
+
+
+def run_keys(seed: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
+    """Make the keys that draw a run's first parameters, its dropout, and its classifiers."""
+    key = jax.random.key(seed)
+    # Folds in 2, because folding in 0 or 1 may repeat the keys of the split.
+    return *jax.random.split(key), jax.random.fold_in(key, 2)
 
 
 @jax.jit

@@ -59,7 +59,8 @@ class Validator:
         if benchmark is not None:
             benchmark.ground_truth()
         self._config, self._benchmark = config, benchmark
-        self._model = config.validation_model
+        size = config.validation_size or config.model.image_size
+        self._model = dataclasses.replace(config.model, image_size=size)
         self._reading = Reading(on_bad_image=on_bad_image, cache=cache, quiet=True)
 
     @property

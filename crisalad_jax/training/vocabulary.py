@@ -45,11 +45,6 @@ _ROUNDS = 100
 """Number of rounds of k-means, which converges earlier."""
 
 
-def needs_vocabulary(config: ModelConfig) -> bool:
-    """Return whether a model needs centroids before it is of use, or trains."""
-    return config.aggregator.starts_from_centroids
-
-
 def with_vocabulary(
     model: Model,
     paths: Sequence[pathlib.Path],
@@ -260,7 +255,7 @@ def vocabulary_words(config: ModelConfig) -> str:
 def _check_vocabulary(config: ModelConfig) -> None:
     has_one = [name for name in AGGREGATORS if AGGREGATORS.make(name).starts_from_centroids]
     require(
-        needs_vocabulary(config),
+        config.aggregator.starts_from_centroids,
         f"aggregator: found {config.aggregator.part_name}, which has no vocabulary, expected "
         f"one that starts from centroids: {', '.join(has_one)}",
     )
@@ -294,7 +289,7 @@ def _k_means(
     features: Float[np.ndarray, "feature dim"], clusters: int, seed: int, *, spherical: bool
 ) -> Float32[np.ndarray, "cluster dim"]:
     """Return the means of clusters; with `spherical` of those nearest by the angle."""
-    import faiss as _faiss  # imported here: `needs_vocabulary` does without it
+    import faiss as _faiss  # imported here: most of training does without it
 
     faiss: Any = _faiss
     kmeans = faiss.Kmeans(

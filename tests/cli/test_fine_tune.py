@@ -42,7 +42,7 @@ def test_the_model_is_the_files_and_the_training_the_recipes(flags, trainable, l
     assert config.model == STARTER
     assert config.model.image_size == (192, 256)
     assert config.model.preprocessing.normalisation == "local-contrast"
-    assert config.validation_model == STARTER  # and not the size that the recipe's code takes
+    assert config.validation_size is None  # and not the size that the recipe's code takes
     assert (config.trainable, config.optimiser.learning_rate) == (trainable, learning_rate)
 
 

@@ -59,17 +59,6 @@ def sizes(model: ModelConfig) -> list[tuple[int, int]]:
     return found
 
 
-OWN_RECIPES = tuple(RECIPES)
-"""Those of this package: other tests register more later."""
-
-
-def test_every_recipe_is_here() -> None:
-    """A new one comes by itself; equal models are traced once."""
-    every = {recipe("b14", name).model for name in OWN_RECIPES}
-    here = {dataclasses.replace(model, compute_dtype="float32") for model in MODELS.values()}
-    assert {dataclasses.replace(model, compute_dtype="float32") for model in every} <= here
-
-
 @ACCELERATORS
 @pytest.mark.parametrize(
     "name",

@@ -1,9 +1,6 @@
 """Batch norms in training: CricaVPR's step, statistics in the state, files and several devices."""
 
 import dataclasses
-import os
-import subprocess
-import sys
 
 import equinox as eqx
 import jax
@@ -21,11 +18,12 @@ from crisalad_jax.training.loop import fit
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.training.step import StepConfig, init_train_state, train_step
-from crisalad_jax.training.trainable import count_trainable, merge_params
+from crisalad_jax.training.trainable import count_trainable, merge_params, split_params
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import MODEL as TESTS_MODEL
 from tests.conftest import RECIPE, assert_equal, random_params
 from tests.nn.test_model import pictures
+from tests.training.programs import run_on_devices
 from tests.training.test_loop import Interrupted, fail_at
 
 # Of 64 the multi-resolution adapter's narrow convolutions have 4 channels.
@@ -73,6 +71,10 @@ def test_the_state_holds_the_statistics_and_no_moments_of_them() -> None:
     assert statistics(state.trainable)
     assert not statistics(frozen)
     assert not statistics(state.optimiser)
+    for trainable in ("adapters+head", "last-1-blocks+head", "all"):
+        chosen, _ = split_params(PARAMS, MODEL, trainable)
+        assert not statistics(chosen)
+        assert any(".adapter.branch1.norm.weight" in name for name in named_leaves(chosen))
     # What counts as trained are the parameters that a gradient moves.
     sizes = sum(x.size for x in jax.tree.leaves(state.trainable))
     measured = sum(x.size for x in statistics(state.trainable).values())
@@ -160,6 +162,4 @@ np.testing.assert_allclose(metrics.loss, alone.loss, rtol=1e-5)
 @pytest.mark.slow
 def test_devices_share_the_statistics_of_the_whole_batch() -> None:
     """Two devices give the step of one, up to the order of sums."""
-    flags = "--xla_backend_optimization_level=0 --xla_force_host_platform_device_count=2"
-    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
-    subprocess.run([sys.executable, "-c", DEVICES], env=environment, check=True)
+    run_on_devices(2, DEVICES)

@@ -1,10 +1,7 @@
 """Training by classification: the classifiers' steps, what a step trains, and whole runs."""
 
 import dataclasses
-import os
 import pathlib
-import subprocess
-import sys
 
 import jax
 import jax.numpy as jnp
@@ -31,9 +28,9 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import MODEL, RECIPE, assert_equal, random_params
 from tests.nn.test_model import pictures
+from tests.training.programs import run_on_devices
 from tests.training.test_loop import Interrupted, assert_same_params, assert_same_run, fail_at
 
-ROOT = pathlib.Path(__file__).parents[2]
 # Eight places make two groups of four classes; two steps of three classes each pass over a group
 # more than once. Four epochs train the groups in turn.
 CONFIG = dataclasses.replace(
@@ -252,18 +249,7 @@ SPREAD = dataclasses.replace(
 
 @pytest.mark.slow
 def test_devices_do_not_change_a_run(shared: pathlib.Path, tmp_path: pathlib.Path):
-    done = subprocess.run(
-        [sys.executable, "-c", DEVICES, str(shared), str(tmp_path)],
-        cwd=ROOT,
-        env={
-            **os.environ,
-            "JAX_NUM_CPU_DEVICES": "3",
-            "XLA_FLAGS": "--xla_backend_optimization_level=0",
-        },
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    run_on_devices(3, DEVICES, shared, tmp_path)
     one, *others = (
         [line["loss"] for line in read_metrics(tmp_path / name / "metrics.jsonl")]
         for name in ("1", "2", "3", "split")

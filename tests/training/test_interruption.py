@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from tests.conftest import RECIPE
+from tests.training.programs import ROOT
 from tests.training.test_loop import metrics_of
 
-ROOT = pathlib.Path(__file__).parents[2]
 EPOCHS = 4
 CONFIG = dataclasses.replace(RECIPE, epochs=EPOCHS, patience=None, save_top_k=2)
 PROGRAM = """
@@ -84,10 +84,13 @@ def start(shared: pathlib.Path, tmp_path_factory):
 def whole(start, tmp_path_factory) -> pathlib.Path:
     """A run that nothing interrupts."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    program = start(out)
+    finish(start(out))
+    return out
+
+
+def finish(program: subprocess.Popen[str]) -> None:
     _, errors = program.communicate()
     assert program.returncode == 0, errors
-    return out
 
 
 def lines_in(out: pathlib.Path) -> int:
@@ -123,9 +126,7 @@ def test_a_signal_saves_first_and_the_same_command_goes_on(start, whole, tmp_pat
     step = metrics_of(out)[-1]["step"]
     assert f"after step {step}; the same command goes on" in said
     assert max(int(path.name) for path in (out / "state").iterdir()) == step
-    program = start(out)
-    _, errors = program.communicate()
-    assert program.returncode == 0, errors
+    finish(start(out))
     assert_same_end(out, whole)
 
 
@@ -148,9 +149,7 @@ def test_a_signal_during_a_validation_does_not_wait_for_its_end(start, whole, tm
     _, errors = program.communicate()
     assert time.monotonic() - began < 50  # the sleep was cut short
     assert program.returncode == 128 + signal.SIGTERM, errors
-    program = start(out)
-    _, errors = program.communicate()
-    assert program.returncode == 0, errors
+    finish(start(out))
     assert_same_end(out, whole)
 
 
@@ -176,7 +175,5 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(
     last = errors.strip().splitlines()[-1]
     assert last.startswith(str(out)), errors
     assert "cannot be written" in last or "cannot write" in last
-    program = start(out)
-    _, errors = program.communicate()
-    assert program.returncode == 0, errors
+    finish(start(out))
     assert_same_end(out, whole)

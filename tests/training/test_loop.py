@@ -90,7 +90,7 @@ def save_steps(config, places, out, params, steps: tuple[int, ...] = (0,)) -> No
     files = RunFiles(out, config, record)
     state = files.load(RunState(state, None))
     for files.record.step in steps:
-        files.save(state, params)
+        files.save(state, lambda: params)
     files.close()
 
 
@@ -122,14 +122,8 @@ def test_a_run_leaves_its_files(run: pathlib.Path, benchmark: Benchmark):
     assert read_config(TrainConfig, run / "config.json") == ENDLESS
     lines = metrics_of(run)
     steps = [line for line in lines if "loss" in line]
-    assert [(line["step"], line["epoch"]) for line in steps] == [
-        (1, 1),
-        (2, 1),
-        (3, 2),
-        (4, 2),
-        (5, 3),
-        (6, 3),
-    ]
+    epochs = [(line["step"], line["epoch"]) for line in steps]
+    assert epochs == [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3), (6, 3)]
     # Linear from 1e-3 to 0 over six steps; float32 keeps seven digits.
     np.testing.assert_allclose(
         [line["learning_rate"] for line in steps], 1e-3 * (1 - np.arange(6) / 6), rtol=1e-6
@@ -506,20 +500,6 @@ def test_a_plan_without_mass_has_no_statistics_and_ends_nothing(
         assert line["marginal_error"] >= 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ({"num_threads": -1}, "num_threads: found -1, expected at least 0"),
-        ({"shard_state": True}, "shard_state: found one device"),
-    ],
-)
-def test_arguments_that_cannot_be_leave_no_folder(tmp_path, places, params, arguments, words):
-    out = tmp_path / "run"
-    with pytest.raises(InputError, match=words):
-        fit(RECIPE, places, out, initial=params, quiet=True, **arguments)
-    assert not out.exists()
-
-
 def test_unreadable_images_are_counted_each_time_they_come_up(tmp_path, city, params):
     places = read_places(city, min_images=2)
     bad = np.arange(0, len(places.files), 5)
@@ -536,12 +516,8 @@ def test_unreadable_images_are_counted_each_time_they_come_up(tmp_path, city, pa
     result = fit(RECIPE, places, tmp_path / "run", initial=params, on_bad_image="skip", quiet=True)
     assert result.skipped_images == expected.sum()
     assert [line["skipped_images"] for line in metrics_of(tmp_path / "run")] == expected.tolist()
-    assert (
-        fit(
-            RECIPE, places, tmp_path / "run", initial=params, on_bad_image="skip", quiet=True
-        ).skipped_images
-        == expected.sum()
-    )
+    again = fit(RECIPE, places, tmp_path / "run", initial=params, on_bad_image="skip", quiet=True)
+    assert again.skipped_images == expected.sum()
 
 
 def test_a_skipped_image_has_no_influence(tmp_path, city, params):
@@ -557,15 +533,22 @@ def test_a_skipped_image_has_no_influence(tmp_path, city, params):
     assert_same_params(*runs)
 
 
-def test_what_does_not_fit_is_found_before_anything_is_written(tmp_path, places, params):
-    for change, words in (
-        ({"trainable": "last-3-blocks+head"}, "last 3 blocks"),
-        ({"places_per_batch": 9}, "8 places"),
-        ({"images_per_place": 4, "min_images": 4}, "images_per_place 4"),
-    ):
-        config = dataclasses.replace(RECIPE, **change)
-        with pytest.raises(InputError, match=words):
-            fit(config, places, tmp_path / "run", initial=params, quiet=True)
+@pytest.mark.parametrize(
+    ("change", "arguments", "words"),
+    [
+        ({"trainable": "last-3-blocks+head"}, {}, "last 3 blocks"),
+        ({"places_per_batch": 9}, {}, "8 places"),
+        ({"images_per_place": 4, "min_images": 4}, {}, "images_per_place 4"),
+        ({}, {"num_threads": -1}, "num_threads: found -1, expected at least 0"),
+        ({}, {"shard_state": True}, "shard_state: found one device"),
+    ],
+)
+def test_what_does_not_fit_is_found_before_anything_is_written(
+    tmp_path, places, params, change, arguments, words
+):
+    config = dataclasses.replace(RECIPE, **change)
+    with pytest.raises(InputError, match=words):
+        fit(config, places, tmp_path / "run", initial=params, quiet=True, **arguments)
     assert not (tmp_path / "run").exists()
 
 

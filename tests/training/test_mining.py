@@ -25,18 +25,12 @@ from crisalad_jax.training.config import MiningConfig, TrainConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.losses import LossConfig, Role, metric_loss, tuple_labels, tuple_pairs
 from crisalad_jax.training.losses.pairwise import SelaVprLoss, TripletConfig
-from crisalad_jax.training.mining import (
-    Mined,
-    Miner,
-    draw_queries,
-    mine_tuples,
-    no_tuples,
-    rounds_of,
-)
+from crisalad_jax.training.mining import Mined, Miner
 from crisalad_jax.training.optimiser import learning_rate_schedule
 from crisalad_jax.training.run_files import checksum_of_places
 from crisalad_jax.utils.errors import InputError
-from tests.conftest import RECIPE, write_picture
+from tests.conftest import RECIPE, assert_equal
+from tests.data.test_query_set import write_street
 from tests.training.test_loop import Interrupted, assert_same_params, fail_at, metrics_of
 
 ROLES = np.array([[0, 1, 2, 2, 2], [0, 1, 2, 3, 3], [0, 1, 3, 3, 3]])
@@ -181,14 +175,30 @@ STREET = line_set([0, 5, 20, 100, 200, 300, 400], [1, 101, 1000])
 LINE = np.array([0.3, 0.1, 0.05, 0.2, 0.9, 0.35, 2.0, 0.0, 0.21, 9.0])
 
 
-def on_the_line(images: np.ndarray) -> np.ndarray:
-    return np.stack([LINE[images], np.zeros(len(images))], axis=1).astype(np.float32)
+def on_the_line(paths: list[pathlib.Path], line: np.ndarray = LINE) -> np.ndarray:
+    numbers = [int(path.stem) for path in paths]
+    return np.stack([line[numbers], np.zeros(len(numbers))], axis=1).astype(np.float32)
 
 
-def mined(config: MiningConfig, describe=on_the_line, before=None, seed=0, step=0) -> Mined:
-    chosen = np.arange(len(STREET.queries))
-    before = no_tuples(config, STREET, len(chosen)).hardest if before is None else before
-    return mine_tuples(config, STREET, chosen, before, describe, seed=seed, step=step)
+def miner_of(mining: MiningConfig, queries: QuerySet = STREET, *, seed=0, batch=1) -> Miner:
+    config = TrainConfig(
+        trainable="head",
+        mining=mining,
+        places_per_batch=batch,
+        images_per_place=2 + mining.negatives,
+        seed=seed,
+    )
+    return Miner(config, queries)
+
+
+def mined(mining: MiningConfig, describe=on_the_line, before=None, seed=0, step=0) -> Mined:
+    """The two tuples of the street, in the order of their queries."""
+    miner = miner_of(mining, seed=seed)
+    if before is not None:
+        miner.mined = miner.mined._replace(hardest=before)
+    miner.mine(2 * step, describe)
+    order = miner.mined.images[:, 0].argsort()
+    return miner.mined._replace(images=miner.mined.images[order], roles=miner.mined.roles[order])
 
 
 @pytest.mark.parametrize("kind", ["whole", "sample"])
@@ -219,10 +229,7 @@ def test_a_negative_at_the_margin_is_none():
     config = MiningConfig(kind="whole", negatives=3, candidates=7, margin=0.5)
     exact = np.array([0.25, 0.25, 9, 0.75, 0.5, 0.7, 2.0, 0.0, 9, 9])
 
-    def describe(images):
-        return np.stack([exact[images], np.zeros(len(images))], axis=1).astype(np.float32)
-
-    found = mined(config, describe)
+    found = mined(config, lambda paths: on_the_line(paths, exact))
     assert found.images[0].tolist() == [7, 0, 4, 5, 3]
     assert found.roles[0].tolist() == [0, 1, 2, 2, 3]  # 3 is at 0.75 = 0.25 + 0.5
 
@@ -259,12 +266,10 @@ def test_too_few_candidates_leave_spare_images():
 
 
 def test_images_that_cannot_be_read_are_no_negatives():
-    def describe(images):
-        rows = on_the_line(images)
-        rows[np.isin(images, (1, 3))] = np.nan
-        return rows
-
-    found = mined(MiningConfig(kind="whole", negatives=3, candidates=7), describe)
+    line = LINE.copy()
+    line[[1, 3]] = np.nan
+    config = MiningConfig(kind="whole", negatives=3, candidates=7)
+    found = mined(config, lambda paths: on_the_line(paths, line))
     assert found.images[0].tolist() == [7, 0, 5, 4, 6]
 
 
@@ -276,40 +281,49 @@ def test_mining_is_that_of_all_distances(kind):
         generator.uniform(0, 2000, 120).tolist(), generator.uniform(0, 2000, 30).tolist()
     )
     descriptors = unit(generator.standard_normal((150, 16)))
-    config = MiningConfig(kind=kind, negatives=5, candidates=120)
-    chosen = generator.permutation(len(queries.queries))
-    start = no_tuples(config, queries, len(chosen)).hardest
-    found = mine_tuples(config, queries, chosen, start, lambda i: descriptors[i], seed=0, step=0)
+    miner = miner_of(MiningConfig(kind=kind, negatives=5, candidates=120), queries)
+    miner.mine(0, lambda paths: descriptors[[int(path.stem) for path in paths]])
     wide = descriptors.astype(np.float64)
-    for query, row in zip(chosen, found.images, strict=True):
+    assert sorted(miner.mined.images[:, 0]) == queries.queries.tolist()
+    for row in miner.mined.images:
         far = np.linalg.norm(wide - wide[row[0]], axis=1)
-        assert row[0] == queries.queries[query]
+        query = queries.queries.tolist().index(row[0])
         assert row[1] == min(queries.positives[query], key=lambda image: far[image])
         others = np.setdiff1d(np.arange(120), queries.near[query])
         assert row[2:].tolist() == sorted(others, key=lambda image: far[image])[:5]
 
 
+def queries_of(miner: Miner, rounds: range) -> list[list[int]]:
+    """The queries of some rounds."""
+    found = []
+    for number in rounds:
+        miner.mine(number * miner.steps_per_round, on_the_line)
+        found.append(miner.mined.images[:, 0].tolist())
+    return found
+
+
 def test_every_query_has_its_turn_in_an_epoch():
-    config = MiningConfig(kind="whole")
-    rounds = [draw_queries(config, 30, 7, seed=1, epoch=2, number=n) for n in range(4)]
-    assert len(set(np.concatenate(rounds).tolist())) == 28
-    again = draw_queries(config, 30, 7, seed=1, epoch=3, number=0)
-    assert again.tolist() != rounds[0].tolist()
-    drawn = dataclasses.replace(config, queries_per_epoch=100)
-    rounds = [draw_queries(drawn, 30, 20, seed=1, epoch=0, number=n) for n in range(5)]
-    assert all(len(set(each.tolist())) == 20 for each in rounds)
-    assert rounds[0].tolist() != rounds[1].tolist()
+    street = line_set([0, 5, 20], [1.0] * 7)
+    turns = MiningConfig(kind="whole", negatives=1, candidates=3, queries_per_round=3)
+    miner = miner_of(turns, street)
+    assert (miner.steps_per_round, miner.steps_per_epoch) == (2, 6)
+    first, second = queries_of(miner, range(3)), queries_of(miner, range(3, 6))
+    assert len(set(itertools.chain(*first))) == len(set(itertools.chain(*second))) == 6
+    assert first != second
+    drawn = queries_of(miner_of(dataclasses.replace(turns, queries_per_epoch=30), street), range(5))
+    assert all(len(set(each)) == len(each) for each in drawn)
+    assert len({tuple(each) for each in drawn}) > 1
 
 
 def test_rounds_of_pitts30k_are_the_codes():
     """Nanne splits n queries into ceil(n / 1,000) parts; pitts30k_train has some 7,320."""
-    config = recipe("b14", "netvlad")
     street = dataclasses.replace(STREET, queries=np.arange(7320))
-    assert rounds_of(config, street) == (8, 915 // 4)
-    selavpr = recipe("l14", "selavpr")
-    assert rounds_of(selavpr, street) == (30, 250)
+    netvlad = Miner(recipe("b14", "netvlad"), street)
+    assert (netvlad.steps_per_epoch, netvlad.steps_per_round) == (8 * (915 // 4), 915 // 4)
+    selavpr = Miner(recipe("l14", "selavpr"), street)
+    assert (selavpr.steps_per_epoch, selavpr.steps_per_round) == (30 * 250, 250)
     with pytest.raises(InputError, match="street: found rounds of 2 queries, of 2 with"):
-        rounds_of(config, STREET)
+        Miner(recipe("b14", "netvlad"), STREET)
 
 
 def test_recipes_are_the_codes():
@@ -363,17 +377,6 @@ def test_learning_rates_are_torchs(name, steps_first):
         assert float(ours(step)) == pytest.approx(expected[step // 7], rel=1e-6)
 
 
-def write_street(root: pathlib.Path) -> pathlib.Path:
-    """Ten places, 100 m apart, of two database images and a query each, with @UTM names."""
-    for part, offsets in (("database", (0, 6)), ("queries", (3,))):
-        for place in range(10):
-            for offset in offsets:
-                name = f"@{500_000 + 100 * place + offset:09.2f}@5000000.00@{part}@.jpg"
-                seed = 900 + place
-                write_picture(root / "images" / "train" / part / name, seed, noise=20.0)
-    return root
-
-
 @pytest.fixture(scope="module")
 def street(tmp_path_factory) -> pathlib.Path:
     return write_street(tmp_path_factory.mktemp("street"))
@@ -390,22 +393,6 @@ CONFIG = dataclasses.replace(
     epochs=2,
 )
 """Two rounds an epoch, of two batches of two tuples."""
-
-
-def test_query_sets_are_read_by_positions(street):
-    found = read_query_set(street)
-    assert (found.database, len(found.files)) == (20, 30)
-    assert found.queries.tolist() == list(range(20, 30))
-    assert [each.tolist() for each in found.positives] == [[2 * n, 2 * n + 1] for n in range(10)]
-    assert [each.tolist() for each in found.near] == [[2 * n, 2 * n + 1] for n in range(10)]
-    # 3.5 m reach both of a place's images; 103 m the first or both of the next as well.
-    wide = read_query_set(street, positive_radius=3.5, negative_radius=97)
-    assert wide.near[1].tolist() == [1, 2, 3, 4]
-    assert wide.positives[1].tolist() == [2, 3]
-    with pytest.raises(InputError, match="found 0 of 10 queries with a database image within 2 m"):
-        read_query_set(street, positive_radius=2)
-    with pytest.raises(InputError, match="and none of them with one farther than 5000 m"):
-        read_query_set(street, negative_radius=5000)
 
 
 def test_training_reads_the_set_as_configured(street, tmp_path, monkeypatch):
@@ -441,30 +428,6 @@ def test_unreadable_images_are_told_in_mining(tmp_path, capfd):
     assert "; 3 unreadable images left out" in " ".join(capfd.readouterr().err.split())
 
 
-def test_images_of_other_cities_are_no_positives(tmp_path):
-    """Two cities of MSLS whose positions are alike, in other zones of UTM."""
-    for city in ("boston", "paris"):
-        for side, norths in (("query", (0, 500)), ("database", (3, 503, 900))):
-            folder = tmp_path / "train_val" / city / side
-            keys = [f"{city}{side}{number}" for number in range(len(norths))]
-            for number, key in enumerate(keys):
-                write_picture(folder / "images" / f"{key}.jpg", number)
-            raw = [f"{n},{key},0,0,0,2020-01-01,False" for n, key in enumerate(keys)]
-            (folder / "raw.csv").write_text(
-                "\n".join([",key,lon,lat,ca,captured_at,pano", *raw]) + "\n"
-            )
-            rows = [
-                f"{n},{key},500000,{4e6 + north}"
-                for n, (key, north) in enumerate(zip(keys, norths, strict=True))
-            ]
-            (folder / "postprocessed.csv").write_text(
-                "\n".join([",key,easting,northing", *rows]) + "\n"
-            )
-    found = read_query_set(tmp_path)
-    assert [each.tolist() for each in found.positives] == [[0], [1], [3], [4]]
-    assert [each.tolist() for each in found.near] == [[0], [1], [3], [4]]
-
-
 def test_checksums_tell_other_positives(street):
     narrow, wide = read_query_set(street), read_query_set(street, negative_radius=97)
     assert checksum_of_places(narrow) != checksum_of_places(wide)
@@ -476,13 +439,10 @@ def test_batches_hold_the_tuples_and_their_roles(street):
     queries = read_query_set(street)
     images = np.array([[20, 0, 4, 6], [21, 2, 8, 0], [22, 4, 0, 2], [23, 6, 2, 0]], np.int32)
     roles = np.array([[0, 1, 2, 2], [0, 1, 2, 3], [0, 1, 2, 2], [0, 1, 3, 3]], np.int32)
-    round_ = no_tuples(CONFIG.mining, queries, 4)._replace(
-        step=np.array(2), images=images, roles=roles
-    )
 
     def batches(step: int, **reading):
         miner = Miner(CONFIG, queries, **reading)
-        miner.mined = round_
+        miner.mined = miner.mined._replace(step=np.array(2), images=images, roles=roles)
         return miner.batches(step)
 
     first, second = batches(2)
@@ -530,7 +490,7 @@ def test_a_run_interrupted_in_a_round_goes_on_with_its_tuples(
 
 
 def test_every_round_is_mined_by_the_model_as_it_is(street, tmp_path, monkeypatch):
-    """Against `mine_tuples` by hand: the model of each round's begin, and the last negatives."""
+    """Against another miner: the model of each round's begin, and the last negatives."""
     queries, out, seen = read_query_set(street), tmp_path / "run", []
     mine = Miner.mine
 
@@ -546,11 +506,10 @@ def test_every_round_is_mined_by_the_model_as_it_is(street, tmp_path, monkeypatc
     )
     fit(config, queries, out, quiet=True)
     assert [int(mined.step) for _, mined in seen] == [0, 2, 4, 6]
-    hardest = no_tuples(config.mining, queries, 4).hardest
-    for number, (params, mined) in enumerate(seen):
+    again = Miner(config, queries)
+    for number, (params, found) in enumerate(seen):
 
-        def describe_all(images, params=params):
-            paths = [queries.path(image) for image in images]
+        def describe_all(paths, params=params):
             (batch,) = image_batches(
                 paths,
                 image_size=config.model.image_size,
@@ -560,15 +519,8 @@ def test_every_round_is_mined_by_the_model_as_it_is(street, tmp_path, monkeypatc
             alone = jnp.eye(len(paths), dtype=bool)
             return np.asarray(describe(params, batch.images, config.model, mask=alone))
 
-        epoch, round_ = divmod(number, 2)
-        chosen = draw_queries(config.mining, 10, 4, seed=5, epoch=epoch, number=round_)
-        step = 2 * number
-        expected = mine_tuples(
-            config.mining, queries, chosen, hardest, describe_all, seed=5, step=step
-        )
-        assert mined.images.tolist() == expected.images.tolist()
-        assert mined.hardest.tolist() == expected.hardest.tolist()
-        hardest = expected.hardest
+        mine(again, 2 * number, describe_all)
+        assert_equal(again.mined, found)
     first, second = seen[0][0], seen[1][0]
     assert any(
         not np.array_equal(*leaves)
@@ -610,19 +562,6 @@ def test_the_wrong_kind_of_set_is_refused(street, shared, tmp_path):
     assert not out.exists()
 
 
-def test_a_set_without_positions_goes_by_its_ground_truth(tmp_path):
-    for side in ("database", "queries"):
-        for number in range(3):
-            write_picture(tmp_path / side / f"{number}.jpg", number)
-    with pytest.raises(InputError, match="no ground truth, nothing to score"):
-        read_query_set(tmp_path)
-    table = "query,database\n0.jpg,1.jpg\n0.jpg,2.jpg\n1.jpg,\n2.jpg,0.jpg\n"
-    (tmp_path / "ground_truth.csv").write_text(table)
-    found = read_query_set(tmp_path)
-    assert found.queries.tolist() == [3, 5]
-    assert [each.tolist() for each in found.near] == [[1, 2], [0]]
-
-
 WHOLE = MiningConfig(kind="whole")
 
 
@@ -630,31 +569,18 @@ WHOLE = MiningConfig(kind="whole")
     ("config", "changes", "message"),
     [
         (WHOLE, {"negatives": 0}, r"MiningConfig\.negatives: found 0"),
-        (
-            WHOLE,
-            {"candidates": 9},
-            r"MiningConfig\.candidates: found 9, expected at l",
-        ),
+        (WHOLE, {"candidates": 9}, r"MiningConfig\.candidates: found 9, expected at l"),
         (WHOLE, {"positive_radius": 30.0}, r"positive_radius: found 30.0, expected metres above 0"),
         (WHOLE, {"margin": -1.0}, r"MiningConfig\.margin: found -1.0"),
+        (CONFIG, {"images_per_place": 5}, "images_per_place: found 5, expected 4 with mined tup"),
+        (CONFIG, {"mining": MiningConfig()}, "kind: found 'none', expected 'whole' or 'sample'"),
         (
-            CONFIG,
-            {"images_per_place": 5},
-            r"images_per_place: found 5, expected 4 with mined tuples",
-        ),
-        (
-            CONFIG,
-            {"mining": MiningConfig()},
-            "kind: found 'none', expected 'whole' or 'sample'",
+            dataclasses.replace(CONFIG, loss=recipe("tiny", "crisalad").loss),
+            {"loss": recipe("tiny", "cosplace").loss},
+            "kind: found 'whole', expected 'none' for loss large-m",
         ),
     ],
 )
 def test_a_configuration_that_does_not_fit_is_refused(config, changes, message):
     with pytest.raises(InputError, match=message):
         dataclasses.replace(config, **changes)
-
-
-def test_a_loss_of_classes_takes_no_tuples():
-    classes = recipe("tiny", "cosplace").loss
-    with pytest.raises(InputError, match="kind: found 'whole', expected 'none' for loss large-m"):
-        TrainConfig(loss=classes, mining=MiningConfig(kind="whole"), images_per_place=12)

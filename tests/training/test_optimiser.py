@@ -38,36 +38,52 @@ def told(params, optimiser: OptimiserConfig, steps: int, steps_per_epoch: int) -
     return [str(each.message) for each in caught if each.category is Note]
 
 
+BOQ = recipe("b14", "boq").optimiser
+"""It warms up for 10 of its 40 epochs."""
+
+
 @pytest.mark.parametrize(
-    ("warmup", "steps", "words"),
+    ("config", "steps", "per_epoch", "words", "short"),
     [
-        (30, 32, "found 30 for a run of 32 steps, which leaves 2 at .*; at most 8 steps would"),
-        (30, 3, "found 30 for a run of 3 steps, which leaves 0 at [^;]* and its decay$"),
-        (9, 36, None),
-        (0, 1, None),
+        (
+            *(OptimiserConfig(warmup_steps=30), 32, 1),
+            *("steps: found 30 for a run of 32 steps, which leaves 2 at .*; at most 8 steps", 8),
+        ),
+        (
+            *(OptimiserConfig(warmup_steps=30), 3, 1),
+            *("steps: found 30 for a run of 3 steps, which leaves 0 at [^;]* and its decay$", 0),
+        ),
+        (OptimiserConfig(warmup_steps=30), 150, 1, None, None),
+        (OptimiserConfig(warmup_steps=9), 36, 1, None, None),
+        (OptimiserConfig(), 1, 1, None, None),
+        (
+            *(BOQ, 5 * 7, 7),
+            *("epochs: found 10, which are 70 steps, for a run of 35 steps, which leaves 0 at", 8),
+        ),
+        (BOQ, 40 * 7, 7, None, None),
+        # Twenty epochs of 7 batches are 40 of the optimiser's steps, and 10 epochs of them 20.
+        (
+            *(OptimiserConfig(warmup_steps=20, accumulate=4), 20 * 7, 7),
+            *("steps: found 20 for a run of 40 steps, which leaves 20 at .*; at most 10 steps", 10),
+        ),
+        (
+            *(OptimiserConfig(warmup_epochs=10, accumulate=4), 20 * 7, 7),
+            *("epochs: found 10, which are 20 steps, for a run of 40 steps", 10),
+        ),
     ],
 )
-def test_a_warm_up_of_more_than_a_quarter_is_told_in_a_line(params, warmup, steps, words) -> None:
-    notes = told(params, OptimiserConfig(warmup_steps=warmup), steps, 1)
+def test_a_warm_up_of_more_than_a_quarter_is_told_in_a_line_and_shortened(
+    params, config, steps, per_epoch, words, short
+) -> None:
+    notes = told(params, config, steps, per_epoch)
     assert len(notes) == (words is not None)
     for note in notes:
         assert "\n" not in note
-        assert re.match(f"--optimiser.warmup-steps: {words}", note)
-
-
-def test_a_warm_up_in_epochs_is_told_and_shortened_too(params) -> None:
-    """Of BoQ, which warms up for 10 of its 40 epochs; here of 7 steps each."""
-    boq = recipe("b14", "boq").optimiser
-    (note,) = told(params, boq, 5 * 7, 7)
-    assert note.startswith(
-        "--optimiser.warmup-epochs: found 10, which are 70 steps, for a run of 35 steps, which "
-        "leaves 0 at"
-    )
-    short = with_short_warmup(boq, 5 * 7, 7)
-    assert short == dataclasses.replace(boq, warmup_steps=8, warmup_epochs=0)
-    assert not told(params, short, 5 * 7, 7)
-    assert not told(params, boq, 40 * 7, 7)
-    assert with_short_warmup(boq, 40 * 7, 7) == boq
+        assert re.match(f"--optimiser.warmup-{words}", note)
+    found = with_short_warmup(config, steps, per_epoch)
+    changes = {} if short is None else {"warmup_steps": short, "warmup_epochs": 0}
+    assert found == dataclasses.replace(config, **changes)
+    assert not told(params, found, steps, per_epoch)
 
 
 def test_it_is_told_once_and_before_the_first_step(shared, tmp_path, monkeypatch) -> None:
@@ -81,13 +97,10 @@ def test_it_is_told_once_and_before_the_first_step(shared, tmp_path, monkeypatch
 
 
 def test_a_shortened_warm_up_reaches_the_learning_rate() -> None:
-    given = OptimiserConfig(learning_rate=1.0, warmup_steps=30)
-    short = with_short_warmup(given, 32, 1)
-    assert short == OptimiserConfig(learning_rate=1.0, warmup_steps=8)
+    short = with_short_warmup(OptimiserConfig(learning_rate=1.0, warmup_steps=30), 32, 1)
     with jax.enable_x64(True):
         rates = [float(learning_rate_schedule(short, 32)(step)) for step in (0, 7, 8, 32)]
     np.testing.assert_allclose(rates, [1 / 8, 1, 1, 0], atol=1e-7)
-    assert with_short_warmup(given, 150, 1) == given
 
 
 EPOCH, STEPS_OF_RUN = 7, 300
@@ -194,18 +207,6 @@ def test_several_batches_share_a_step_and_its_learning_rate(epoch: int) -> None:
     np.testing.assert_allclose(found, rates, rtol=2e-6)
     # The milestones after the warm-up: of one step an epoch that is at epoch 23.
     assert len(set(rates)) >= 23 + 2
-
-
-def test_a_warm_up_of_shared_steps_is_told_and_shortened_in_steps(params) -> None:
-    """Twenty epochs of 7 batches are 40 of the optimiser's steps, and 10 epochs of them 20."""
-    config = OptimiserConfig(warmup_steps=20, accumulate=4)
-    (note,) = told(params, config, 20 * 7, 7)
-    assert "found 20 for a run of 40 steps, which leaves 20 at" in note
-    assert "at most 10 steps" in note
-    assert with_short_warmup(config, 20 * 7, 7).warmup_steps == 10
-    epochs = OptimiserConfig(warmup_epochs=10, accumulate=4)
-    (note,) = told(params, epochs, 20 * 7, 7)
-    assert "found 10, which are 20 steps, for a run of 40 steps" in note
 
 
 @pytest.mark.parametrize(

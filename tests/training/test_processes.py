@@ -1,7 +1,6 @@
 """The same run on 1, 2, 4 and 8 devices, and in two processes that meet on this machine."""
 
 import dataclasses
-import os
 import pathlib
 import re
 import shutil
@@ -17,20 +16,18 @@ import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.training import distributed as processes
 from crisalad_jax.training.log import read_metrics
-from crisalad_jax.utils import distributed as processes
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import RECIPE
+from tests.training.programs import COMPILED_SOON, ROOT, run_on_devices
 
-ROOT = pathlib.Path(__file__).parents[2]
 # Eight images a step, two steps an epoch: ten steps.
 CONFIG = dataclasses.replace(
     RECIPE, trainable="adapters+head", places_per_batch=4, epochs=5, patience=None
 )
-# Ten steps of a tiny model take XLA longer to optimise than to run.
-COMPILED_SOON = {**os.environ, "XLA_FLAGS": "--xla_backend_optimization_level=0"}
 DEVICES = """
 import dataclasses, pathlib, sys
 from unittest import mock
@@ -88,21 +85,9 @@ run("all", dataclasses.replace(CONFIG, trainable="all", epochs=1), 8)
 def by_devices(shared: pathlib.Path, tmp_path_factory) -> pathlib.Path:
     """A run on each number of devices, in folders named by it; what comes back is on one."""
     out = tmp_path_factory.mktemp("devices")
-    said = run_by_devices(shared, out, "counts")
+    said = run_on_devices(8, DEVICES, shared, out, "counts")
     assert said == ["1 1 False 1", "2 2 False 1", "4 4 False 1", "8 8 False 1"]
     return out
-
-
-def run_by_devices(shared: pathlib.Path, out: pathlib.Path, part: str) -> list[str]:
-    done = subprocess.run(
-        [sys.executable, "-c", DEVICES, str(shared), str(out), part],
-        cwd=ROOT,
-        env={**COMPILED_SOON, "JAX_NUM_CPU_DEVICES": "8"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
 
 
 def free_port() -> int:
@@ -226,7 +211,7 @@ def test_devices_do_not_change_a_run(by_devices: pathlib.Path, name: str):
 @pytest.mark.slow
 def test_a_split_state_does_not_change_a_run(shared, by_devices, tmp_path):
     """Nor is anything compiled once it runs. Where all trains a CPU's devices do not share it."""
-    assert run_by_devices(shared, tmp_path, "split") == [
+    assert run_on_devices(8, DEVICES, shared, tmp_path, "split") == [
         *("split 8 True 1", "compiled after the first step of ten: 0", "all 1 False 1"),
     ]
     assert_same_run(tmp_path / "split", by_devices / "1")

@@ -12,7 +12,6 @@ from crisalad_jax.experiments.train import train
 from crisalad_jax.nn.model import Model
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.training.start import with_vocabulary_of
-from crisalad_jax.training.vocabulary import needs_vocabulary
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import random_params
 
@@ -41,7 +40,7 @@ def test_a_recipe_trains_its_own_parts_from_its_own_start(
     )
     given = random_params(config.model)
     save_weights(tmp_path / "given.safetensors", Model(given, config.model))
-    what = "backbone" if needs_vocabulary(config.model) else "weights"
+    what = "backbone" if config.model.aggregator.starts_from_centroids else "weights"
     options = {what: tmp_path / "given.safetensors", "quiet": True}
     result = train(config, shared / "city", tmp_path / "run", **options)
     assert result.steps == 2

@@ -1,13 +1,9 @@
 """What devices exchange in a training step, and that this changes no result."""
 
-import os
-import pathlib
-import subprocess
-import sys
-
 import pytest
 
-ROOT = pathlib.Path(__file__).parents[2]
+from tests.training.programs import run_on_devices
+
 PROGRAM = """
 import collections, dataclasses, re, sys, warnings
 import jax, numpy as np, optax
@@ -106,20 +102,6 @@ for note in notes:
 """
 
 
-def on_eight_devices(source: str, *arguments: str) -> list[str]:
-    flags = "--xla_backend_optimization_level=0 --xla_force_host_platform_device_count=8"
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM + source, *arguments],
-        cwd=ROOT,
-        env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
-
-
 def test_a_step_exchanges_what_it_must_and_no_more() -> None:
     """Gathers of labels, of each layer's keys and values, and of descriptors; then gradients.
 
@@ -128,7 +110,7 @@ def test_a_step_exchanges_what_it_must_and_no_more() -> None:
     each layer's keys and values, and its first half nothing.
     """
     expected = "{'all-gather': 4, 'all-reduce': 1, 'reduce-scatter': 2}"
-    assert on_eight_devices(COUNTS, "count") == [
+    assert run_on_devices(8, PROGRAM + COUNTS, "count") == [
         expected,
         "[True, False]",
         "['f32>', 'f32>']",
@@ -139,7 +121,7 @@ def test_a_step_exchanges_what_it_must_and_no_more() -> None:
 
 @pytest.mark.slow
 def test_eight_devices_take_the_step_of_one() -> None:
-    assert on_eight_devices(VALUES) == [
+    assert run_on_devices(8, PROGRAM + VALUES) == [
         "training: found 8 devices for 6 images a step, of which 6 share them, the most that "
         "divide them in each process"
     ]

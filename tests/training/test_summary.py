@@ -35,10 +35,7 @@ def test_what_trains_by_default(config, trainable):
     total = sum(cost.parameters for cost in summary.parts)
     assert summary.frozen_parameters + summary.trainable_parameters == total
     assert (summary.one_adapter is None) == (config is BARE)
-
-
-def test_all_that_trains():
-    assert model_summary(MODEL, "all").frozen_parameters == 0
+    assert model_summary(config, "all").frozen_parameters == 0
 
 
 def test_as_json_and_for_the_terminal():

@@ -27,7 +27,7 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, Model, unit_features
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.trainable import split_params
-from crisalad_jax.training.vocabulary import needs_vocabulary, with_vocabulary
+from crisalad_jax.training.vocabulary import with_vocabulary
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.output import Note
@@ -130,14 +130,6 @@ def test_a_seed_draws_images_and_centroids(fresh, paths, built) -> None:
     for i, j in ((0, 1), (0, 2), (1, 2)):
         assert not np.array_equal(some[i], some[j])
     assert_equal(dataclasses.replace(built, aggregator=fresh.aggregator), fresh)
-
-
-def test_who_needs_one() -> None:
-    assert needs_vocabulary(ANYLOC)
-    assert needs_vocabulary(NETVLAD)
-    assert needs_vocabulary(IMAGE)
-    assert needs_vocabulary(VLAD_BUFF)
-    assert not needs_vocabulary(MODEL)
 
 
 def test_what_does_not_fit_is_said_before_images_are_read(fresh, tmp_path) -> None:

@@ -53,7 +53,6 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.start import with_vocabulary_of
-from crisalad_jax.training.vocabulary import needs_vocabulary
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_target, real_path, split_markers, write_json
 from crisalad_jax.utils.locks import POLL, BusyFolderError, lock
@@ -279,7 +278,7 @@ def _start(prepared: Prepared, run: Run, training: TrainConfig, quiet: bool) -> 
     params = init_crisalad(key, model)
     if prepared.config.backbone is not None:
         params = with_backbone_of(params, model, prepared.config.backbone)
-    if not needs_vocabulary(model):
+    if not model.aggregator.starts_from_centroids:
         return params
     places = run.variant.places
     assert places is not None

@@ -1,15 +1,16 @@
 """Recipes: how a published method is trained, by its name; or a recipe with one part swapped."""
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from crisalad_jax.config.checks import choose, require, takes
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.plugins import load_entry_points
-from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
+from crisalad_jax.nn.aggregators import AGGREGATORS
+from crisalad_jax.nn.backbones import BACKBONES
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig, has_adapters
 from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, HEAD
@@ -105,24 +106,54 @@ def _of_model(config: TrainConfig, model: ModelConfig | None) -> TrainConfig:
     return dataclasses.replace(config, model=model, trainable=trainable, validation_size=None)
 
 
-def resized(chain: PreprocessingConfig, **fields: Any) -> PreprocessingConfig:
-    """Set how photographs are resized, as the published weights' code does.
+def model_of(
+    model: ModelConfig,
+    preset: str,
+    backbone: Any,
+    aggregator: str,
+    *,
+    head: Mapping[str, Any] | None = None,
+    image_size: tuple[int, int] | None = None,
+    compute_dtype: Any = "float32",
+    **preprocessing: Any,
+) -> ModelConfig:
+    """Make the model of a published method, without a cross-image encoder.
 
-    Training images are resized as `PreprocessingConfig.for_training` says, whatever is set. A model
-    that normalises by local contrast, as `tiny`, takes the filter alone: it is no published one.
+    Training images are resized as `PreprocessingConfig.for_training` says, whatever is set here. A
+    model that normalises by local contrast, as `tiny`, takes the filter alone: it is no published
+    one.
 
     Args:
-        chain: the preset's.
-        **fields: of `PreprocessingConfig`.
+        model: the preset's.
+        preset: its name.
+        backbone: the method's.
+        aggregator: name of the head, which comes in the preset's size.
+        head: settings of the head that are other than the preset's.
+        image_size: height and width over a convolutional backbone, which for `tiny` is a small
+            ResNet with its images; None is the preset's.
+        compute_dtype: see `ModelConfig`.
+        **preprocessing: how photographs are resized, as fields of `PreprocessingConfig`.
 
     Example:
         >>> from crisalad_jax import PRESETS
-        >>> resized(PRESETS["b14"].preprocessing, filter="bicubic").filter
+        >>> tiny = PRESETS["tiny"]
+        >>> model_of(tiny, "tiny", tiny.backbone, "gem", filter="bicubic").preprocessing.filter
         'bicubic'
     """
+    if preset == "tiny" and image_size is not None:
+        backbone, image_size = BACKBONES.make("resnet", preset), None
+    chain = model.preprocessing
     if chain.normalisation == "local-contrast":
-        fields = {name: value for name, value in fields.items() if name == "filter"}
-    return dataclasses.replace(chain, **fields)
+        preprocessing = {name: each for name, each in preprocessing.items() if name == "filter"}
+    return dataclasses.replace(
+        model,
+        image_size=image_size or model.image_size,
+        preprocessing=dataclasses.replace(chain, **preprocessing),
+        backbone=backbone,
+        aggregator=AGGREGATORS.make(aggregator, preset, **(head or {})),
+        cross_image=dataclasses.replace(model.cross_image, layers=0),
+        compute_dtype=compute_dtype,
+    )
 
 
 def validation_size(preset: str, side: int) -> tuple[int, int] | None:

@@ -14,8 +14,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.losses.large_margin_cosine import LargeMarginCosineConfig
-from crisalad_jax.training.recipes.base import register_recipe, with_head
-from crisalad_jax.training.recipes.convolutional import model_over
+from crisalad_jax.training.recipes.base import model_of, register_recipe, with_head
 
 _VIEWPOINTS = LargeMarginCosineConfig(
     scale=100.0,
@@ -43,10 +42,13 @@ def _over_resnet(
     model: ModelConfig, preset: str, loss: LargeMarginCosineConfig, dtype: str, **fields: Any
 ) -> TrainConfig:
     """Make a recipe over ResNet-18, whose last two stages train, for images at their own sizes."""
-    head = AGGREGATORS.make("cosplace", preset)
-    backbone, size = ResNetConfig(layers=18), (512, 512)
     return _classified(
-        model_over(preset, model, backbone, head, size, compute_dtype=dtype, size_rule="native"),
+        model_of(
+            *(model, preset, ResNetConfig(layers=18), "cosplace"),
+            image_size=(512, 512),
+            compute_dtype=dtype,
+            size_rule="native",
+        ),
         loss,
         trainable="last-2-blocks+head",
         augmentation=ColourCropConfig(),

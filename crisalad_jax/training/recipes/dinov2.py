@@ -10,12 +10,11 @@ from typing import Any
 from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import MiningConfig, OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.losses.pairwise import SelaVprLoss
-from crisalad_jax.training.recipes.base import register_recipe, resized, validation_size
+from crisalad_jax.training.recipes.base import model_of, register_recipe, validation_size
 
 NO_ADAPTER = AdapterConfig(kind="none")
 ADAM_STEP = OptimiserConfig(kind="adam", learning_rate=5e-5, schedule="step", weight_decay=0.0)
@@ -49,45 +48,15 @@ MIXVPR_OPTIMISER = OptimiserConfig(
 """That of amaralibey/MixVPR, for 120 places."""
 
 
-def _model(
-    model: ModelConfig,
-    preset: str,
-    aggregator: str | None,
-    *,
-    adapter: AdapterConfig = NO_ADAPTER,
-    layers: int = 0,
-    compute_dtype: Any = "float32",
-    backbone: dict[str, Any] | None = None,
-    **preprocessing: Any,
-) -> ModelConfig:
-    """Put a method's head and adapters on a preset's backbone.
-
-    Args:
-        model: the preset's.
-        preset: its name.
-        aggregator: name of the head; None keeps the preset's.
-        adapter: what is beside the blocks.
-        layers: number of layers of the cross-image encoder.
-        compute_dtype: see `ModelConfig`.
-        backbone: other settings of the backbone.
-        **preprocessing: how photographs are resized; see `resized`.
-    """
-    head = model.aggregator if aggregator is None else AGGREGATORS.make(aggregator, preset)
-    vit: Any = dataclasses.replace(model.backbone, adapter=adapter, **(backbone or {}))
-    return dataclasses.replace(
-        model,
-        preprocessing=resized(model.preprocessing, **preprocessing),
-        backbone=vit,
-        aggregator=head,
-        cross_image=dataclasses.replace(model.cross_image, layers=layers),
-        compute_dtype=compute_dtype,
-    )
+def _vit(model: ModelConfig, *, adapter: AdapterConfig = NO_ADAPTER, **fields: Any) -> Any:
+    """Change a preset's backbone; methods other than CriSALAD have no adapter, or their own."""
+    return dataclasses.replace(model.backbone, adapter=adapter, **fields)
 
 
 @register_recipe("anyloc")
 def anyloc(model: ModelConfig, preset: str) -> TrainConfig:
     """Make AnyLoc's recipe (Keetha et al., RA-L 2023), of whose model nothing trains."""
-    return TrainConfig(model=_model(model, preset, "anyloc"), trainable="head")
+    return TrainConfig(model=model_of(model, preset, _vit(model), "anyloc"), trainable="head")
 
 
 @register_recipe("salad")
@@ -100,7 +69,7 @@ def salad(model: ModelConfig, preset: str) -> TrainConfig:
     learning rate lower by less than 1 part in 1,000.
     """
     return TrainConfig(
-        model=_model(model, preset, None, compute_dtype="bfloat16"),
+        model=model_of(model, preset, _vit(model), "salad", compute_dtype="bfloat16"),
         optimiser=OptimiserConfig(weight_decay=9.5e-9, end_lr_fraction=0.2, decay_steps=4000),
         trainable="last-4-blocks+head",
         places_per_batch=60,
@@ -118,8 +87,8 @@ def vlad_buff(model: ModelConfig, preset: str) -> TrainConfig:
     500 training images. The code takes images of London for these; its published weights are those
     of the last epoch.
     """
-    head = _model(model, preset, "vlad-buff", compute_dtype="bfloat16")
-    return dataclasses.replace(salad(model, preset), model=head)
+    whole = model_of(model, preset, _vit(model), "vlad-buff", compute_dtype="bfloat16")
+    return dataclasses.replace(salad(model, preset), model=whole)
 
 
 @register_recipe("cricavpr")
@@ -130,14 +99,10 @@ def cricavpr(model: ModelConfig, preset: str) -> TrainConfig:
     epochs, fewer than its patience of 10 would ever end. The best weights are those of the best
     R@5, as in its code of today; its first version added R@1.
     """
+    backbone = _vit(model, adapter=AdapterConfig(kind="multi-resolution"))
+    alone = model_of(model, preset, backbone, "gem-pyramid", antialias=False, pixels="floats")
     return TrainConfig(
-        model=_model(
-            *(model, preset, "gem-pyramid"),
-            adapter=AdapterConfig(kind="multi-resolution"),
-            layers=model.cross_image.layers,
-            antialias=False,
-            pixels="floats",
-        ),
+        model=dataclasses.replace(alone, cross_image=model.cross_image),
         optimiser=dataclasses.replace(ADAM_STEP, learning_rate=1e-4),
         places_per_batch=72,
         epochs=10,
@@ -154,22 +119,17 @@ def selavpr(model: ModelConfig, preset: str) -> TrainConfig:
     from the weights of MSLS, it has 5,000: `--mining.queries-per-epoch 5000`. The code validates
     with re-ranking, here without.
     """
-    mining = MiningConfig(kind="sample", negatives=2, queries_per_epoch=30_000)
+    backbone = _vit(model, adapter=AdapterConfig(kind="serial-parallel"))
     return TrainConfig(
-        model=_model(
-            *(model, preset, "selavpr"),
-            adapter=AdapterConfig(kind="serial-parallel"),
-            antialias=False,
-            pixels="floats",
-        ),
+        model=model_of(model, preset, backbone, "selavpr", antialias=False, pixels="floats"),
         loss=LossConfig(kind=SelaVprLoss(), miner="none"),
         optimiser=OptimiserConfig(
             kind="adam", learning_rate=1e-5, end_lr_fraction=1.0, weight_decay=0.0
         ),
         augmentation=NoAugmentation(),
-        mining=mining,
+        mining=MiningConfig(kind="sample", negatives=2, queries_per_epoch=30_000),
         places_per_batch=4,
-        images_per_place=2 + mining.negatives,
+        images_per_place=4,
         epochs=50,
         patience=3,
     )
@@ -182,10 +142,9 @@ def edtformer(model: ModelConfig, preset: str) -> TrainConfig:
     It has adapters of width 4 beside the blocks, a decoder, and Adam with step decay.
     """
     adapter = AdapterConfig(kind="side", bottleneck=4 / model.backbone.dim, alpha=0.5)
+    backbone = _vit(model, adapter=adapter)
     return TrainConfig(
-        model=_model(
-            model, preset, "edtformer", adapter=adapter, pixels="floats", round_to_patch=True
-        ),
+        model=model_of(model, preset, backbone, "edtformer", pixels="floats", round_to_patch=True),
         optimiser=dataclasses.replace(ADAM_STEP, learning_rate=1e-4, step_gamma=0.7),
         places_per_batch=72,
         epochs=15,
@@ -203,7 +162,9 @@ def supervlad(model: ModelConfig, preset: str) -> TrainConfig:
     optimiser of its own, which after the first step finds no gradient.)
     """
     return TrainConfig(
-        model=_model(model, preset, "supervlad", pixels="floats", round_to_patch=True),
+        model=model_of(
+            model, preset, _vit(model), "supervlad", pixels="floats", round_to_patch=True
+        ),
         optimiser=ADAM_STEP,
         trainable="last-4-blocks+no-norm+head",
         places_per_batch=120,
@@ -221,22 +182,21 @@ def image(model: ModelConfig, preset: str) -> TrainConfig:
     the last features of 5,000 training images. The code takes images of MSLS for these, unless
     asked otherwise, at 322 x 322.
     """
-    tokens: Any = AGGREGATORS.make("aggregation-tokens", preset)
-    return TrainConfig(
-        model=_model(
-            *(model, preset, "aggregation-tokens"),
-            compute_dtype="bfloat16",
-            backbone={"registers": 4, "position_resize": "plain"},
-            pixels="floats",
-            round_to_patch=True,
-        ),
-        optimiser=ADAM_STEP,
+    config = model_of(
+        model,
+        preset,
+        _vit(model, registers=4, position_resize="plain"),
+        "aggregation-tokens",
+        compute_dtype="bfloat16",
+        pixels="floats",
+        round_to_patch=True,
+    )
+    tokens: Any = config.aggregator
+    return dataclasses.replace(
+        supervlad(model, preset),
+        model=config,
         trainable=f"last-{-tokens.insertion}-blocks+no-norm+head",
-        places_per_batch=120,
-        epochs=20,
-        monitor="R@1+R@5",
         patience=20,
-        validation_size=validation_size(preset, 322),
     )
 
 
@@ -248,8 +208,11 @@ def boq(model: ModelConfig, preset: str) -> TrainConfig:
     code's own default is wider and has 8,192.
     """
     return TrainConfig(
-        model=_model(
-            model, preset, "boq", compute_dtype="bfloat16", filter="bicubic", pixels="floats"
+        model=model_of(
+            *(model, preset, _vit(model), "boq"),
+            compute_dtype="bfloat16",
+            filter="bicubic",
+            pixels="floats",
         ),
         validation_size=validation_size(preset, 322),
         **BOQ_TRAINING,
@@ -264,12 +227,14 @@ def dino_mix(model: ModelConfig, preset: str) -> TrainConfig:
     before the blocks. Its code validates on Pitts30k's test set, by which it chooses the best
     weights; here they are chosen on `--val`.
     """
-    config = _model(
-        model, preset, "mixvpr", compute_dtype="bfloat16", antialias=False, pixels="floats"
-    )
-    mixers: Any = dataclasses.replace(config.aggregator, depth=2, last_norm=False)
     return TrainConfig(
-        model=dataclasses.replace(config, aggregator=mixers),
+        model=model_of(
+            *(model, preset, _vit(model), "mixvpr"),
+            head={"depth": 2, "last_norm": False},
+            compute_dtype="bfloat16",
+            antialias=False,
+            pixels="floats",
+        ),
         optimiser=dataclasses.replace(
             MIXVPR_OPTIMISER, learning_rate=0.005, accumulate=4, clip_value=0.5
         ),

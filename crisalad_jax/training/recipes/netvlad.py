@@ -1,22 +1,26 @@
 """NetVLAD and Patch-NetVLAD over VGG-16, of Nanne/pytorch-NetVlad and QVPR/Patch-NetVLAD."""
 
 import dataclasses
+from typing import Any
 
 from crisalad_jax.data.augmentations import NoAugmentation
-from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import MiningConfig, OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.losses.pairwise import TripletConfig
-from crisalad_jax.training.recipes.base import register_recipe
-from crisalad_jax.training.recipes.convolutional import model_over
+from crisalad_jax.training.recipes.base import model_of, register_recipe
 
 MARGIN = 0.1**0.5
 """The code squares distances in its mind: the root of 0.1 is the margin of Euclidean ones."""
 _SGD = OptimiserConfig(
     kind="sgd", learning_rate=1e-4, schedule="step", step_epochs=5, weight_decay=1e-3
 )
+
+
+def _model(model: ModelConfig, preset: str, **head: Any) -> ModelConfig:
+    """Make NetVLAD's model over VGG-16."""
+    return model_of(model, preset, VggConfig(), "netvlad", head=head, image_size=(480, 640))
 
 
 @register_recipe("netvlad")
@@ -32,19 +36,17 @@ def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
     part of the file; here all are shuffled. Its loader's processes forget a query's last negatives
     with each round, which the paper keeps, as is done here.
     """
-    head = AGGREGATORS.make("netvlad", preset)
-    mining = MiningConfig(kind="whole", negatives=10, margin=MARGIN)
     return TrainConfig(
-        model=model_over(preset, model, VggConfig(), head, (480, 640), compute_dtype="float32"),
+        model=_model(model, preset),
         loss=LossConfig(kind=TripletConfig(margin=MARGIN, average="all"), miner="none"),
         optimiser=dataclasses.replace(
             _SGD, schedule="milestones", milestones=(4, 9, 14, 19, 24, 29), step_gamma=0.5
         ),
         trainable="last-1-blocks+head",
         augmentation=NoAugmentation(),
-        mining=mining,
+        mining=MiningConfig(kind="whole", negatives=10, margin=MARGIN),
         places_per_batch=4,
-        images_per_place=2 + mining.negatives,
+        images_per_place=12,
         epochs=30,
         patience=11,
     )
@@ -62,17 +64,12 @@ def patch_netvlad(model: ModelConfig, preset: str) -> TrainConfig:
     It looks for violations by inner products with a sign that nearly every query passes; here every
     one does. Re-ranking by patches learns nothing, and `crisalad pca` fits the whitening.
     """
-    config = netvlad(model, preset)
-    mining = MiningConfig(kind="sample", negatives=5)
-    aggregator = config.model.aggregator
-    if preset != "tiny":
-        aggregator = dataclasses.replace(aggregator, clusters=16)
     return dataclasses.replace(
-        config,
-        model=dataclasses.replace(config.model, aggregator=aggregator),
+        netvlad(model, preset),
+        model=_model(model, preset, **({} if preset == "tiny" else {"clusters": 16})),
         optimiser=_SGD,
-        mining=mining,
-        images_per_place=2 + mining.negatives,
+        mining=MiningConfig(kind="sample", negatives=5),
+        images_per_place=7,
     )
 
 
@@ -83,7 +80,7 @@ def netvlad_gsv(model: ModelConfig, preset: str) -> TrainConfig:
     Batches, loss and augmentation are CriSALAD's, as for all methods of the paper's Table 1.
     """
     return TrainConfig(
-        model=netvlad(model, preset).model,
+        model=_model(model, preset),
         optimiser=_SGD,
         trainable="last-1-blocks+head",
         epochs=30,

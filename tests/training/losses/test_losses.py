@@ -233,45 +233,42 @@ def test_the_paper_batch() -> None:
     assert np.linalg.norm(our_gradient - gradient) < 1e-4 * np.linalg.norm(gradient)
 
 
-@pytest.mark.parametrize(
-    "labels",
-    [[0, 0, 0, 0], [0, 1, 2, 3]],
-    ids=["one place: no negatives", "all different: no positives"],
-)
-def test_batches_without_pairs_have_loss_and_gradient_zero(labels: list[int]) -> None:
-    x = unit(np.random.default_rng(0).standard_normal((4, 8)))
-    value, gradient = ours(jnp.asarray(x), jnp.asarray(labels), LossConfig())
-    assert value == 0
-    np.testing.assert_array_equal(gradient, 0)
-    assert metric_loss(jnp.asarray(x), jnp.asarray(labels), PAPER).easy_anchor_fraction == 1
-
-
 def test_a_nan_is_not_taken_for_a_perfect_batch() -> None:
     x, labels = random_batch(0)
     x[0] = np.nan
     assert jnp.isnan(metric_loss(jnp.asarray(x), jnp.asarray(labels), PAPER).loss)
 
 
-def test_the_librarys_zero_is_an_option() -> None:
-    """One positive and one negative pair mined in the whole batch: the library says 0.
-
-    Anchor 0 alone has a positive (1) less similar than a negative (2) plus 0.1; the pairs of
-    anchor 1 are in order, and anchor 2 has no positive.
-    """
-    similarities = np.array([[1.0, 0.60, 0.55], [0.60, 1.0, 0.10], [0.55, 0.10, 1.0]])
-    x = np.linalg.cholesky(similarities).astype(np.float32)
-    labels = np.array([0, 0, 1])
-    pairs = mine(jnp.asarray(x @ x.T), all_pairs(jnp.asarray(labels)), margin=0.1)
-    assert pairs.positives.sum() == 1
-    assert pairs.negatives.sum() == 1
-    assert theirs(x, labels, LossConfig())[0] == 0
-    zero, plain = (
-        metric_loss(jnp.asarray(x), jnp.asarray(labels), LossConfig(pml_compat=option)).loss
+@pytest.mark.parametrize(
+    ("upper", "labels", "mined"),
+    [
+        # Anchor 0 alone has a positive, at 0.6, less similar than a negative, at 0.55, plus 0.1;
+        # the pairs of anchor 1 are in order, and anchor 2 has no positive.
+        ((0.60, 0.55, 0.10), [0, 0, 1], (1, 1)),
+        # Its positive at 0.6, negatives at 0.55 and 0.58.
+        ((0.60, 0.55, 0.58, 0.10, 0.10, 0.30), [0, 0, 1, 2], (1, 2)),
+        # Its positives at 0.6 and 0.58, a negative at 0.55.
+        ((0.60, 0.58, 0.55, 0.50, 0.10, 0.10), [0, 0, 0, 1], (2, 1)),
+    ],
+)
+def test_the_librarys_zero_needs_few_pairs_on_both_sides(upper, labels, mined) -> None:
+    """One positive and one negative pair mined in the whole batch: the library says 0."""
+    similarities = np.eye(len(labels))
+    similarities[np.triu_indices(len(labels), 1)] = upper
+    similarities = np.maximum(similarities, similarities.T)
+    x = jnp.asarray(np.linalg.cholesky(similarities), jnp.float32)
+    pairs = mine(x @ x.T, all_pairs(jnp.asarray(labels)), margin=0.1)
+    assert (pairs.positives.sum(), pairs.negatives.sum()) == mined
+    loss, _, _ = theirs(np.array(x), np.array(labels), LossConfig())
+    assert (loss == 0) == (mined == (1, 1))
+    value, plain = (
+        metric_loss(x, jnp.asarray(labels), LossConfig(pml_compat=option)).loss
         for option in (True, False)
     )
-    assert zero == 0
-    by_hand = (np.log1p(np.exp(-0.60)) + np.log1p(np.exp(50 * 0.55)) / 50) / 3
-    np.testing.assert_allclose(plain, by_hand, rtol=1e-6)
+    np.testing.assert_allclose(value, loss, rtol=1e-5)
+    if mined == (1, 1):
+        by_hand = (np.log1p(np.exp(-0.60)) + np.log1p(np.exp(50 * 0.55)) / 50) / 3
+        np.testing.assert_allclose(plain, by_hand, rtol=1e-6)
 
 
 def test_ties_with_the_margin_mine_nothing() -> None:
@@ -286,37 +283,6 @@ def test_ties_with_the_margin_mine_nothing() -> None:
     assert wider.negatives.sum() == 2
 
 
-@pytest.mark.parametrize(
-    ("to_first", "others", "labels", "positives", "negatives"),
-    [
-        # Anchor 0's positive at 0.6, negatives at 0.55 and 0.58.
-        ((0.60, 0.55, 0.58), (0.10, 0.10, 0.30), [0, 0, 1, 2], 1, 2),
-        # Its positives at 0.6 and 0.58, a negative at 0.55.
-        ((0.60, 0.58, 0.55), (0.50, 0.10, 0.10), [0, 0, 0, 1], 2, 1),
-    ],
-)
-def test_the_librarys_zero_needs_few_pairs_on_both_sides(
-    to_first: tuple[float, ...],
-    others: tuple[float, ...],
-    labels: list[int],
-    positives: int,
-    negatives: int,
-) -> None:
-    """Anchor 0 alone mines: one pair on one side and two on the other are not few."""
-    similarities = np.eye(4)
-    similarities[np.triu_indices(4, 1)] = (*to_first, *others)
-    similarities = np.maximum(similarities, similarities.T)
-    x = np.linalg.cholesky(similarities).astype(np.float32)
-    pairs = mine(jnp.asarray(x @ x.T), all_pairs(jnp.asarray(labels)), margin=0.1)
-    assert pairs.positives.sum() == positives
-    assert pairs.negatives.sum() == negatives
-    config = LossConfig(pml_compat=True)
-    loss, _, _ = theirs(x, np.array(labels), config)
-    assert loss > 0
-    value, _ = ours(jnp.asarray(x), jnp.asarray(labels), config)
-    np.testing.assert_allclose(value, loss, rtol=1e-5)
-
-
 def test_the_easy_anchor_fraction_counts_anchors_without_a_hard_positive() -> None:
     """Two tight places far apart are easy but for one image that strayed to the other place."""
     x = np.array([[1, 0], [1, 0], [0, 1], [1, 0]], np.float32)
@@ -326,6 +292,8 @@ def test_the_easy_anchor_fraction_counts_anchors_without_a_hard_positive() -> No
     assert metric_loss(jnp.asarray(x), labels, PAPER).easy_anchor_fraction == 0
     x[3] = [0, 1]
     assert metric_loss(jnp.asarray(x), labels, PAPER).easy_anchor_fraction == 1
+    for alone in (jnp.zeros(4, int), jnp.arange(4)):  # without negatives, without positives
+        assert metric_loss(jnp.asarray(x), alone, PAPER).easy_anchor_fraction == 1
 
 
 def large_margin_cosine_loss(

@@ -8,7 +8,7 @@ import json
 import os
 import re
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -140,11 +140,6 @@ def _check_port(address: str) -> None:
         ) from error
 
 
-def are_several() -> bool:
-    """Return whether the run has several processes."""
-    return jax.process_count() > 1
-
-
 def is_primary() -> bool:
     """Return whether this process is the one that reads and writes the run's folder."""
     return jax.process_index() == 0
@@ -154,33 +149,11 @@ def run_on_primary(work: Callable[[], _T]) -> _T:
     """Run `work` in the primary process alone; return its value, a JSON value, in every process.
 
     Raises:
-        InputError, Interrupted: in every process, where `work` raises it.
+        InputError, Interrupted: in every process, as `raise_together` does.
     """
+    value: Any = raise_together(lambda: work() if is_primary() else None)
     if jax.process_count() == 1:
-        return work()
-    error: BaseException | None = None
-    value: Any = None
-    message: dict[str, Any] = {}
-    if is_primary():
-        try:
-            value = work()
-            message = {"value": value}
-        except Interrupted as stopped:
-            error, message = stopped, {"stopped": stopped.number}
-        except BaseException as raised:
-            error, message = raised, {"error": str(raised)[:1000]}
-    received = _broadcast_json(message)
-    if error is not None:
-        raise error
-    if "stopped" in received:
-        raise Interrupted(received["stopped"])
-    if "error" in received:
-        raise InputError(f"process 0: {received['error']}")
-    return value if is_primary() else received["value"]
-
-
-def _broadcast_json(value: dict[str, Any]) -> dict[str, Any]:
-    """Return the primary process's value in every process."""
+        return value
     text = json.dumps(value).encode()
     if len(text) > _MESSAGE:
         raise ValueError(f"found a message of {len(text)} bytes, expected at most {_MESSAGE}")
@@ -199,17 +172,19 @@ def all_max(*numbers: int) -> tuple[int, ...]:
     return tuple(_gather(*numbers).max(axis=0).tolist())
 
 
-def check_same(name: str, number: int) -> None:
-    """Check that all processes give the same number for `name`.
+def check_same(numbers: Mapping[str, int]) -> None:
+    """Check that all processes give the same numbers, named for messages.
 
     Raises:
         InputError: they do not, in every process.
     """
-    numbers = _gather(number)[:, 0]
-    others = np.flatnonzero(numbers != numbers[0])
-    if others.size:
+    gathered = _gather(*numbers.values())
+    others = np.argwhere(gathered != gathered[0])
+    if len(others):
+        process, position = others[0]
         raise InputError(
-            f"processes: found other {name} in process {others[0]} than in 0, expected the same"
+            f"processes: found other {list(numbers)[position]} in process {process} than in 0, "
+            "expected the same"
         )
 
 
@@ -224,16 +199,21 @@ def raise_together(work: Callable[[], _T]) -> _T:
     """Run `work` in every process and return its value; raise in all if it fails in one.
 
     Raises:
+        Interrupted: a signal has ended it, here or in another process.
         InputError: it failed in another process. In that one, its own error.
     """
-    error, value = None, None
+    error, value, code = None, None, 0
     try:
         value = work()
     except Exception as raised:
-        error = raised
-    (failed,) = all_max(error is not None)
+        error, code = raised, 1
+        if isinstance(raised, Interrupted):
+            code += raised.number
+    (failed,) = all_max(code)
     if error is not None:
         raise error
+    if failed > 1:
+        raise Interrupted(failed - 1)
     if failed:
         raise InputError(ANOTHER_FAILED)
     return value  # pyright: ignore[reportReturnType]
