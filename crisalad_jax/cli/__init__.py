@@ -107,7 +107,7 @@ def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
     load_entry_points()
     for plugin in _plugins(arguments):
         load_plugin(plugin)
-    from crisalad_jax.cli.common import emit_json, prepare_json
+    from crisalad_jax.cli.common import emit_json, prepare_output
 
     module = importlib.import_module(f"{__name__}.{name}")
     if hasattr(module, "prepare"):
@@ -118,17 +118,16 @@ def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
         require(
             abs(number) <= 2**40, f"--{flag}: found {number}, expected a number of at most 2**40"
         )
+    prepare_output(chosen)
     if not hasattr(module, "needs_jax") or module.needs_jax(chosen):
         from crisalad_jax.utils import compiler, executable_cache
 
         compiler.configure()
         if keep_programs and not has_plugins():
             executable_cache.cache_executables()
-    file = getattr(chosen, "json", None)
-    prepare_json(file, getattr(chosen, "json_suffixes", ()))
     values = module.run(chosen)
     if values is not None:
-        emit_json(file, values)
+        emit_json(chosen.json, values)
 
 
 def _numbers(flag: str, value: Any) -> Iterator[tuple[str, int]]:

@@ -2,12 +2,12 @@
 
 import dataclasses
 import pathlib
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import rich.console
 
 from crisalad_jax.cli.common import echo, find_given, pick, show
-from crisalad_jax.cli.flags import JsonFlag, ReadFlags, SizeFlags
+from crisalad_jax.cli.flags import FOLDER, JsonFlag, ReadFlags, SizeFlags
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -16,7 +16,7 @@ class ComparisonFlags(ReadFlags, SizeFlags, JsonFlag):
 
     test: tuple[pathlib.Path, ...]
     """Evaluation sets, each in any layout that `evaluate` reads."""
-    out: pathlib.Path
+    out: Annotated[pathlib.Path, FOLDER]
     """Folder of the comparison; the same command resumes what is in it. It also gets table.md,
     table.csv, results.json, and the page index.html."""
     train: pathlib.Path | None = None

@@ -10,7 +10,7 @@ from crisalad_jax.checkpoints.formats import FORMATS
 from crisalad_jax.checkpoints.public import convert
 from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.cli.common import echo, find_given, pick
-from crisalad_jax.cli.flags import JsonFlag, PluginFlag
+from crisalad_jax.cli.flags import JsonFlag, PluginFlag, Target
 from crisalad_jax.config.checks import require
 from crisalad_jax.training.summary import model_words
 
@@ -38,7 +38,7 @@ class Convert(PluginFlag, JsonFlag):
     source: Annotated[
         tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="SRC", help=_sources())
     ]
-    target: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="DST")]
+    target: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="DST"), Target()]
     """A .safetensors file; for a source of this package, the public checkpoint to write."""
     format: Annotated[str | None, tyro.conf.arg(help=_formats())] = None
     backbone: pathlib.Path | None = None

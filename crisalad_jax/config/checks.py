@@ -71,7 +71,6 @@ def check_count(what: str, count: Any) -> None:
 
 PATH = (str, os.PathLike)
 """Classes of a file's or a folder's name."""
-_ABSENT = object()
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -101,10 +100,9 @@ def takes(**kinds: type | tuple[type, ...]) -> Callable[[_F], _F]:
 
         @functools.wraps(function)
         def call(*args: Any, **options: Any) -> Any:
-            given = signature.bind_partial(*args, **options).arguments
-            for name, kind in kinds.items():
-                value = given.get(name, _ABSENT)
-                if value is not _ABSENT and not isinstance(value, kind):
+            for name, value in signature.bind_partial(*args, **options).arguments.items():
+                kind = kinds.get(name, object)
+                if not isinstance(value, kind):
                     plain = value is None or isinstance(value, str | int | float)
                     found = repr(value) if plain else type(value).__name__
                     classes = kind if isinstance(kind, tuple) else (kind,)

@@ -97,20 +97,14 @@ def _config(kind: Any, value: Any, path: str) -> Any:
 
 def _value(hint: Any, value: Any, path: str) -> Any:
     """Convert a field's value to exactly its type: 3.7 is no number of epochs."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    origin, (kind, *_) = typing.get_origin(hint), typing.get_args(hint) or (None,)
     if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in arguments:
-            return None
-        # Every union here is of None and one type, or of a part and its name.
-        kind = next(each for each in arguments if each is not type(None))
-        return _value(kind, value, path)
+        # Every union here is of one type and None, or of a part and its name.
+        return None if value is None and fits(hint, None) else _value(kind, value, path)
     if dataclasses.is_dataclass(hint):
         return _config(hint, value, path)
-    if origin is tuple and isinstance(value, list | tuple):
-        kinds = arguments[:1] * len(value) if arguments[-1:] == (...,) else arguments
-        if len(kinds) == len(value):
-            pairs = enumerate(zip(kinds, value, strict=True))
-            return tuple(_value(kind, each, f"{path}[{number}]") for number, (kind, each) in pairs)
+    if origin is tuple and isinstance(value, list | tuple):  # none here mixes types
+        value = tuple(_value(kind, each, f"{path}[{i}]") for i, each in enumerate(value))
     if not fits(hint, value):
         raise InputError(f"found {value!r}, expected {in_words(hint)} @ {path}")
     made: Any = value

@@ -28,7 +28,8 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 from tests.attack.world import (
-    VERBS,
+    ALL,
+    NEEDS,
     Done,
     Row,
     World,
@@ -60,8 +61,6 @@ RESUMABLE: Mapping[str, str] = {
     "extract .npy": r"d\.npy\.partial/.*",
     "extract .h5": r"d\.h5\.partial/.*",
 }
-NEEDS: Mapping[str, tuple[str, ...]] = {"query": ("index",), "pca": ("extract .npy",)}
-"""Products that a verb reads, by the verbs that make them."""
 # Files that hold times, or are drawn from them.
 _TIMED = re.compile(
     r"metrics\.jsonl|/tensorboard/|/state/|curves\.png|training\.(json|png)|speed\.json|index\.html|"
@@ -70,23 +69,6 @@ _TIMED = re.compile(
 )
 
 
-def _vocabulary(world: World, out: pathlib.Path) -> list[str]:
-    return [
-        *("vocabulary", "--images", f"{world.images}", "--out", f"{out / 'v.safetensors'}"),
-        *("--preset", "tiny", "--image-size", "98", "98", "--clusters", "4", "--quiet"),
-        *("--aggregator", "netvlad"),
-    ]
-
-
-def _ablate(world: World, out: pathlib.Path) -> list[str]:
-    return [
-        *("ablate", "--train", f"{world.city}", "--test", f"{world.town}", "--preset", "tiny"),
-        *("--rows", "gem", "--seeds", "1", "--epochs", "1", "--image-size", "98", "98"),
-        *("--out", f"{out / 'ablation'}", "--quiet"),
-    ]
-
-
-ALL = {**VERBS, "vocabulary": _vocabulary, "ablate": _ablate}
 TARGETS: Mapping[str, tuple[str, ...]] = {
     "evaluate": ("table.json", "pictures/config.json", "report/index.html"),
     "extract .npy": ("d.npy", "d.names.txt", "d.npy.json", "pairs.txt"),
