@@ -13,7 +13,6 @@ import rich.table
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.cli.flags import ModelFlags, RuntimeName, SetFlags, SizeFlags, Target
-from crisalad_jax.config.checks import require
 from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_format, write_json
@@ -117,11 +116,29 @@ def pick(flags: Any, *names: str) -> dict[str, Any]:
 
 def refuse_with(flag: str, **others: Any) -> None:
     """Raise InputError where one of the other flags, which exclude `flag`, has a value."""
-    for name, given in others.items():
-        require(
-            given in (None, False, ()),
-            f"--{name.replace('_', '-')}: found with {flag}, expected only one of the two",
-        )
+    for name in _given(others):
+        raise InputError(f"{name}: found with {flag}, expected only one of the two")
+
+
+def refuse_without(flag: str, value: Any, **others: Any) -> None:
+    """Raise InputError where one of the other flags has a value, and `flag`, which it needs, none.
+
+    Args:
+        flag: its name.
+        value: its value.
+        **others: the values of flags that need it.
+    """
+    for name in _given(others) if value is None else ():
+        raise InputError(f"{name}: found without {flag}, expected both")
+
+
+def _given(flags: Mapping[str, Any]) -> list[str]:
+    """List the flags that have a value; 0 is one."""
+    return [
+        f"--{name.replace('_', '-')}"
+        for name, value in flags.items()
+        if value is not None and value is not False and value != ()
+    ]
 
 
 def waiting_words(result: Any) -> str | None:

@@ -7,10 +7,18 @@ from typing import Annotated
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import echo, emit_json, open_model, open_set, pick, refuse_with, show
+from crisalad_jax.cli.common import (
+    echo,
+    emit_json,
+    open_model,
+    open_set,
+    pick,
+    refuse_with,
+    refuse_without,
+    show,
+)
 from crisalad_jax.cli.flags import FOLDER, JsonFlag, ModelFlags, ReadFlags, SetFlags
 from crisalad_jax.cli.tables import grouping_table, points_table
-from crisalad_jax.config.checks import require
 from crisalad_jax.evaluation.evaluate import check_evaluation, evaluate
 from crisalad_jax.evaluation.record import evaluation_settings, results_json, table_notes
 from crisalad_jax.evaluation.similarity import FirstSimilarities
@@ -130,10 +138,7 @@ def _check_flags(arguments: Evaluate) -> None:
         refuse_with("--weights", preset=arguments.preset)
     if arguments.runtime != "jax":
         refuse_with(f"--runtime {arguments.runtime}", **pick(arguments, "report", "preset"))
-    require(
-        arguments.rerank is not None or arguments.rerank_weights is None,
-        "--rerank-weights: found without --rerank, expected both, as in --rerank transvpr:100",
-    )
+    refuse_without("--rerank", arguments.rerank, rerank_weights=arguments.rerank_weights)
 
 
 def _untrained(preset: str, arguments: Evaluate) -> tuple[Model, str]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from crisalad_jax.cli.common import STDOUT, echo, find_given, pick, refuse_with
+from crisalad_jax.cli.common import STDOUT, echo, find_given, pick, refuse_with, refuse_without
 from crisalad_jax.cli.flags import JsonFlag, ReadFlags, RuntimeName, Target
 from crisalad_jax.config.checks import require
 from crisalad_jax.data.live import Camera, FolderWatch
@@ -144,10 +144,8 @@ def run(arguments: Query) -> None:
 def _check_files(arguments: Query) -> None:
     """Check that the gallery has what it needs, and a file of its own."""
     gallery, file = arguments.gallery, arguments.json
+    refuse_without("--gallery", gallery, map_images=arguments.map_images)
     if gallery is None:
-        require(
-            arguments.map_images is None, "--map-images: found without --gallery, expected both"
-        )
         return
     importlib.import_module("crisalad_jax.experiments.report")  # or its extra is missing
     require(
@@ -159,10 +157,7 @@ def _check_files(arguments: Query) -> None:
 def _sequence_of(arguments: Query) -> BayesFilter | None:
     """Make the filter that the flags ask for; None where they ask for none."""
     reach = arguments.sequence_reach
-    require(
-        reach is None or arguments.sequence is not None,
-        "--sequence-reach: found without --sequence bayes, expected both",
-    )
+    refuse_without("--sequence bayes", arguments.sequence, sequence_reach=reach)
     if arguments.sequence is None:
         return None
     return BayesFilter() if reach is None else BayesFilter(reach=reach)
