@@ -11,7 +11,6 @@ import re
 import subprocess
 import sys
 
-import h5py
 import jax
 import numpy as np
 import pytest
@@ -677,21 +676,6 @@ def test_extract_writes_descriptors_names_and_configuration(
         "skipped": [],
         "model": to_plain(MODEL),
     }
-
-    succeeds(capfd, *extract(shared, town, tmp_path / "h" / "d.h5"))
-    assert files_in(tmp_path / "h") == {"d.h5", "d.h5.json"}
-    with h5py.File(tmp_path / "h" / "d.h5", "r") as file:
-        for name, row in zip(names, found, strict=True):
-            np.testing.assert_array_equal(file[name]["global_descriptor"][()], row)
-
-    succeeds(capfd, *extract(shared, town, tmp_path / "s.npy", "--grouping", "sequential"))
-    database = np.stack([resize_image(read_image(town / name), (42, 56)) for name in names[:BATCH]])
-    np.testing.assert_allclose(
-        np.load(tmp_path / "s.npy")[:BATCH],
-        describe(params, database, MODEL),
-        atol=TOLERANCE,
-        rtol=0,
-    )
 
 
 @SPOILT

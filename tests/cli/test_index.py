@@ -333,8 +333,6 @@ def test_extract_writes_pairs_that_hloc_reads(shared, database, queries, tmp_pat
     assert between == nearest(sides[1], sides[0], 3)
 
     for more, words in (
-        (("--database", tmp_path / "db.h5"), "--database: found without --pairs, expected both"),
-        (("--pairs", two, "--k", 0), "k: found 0, expected at least 1"),
         (("--pairs", two, "--database", tmp_path / "no.h5"), "no.h5: found no such file, expected"),
         (("--root", queries), f"--root: found {queries}, expected a folder that holds {database}"),
     ):
