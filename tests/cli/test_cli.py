@@ -378,18 +378,6 @@ def test_a_bad_training_image_stops_the_run_until_it_is_repaired(
     assert f"{STEPS} steps" in succeeds(capfd, *arguments)
 
 
-def test_bad_training_images_are_skipped_and_counted(capfd, tmp_path, shared, city):
-    paths = sorted((city / "Images").rglob("*_000000[01]_*.jpg"))
-    for path, how in zip(paths, ["empty", "cut", "text"] * 4, strict=True):
-        spoil(path, how)
-    arguments = train(shared, city, tmp_path / "run", "--on-bad-image", "skip")
-    out = succeeds(capfd, *arguments)
-    log = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
-    skipped = sum(json.loads(line)["skipped_images"] for line in log)
-    assert skipped > 0
-    assert f"{skipped} unreadable images skipped" in out
-
-
 def test_a_loss_that_is_not_finite_names_the_step_and_saves_the_state(
     capfd, tmp_path, shared, params
 ):
@@ -405,23 +393,6 @@ def test_a_loss_that_is_not_finite_names_the_step_and_saves_the_state(
     for name, leaf in named_leaves(kept).items():
         np.testing.assert_array_equal(leaf, named_leaves(huge)[name])
     assert (tmp_path / "run" / "metrics.jsonl").read_text() == ""
-
-
-def test_a_folder_of_other_files_or_of_another_run_is_left_alone(capfd, tmp_path, shared, run):
-    (tmp_path / "notes.txt").write_text("mine")
-    fails(
-        capfd,
-        *train(shared, shared / "city", tmp_path),
-        words=(f"crisalad: {tmp_path}: found files but no run",),
-    )
-    assert files_in(tmp_path) == {"notes.txt"}
-    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
-    fails(
-        capfd,
-        *train(shared, shared / "city", run, "--seed", "6"),
-        words=(f"crisalad: {run}: holds a run of another configuration", "seed: found 6, expected"),
-    )
-    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
 
 
 # Weights

@@ -1,6 +1,5 @@
 """`crisalad index`, `query` and `info --map`: maps made, grown, asked, refused."""
 
-import dataclasses
 import json
 import pathlib
 
@@ -8,16 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from crisalad_jax.checkpoints.weights import load_weights, save_weights
+from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.tables import fact_lines
 from crisalad_jax.data.images import list_images
-from crisalad_jax.nn.model import Model
-from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
-from crisalad_jax.retrieval.maps.map import Map, open_for_appending
-from crisalad_jax.retrieval.maps.metadata import new_metadata
+from crisalad_jax.retrieval.maps.map import Map
 from tests.cli.test_cli import fails, files_in, runs, succeeds
-from tests.conftest import BATCH, MODEL, describe_single, random_params
+from tests.conftest import BATCH, describe_single
 from tests.retrieval.maps.test_stores import brute_force
 from tests.retrieval.test_hloc_pairs import brute_force as nearest
 from tests.retrieval.test_hloc_pairs import by_name, pairs_as_hloc_reads_them
@@ -214,21 +210,6 @@ def test_positions_come_from_a_table(shared, database, tmp_path, capfd):
 # Refused
 
 
-def test_a_map_of_another_model_is_refused(shared, folder, database, queries, tmp_path, capfd):
-    salad = dataclasses.replace(
-        MODEL.aggregator, sinkhorn=dataclasses.replace(MODEL.aggregator.sinkhorn, iterations=5)
-    )
-    config = dataclasses.replace(MODEL, aggregator=salad)
-    other = tmp_path / "other.safetensors"
-    save_weights(other, Model(random_params(config), config))
-    before = files_in(folder)
-    words = (f"{folder}: found a map made by model", "is model", other)
-    made = ("index", "--weights", other, "--images", database, "--out", folder)
-    fails(capfd, *made, words=words)
-    fails(capfd, *query(folder, queries, "--weights", other), words=words)
-    assert files_in(folder) == before
-
-
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
@@ -265,24 +246,6 @@ def test_a_map_keeps_its_settings(shared, folder, database, capfd, flags, words)
 def test_bad_questions_are_one_line(folder, queries, capfd, arguments, words):
     filled = [str(part).format(map=folder, images=queries) for part in arguments]
     fails(capfd, *query(folder)[:1], "--map", folder, *filled, "--quiet", words=(words,))
-
-
-def test_a_command_that_failed_binds_the_corrected_one_to_nothing(
-    shared, database, tmp_path, capfd, weights
-):
-    """No server answers; then a kill has left a map of other settings without an image."""
-    out = tmp_path / "map"
-    nowhere = ("--store", "milvus:http://127.0.0.1:9")
-    fails(capfd, *index(shared, database, out, *nowhere), words=("Fail connecting",))
-    assert not out.exists()
-    describer = describer_of(load_weights(weights))
-    other = new_metadata(describer, tmp_path / "w", out, dtype="float16")
-    other = dataclasses.replace(other, model="0" * 64)
-    with open_for_appending(out, other):
-        pass
-    succeeds(capfd, *index(shared, database, out, "--dtype", "float32"))
-    with Map.open(out) as found:
-        assert (len(found), found.metadata.dtype) == (7, "float32")
 
 
 def test_positions_of_images_that_are_there_are_said_to_stay(
