@@ -87,14 +87,14 @@ def prepare_output(flags: Any) -> None:
         InputError: a file or folder cannot be made, or its name says another format.
     """
     console.stderr = getattr(flags, "json", None) == STDOUT
-    for name, hint in get_type_hints(type(flags), include_extras=True).items():
+    hints = get_type_hints(type(flags), include_extras=True)
+    marks = [(name, mark) for name in hints for mark in getattr(hints[name], "__metadata__", ())]
+    for name, target in marks:
         path = getattr(flags, name)
-        for target in getattr(hint, "__metadata__", ()):
-            is_file = path is not None and (name, path) != ("json", STDOUT)
-            if is_file and isinstance(target, Target):
-                if target.suffixes:
-                    check_format(f"--{name}", path, *target.suffixes)
-                target.check(path)
+        if isinstance(target, Target) and path is not None and (name, path) != ("json", STDOUT):
+            if target.suffixes:
+                check_format(f"--{name}", path, *target.suffixes)
+            target.check(path)
 
 
 def emit_json(file: pathlib.Path | None, value: Mapping[str, Any]) -> None:

@@ -240,24 +240,21 @@ def _full(
     old: tuple[str, ...],
 ) -> None:
     words = f"room for {100 * fraction:.0f} %" + (" over earlier files" if old else "")
-    out = folder / "out"
+    out, limit = folder / "out", None
     if way == "limit":
-        out.mkdir(parents=True)
-        before = _old(out, old)
-        room = int(fraction * max(whole.files.values()))
-        done = start(ALL[verb](world, out), cwd=folder, file_limit=room)
-        judge(row, f"{words} of the largest file", verb, out, done, before)
-        finish(row, words, verb, world, out, whole)
+        limit = int(fraction * max(whole.files.values()))
+        disk, words = contextlib.nullcontext(lambda: None), f"{words} of the largest file"
     else:
         pages = sum(-(-size // PAGE) for size in whole.files.values())
         room = int(fraction * (pages - 1)) + len(old)
-        with small_disk(folder, room * PAGE) as more:
-            out.mkdir()
-            before = _old(out, old)
-            done = start(ALL[verb](world, out), cwd=folder)
-            judge(row, f"{words} ({room} pages)", verb, out, done, before)
-            more()
-            finish(row, words, verb, world, out, whole)
+        disk, words = small_disk(folder, room * PAGE), f"{words} ({room} pages)"
+    with disk as more:
+        out.mkdir(parents=True)
+        before = _old(out, old)
+        done = start(ALL[verb](world, out), cwd=folder, file_limit=limit)
+        judge(row, words, verb, out, done, before)
+        more()
+        finish(row, words, verb, world, out, whole)
     shutil.rmtree(folder, ignore_errors=True)
 
 
