@@ -61,14 +61,6 @@ def test_every_output_is_checked_before_any_work(capfd, tmp_path, monkeypatch, o
     assert files_in(tmp_path) == {"file"}
 
 
-def test_pairs_do_not_overwrite_what_extract_writes(capfd, tmp_path, shared):
-    start = extract(
-        shared, shared / "town", tmp_path / "d.npy", "--pairs", tmp_path / "d.names.txt"
-    )
-    fails(capfd, *start, words=(f"--pairs: found {tmp_path}/d.names.txt, which --out writes",))
-    assert files_in(tmp_path) == set()
-
-
 def test_verify_needs_a_map(capfd):
     fails(capfd, "info", "--verify", words=("--verify: found without --map",))
 
