@@ -182,7 +182,7 @@ def test_no_command_prints_the_usage(capfd):
         ("evaluate --data d --grouping single,sorted", "grouping: found 'sorted', expected one of"),
         ("evaluate --data d --grouping a/b/c", "grouping: found 'a/b/c', .*QUERIES/DATABASE"),
         ("evaluate --data d --seeds 0", "seeds: found 0, expected at least 1"),
-        ("evaluate --data d --batch-size 0", "batch size: found 0"),
+        ("evaluate --data d --batch-size 0", "batch.size: found 0"),
         ("evaluate --data d --seed -1", "seed: found -1"),
         ("extract --weights w --images d --out f.txt", r"f\.txt: suffix.*\.h5, \.npy"),
         ("extract --weights w --images d --out f.npy --grouping all", "grouping: found 'all'"),

@@ -218,7 +218,7 @@ def test_positions_come_from_a_table(shared, database, tmp_path, capfd):
         (("--dtype", "float16"), "found dtype float16, expected float32 as in the map"),
         (("--store", "milvus:x.db"), "expected files as in the map"),
         (("--store", "redis"), "store: found 'redis', expected files or milvus:URI"),
-        (("--batch-size", 0), "batch size: found 0, expected at least 1"),
+        (("--batch-size", 0), "size: found 0, expected at least 1"),
     ],
 )
 def test_a_map_keeps_its_settings(shared, folder, database, capfd, flags, words):
