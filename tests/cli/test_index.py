@@ -230,7 +230,7 @@ def test_a_map_keeps_its_settings(shared, folder, database, capfd, flags, words)
     [
         (("{images}", "--k", 0), "k: found 0, expected at least 1"),
         (("{map}/map.json",), "map.json: found"),
-        (("{map}/none.jpg",), "none.jpg: found no such file, expected an image file"),
+        (("{map}/none.jpg",), "none.jpg: found no such file, expected"),
         (("{map}/segments",), "segments: found no image"),
         (("{images}", "--gallery", "{map}"), "map: found a folder, expected a file"),
         (("{images}", "--map-images", "{map}"), "--map-images: found without --gallery, expected"),
