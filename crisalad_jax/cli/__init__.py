@@ -16,7 +16,12 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.config.plugins import has_plugins, load_entry_points, load_plugin, plugin_failure
+from crisalad_jax.config.plugins import (
+    load_entry_points,
+    load_plugin,
+    loaded_plugins,
+    plugin_failure,
+)
 from crisalad_jax.utils.errors import InputError, Interrupted, how_ended
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.output import Note, one_line, printable
@@ -79,15 +84,6 @@ def _usage() -> str:
     return "\n".join(lines)
 
 
-def _plugins(given: Sequence[str]) -> Iterator[str]:
-    """Yield the plug-ins after each --plugin."""
-    from crisalad_jax.config.flags import flag_values
-
-    for names in flag_values(given, "--plugin"):
-        require(bool(names), "--plugin: found no value, expected FILE.py or MODULE")
-        yield from names
-
-
 def _limit_pixels(given: Sequence[str]) -> None:
     """Set the largest image that OpenCV decodes, before OpenCV is imported."""
     from crisalad_jax.config.flags import find_flag
@@ -105,9 +101,13 @@ def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
     require("" not in arguments, "arguments: found an empty one, expected a value")
     _limit_pixels(arguments)
     load_entry_points()
-    for plugin in _plugins(arguments):
-        load_plugin(plugin)
-    from crisalad_jax.cli.common import emit_json, prepare_json
+    from crisalad_jax.cli.common import emit_json, prepare_output
+    from crisalad_jax.config.flags import flag_values
+
+    for plugins in flag_values(arguments, "--plugin"):
+        require(bool(plugins), "--plugin: found no value, expected FILE.py or MODULE")
+        for plugin in plugins:
+            load_plugin(plugin)
 
     module = importlib.import_module(f"{__name__}.{name}")
     if hasattr(module, "prepare"):
@@ -118,17 +118,16 @@ def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
         require(
             abs(number) <= 2**40, f"--{flag}: found {number}, expected a number of at most 2**40"
         )
+    prepare_output(chosen)
     if not hasattr(module, "needs_jax") or module.needs_jax(chosen):
         from crisalad_jax.utils import compiler, executable_cache
 
         compiler.configure()
-        if keep_programs and not has_plugins():
+        if keep_programs and not loaded_plugins():
             executable_cache.cache_executables()
-    file = getattr(chosen, "json", None)
-    prepare_json(file, getattr(chosen, "json_suffixes", ()))
     values = module.run(chosen)
     if values is not None:
-        emit_json(file, values)
+        emit_json(chosen.json, values)
 
 
 def _numbers(flag: str, value: Any) -> Iterator[tuple[str, int]]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import tyro
 
-from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison
+from crisalad_jax.cli.compare import ComparisonFlags, names_of, run_comparison
 
 COMMON = (
     "test out train rows row reference jobs backbone preset seeds epochs image-size grouping "

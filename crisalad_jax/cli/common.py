@@ -5,18 +5,17 @@ import json
 import pathlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, get_type_hints
 
 import rich.console
 import rich.table
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.cli.flags import ModelFlags, RuntimeName, SetFlags, SizeFlags
-from crisalad_jax.config.checks import require
+from crisalad_jax.cli.flags import ModelFlags, RuntimeName, SetFlags, SizeFlags, Target
 from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_format, check_target, write_json
+from crisalad_jax.utils.files import check_format, write_json
 from crisalad_jax.utils.output import printable
 
 if TYPE_CHECKING:  # commands that load no model of a file start without these
@@ -79,16 +78,23 @@ STDOUT = pathlib.Path("-")
 """Name of the terminal, or of what reads the output, in place of a file of JSON."""
 
 
-def prepare_json(file: pathlib.Path | None, suffixes: Sequence[str] = (".json",)) -> None:
-    """Check a flag --json before any work; where it is `STDOUT`, print all else on stderr.
+def prepare_output(flags: Any) -> None:
+    """Check all that a command will write before any work.
+
+    Where --json is `STDOUT`, print all else on stderr.
 
     Raises:
-        InputError: the file cannot be written, or its name says another format than `suffixes`.
+        InputError: a file or folder cannot be made, or its name says another format.
     """
-    console.stderr = file == STDOUT
-    if file not in (None, STDOUT):
-        check_format("--json", file, *suffixes)
-        check_target(file)
+    console.stderr = getattr(flags, "json", None) == STDOUT
+    hints = get_type_hints(type(flags), include_extras=True)
+    marks = [(name, mark) for name in hints for mark in getattr(hints[name], "__metadata__", ())]
+    for name, target in marks:
+        path = getattr(flags, name)
+        if isinstance(target, Target) and path is not None and (name, path) != ("json", STDOUT):
+            if target.suffixes:
+                check_format(f"--{name}", path, *target.suffixes)
+            target.check(path)
 
 
 def emit_json(file: pathlib.Path | None, value: Mapping[str, Any]) -> None:
@@ -110,11 +116,29 @@ def pick(flags: Any, *names: str) -> dict[str, Any]:
 
 def refuse_with(flag: str, **others: Any) -> None:
     """Raise InputError where one of the other flags, which exclude `flag`, has a value."""
-    for name, given in others.items():
-        require(
-            given in (None, False, ()),
-            f"--{name.replace('_', '-')}: found with {flag}, expected only one of the two",
-        )
+    for name in _given(others):
+        raise InputError(f"{name}: found with {flag}, expected only one of the two")
+
+
+def refuse_without(flag: str, value: Any, **others: Any) -> None:
+    """Raise InputError where one of the other flags has a value, and `flag`, which it needs, none.
+
+    Args:
+        flag: its name.
+        value: its value.
+        **others: the values of flags that need it.
+    """
+    for name in _given(others) if value is None else ():
+        raise InputError(f"{name}: found without {flag}, expected both")
+
+
+def _given(flags: Mapping[str, Any]) -> list[str]:
+    """List the flags that have a value; 0 is one."""
+    return [
+        f"--{name.replace('_', '-')}"
+        for name, value in flags.items()
+        if value is not None and value is not False and value != ()
+    ]
 
 
 def waiting_words(result: Any) -> str | None:

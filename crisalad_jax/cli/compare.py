@@ -1,15 +1,104 @@
-"""`crisalad compare`."""
+"""`crisalad compare`, and what `crisalad ablate` shares with it."""
 
 import dataclasses
-from typing import Any
+import pathlib
+from typing import Annotated, Any, Literal
 
-from crisalad_jax.cli.comparing import ComparisonFlags, names_of, run_comparison
+import rich.console
+
+from crisalad_jax.cli.common import echo, find_given, pick, show
+from crisalad_jax.cli.flags import FOLDER, JsonFlag, ReadFlags, SizeFlags
 
 COMMON = (
     "test out train methods weights backbone preset seeds epochs image-size grouping batch-size "
     "rerank reference jobs page json on-bad-image quiet"
 )
 EXAMPLE = "crisalad compare --test pitts30k_test.mat --weights salad megaloc --out compared"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ComparisonFlags(ReadFlags, SizeFlags, JsonFlag):
+    """The flags of both commands."""
+
+    test: tuple[pathlib.Path, ...]
+    """Evaluation sets, each in any layout that `evaluate` reads."""
+    out: Annotated[pathlib.Path, FOLDER]
+    """Folder of the comparison; the same command resumes what is in it. It also gets table.md,
+    table.csv, results.json, and the page index.html."""
+    train: pathlib.Path | None = None
+    """Training set: a folder with one folder a place, a table name,place[,lat,lon[,heading]]
+    (places.csv in the folder, or the file), or Dataframes/ and Images/ of GSV-Cities."""
+    backbone: pathlib.Path | None = None
+    """Train from this backbone, as the recipes say: a file of this package, a public checkpoint, or
+    a published model's name. None trains all from nothing, by the recipe scratch."""
+    preset: str = "b14"
+    """tiny, s14, b14, l14 or g14."""
+    seeds: int = 3
+    """Runs of each, of seed 0, 1 and so on."""
+    epochs: int | None = None
+    """By default the recipes'; from nothing 6."""
+    grouping: str = "single"
+    """Comma-separated, as `evaluate` takes them, for methods with a cross-image encoder."""
+    reference: str | None = None
+    """Which line differences, speeds and training times are relative to; by default crisalad, or
+    the first where that is not compared."""
+    jobs: int = 1
+    """Runs at once, each in a process of its own: on a GPU of its own where there are as many, else
+    sharing one. Other hosts that run the same command on a shared folder take runs too."""
+    page: pathlib.Path | None = None
+    """Also put the tables into this Markdown page, between its comments <!-- NAME --> and <!-- end
+    of NAME -->, where NAME is the name of the folder --out."""
+
+
+def names_of(text: str) -> tuple[str, ...]:
+    """Split text at commas into names."""
+    return tuple(name.strip() for name in text.split(","))
+
+
+def run_comparison(
+    flags: ComparisonFlags,
+    command: Literal["compare", "ablate"],
+    names: tuple[str, ...],
+    **more: Any,
+) -> dict[str, Any]:
+    """Carry out a comparison, and print its tables.
+
+    Args:
+        flags: of both commands.
+        command: "compare" or "ablate".
+        names: what is compared.
+        **more: the settings of the `ComparisonConfig` that one command alone has.
+
+    Returns:
+        The result as JSON values.
+    """
+    from crisalad_jax.experiments.comparison import ComparisonConfig, compare
+    from crisalad_jax.experiments.comparison.tables import as_json, tables_of
+
+    backbone = find_given(flags.backbone, quiet=flags.quiet)
+    config = ComparisonConfig(
+        command,
+        names,
+        test=tuple(map(str, flags.test)),
+        train=None if flags.train is None else str(flags.train),
+        backbone=None if backbone is None else str(backbone),
+        **pick(flags, "preset", "epochs", "image_size", "resize", "batch_size", "grouping"),
+        **pick(flags, "seeds", "reference"),
+        **more,
+    )
+    notes = rich.console.Console(stderr=True, markup=False, emoji=False, quiet=flags.quiet)
+    summary = compare(
+        config,
+        flags.out,
+        **pick(flags, "page", "on_bad_image", "jobs", "quiet"),
+        say=lambda line: notes.print(line, soft_wrap=True, highlight=False),
+    )
+    for table in tables_of(summary).values():
+        show(table.terminal())
+    for note in summary.notes:
+        echo(note)
+    echo(f"table.md, table.csv, results.json, and a page: {flags.out / 'index.html'}")
+    return as_json(summary)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,8 @@ import tyro
 from crisalad_jax.checkpoints.formats import FORMATS
 from crisalad_jax.checkpoints.public import convert
 from crisalad_jax.checkpoints.published import PUBLISHED
-from crisalad_jax.cli.common import echo, find_given, pick
-from crisalad_jax.cli.flags import JsonFlag, PluginFlag
+from crisalad_jax.cli.common import echo, find_given, pick, refuse_without
+from crisalad_jax.cli.flags import JsonFlag, PluginFlag, Target
 from crisalad_jax.config.checks import require
 from crisalad_jax.training.summary import model_words
 
@@ -38,7 +38,7 @@ class Convert(PluginFlag, JsonFlag):
     source: Annotated[
         tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="SRC", help=_sources())
     ]
-    target: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="DST")]
+    target: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="DST"), Target()]
     """A .safetensors file; for a source of this package, the public checkpoint to write."""
     format: Annotated[str | None, tyro.conf.arg(help=_formats())] = None
     backbone: pathlib.Path | None = None
@@ -61,10 +61,7 @@ def run(arguments: Convert) -> dict[str, Any]:
     source, target, backbone = arguments.source, arguments.target, arguments.backbone
     given = pick(arguments, "layer", "facet", "assignment")
     fields = {name: value for name, value in given.items() if value is not None}
-    require(
-        not fields or backbone is not None,
-        f"--{next(iter(fields), '')}: found without --backbone, expected both",
-    )
+    refuse_without("--backbone", backbone, **given)
     require(
         str(source) not in PUBLISHED or source.exists(),
         f"{source}: found the name of a published model, expected a file; --weights {source} "

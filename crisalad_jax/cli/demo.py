@@ -2,10 +2,10 @@
 
 import dataclasses
 import pathlib
-from typing import Any
+from typing import Annotated, Any
 
 from crisalad_jax.cli.common import echo, show
-from crisalad_jax.cli.flags import JsonFlag, QuietFlag
+from crisalad_jax.cli.flags import FOLDER, JsonFlag, QuietFlag
 from crisalad_jax.retrieval.grouping import grouping_words
 
 EXAMPLE = "crisalad demo --out demo"
@@ -15,7 +15,7 @@ EXAMPLE = "crisalad demo --out demo"
 class Demo(JsonFlag, QuietFlag):
     """Render a synthetic city, train a tiny model on it, and show Recall@K before and after."""
 
-    out: pathlib.Path = pathlib.Path("demo")
+    out: Annotated[pathlib.Path, FOLDER] = pathlib.Path("demo")
     """Folder for the city, the run, the tables and the pictures."""
     seed: int = 0
     """Draws the city and the run."""

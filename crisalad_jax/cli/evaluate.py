@@ -3,13 +3,22 @@
 import contextlib
 import dataclasses
 import pathlib
+from typing import Annotated
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import echo, emit_json, open_model, open_set, pick, refuse_with, show
-from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags, SetFlags
+from crisalad_jax.cli.common import (
+    echo,
+    emit_json,
+    open_model,
+    open_set,
+    pick,
+    refuse_with,
+    refuse_without,
+    show,
+)
+from crisalad_jax.cli.flags import FOLDER, JsonFlag, ModelFlags, ReadFlags, SetFlags
 from crisalad_jax.cli.tables import grouping_table, points_table
-from crisalad_jax.config.checks import require
 from crisalad_jax.evaluation.evaluate import check_evaluation, evaluate
 from crisalad_jax.evaluation.record import evaluation_settings, results_json, table_notes
 from crisalad_jax.evaluation.similarity import FirstSimilarities
@@ -17,7 +26,7 @@ from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.grouping import DEFAULT_GROUPINGS
 from crisalad_jax.retrieval.pca import load_pca
 from crisalad_jax.retrieval.reranking import Reranking, parse_reranking
-from crisalad_jax.utils.files import check_target, write_json
+from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.locks import staged_folder
 
 COMMON = (
@@ -51,9 +60,9 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, JsonFlag):
     """Draws the first shuffled order, and untrained weights."""
     seeds: int = 3
     """Shuffled orders: their mean and standard deviation are printed."""
-    out: pathlib.Path | None = None
+    out: Annotated[pathlib.Path | None, FOLDER] = None
     """Folder for a gallery of retrievals and the resolved configuration."""
-    report: pathlib.Path | None = None
+    report: Annotated[pathlib.Path | None, FOLDER] = None
     """Folder for a page of all results, index.html, that needs no other file and no network; and
     its pictures."""
 
@@ -124,18 +133,12 @@ def run(arguments: Evaluate) -> None:
 
 
 def _check_flags(arguments: Evaluate) -> None:
-    """Check before any work that files can be written and flags go together."""
-    for folder, file in ((arguments.out, "config.json"), (arguments.report, "index.html")):
-        if folder is not None:
-            check_target(folder / file)
+    """Check before any work that flags go together."""
     if arguments.weights is not None:
         refuse_with("--weights", preset=arguments.preset)
     if arguments.runtime != "jax":
         refuse_with(f"--runtime {arguments.runtime}", **pick(arguments, "report", "preset"))
-    require(
-        arguments.rerank is not None or arguments.rerank_weights is None,
-        "--rerank-weights: found without --rerank, expected both, as in --rerank transvpr:100",
-    )
+    refuse_without("--rerank", arguments.rerank, rerank_weights=arguments.rerank_weights)
 
 
 def _untrained(preset: str, arguments: Evaluate) -> tuple[Model, str]:

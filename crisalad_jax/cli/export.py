@@ -2,10 +2,10 @@
 
 import dataclasses
 import pathlib
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from crisalad_jax.cli.common import echo, load_model
-from crisalad_jax.cli.flags import ComputeFlags, JsonFlag, PluginFlag
+from crisalad_jax.cli.flags import NEW_FOLDER, ComputeFlags, JsonFlag, PluginFlag
 from crisalad_jax.config.checks import require
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ class Export(ComputeFlags, PluginFlag, JsonFlag):
 
     weights: pathlib.Path
     """A .safetensors file of this package, or a published model's name (`crisalad models`)."""
-    out: pathlib.Path
+    out: Annotated[pathlib.Path, NEW_FOLDER]
     """New folder for the program, its manifest.json and its weights."""
     format: Literal["stablehlo", "onnx", "openvino"] = "stablehlo"
     """stablehlo, for JAX; onnx, for onnxruntime, TensorRT and others; or openvino. The last two are

@@ -2,10 +2,10 @@
 
 import dataclasses
 import pathlib
-from typing import Any
+from typing import Annotated, Any
 
 from crisalad_jax.cli.common import echo, open_model, pick, waiting_words
-from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags
+from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags, Target
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
 from crisalad_jax.utils.output import counted
@@ -26,7 +26,7 @@ class Extract(ReadFlags, ModelFlags, JsonFlag):
     images: pathlib.Path
     """Folder, searched with its subfolders; or a file, a pattern, a list, a table or a video
     (docs/how-to/image-sources.md)."""
-    out: pathlib.Path
+    out: Annotated[pathlib.Path, Target()]
     """descriptors.npy (with names in .names.txt) or features.h5 (hloc)."""
     fps: float | None = None
     """Frames a second taken of a video, by default 1."""
@@ -37,7 +37,7 @@ class Extract(ReadFlags, ModelFlags, JsonFlag):
     """Draws the shuffled order."""
     root: pathlib.Path | None = None
     """Folder that names are relative to, by default --images: hloc's folder of all images."""
-    pairs: pathlib.Path | None = None
+    pairs: Annotated[pathlib.Path | None, Target((".txt",))] = None
     """File for hloc's pairs: each image with those most similar to it, a pair a line."""
     database: pathlib.Path | None = None
     """Descriptors, .h5 or .npy, of the images that are paired with these; by default these."""

@@ -1,8 +1,12 @@
 """Flags that several commands share."""
 
 import dataclasses
+import functools
 import pathlib
-from typing import TYPE_CHECKING, ClassVar, Literal
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+
+from crisalad_jax.utils.files import check_folder, check_new_folder, check_target
 
 if TYPE_CHECKING:  # commands that load no model of a file start without these
     from crisalad_jax.data.reading import Reading
@@ -12,13 +16,24 @@ RuntimeName = Literal["jax", "onnxruntime", "openvino"]
 """What computes a model: JAX, or another engine (`checkpoints.engines.EngineName`)."""
 
 
+class Target(NamedTuple):
+    """Marks a flag that names what a command writes, which is checked before any work."""
+
+    suffixes: tuple[str, ...] = ()
+    """What the file's name may end with; any, where there are none."""
+    check: Callable[[pathlib.Path], None] = check_target
+
+
+WEIGHTS = Target(check=functools.partial(check_target, suffix=".safetensors"))
+FOLDER = Target(check=check_folder)
+NEW_FOLDER = Target(check=check_new_folder)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class JsonFlag:
     """Where the result goes as JSON."""
 
-    json_suffixes: ClassVar[tuple[str, ...]] = (".json",)
-    """What the file's name may end with."""
-    json: pathlib.Path | None = None
+    json: Annotated[pathlib.Path | None, Target((".json",))] = None
     """File for the result as JSON; - prints it."""
 
 

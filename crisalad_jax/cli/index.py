@@ -2,10 +2,10 @@
 
 import dataclasses
 import pathlib
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from crisalad_jax.cli.common import echo, open_model, pick, waiting_words
-from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags
+from crisalad_jax.cli.flags import FOLDER, JsonFlag, ModelFlags, ReadFlags
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
 from crisalad_jax.retrieval.maps.build import Indexed, index
@@ -31,7 +31,7 @@ class Index(ReadFlags, ModelFlags, JsonFlag):
     images: pathlib.Path
     """Folder, file, pattern, list, table or video (docs/how-to/image-sources.md); the map names
     images by their paths in the folder, subfolders included."""
-    out: pathlib.Path
+    out: Annotated[pathlib.Path, FOLDER]
     """The map's folder. After a kill the same command goes on."""
     fps: float | None = None
     """Frames a second taken of a video, by default 1."""

@@ -4,10 +4,9 @@ import dataclasses
 import pathlib
 from typing import Any
 
-from crisalad_jax.cli.common import echo, load_model, refuse_with, show
+from crisalad_jax.cli.common import echo, load_model, refuse_with, refuse_without, show
 from crisalad_jax.cli.flags import JsonFlag, PluginFlag, SizeFlags
 from crisalad_jax.cli.tables import fact_lines, summary_table
-from crisalad_jax.config.checks import require
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.training.summary import model_summary, summary_json, summary_lines
@@ -36,10 +35,7 @@ class Info(SizeFlags, PluginFlag, JsonFlag):
 
 def run(arguments: Info) -> dict[str, Any]:
     """Print the table of a model or a map."""
-    require(
-        not arguments.verify or arguments.map is not None,
-        "--verify: found without --map, expected both",
-    )
+    refuse_without("--map", arguments.map, verify=arguments.verify)
     return _model(arguments) if arguments.map is None else _map(arguments.map, arguments)
 
 

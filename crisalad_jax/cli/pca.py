@@ -2,17 +2,16 @@
 
 import dataclasses
 import pathlib
-from typing import Any
+from typing import Annotated, Any
 
 from crisalad_jax.checkpoints.load import find_weights, load
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.cli.common import echo, pick
-from crisalad_jax.cli.flags import JsonFlag, QuietFlag
+from crisalad_jax.cli.flags import WEIGHTS, JsonFlag, QuietFlag
 from crisalad_jax.config.checks import require
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.descriptor_files import open_npy
 from crisalad_jax.retrieval.pca import SAMPLES, PcaConfig, fit_pca, save_pca
-from crisalad_jax.utils.files import check_target
 
 EXAMPLE = "crisalad pca --descriptors photos.npy --dim 512 --out pca.safetensors"
 
@@ -23,7 +22,7 @@ class Pca(JsonFlag, QuietFlag):
 
     descriptors: pathlib.Path
     """A .npy file, such as `crisalad extract` writes; not of images that are evaluated on."""
-    out: pathlib.Path
+    out: Annotated[pathlib.Path, WEIGHTS]
     """A .safetensors file: the components, or with --weights a model."""
     weights: str | None = None
     """Make a model of these weights with the components as its last layer."""
@@ -43,7 +42,6 @@ class Pca(JsonFlag, QuietFlag):
 
 def run(arguments: Pca) -> dict[str, Any]:
     """Fit components, write them, and print their share of the variance."""
-    check_target(arguments.out, ".safetensors")
     model = None
     if arguments.weights is not None:
         weights = find_weights(arguments.weights, quiet=arguments.quiet)

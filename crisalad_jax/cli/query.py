@@ -6,19 +6,19 @@ import importlib
 import pathlib
 import sys
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from crisalad_jax.cli.common import STDOUT, echo, find_given, pick, refuse_with
-from crisalad_jax.cli.flags import JsonFlag, ReadFlags, RuntimeName
+from crisalad_jax.cli.common import STDOUT, echo, find_given, pick, refuse_with, refuse_without
+from crisalad_jax.cli.flags import JsonFlag, ReadFlags, RuntimeName, Target
 from crisalad_jax.config.checks import require
 from crisalad_jax.data.live import Camera, FolderWatch
 from crisalad_jax.retrieval.maps.live import latency_words, query_live
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
 from crisalad_jax.retrieval.sequence import BayesFilter
-from crisalad_jax.utils.files import atomic_path, check_format, check_target, real_path
+from crisalad_jax.utils.files import atomic_path, real_path
 from crisalad_jax.utils.output import counted, printable
 from crisalad_jax.utils.signals import defer_signals
 
@@ -43,7 +43,6 @@ EXAMPLE = "crisalad query new.jpg --map map --json -"
 class Query(ReadFlags, JsonFlag):
     """Find the images of a map that are most similar to others, and say where they were taken."""
 
-    json_suffixes: ClassVar[tuple[str, ...]] = (".json", ".jsonl")
     images: Annotated[
         tuple[pathlib.Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE...")
     ]
@@ -77,10 +76,10 @@ class Query(ReadFlags, JsonFlag):
     say no times or positions, images of the map a frame."""
     exact: bool = False
     """Search exactly, although the map has an approximate search."""
-    json: pathlib.Path | None = None
+    json: Annotated[pathlib.Path | None, Target((".json", ".jsonl"))] = None
     """File for the answers: .jsonl, a line of JSON for each query, or .json, a list; - prints
     lines."""
-    gallery: pathlib.Path | None = None
+    gallery: Annotated[pathlib.Path | None, Target((".png",))] = None
     """PNG of up to 24 queries beside up to 8 answers each."""
     map_images: pathlib.Path | None = None
     """Folder of the map's images, for the gallery, if they are not where they were."""
@@ -143,16 +142,12 @@ def run(arguments: Query) -> None:
 
 
 def _check_files(arguments: Query) -> None:
-    """Check before any work that the files can be written."""
+    """Check that the gallery has what it needs, and a file of its own."""
     gallery, file = arguments.gallery, arguments.json
+    refuse_without("--gallery", gallery, map_images=arguments.map_images)
     if gallery is None:
-        require(
-            arguments.map_images is None, "--map-images: found without --gallery, expected both"
-        )
         return
     importlib.import_module("crisalad_jax.experiments.report")  # or its extra is missing
-    check_format("--gallery", gallery, ".png")
-    check_target(gallery)
     require(
         file in (None, STDOUT) or real_path(file) != real_path(gallery),
         f"--gallery: found {gallery}, as --json, expected two files",
@@ -162,10 +157,7 @@ def _check_files(arguments: Query) -> None:
 def _sequence_of(arguments: Query) -> BayesFilter | None:
     """Make the filter that the flags ask for; None where they ask for none."""
     reach = arguments.sequence_reach
-    require(
-        reach is None or arguments.sequence is not None,
-        "--sequence-reach: found without --sequence bayes, expected both",
-    )
+    refuse_without("--sequence bayes", arguments.sequence, sequence_reach=reach)
     if arguments.sequence is None:
         return None
     return BayesFilter() if reach is None else BayesFilter(reach=reach)

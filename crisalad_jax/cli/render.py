@@ -2,10 +2,10 @@
 
 import dataclasses
 import pathlib
-from typing import Any
+from typing import Annotated, Any
 
 from crisalad_jax.cli.common import echo
-from crisalad_jax.cli.flags import JsonFlag, QuietFlag
+from crisalad_jax.cli.flags import FOLDER, JsonFlag, QuietFlag
 from crisalad_jax.synthetic import (
     SCENERIES,
     VARIATIONS,
@@ -25,7 +25,7 @@ EXAMPLE = "crisalad render --out world --scenes 2400"
 class Render(JsonFlag, QuietFlag):
     """Render a world of streets, corridors and country: places to train on, and others to test."""
 
-    out: pathlib.Path
+    out: Annotated[pathlib.Path, FOLDER]
     """Folder for the world: train/ in the layout of GSV-Cities, test/ in that of
     VPR-datasets-downloader."""
     scenes: int = WorldConfig.scenes

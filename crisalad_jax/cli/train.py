@@ -4,12 +4,12 @@ import dataclasses
 import os
 import pathlib
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.runtime import read_model
-from crisalad_jax.cli.common import console, pick, refuse_with
-from crisalad_jax.cli.flags import JsonFlag, PluginFlag, QuietFlag
+from crisalad_jax.cli.common import console, pick, refuse_with, refuse_without
+from crisalad_jax.cli.flags import FOLDER, JsonFlag, PluginFlag, QuietFlag
 from crisalad_jax.cli.help import asked_for
 from crisalad_jax.config.flags import find_flag, parse_settings, with_settings
 from crisalad_jax.config.io import read_config
@@ -34,7 +34,7 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     """Folder with one folder a place, a table name,place[,lat,lon[,heading]] (places.csv in the
     folder, or the file), or Dataframes/ and Images/ of GSV-Cities; for netvlad, patch-netvlad and
     selavpr, which mine tuples, a training set of queries in any layout that `evaluate` reads."""
-    out: pathlib.Path
+    out: Annotated[pathlib.Path, FOLDER]
     """Folder of the run."""
     settings: Any
     place_radius: float | None = None
@@ -164,14 +164,11 @@ def run(arguments: Train) -> dict[str, Any] | None:
     from crisalad_jax.experiments.train import train
     from crisalad_jax.training import distributed
 
-    which = arguments.num_processes, arguments.process_id, arguments.local_device_ids
-    if arguments.coordinator_address is not None:
-        distributed.join_processes(arguments.coordinator_address, *which)
-    elif which != (None, None, None):
-        raise InputError(
-            "--num-processes, --process-id, --local-device-ids: found no --coordinator-address, "
-            "expected it with them"
-        )
+    address = arguments.coordinator_address
+    which = pick(arguments, "num_processes", "process_id", "local_device_ids")
+    refuse_without("--coordinator-address", address, **which)
+    if address is not None:
+        distributed.join_processes(address, *which.values())
     console.quiet = not distributed.is_primary()
     config: TrainConfig = arguments.settings
     result = train(

@@ -2,10 +2,10 @@
 
 import dataclasses
 import pathlib
-from typing import Any
+from typing import Annotated, Any
 
 from crisalad_jax.cli.common import echo, find_given, load_model, pick, refuse_with
-from crisalad_jax.cli.flags import JsonFlag, ReadFlags, SizeFlags
+from crisalad_jax.cli.flags import WEIGHTS, JsonFlag, ReadFlags, SizeFlags
 from crisalad_jax.nn.model import Model
 from crisalad_jax.training.vocabulary import (
     IMAGES,
@@ -13,7 +13,6 @@ from crisalad_jax.training.vocabulary import (
     start_vocabulary,
     vocabulary_words,
 )
-from crisalad_jax.utils.files import check_target
 
 COMMON = (
     "images out weights backbone preset aggregator clusters image-size max-images batch-size "
@@ -34,7 +33,7 @@ class Vocabulary(ReadFlags, SizeFlags, JsonFlag):
     images: pathlib.Path
     """Folder, searched with its subfolders; or a file, a pattern, a list, a table or a video
     (docs/how-to/image-sources.md). Not of images that are evaluated on."""
-    out: pathlib.Path
+    out: Annotated[pathlib.Path, WEIGHTS]
     """A .safetensors file."""
     fps: float | None = None
     """Frames a second taken of a video, by default 1."""
@@ -66,7 +65,6 @@ class Vocabulary(ReadFlags, SizeFlags, JsonFlag):
 
 def run(arguments: Vocabulary) -> dict[str, Any]:
     """Build the vocabulary, write the model, and print its size."""
-    check_target(arguments.out, ".safetensors")
     model = _model(arguments)
     built = build_vocabulary(
         model,

@@ -7,7 +7,17 @@ import math
 import os
 import types
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import (
+    Any,
+    Literal,
+    NamedTuple,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 
@@ -62,7 +72,7 @@ def check_count(what: str, count: Any) -> None:
     Raises:
         InputError: it is below, or no whole number.
     """
-    whole = "" if fits(int, count) else "a whole number of "
+    whole = "" if kind_of(int).fits(count) else "a whole number of "
     require(
         not whole and count >= 1,
         f"{what}: found {in_one_line(count)}, expected {whole}at least 1",
@@ -71,7 +81,6 @@ def check_count(what: str, count: Any) -> None:
 
 PATH = (str, os.PathLike)
 """Classes of a file's or a folder's name."""
-_ABSENT = object()
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -101,14 +110,17 @@ def takes(**kinds: type | tuple[type, ...]) -> Callable[[_F], _F]:
 
         @functools.wraps(function)
         def call(*args: Any, **options: Any) -> Any:
-            given = signature.bind_partial(*args, **options).arguments
-            for name, kind in kinds.items():
-                value = given.get(name, _ABSENT)
-                if value is not _ABSENT and not isinstance(value, kind):
+            for name, value in signature.bind_partial(*args, **options).arguments.items():
+                kind = kinds.get(name, object)
+                if not isinstance(value, kind):
                     plain = value is None or isinstance(value, str | int | float)
                     found = repr(value) if plain else type(value).__name__
                     classes = kind if isinstance(kind, tuple) else (kind,)
-                    words = "a path" if kind is PATH else ", or ".join(map(in_words, classes))
+                    words = (
+                        "a path"
+                        if kind is PATH
+                        else ", or ".join(kind_of(each).words for each in classes)
+                    )
                     raise InputError(f"{name}: found {found}, expected {words}")
             return function(*args, **options)
 
@@ -138,11 +150,9 @@ def check_types(config: Any) -> None:
     """
     for name, hint in _checked_hints(type(config)).items():
         value = getattr(config, name)
-        require(
-            fits(hint, value),
-            f"{type(config).__name__}.{name}: found {in_one_line(value)}, expected "
-            f"{in_words(hint)}",
-        )
+        kind = kind_of(hint)
+        where = f"{type(config).__name__}.{name}"
+        require(kind.fits(value), f"{where}: found {in_one_line(value)}, expected {kind.words}")
 
 
 @functools.cache
@@ -153,42 +163,46 @@ def _checked_hints(kind: type) -> Mapping[str, Any]:
     return {f.name: hints[f.name] for f in fields if REGISTRY not in f.metadata}
 
 
-def fits(hint: Any, value: Any) -> bool:
-    """Return whether a value is of a type."""
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin in (Union, types.UnionType):
-        return any(fits(each, value) for each in arguments)
-    if origin is Literal:
-        return type(value) in map(type, arguments) and value in arguments
-    if origin is tuple and isinstance(value, tuple):
-        endless = arguments[-1:] == (...,)
-        kinds = arguments[:1] * len(value) if endless else arguments
-        return len(kinds) == len(value) and all(map(fits, kinds, value))
-    if hint in _PLAIN:
-        # A bool is an int to Python, and no number of anything.
-        return isinstance(value, _PLAIN[hint][1]) and (hint is bool or type(value) is not bool)
-    kind = origin or hint
-    if hint is Any:  # a class to `isinstance`, which refuses it
-        return True
-    return not isinstance(kind, type) or isinstance(value, kind)
+class Kind(NamedTuple):
+    """What a type hint says of values."""
+
+    fits: Callable[[Any], bool]
+    """Returns whether a value is of the type."""
+    words: str
+    """The type, for a message."""
 
 
-def in_words(hint: Any) -> str:
-    """Describe a type for a message."""
+@functools.cache
+def kind_of(hint: Any) -> Kind:
+    """Return what a type hint says of values."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
-        return ", or ".join(map(in_words, arguments))
+        kinds = [kind_of(each) for each in arguments]
+        words = ", or ".join(kind.words for kind in kinds)
+        return Kind(lambda value: any(kind.fits(value) for kind in kinds), words)
     if origin is Literal:
-        return f"one of {', '.join(sorted(map(str, arguments)))}"
+        names = ", ".join(sorted(map(str, arguments)))
+        of_types = set(map(type, arguments))
+        return Kind(lambda x: type(x) in of_types and x in arguments, f"one of {names}")
     if origin is tuple:
-        length = "" if arguments[-1:] == (...,) else f" of {len(arguments)}"
-        return f"a tuple{length}, each {in_words(arguments[0])}"  # no tuple here mixes types
+        each = kind_of(arguments[0])  # no tuple here mixes types
+        count = None if arguments[-1] is ... else len(arguments)
+        return Kind(
+            lambda x: isinstance(x, tuple) and count in (None, len(x)) and all(map(each.fits, x)),
+            f"a tuple{'' if count is None else f' of {count}'}, each {each.words}",
+        )
     if hint in _PLAIN:
-        return _PLAIN[hint][0]
-    if hint is type(None):
-        return "None"
+        words, classes = _PLAIN[hint]
+        # A bool is an int to Python, and no number of anything.
+        return Kind(lambda x: isinstance(x, classes) and (type(x) is bool) <= (hint is bool), words)
     # jaxlib's Array has its module in its name.
-    return hint.__name__.rpartition(".")[2] if hasattr(hint, "__name__") else str(hint)
+    words = (
+        "None" if hint is type(None) else getattr(hint, "__name__", str(hint)).rpartition(".")[2]
+    )
+    kind = origin or hint
+    # Any is a class to `isinstance`, which refuses it.
+    is_class = isinstance(kind, type) and hint is not Any
+    return Kind((lambda x: isinstance(x, kind)) if is_class else lambda x: True, words)
 
 
 def require_field(config: object, name: str, holds: bool, expected: str) -> None:
@@ -218,6 +232,5 @@ def _require_each(
 ) -> None:
     for name in names:
         value = getattr(config, name)
-        where = f"{type(config).__name__}.{name}"
         # Where None is a value, it stands for no limit.
-        require(value is None or is_fit(value), f"{where}: found {value}, expected {expected}")
+        require_field(config, name, value is None or is_fit(value), expected)

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from crisalad_jax.config.checks import fits, in_words
+from crisalad_jax.config.checks import kind_of
 from crisalad_jax.config.part import NAME, Part
 from crisalad_jax.config.plugins import home_of
 from crisalad_jax.config.short_repr import default_of, fields_in_use
@@ -97,22 +97,16 @@ def _config(kind: Any, value: Any, path: str) -> Any:
 
 def _value(hint: Any, value: Any, path: str) -> Any:
     """Convert a field's value to exactly its type: 3.7 is no number of epochs."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    origin, (kind, *_) = typing.get_origin(hint), typing.get_args(hint) or (None,)
     if origin in (typing.Union, types.UnionType):
-        if value is None and type(None) in arguments:
-            return None
-        # Every union here is of None and one type, or of a part and its name.
-        kind = next(each for each in arguments if each is not type(None))
-        return _value(kind, value, path)
+        # Every union here is of one type and None, or of a part and its name.
+        return None if value is None and kind_of(hint).fits(None) else _value(kind, value, path)
     if dataclasses.is_dataclass(hint):
         return _config(hint, value, path)
-    if origin is tuple and isinstance(value, list | tuple):
-        kinds = arguments[:1] * len(value) if arguments[-1:] == (...,) else arguments
-        if len(kinds) == len(value):
-            pairs = enumerate(zip(kinds, value, strict=True))
-            return tuple(_value(kind, each, f"{path}[{number}]") for number, (kind, each) in pairs)
-    if not fits(hint, value):
-        raise InputError(f"found {value!r}, expected {in_words(hint)} @ {path}")
+    if origin is tuple and isinstance(value, list | tuple):  # none here mixes types
+        value = tuple(_value(kind, each, f"{path}[{i}]") for i, each in enumerate(value))
+    if not kind_of(hint).fits(value):
+        raise InputError(f"found {value!r}, expected {kind_of(hint).words} @ {path}")
     made: Any = value
     return float(made) if hint is float else made
 

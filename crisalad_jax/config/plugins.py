@@ -73,11 +73,6 @@ def load_plugin(plugin: str) -> None:
     _LOADED[spec.origin if plugin.endswith(".py") else plugin] = spec.name
 
 
-def has_plugins() -> bool:
-    """Return whether code of any plug-in was loaded, of a file, a module or an entry point."""
-    return bool(_LOADED)
-
-
 def loaded_plugins() -> list[str]:
     """Return what `load_plugin` takes to load the same in another process."""
     return list(_LOADED)

@@ -137,12 +137,13 @@ class Registry(Generic[P]):
         """Return whether a part has this name."""
         return name in self._parts
 
-    def find(self, name: str, plugin: str | None = None) -> type[P]:
+    def find(self, name: str, plugin: str | None = None, *, where: str | None = None) -> type[P]:
         """Return the class of the part with this name; if needed, load installed plug-ins first.
 
         Args:
             name: of the part.
             plugin: the plug-in that registered it, where that is known.
+            where: what messages call the name; None is the kind.
 
         Raises:
             InputError: there is none; the message lists all parts.
@@ -155,7 +156,7 @@ class Registry(Generic[P]):
             if plugin is not None:
                 hint = f"the plug-in {plugin} had it: --plugin {plugin}, or load_plugin"
             raise InputError(
-                f"{self.kind}: found {name!r}, expected one of {', '.join(self.names())} ({hint})"
+                f"{where or self.kind}: found {name!r}, expected one of {', '.join(self)} ({hint})"
             )
         return self._parts[name]
 
@@ -179,12 +180,7 @@ class Registry(Generic[P]):
             InputError: a name that is not registered, or a value that is no part of this kind.
         """
         if isinstance(value, str):
-            try:
-                return self.make(value)
-            except InputError as error:
-                # `where` says what kind of part it is for.
-                words = str(error).removeprefix(f"{self.kind}: ")
-                raise InputError(f"{where}: {words}") from error
+            return self.find(value, where=where)()
         is_part = isinstance(value, self.base)
         if not is_part or "part_name" not in vars(type(value)):
             found = f"{in_one_line(value)}{', which is not registered' if is_part else ''}"

@@ -9,7 +9,6 @@ from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.operating_point import (
     OperatingPoint,
     caveats,
-    check_precision,
     check_supported,
 )
 from crisalad_jax.nn.model import Model
@@ -75,7 +74,6 @@ def calibrate(
         >>> found.right, found.answered
         (4, 4)
     """
-    check_precision(precision)
     (result,) = evaluate(
         places.describer(model),
         benchmark,

@@ -158,21 +158,19 @@ def evaluate(
             observer = observe and functools.partial(observe, name)
             rankings = _rank(describe, sides, drawn, k, observer, unit=unit)
             for label, stage in stages.items():
-                ranked = {seed: _first(stage(each), max(KS)) for seed, each in rankings.items()}
-                results.append(
-                    summarise(
-                        name,
-                        ranked,
-                        positives,
-                        KS,
-                        query_share=query_share,
-                        database_share=database_share,
-                        is_random=is_random,
-                        rerank=label,
-                        skipped=skipped,
-                        precision=precision,
-                    )
+                result = summarise(
+                    name,
+                    {seed: _first(stage(each), max(KS)) for seed, each in rankings.items()},
+                    positives,
+                    KS,
+                    is_random=is_random,
+                    precision=precision,
+                    query_share=query_share,
+                    database_share=database_share,
+                    rerank=label,
+                    skipped=skipped,
                 )
+                results.append(result)
     return results
 
 

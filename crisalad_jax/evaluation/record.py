@@ -13,7 +13,6 @@ from crisalad_jax.evaluation.results import ANY, GroupingResult, to_json
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import Grouping, grouping_words
 
-StrPath = str | os.PathLike[str]
 _RECALLS = (
     "Percent of all queries; below it, 95 % by bootstrap over queries as if they were independent. "
     "AP: area under precision and recall of the first retrievals, by similarity. R at 100 % P: of "
@@ -21,49 +20,26 @@ _RECALLS = (
 )
 
 
-def evaluation_settings(
-    benchmark: Benchmark,
-    config: ModelConfig,
-    *,
-    weights: StrPath | None = None,
-    batch_size: int = 16,
-    seed: int = 0,
-    seeds: int = 3,
-    pca: StrPath | None = None,
-    rerank: str | None = None,
-    rerank_weights: StrPath | None = None,
-) -> dict[str, Any]:
+def evaluation_settings(benchmark: Benchmark, config: ModelConfig, **asked: Any) -> dict[str, Any]:
     """Put all settings that decide an evaluation's result into JSON values.
 
     Args:
         benchmark: what is evaluated on.
         config: the model.
-        weights: the file of its parameters; None is an untrained model.
-        batch_size: number of images that look at each other.
-        seed: draws the first shuffled order.
-        seeds: number of shuffled orders.
-        pca: the file of the components that shorten descriptors.
-        rerank: what puts the first retrievals in a new order, as `parse_reranking` reads it.
-        rerank_weights: the file of the model that does so; None is the first stage's.
+        **asked: what `crisalad evaluate` was asked for: the files `weights` (None is an untrained
+            model), `pca` and `rerank_weights` (None is the first stage's), `batch_size`, `seed`,
+            `seeds` and `rerank`.
 
     Returns:
         The values by name.
     """
-
-    def words(file: StrPath | None) -> str | None:
-        return None if file is None else starter.named(file)
-
+    files = {name: each for name, each in asked.items() if isinstance(each, os.PathLike)}
     return {
-        "weights": words(weights),
+        **asked,
+        **{name: starter.named(file) for name, file in files.items()},
         "benchmark": benchmark.name,
         "rule": benchmark.rule,
         "same_place": same_place_rule(benchmark),
-        "batch_size": batch_size,
-        "seed": seed,
-        "seeds": seeds,
-        "pca": words(pca),
-        "rerank": rerank,
-        "rerank_weights": words(rerank_weights),
         "model": to_plain(config),
     }
 

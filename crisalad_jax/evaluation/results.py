@@ -104,12 +104,9 @@ def summarise(
     positives: Sequence[Int[np.ndarray, " _"]],
     ks: Sequence[int],
     *,
-    query_share: float | None,
-    database_share: float | None,
     is_random: bool,
-    rerank: str | None = None,
-    skipped: Skipped = _NONE,
     precision: float | None = None,
+    **known: Any,
 ) -> GroupingResult:
     """Summarise the rankings of one grouping as its result.
 
@@ -118,12 +115,9 @@ def summarise(
         rankings: seed -> neighbours; one ranking where nothing is random.
         positives: the database indices that are right for each query.
         ks: the values of K.
-        query_share: as in `GroupingResult`.
-        database_share: likewise.
         is_random: whether the rankings differ by their seeds.
-        rerank: as in `GroupingResult`.
-        skipped: likewise.
         precision: of the operating point; None for no such point.
+        **known: other fields of `GroupingResult`, such as its shares.
 
     Raises:
         InputError: what `recalls` and `operating_point` raise.
@@ -146,18 +140,15 @@ def summarise(
         mean.recalls,
         first,
         intervals={k: bootstrap_interval(hits[k], trials=len(rights)) for k in ks},
-        query_share=query_share,
-        database_share=database_share,
         precision_recall=curves[0],
         average_precision=mean.average_precision,
         recall_at_full_precision=mean.recall_at_full_precision,
         spread=_over(scores, statistics.stdev) if len(scores) > 1 else None,
         by_seed=dict(zip(rankings, scores, strict=True)) if is_random else {},
-        rerank=rerank,
-        skipped=skipped,
         operating_point=None
         if precision is None
         else operating_point(*first, positives, precision),
+        **known,
     )
 
 

@@ -6,8 +6,9 @@ import json
 import os
 import pathlib
 import stat
+import tempfile
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -220,16 +221,32 @@ def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> Non
         raise InputError(f"{path}: found the suffix {path.suffix!r}, expected {suffix}")
     if (found := _found_instead(path)) not in (None, _NOTHING):
         raise InputError(f"{path}: found {found}, expected a file or nothing yet")
-    _check_can_make(path)
+    _check_can_make(path, path.parents)
 
 
-def _check_can_make(path: pathlib.Path) -> None:
-    """Check that something can be made at `path`, in a folder that may have to be made too."""
-    nearest = next(folder for folder in path.parents if folder.exists())
-    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
+def check_folder(path: str | os.PathLike[str]) -> None:
+    """Check that files can be made in a folder, which may have to be made too.
+
+    Raises:
+        InputError: as `check_target`.
+    """
+    path = pathlib.Path(path)
+    found = _found_instead(path) or "a file"
+    if found not in ("a folder", _NOTHING):
+        raise InputError(f"{path}: found {found}, expected a folder or nothing yet")
+    _check_can_make(path, (path, *path.parents))
+
+
+def _check_can_make(path: pathlib.Path, folders: Iterable[pathlib.Path]) -> None:
+    """Check that the first of some folders that is there takes files."""
+    nearest = next(folder for folder in folders if folder.exists())
+    try:
+        # A folder's permissions say nothing of /proc or of a disk that is only read.
+        tempfile.TemporaryFile(dir=nearest).close()
+    except OSError as error:
         raise InputError(
             f"{path}: cannot be made: found {nearest}, expected a folder that can be written to"
-        )
+        ) from error
 
 
 def check_format(what: str, path: str | os.PathLike[str], *suffixes: str) -> None:
@@ -369,7 +386,7 @@ def check_new_folder(path: str | os.PathLike[str]) -> None:
     path = pathlib.Path(path)
     found = _found_instead(path) or "a file"
     if found == _NOTHING:
-        _check_can_make(path)
+        _check_can_make(path, path.parents)
     elif found != "a folder":
         raise InputError(f"{path}: found {found}, expected a new or empty folder")
     elif path.samefile(os.curdir):

@@ -8,9 +8,10 @@
 import dataclasses
 import pathlib
 import sys
-from typing import Any
+from typing import Annotated, Any
 
-from crisalad_jax.cli.common import emit_json, prepare_json, show
+from crisalad_jax.cli.common import emit_json, prepare_output, show
+from crisalad_jax.cli.flags import Target
 from crisalad_jax.cli.train import defaults
 from crisalad_jax.config.flags import parse_settings
 from crisalad_jax.utils.errors import InputError
@@ -44,7 +45,7 @@ class CompileCheck:
     of collectives, sums in bfloat16, calls of fused attention and calls of the host."""
     keep: pathlib.Path | None = None
     """Existing folder for the texts of the compiled programs (HLO)."""
-    json: pathlib.Path | None = None
+    json: Annotated[pathlib.Path | None, Target((".json",))] = None
     """File for the figures as JSON, which --expect reads; - prints it."""
     quiet: bool = False
     """No progress bar."""
@@ -55,7 +56,7 @@ def main() -> None:
     given = sys.argv[1:]
     arguments = parse_settings(CompileCheck, "compile_check", given, defaults(given))
     compile_on_cpu()
-    prepare_json(arguments.json)
+    prepare_output(arguments)
     expected = None if arguments.expect is None else read_check(arguments.expect)
     check = compile_check(
         arguments.settings,

@@ -29,8 +29,8 @@ Reader = Callable[[pathlib.Path], Any]
 """Reads a set of files in a folder."""
 
 
-def readers(world: World) -> Mapping[str, tuple[str, str, Reader]]:
-    """Return, for each kind of file, its folder, its name there, and what reads it."""
+def readers(world: World) -> Mapping[str, tuple[str, Reader]]:
+    """Return, for each kind of file, its name, and what reads it."""
     from crisalad_jax.checkpoints.train_state import StateStore
     from crisalad_jax.checkpoints.weights import load_weights
     from crisalad_jax.config.io import read_config
@@ -63,30 +63,26 @@ def readers(world: World) -> Mapping[str, tuple[str, str, Reader]]:
         with Map.open(folder / "map"):
             pass
 
-    def result(folder: pathlib.Path) -> None:
-        read_result(folder / "result.json")
+    def config(folder: pathlib.Path) -> None:
+        read_config(TrainConfig, folder / "run" / "config.json")
 
     return {
-        "weights": ("", "run/last.safetensors", lambda f: load_weights(f / "run/last.safetensors")),
-        "principal components": ("", "pca.safetensors", lambda f: load_pca(f / "pca.safetensors")),
-        "descriptors .npy": ("", "d.npy", lambda f: read_descriptors(f / "d.npy")),
-        "names of descriptors": ("", "d.names.txt", lambda f: read_descriptors(f / "d.npy")),
-        "record of descriptors": ("", "d.npy.json", lambda f: read_descriptors(f / "d.npy")),
-        "descriptors .h5": ("", "d.h5", lambda f: read_descriptors(f / "d.h5")),
-        "description of a map": ("map", "map/map.json", opened),
-        "record of a map": ("map", "map/segments/0000000000.json", opened),
-        "descriptors of a map": ("map", "map/segments/0000000000.npy", opened),
-        "state of training": ("run", "run/state", state),
-        "configuration of a run": (
-            "",
-            "run/config.json",
-            lambda f: read_config(TrainConfig, f / "run" / "config.json"),
-        ),
-        "result of a comparison": ("", "result.json", result),
-        "exported program": ("program", "program/describe.jax_export", exported),
-        "manifest of an export": ("program", "program/manifest.json", exported),
-        "weights of an export": ("program", "program/weights.safetensors", exported),
-        "index of faiss": ("", "some.index", lambda f: load_index(f / "some.index")),
+        "weights": ("run/last.safetensors", lambda f: load_weights(f / "run/last.safetensors")),
+        "principal components": ("pca.safetensors", lambda f: load_pca(f / "pca.safetensors")),
+        "descriptors .npy": ("d.npy", lambda f: read_descriptors(f / "d.npy")),
+        "names of descriptors": ("d.names.txt", lambda f: read_descriptors(f / "d.npy")),
+        "record of descriptors": ("d.npy.json", lambda f: read_descriptors(f / "d.npy")),
+        "descriptors .h5": ("d.h5", lambda f: read_descriptors(f / "d.h5")),
+        "description of a map": ("map/map.json", opened),
+        "record of a map": ("map/segments/0000000000.json", opened),
+        "descriptors of a map": ("map/segments/0000000000.npy", opened),
+        "state of training": ("run/state", state),
+        "configuration of a run": ("run/config.json", config),
+        "result of a comparison": ("result.json", lambda f: read_result(f / "result.json")),
+        "exported program": ("program/describe.jax_export", exported),
+        "manifest of an export": ("program/manifest.json", exported),
+        "weights of an export": ("program/weights.safetensors", exported),
+        "index of faiss": ("some.index", lambda f: load_index(f / "some.index")),
     }
 
 
@@ -133,21 +129,11 @@ def outcome(read: Reader, folder: pathlib.Path) -> str:
 def attack(world: World, folder: pathlib.Path, changes: int, seed: int) -> list[Row]:
     """Change bytes of each kind of file in a copy of the products."""
     rows = []
-    for kind, (part, name, read) in readers(world).items():
+    for kind, (name, read) in readers(world).items():
         row = Row(f"a changed byte: {kind}", PROMISE)
         generator = random.Random(f"{seed} {kind}")
         copy = folder / kind.replace(" ", "-")
-        whole = copy / part if part else copy
-        source = world.root / "products" / part if part else world.root / "products"
-        if part:
-            shutil.copytree(source, whole)
-        else:
-            copy.mkdir()
-            for path in source.glob(f"{name.partition('.')[0]}*"):
-                shutil.copy(path, copy)
-            if "/" in name:
-                (copy / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy(source / name, copy / name)
+        shutil.copytree(world.root / "products", copy)
         before = outcome(read, copy)
         assert before == "silent", (kind, before)
         target = copy / name

@@ -28,7 +28,8 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 from tests.attack.world import (
-    VERBS,
+    ALL,
+    NEEDS,
     Done,
     Row,
     World,
@@ -60,8 +61,6 @@ RESUMABLE: Mapping[str, str] = {
     "extract .npy": r"d\.npy\.partial/.*",
     "extract .h5": r"d\.h5\.partial/.*",
 }
-NEEDS: Mapping[str, tuple[str, ...]] = {"query": ("index",), "pca": ("extract .npy",)}
-"""Products that a verb reads, by the verbs that make them."""
 # Files that hold times, or are drawn from them.
 _TIMED = re.compile(
     r"metrics\.jsonl|/tensorboard/|/state/|curves\.png|training\.(json|png)|speed\.json|index\.html|"
@@ -70,23 +69,6 @@ _TIMED = re.compile(
 )
 
 
-def _vocabulary(world: World, out: pathlib.Path) -> list[str]:
-    return [
-        *("vocabulary", "--images", f"{world.images}", "--out", f"{out / 'v.safetensors'}"),
-        *("--preset", "tiny", "--image-size", "98", "98", "--clusters", "4", "--quiet"),
-        *("--aggregator", "netvlad"),
-    ]
-
-
-def _ablate(world: World, out: pathlib.Path) -> list[str]:
-    return [
-        *("ablate", "--train", f"{world.city}", "--test", f"{world.town}", "--preset", "tiny"),
-        *("--rows", "gem", "--seeds", "1", "--epochs", "1", "--image-size", "98", "98"),
-        *("--out", f"{out / 'ablation'}", "--quiet"),
-    ]
-
-
-ALL = {**VERBS, "vocabulary": _vocabulary, "ablate": _ablate}
 TARGETS: Mapping[str, tuple[str, ...]] = {
     "evaluate": ("table.json", "pictures/config.json", "report/index.html"),
     "extract .npy": ("d.npy", "d.names.txt", "d.npy.json", "pairs.txt"),
@@ -258,24 +240,21 @@ def _full(
     old: tuple[str, ...],
 ) -> None:
     words = f"room for {100 * fraction:.0f} %" + (" over earlier files" if old else "")
-    out = folder / "out"
+    out, limit = folder / "out", None
     if way == "limit":
-        out.mkdir(parents=True)
-        before = _old(out, old)
-        room = int(fraction * max(whole.files.values()))
-        done = start(ALL[verb](world, out), cwd=folder, file_limit=room)
-        judge(row, f"{words} of the largest file", verb, out, done, before)
-        finish(row, words, verb, world, out, whole)
+        limit = int(fraction * max(whole.files.values()))
+        disk, words = contextlib.nullcontext(lambda: None), f"{words} of the largest file"
     else:
         pages = sum(-(-size // PAGE) for size in whole.files.values())
         room = int(fraction * (pages - 1)) + len(old)
-        with small_disk(folder, room * PAGE) as more:
-            out.mkdir()
-            before = _old(out, old)
-            done = start(ALL[verb](world, out), cwd=folder)
-            judge(row, f"{words} ({room} pages)", verb, out, done, before)
-            more()
-            finish(row, words, verb, world, out, whole)
+        disk, words = small_disk(folder, room * PAGE), f"{words} ({room} pages)"
+    with disk as more:
+        out.mkdir(parents=True)
+        before = _old(out, old)
+        done = start(ALL[verb](world, out), cwd=folder, file_limit=limit)
+        judge(row, words, verb, out, done, before)
+        more()
+        finish(row, words, verb, world, out, whole)
     shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -30,9 +30,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tests.attack.world import (
+    ALL,
     HUNG,
+    NEEDS,
     PRODUCTS,
-    VERBS,
     Done,
     Row,
     World,
@@ -49,6 +50,8 @@ PROMISE = (
     "exit code 2 and one line that names the file or argument, without a traceback, within the "
     "limit of time, in less than 1.5 GB beyond the start; nothing is left in the folder of results"
 )
+HANGS = 60.0
+"""Seconds until a command counts as hung."""
 ABORTED = "ended by signal "
 UNCAUGHT = (
     "none: where memory ends inside of XLA, BLAS or OpenMP, these abort the process in C++, before "
@@ -79,6 +82,11 @@ class Case(NamedTuple):
     """Returns what else is wrong."""
 
 
+def of(verb: str, attack: str, words: str, make: Make, *named: str, **more: Any) -> Case:
+    """Return a bad input of a verb, with the products that this reads."""
+    return Case(attack, words, make, named, needs=NEEDS.get(verb, ()), **more)
+
+
 def with_flag(arguments: Sequence[str], flag: str, *values: str) -> list[str]:
     """Give a flag other values, in place of those it has."""
     given = list(arguments)
@@ -93,16 +101,28 @@ def with_flag(arguments: Sequence[str], flag: str, *values: str) -> list[str]:
 
 def base(verb: str, world: World, folder: pathlib.Path) -> list[str]:
     """Return a verb's good arguments, which write into `folder`/out."""
-    out = folder / "out"
-    if verb == "vocabulary":
-        given = ["vocabulary", "--images", f"{world.images}", "--out", f"{out / 'v.safetensors'}"]
-        given += ["--preset", "tiny", "--aggregator", "netvlad", "--clusters", "4", "--quiet"]
-        return [*given, "--image-size", "98", "98"]
-    if verb == "ablate":
-        given = ["ablate", *VERBS["compare"](world, out)[1:]]
-        del given[given.index("--methods") : given.index("--methods") + 2]
-        return with_flag([*given, "--rows", "gem"], "--out", f"{out / 'ablation'}")
-    return VERBS["extract .npy" if verb == "extract" else verb](world, out)
+    return ALL["extract .npy" if verb == "extract" else verb](world, folder / "out")
+
+
+def put(verb: str, flag: str, given: list[str], *values: str) -> list[str]:
+    """Give an argument other values, by its flag or its place."""
+    if flag in ("IMAGE", "SRC"):
+        return [given[0], *values, *given[2:]]
+    if flag == "DST":
+        return [*given[:2], *values, *given[3:]]
+    if (verb, flag) == ("info", "--map"):
+        return ["info", "--map", *values, "--json", given[-1]]
+    if flag in ("--recipe", "--preset") and "--weights" in given:
+        where = given.index("--weights")
+        given = [*given[:where], *given[where + 2 :], "--preset", "tiny"]
+    if (verb, flag) == ("compare", "--rerank"):
+        given = with_flag(given, "--methods", "patch-netvlad")
+    return with_flag(given, flag, *values)
+
+
+def with_values(verb: str, flag: str, *values: str) -> Make:
+    """Give a verb's argument other values."""
+    return lambda world, bad: put(verb, flag, base(verb, world, bad), *values)
 
 
 Write = Callable[[pathlib.Path], Any]
@@ -133,7 +153,7 @@ def with_file(verb: str, flag: str, name: str, write: Write, value: str | None =
 
     def make(world: World, bad: pathlib.Path) -> list[str]:
         write(bad / name)
-        return _put(verb, flag, base(verb, world, bad), str(bad / (value or name)))
+        return put(verb, flag, base(verb, world, bad), str(bad / (value or name)))
 
     return make
 
@@ -216,107 +236,51 @@ FILES: Mapping[str, Callable[[pathlib.Path], Any]] = {
 }
 FOLDERS = ("no file", "a pipe", "a socket", "a link to itself", "/dev/zero", "random bytes")
 
-# Verb, flag, name of the bad file, whether a folder is right in its place.
-FILE_ARGUMENTS: tuple[tuple[str, str, str, bool], ...] = (
-    ("train", "--data", "places", True),
-    ("train", "--config", "recipe.json", False),
-    ("train", "--weights", "model.safetensors", False),
-    ("train", "--backbone", "backbone.pth", False),
-    ("train", "--val", "town", True),
-    ("train", "--plugin", "part.py", False),
-    ("evaluate", "--data", "town", True),
-    ("evaluate", "--data", "set.mat", False),
-    ("evaluate", "--weights", "model.safetensors", False),
-    ("evaluate", "--pca", "pca.safetensors", False),
-    ("extract", "--weights", "model.safetensors", False),
-    ("extract", "--images", "pictures", True),
-    ("extract", "--database", "d.h5", False),
-    ("extract", "--database", "d.npy", False),
-    ("extract", "--pca", "pca.safetensors", False),
-    ("index", "--images", "pictures", True),
-    ("index", "--positions", "positions.csv", False),
-    ("index", "--weights", "model.safetensors", False),
-    ("query", "IMAGE", "query.jpg", False),
-    ("query", "--map", "map", True),
-    ("query", "--weights", "model.safetensors", False),
-    ("pca", "--descriptors", "d.npy", False),
-    ("convert", "SRC", "model.pth", False),
-    ("convert", "SRC", "model.safetensors", False),
-    ("info", "--weights", "model.safetensors", False),
-    ("info", "--map", "map", True),
-    ("export", "--weights", "model.safetensors", False),
-    ("vocabulary", "--images", "pictures", True),
-    ("vocabulary", "--backbone", "backbone.pth", False),
-    ("compare", "--train", "places", True),
-    ("compare", "--test", "town", True),
-    ("compare", "--backbone", "backbone.safetensors", False),
-    ("compare", "--page", "page.md", False),
-    ("ablate", "--train", "places", True),
-)
-# A page of random text is read; an empty plug-in, or one of JSON, is right Python.
-RIGHT = {("train", "--plugin", kind) for kind in ("an empty file", "a list in JSON")}
-
-
-def _put(verb: str, flag: str, given: list[str], value: str) -> list[str]:
-    """Give an argument a value, by its flag or its place."""
-    if flag in ("IMAGE", "SRC"):
-        return [given[0], value, *given[2:]]
-    if flag == "DST":
-        return [*given[:2], value, *given[3:]]
-    if (verb, flag) == ("vocabulary", "--backbone"):
-        given = with_flag(given, "--preset", "tiny")
-    if (verb, flag) == ("info", "--map"):
-        return ["info", "--map", value, "--json", given[-1]]
-    return with_flag(given, flag, value)
-
-
-def _products_of(verb: str) -> tuple[str, ...]:
-    return {"query": ("index",), "pca": ("extract .npy",)}.get(verb, ())
+FILE_ARGUMENTS = {
+    "train": "--data places/, --config recipe.json, --weights model.safetensors, "
+    "--backbone backbone.pth, --val town/, --plugin part.py",
+    "evaluate": "--data town/, --data set.mat, --weights model.safetensors, --pca pca.safetensors",
+    "extract": "--weights model.safetensors, --images pictures/, --database d.h5, "
+    "--database d.npy, --pca pca.safetensors",
+    "index": "--images pictures/, --positions positions.csv, --weights model.safetensors",
+    "query": "IMAGE query.jpg, --map map/, --weights model.safetensors",
+    "pca": "--descriptors d.npy",
+    "convert": "SRC model.pth, SRC model.safetensors",
+    "info": "--weights model.safetensors, --map map/",
+    "export": "--weights model.safetensors",
+    "vocabulary": "--images pictures/, --backbone backbone.pth",
+    "compare": "--train places/, --test town/, --backbone backbone.safetensors, --page page.md",
+    "ablate": "--train places/",
+}
+"""Arguments of each verb, with the name of the bad file; a folder is right in place of NAME/."""
+RIGHT = {("--plugin", kind) for kind in ("an empty file", "a list in JSON")}  # right Python
+RIGHT |= {("IMAGE", "a folder"), ("IMAGE", "a picture")}
 
 
 def wrong_files() -> Iterator[Case]:
     """Put something else in place of each file and folder."""
-    for verb, flag, name, folder in FILE_ARGUMENTS:
-        for kind in FOLDERS if folder else FILES:
-            if not folder and (verb, flag, kind) in RIGHT:
-                continue
-            if (flag, kind) in (("IMAGE", "a folder"), ("IMAGE", "a picture")):
-                continue
-
-            make, needs = with_file(verb, flag, name, FILES[kind]), _products_of(verb)
-            yield Case(f"files: {kind}", f"{verb} {flag} {name}", make, (name, flag), needs=needs)
-        for value in ("", "-", "x" * 300, "no\x1b[31mred\nline", "caf\udce9", "/dev/zero"):
-            # Empty values are refused before flags are told apart.
-            words = (flag, "argument", value[:20], "red", "caf", flag.lower())
-            make, needs = _with_value(verb, flag, value), _products_of(verb)
-            yield Case(f"names: {value[:12]!r}", f"{verb} {flag}", make, words, needs=needs)
-
-
-def _with_value(verb: str, flag: str, value: str) -> Make:
-    return lambda world, bad: _put(verb, flag, base(verb, world, bad), value)
+    for verb, arguments in FILE_ARGUMENTS.items():
+        for flag, name in (argument.split() for argument in arguments.split(", ")):
+            words, is_folder = f"{verb} {flag} {name}", name.endswith("/")
+            for kind in FOLDERS if is_folder else FILES:
+                if (flag, kind) not in RIGHT:
+                    make = with_file(verb, flag, name.rstrip("/"), FILES[kind])
+                    yield of(verb, f"files: {kind}", words, make, name.rstrip("/"), flag)
+            for value in ("", "-", "x" * 300, "no\x1b[31mred\nline", "caf\udce9", "/dev/zero"):
+                # Empty values are refused before flags are told apart.
+                named = (flag, "argument", value[:20], "red", "caf", flag.lower())
+                make = with_values(verb, flag, value)
+                yield of(verb, f"names: {value[:12]!r}", f"{verb} {flag}", make, *named)
 
 
 # ---- Targets ----
 
-TARGETS: tuple[tuple[str, str], ...] = (
-    ("train", "--out"),
-    ("evaluate", "--json"),
-    ("evaluate", "--out"),
-    ("evaluate", "--report"),
-    ("extract", "--out"),
-    ("extract", "--pairs"),
-    ("index", "--out"),
-    ("query", "--json"),
-    ("query", "--gallery"),
-    ("pca", "--out"),
-    ("convert", "DST"),
-    ("info", "--json"),
-    ("export", "--out"),
-    ("vocabulary", "--out"),
-    ("compare", "--out"),
-    ("demo", "--out"),
-    ("render", "--out"),
-)
+TARGETS = {
+    **{"evaluate": "--json --out --report", "extract": "--out --pairs", "convert": "DST"},
+    **{"query": "--json --gallery", "info": "--json"},
+    **dict.fromkeys(("train", "index", "pca", "export", "vocabulary"), "--out"),
+    **dict.fromkeys(("compare", "demo", "render"), "--out"),
+}
 SUFFIX = {
     ("extract", "--out"): ".npy",
     ("pca", "--out"): ".safetensors",
@@ -364,21 +328,20 @@ BAD_TARGETS: Mapping[str, Callable[[pathlib.Path], pathlib.Path]] = {
 
 def wrong_targets() -> Iterator[Case]:
     """Let each verb write to where nothing can be written, or must not be."""
-    for verb, flag in TARGETS:
+    targets = [(verb, flag) for verb, flags in TARGETS.items() for flag in flags.split()]
+    for verb, flag in targets:
         for kind, prepare in BAD_TARGETS.items():
             # A folder of pictures or pages may hold others.
-            if kind == "a folder with files" and verb == "evaluate" and flag != "--json":
-                continue
-
-            words = ("target", "xxx", "loop", "/proc", "mine")
-            make, needs = _with_target(verb, flag, prepare), _products_of(verb)
-            yield Case(f"targets: {kind}", f"{verb} {flag}", make, words, needs=needs)
+            if kind != "a folder with files" or verb != "evaluate" or flag == "--json":
+                make, words = _with_target(verb, flag, prepare), f"{verb} {flag}"
+                named = ("target", "xxx", "loop", "/proc", "mine")
+                yield of(verb, f"targets: {kind}", words, make, *named)
 
 
 def _with_target(verb: str, flag: str, prepare: Callable[[pathlib.Path], pathlib.Path]) -> Make:
     def make(world: World, bad: pathlib.Path) -> list[str]:
         target = prepare(bad / f"target{SUFFIX.get((verb, flag), '')}")
-        return _put(verb, flag, base(verb, world, bad), str(target))
+        return put(verb, flag, base(verb, world, bad), str(target))
 
     return make
 
@@ -480,21 +443,8 @@ def wrong_values() -> Iterator[Case]:
                 ("train", "--trainable", "last-0-blocks+head"),  # the head alone
                 ("evaluate", "--queries", "../../.."),
             )
-            make, needs = _with_values(verb, flag, value.split()), _products_of(verb)
-            yield Case(f"values: {flag}", f"{verb} {value}", make, named, fine, needs)
-
-
-def _with_values(verb: str, flag: str, values: Sequence[str]) -> Make:
-    def make(world: World, bad: pathlib.Path) -> list[str]:
-        given = base(verb, world, bad)
-        if flag in ("--recipe", "--preset"):
-            given = [a for a in given if a not in ("--weights", str(world.weights))]
-            given = with_flag(given, "--preset", "tiny")
-        if flag == "--rerank" and verb == "compare":
-            given = with_flag(given, "--methods", "patch-netvlad")
-        return with_flag(given, flag, *values)
-
-    return make
+            make = with_values(verb, flag, *value.split())
+            yield of(verb, f"values: {flag}", f"{verb} {value}", make, *named, fine=fine)
 
 
 def wrong_flags() -> Iterator[Case]:
@@ -510,19 +460,14 @@ def wrong_flags() -> Iterator[Case]:
         }.items():
             fine = (verb, words) == ("query", "a word too many")
             named = ("argument", "option", "one", "--", "no such", "plugin")
-            make, needs = with_more(verb, *more), _products_of(verb)
-            yield Case("flags", f"{verb}: {words}", make, named, fine, needs)
+            make = with_more(verb, *more)
+            yield of(verb, "flags", f"{verb}: {words}", make, *named, fine=fine)
     for given in (["x"], ["--frobnicate"], [""], ["train"], ["\x1b[31m"], ["\udce9"], ["help"]):
         yield Case("flags", f"{given}", lambda world, bad, given=given: list(given))
     # A flag given twice: the last one counts, or it is refused.
     for verb, flag, first, last in (("extract", "--seed", "1", "-1"), ("pca", "--dim", "3", "0")):
-        named, needs = (flag, flag.strip("-")), _products_of(verb)
-        make = _twice(verb, flag, first, last)
-        yield Case("flags", f"{verb} {flag} twice", make, named, needs=needs)
-
-
-def _twice(verb: str, flag: str, first: str, last: str) -> Make:
-    return lambda world, bad: [*with_flag(base(verb, world, bad), flag, first), flag, last]
+        words, make = f"{verb} {flag} twice", with_more(verb, flag, first, flag, last)
+        yield of(verb, "flags", words, make, flag, flag.strip("-"))
 
 
 # ---- What is in files ----
@@ -983,8 +928,7 @@ def pictures() -> Iterator[Case]:
     for kind, data in PICTURES.items():
         for verb, flag in (("extract", "--images"), ("index", "--images"), ("query", "IMAGE")):
             make = with_file(verb, flag, "pictures/bad.png", containing(data), "pictures")
-            needs = _products_of(verb)
-            yield Case("pictures", f"{verb}: {kind}", make, ("bad.png",), needs=needs)
+            yield of(verb, "pictures", f"{verb}: {kind}", make, "bad.png")
     # A link to the root would find pictures of all kinds.
     for kind, made in {
         "a folder that links to itself": (("a/b", "../a"),),
@@ -1314,8 +1258,8 @@ def memory() -> Iterator[Case]:
     verbs = ("train", "evaluate", "extract", "index", "query", "pca", "convert", "info", "export")
     for verb in verbs:
         for megabytes in (16, 64, 256, 1024):
-            words, needs, most = f"{verb}: {megabytes} MB", _products_of(verb), megabytes * 2**20
-            yield Case("memory", words, with_more(verb), (), True, needs, memory=most)
+            words, most = f"{verb}: {megabytes} MB", megabytes * 2**20
+            yield of(verb, "memory", words, with_more(verb), fine=True, memory=most)
 
 
 MARKUP = "<script>alert(1)</script>"
@@ -1413,7 +1357,7 @@ def judge(case: Case, done: Done, before: set[str], folder: pathlib.Path) -> str
     return f"{'; '.join(wrong)}: {done.err[-700:]!r}" if wrong else None
 
 
-def attack(case: Case, world: World, folder: pathlib.Path, limit: float) -> str | None:
+def attack(case: Case, world: World, folder: pathlib.Path) -> str | None:
     """Try a case in a new folder; return what is wrong."""
     (folder / "out").mkdir(parents=True)
     around = files_in(folder.parent)
@@ -1422,7 +1366,7 @@ def attack(case: Case, world: World, folder: pathlib.Path, limit: float) -> str 
         before = files_in(folder / "out")
         made = files_in(folder.parent)
         slow = 4 if case.needs == ("compare",) or case.fine or case.memory else 1
-        done = run(arguments, cwd=folder, limit=slow * limit, memory=case.memory)
+        done = run(arguments, cwd=folder, limit=slow * HANGS, memory=case.memory)
         wrong = judge(case, done, before, folder)
         outside = {name for name in files_in(folder.parent) - made - around if "/out" not in name}
         if outside and wrong is None and case.attack != "comparisons":
@@ -1440,8 +1384,6 @@ def main() -> int:
     parser.add_argument("--most", type=int, default=None)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--only", default="")
-    parser.add_argument("--limit", type=float, default=60, help="seconds until a command hangs")
-    parser.add_argument("--world", type=pathlib.Path, help="a folder to keep the world in")
     given = parser.parse_args()
     import_everything()
     chosen = [case for case in cases(given.seed) if given.only in f"{case.attack}: {case.words}"]
@@ -1455,23 +1397,12 @@ def main() -> int:
     rows = {case.attack: Row(case.attack, PROMISE) for case in chosen}
     with contextlib.ExitStack() as stack:
         folder = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        home = given.world or folder / "world"
-        if given.world is None or not home.exists():
-            world = make_world(home)
-        else:
-            names = ("city", "town", "images", "weights.safetensors", "recipe.json")
-            world = World(home, *(home / name for name in names))
-        needed = dict.fromkeys(need for case in chosen for need in case.needs)
-        there = home / "products" / "made.txt"
-        made = there.read_text().splitlines() if there.exists() else []
-        make_products(
-            world, [verb for verb in (*PRODUCTS, "compare") if verb in needed and verb not in made]
-        )
-        there.parent.mkdir(exist_ok=True)
-        there.write_text("\n".join([*made, *needed]))
+        world = make_world(folder / "world")
+        needed = {need for case in chosen for need in case.needs}
+        make_products(world, [verb for verb in (*PRODUCTS, "compare") if verb in needed])
         started = time.monotonic()
         for number, case in enumerate(chosen, start=1):
-            wrong = attack(case, world, folder / "tried" / f"{number}", given.limit)
+            wrong = attack(case, world, folder / "tried" / f"{number}")
             aborted = wrong is not None and wrong.startswith(ABORTED)
             row = rows.setdefault("memory: aborts", Row("memory: aborts", UNCAUGHT))
             row = row if aborted else rows[case.attack]

@@ -407,6 +407,77 @@ def map_files(folder: pathlib.Path) -> dict[str, bytes]:
     return found | {"map.json": json.dumps(description).encode()}
 
 
+def a_moment(
+    bench: Bench,
+    marks: Marks,
+    seconds: float,
+    times: Sequence[int],
+    spreads: Sequence[float],
+) -> Moment:
+    """Draw a moment to kill at: in the whole run, or soon after some work has begun.
+
+    Args:
+        bench: draws.
+        marks: of the child.
+        seconds: of the whole run.
+        times: of each work, the last beginning that is drawn.
+        spreads: most seconds after a beginning, one of which is drawn.
+    """
+    if bench.random.random() < 0.3:
+        return Moment(marks, signal.SIGKILL, after=bench.random.uniform(0, seconds))
+    work, most = bench.random.choice(list(zip(marks.works, times, strict=True)))
+    after = bench.random.uniform(0, bench.random.choice(spreads))
+    nth = bench.random.randint(1, most)
+    return Moment(marks, signal.SIGKILL, after=after, work=work, nth=nth)
+
+
+def kill_chains(
+    bench: Bench,
+    folder: pathlib.Path,
+    kills: int,
+    go: Callable[..., Done],
+    moment: Callable[[], Moment],
+    at_each: tuple[Row, Callable[[pathlib.Path], str]] | None,
+    at_end: tuple[Row, Callable[[pathlib.Path], list[str]]],
+    *,
+    prepare: Callable[[pathlib.Path, int], None] = lambda chain, number: None,
+) -> None:
+    """Kill a command in one folder after another, in each until it has finished.
+
+    Args:
+        bench: draws and says.
+        folder: of the chains.
+        kills: number of all.
+        go: runs the command in a chain's folder, with what is called during it.
+        moment: draws when to kill.
+        at_each: a row, and what is wrong with a chain's folder after a kill.
+        at_end: a row, and what is wrong with it after the command.
+        prepare: makes a chain's folder, of this number.
+    """
+    killed = number = 0
+    while killed < kills:
+        chain, met = folder / f"chain{number}", []
+        prepare(chain, number)
+        words = f"seed {bench.seed}, chain {number}"
+        while killed < kills:
+            when = moment()
+            done = go(chain, when)
+            if done.code == 0:
+                break
+            killed += 1
+            met.append(when.during)
+            if at_each is not None:
+                bad = at_each[1](chain)
+                bad = bad or (f"exit code {done.code}" if done.code != -signal.SIGKILL else "")
+                at_each[0].note(not bad, f"{words}, {when}: {bad}")
+        if done.code != 0:
+            done = go(chain)
+        wrong = [done.err[-300:]] if done.code else at_end[1](chain)
+        at_end[0].note(not wrong, f"{words}, {met}: {wrong}")
+        bench.say(f"{at_end[0].attack}: {killed} of {kills} kills, chain {number}")
+        number += 1
+
+
 def attack_maps(bench: Bench, kills: int) -> list[Row]:
     """Kill `index`, read maps after each kill, and search a map while it grows."""
     import crisalad_jax.retrieval.maps.build
@@ -454,31 +525,14 @@ def attack_maps(bench: Bench, kills: int) -> list[Row]:
 
     at_each = Row("kills of index: each moment", "the map opens with the first images, or has none")
     of_chains = Row("kills of index: chains", "the map ends with the bits of an uninterrupted one")
-    killed = chain = 0
-    while killed < kills:
-        out, bad, met = folder / f"chain{chain}", "", []
-        while killed < kills:
-            if bench.random.random() < 0.3:
-                moment = Moment(INDEXING, signal.SIGKILL, after=bench.random.uniform(0, seconds))
-            else:
-                work = bench.random.choice(INDEXING.works)
-                nth = 1 if work == INDEXING.works[0] else bench.random.randint(1, 3)
-                after = bench.random.uniform(0, bench.random.choice([0.0005, 0.005, 0.05]))
-                moment = Moment(INDEXING, signal.SIGKILL, after=after, work=work, nth=nth)
-            done = go(out, moment)
-            if done.code == 0:
-                break
-            killed += 1
-            met.append(moment.during)
-            bad = wrong_with(out)
-            bad = bad or (f"exit code {done.code}" if done.code != -signal.SIGKILL else "")
-            at_each.note(not bad, f"seed {bench.seed}, chain {chain}, {moment}: {bad}")
-        if done.code != 0:
-            done = go(out)
-        same = done.code == 0 and map_files(out) == expected and not has_temporaries(out)
-        of_chains.note(same, f"seed {bench.seed}, chain {chain}, {met}: {done.err[-300:]}")
-        bench.say(f"index: {killed} of {kills} kills, chain {chain}")
-        chain += 1
+
+    def wrong_at_end(out: pathlib.Path) -> list[str]:
+        return ["other bits"] * (map_files(out) != expected) + has_temporaries(out)
+
+    def moment() -> Moment:
+        return a_moment(bench, INDEXING, seconds, (1, 3, 3, 3), (0.0005, 0.005, 0.05))
+
+    kill_chains(bench, folder, kills, go, moment, (at_each, wrong_with), (of_chains, wrong_at_end))
     return [at_each, of_chains, *attack_readers(bench, folder, go, rows)]
 
 
@@ -595,14 +649,19 @@ def attack_extract(bench: Bench, suffix: str, kills: int) -> list[Row]:
     names, new = read(whole)
     old = np.ascontiguousarray(new[::-1])
 
-    def wrong_with(out: pathlib.Path, had_old: bool) -> str:
+    had_old: set[pathlib.Path] = set()
+
+    def in_chain(chain: pathlib.Path, during: Callable[[int], None] | None = None) -> Done:
+        return go(chain / whole.name, during)
+
+    def wrong_with(chain: pathlib.Path) -> str:
         try:
-            found, descriptors = read(out)
+            found, descriptors = read(chain / whole.name)
         except InputError as error:
             return "" if is_told(error) else f"refused in several lines: {error}"
         except Exception as error:
             return f"raised {error!r}"
-        sets = [new, old] if had_old else [new]
+        sets = [new, old] if chain in had_old else [new]
         right = found == names and any(np.array_equal(descriptors, each) for each in sets)
         return "" if right else "read a mixture"
 
@@ -613,40 +672,24 @@ def attack_extract(bench: Bench, suffix: str, kills: int) -> list[Row]:
     of_chains = Row(
         f"kills of extract {suffix}: chains", "the set has the bits of an uninterrupted one"
     )
-    left_over = 0
-    killed = chain = 0
-    while killed < kills:
-        out, met, had_old = folder / f"chain{chain}" / f"d{suffix}", [], chain % 2 == 1
-        out.parent.mkdir()
-        if had_old:
-            write_descriptors(out, old, names)
-        while killed < kills:
-            if bench.random.random() < 0.3:
-                moment = Moment(EXTRACTING, signal.SIGKILL, after=bench.random.uniform(0, seconds))
-            else:
-                work = bench.random.choice(EXTRACTING.works)
-                nth = bench.random.randint(1, 4) if work == EXTRACTING.works[0] else 1
-                after = bench.random.uniform(0, bench.random.choice([0.002, 0.005, 0.02]))
-                moment = Moment(EXTRACTING, signal.SIGKILL, after=after, work=work, nth=nth)
-            done = go(out, moment)
-            if done.code == 0:
-                break
-            killed += 1
-            met.append(moment.during)
-            bad = wrong_with(out, had_old)
-            bad = bad or (f"exit code {done.code}" if done.code != -signal.SIGKILL else "")
-            at_each.note(not bad, f"seed {bench.seed}, chain {chain}, {moment}: {bad}")
-        if done.code != 0:
-            done = go(out)
-        found = bytes_of(out)
-        temporaries = [name for name in found if name.startswith(".crisalad-")]
-        left_over += len(temporaries)
-        same = {name: data for name, data in found.items() if name not in temporaries} == expected
-        folders = [path.name for path in out.parent.iterdir() if path.is_dir()]
-        words = f"seed {bench.seed}, chain {chain}, {met}: {folders} {done.err[-300:]}"
-        of_chains.note(done.code == 0 and same and not folders, words)
-        bench.say(f"extract {suffix}: {killed} of {kills} kills, {left_over} temporaries left")
-        chain += 1
+
+    def prepare(chain: pathlib.Path, number: int) -> None:
+        chain.mkdir()
+        if number % 2:
+            had_old.add(chain)
+            write_descriptors(chain / whole.name, old, names)
+
+    def wrong_at_end(chain: pathlib.Path) -> list[str]:
+        found = bytes_of(chain / whole.name)
+        whole_ones = {n: data for n, data in found.items() if not n.startswith(".crisalad-")}
+        folders = [path.name for path in chain.iterdir() if path.is_dir()]
+        return ["other bits"] * (whole_ones != expected) + folders
+
+    def moment() -> Moment:
+        return a_moment(bench, EXTRACTING, seconds, (4, 1), (0.002, 0.005, 0.02))
+
+    ends = (at_each, wrong_with), (of_chains, wrong_at_end)
+    kill_chains(bench, folder, kills, in_chain, moment, *ends, prepare=prepare)
     return [at_each, of_chains]
 
 
@@ -687,25 +730,11 @@ def attack_compare(bench: Bench, kills: int) -> list[Row]:
     seconds = go(folder / "again").seconds
     assert not wrong_with(folder / "again"), wrong_with(folder / "again")
     row = Row("kills of compare", "the comparison ends with the weights and ranks of a whole one")
-    killed = chain = 0
-    while killed < kills:
-        out, met = folder / f"chain{chain}", []
-        while killed < kills:
-            work = bench.random.choice([None, *COMPARING.works])
-            after = bench.random.uniform(0, seconds if work is None else 0.3 * seconds)
-            moment = Moment(COMPARING, signal.SIGKILL, after=after, work=work)
-            done = go(out, moment)
-            if done.code == 0:
-                break
-            killed += 1
-            met.append(moment.during)
-        if done.code != 0:
-            done = go(out)
-        wrong = wrong_with(out) if done.code == 0 else [done.err[-300:]]
-        for name in met:
-            row.note(not wrong, f"seed {bench.seed}, chain {chain}, {name}: {'; '.join(wrong)}")
-        bench.say(f"compare: {killed} of {kills} kills")
-        chain += 1
+
+    def moment() -> Moment:
+        return a_moment(bench, COMPARING, seconds, (1, 1, 1), (0.3 * seconds,))
+
+    kill_chains(bench, folder, kills, go, moment, None, (row, wrong_with))
     return [row]
 
 

@@ -124,6 +124,22 @@ def _compare(world: World, out: pathlib.Path) -> Arguments:
     ]
 
 
+def _vocabulary(world: World, out: pathlib.Path) -> Arguments:
+    return [
+        *("vocabulary", "--images", f"{world.images}", "--out", f"{out / 'v.safetensors'}"),
+        *("--preset", "tiny", "--image-size", "98", "98", "--clusters", "4", "--quiet"),
+        *("--aggregator", "netvlad"),
+    ]
+
+
+def _ablate(world: World, out: pathlib.Path) -> Arguments:
+    return [
+        *("ablate", "--train", f"{world.city}", "--test", f"{world.town}", "--preset", "tiny"),
+        *("--rows", "gem", "--seeds", "1", "--epochs", "1", "--image-size", "98", "98"),
+        *("--out", f"{out / 'ablation'}", "--quiet"),
+    ]
+
+
 VERBS: Mapping[str, Callable[[World, pathlib.Path], Arguments]] = {
     "train": _train,
     "evaluate": _evaluate,
@@ -158,6 +174,10 @@ VERBS: Mapping[str, Callable[[World, pathlib.Path], Arguments]] = {
     "demo": lambda world, out: ["demo", "--out", f"{out / 'demo'}", "--quiet"],
 }
 """A command of each verb that writes files, by what it writes into a folder."""
+ALL = {**VERBS, "vocabulary": _vocabulary, "ablate": _ablate}
+"""These, and the two that take as long as others and do much the same."""
+NEEDS: Mapping[str, tuple[str, ...]] = {"query": ("index",), "pca": ("extract .npy",)}
+"""Products that a verb reads, by the verbs that make them."""
 
 
 PRODUCTS = ("extract .npy", "extract .h5", "index", "pca", "export", "train")

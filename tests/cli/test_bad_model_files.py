@@ -113,23 +113,6 @@ def test_a_part_of_a_model_or_one_of_another_size(capfd, tmp_path, name):
     assert [path.name for path in tmp_path.iterdir()] == ["file.pth"]
 
 
-@pytest.mark.parametrize("suffix", [".pth", ".ckpt", ".safetensors", ".mat"])
-@pytest.mark.parametrize("kept", [0.0, 0.001, 0.5, 0.99])
-def test_a_file_that_is_cut_short(capfd, tmp_path, suffix, kept):
-    file = tmp_path / f"file{suffix}"
-    if suffix == ".mat":
-        scipy.io.savemat(file, {"net": {"layers": np.zeros((64, 64))}})
-    else:
-        save(file, salad())
-    whole = file.read_bytes()
-    file.write_bytes(whole[: int(kept * len(whole))])
-    words = f"{file}: not a whole "
-    fails(capfd, "convert", file, tmp_path / "ours.safetensors", words=(words,))
-    with pytest.raises(InputError, match=f"^{words}"):
-        cj.load(file)
-    assert [path.name for path in tmp_path.iterdir()] == [file.name]
-
-
 @pytest.mark.parametrize("verb", ["extract", "info"])
 def test_public_files_are_told_from_ours_where_weights_are_asked_for(capfd, tmp_path, verb):
     more = {

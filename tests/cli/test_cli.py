@@ -11,11 +11,8 @@ import re
 import subprocess
 import sys
 
-import cv2
-import h5py
 import jax
 import numpy as np
-import PIL.Image
 import pytest
 import safetensors.numpy
 import torch
@@ -23,8 +20,7 @@ import torch
 import crisalad_jax.cli
 from crisalad_jax.checkpoints.formats import public_shapes
 from crisalad_jax.checkpoints.public import read_checkpoint
-from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
-from crisalad_jax.checkpoints.weights import FORMAT, load_weights, save_weights
+from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.cli import main
 from crisalad_jax.config.io import read_config, to_plain
 from crisalad_jax.data.images import list_images, read_image
@@ -60,12 +56,19 @@ WITHOUT_ENCODER = dataclasses.replace(
 TOLERANCE = 2e-6
 
 
-def succeeds(capfd: Capture, *arguments: object) -> str:
-    """Run; the words on stdout, with any space or line break as one space."""
+def runs(capfd: Capture, *arguments: object) -> tuple[str, str]:
+    """Run; what stands on stdout, and on stderr."""
     code = main([str(a) for a in arguments])
     printed = capfd.readouterr()
-    assert (code, printed.err) == (0, "")
-    return " ".join(printed.out.split())
+    assert code == 0, printed.err
+    return printed
+
+
+def succeeds(capfd: Capture, *arguments: object) -> str:
+    """Run; the words on stdout, with any space or line break as one space."""
+    out, err = runs(capfd, *arguments)
+    assert err == ""
+    return " ".join(out.split())
 
 
 def fails(capfd: Capture, *arguments: object, words: tuple[object, ...]) -> str:
@@ -179,7 +182,7 @@ def test_no_command_prints_the_usage(capfd):
         ("evaluate --data d --grouping single,sorted", "grouping: found 'sorted', expected one of"),
         ("evaluate --data d --grouping a/b/c", "grouping: found 'a/b/c', .*QUERIES/DATABASE"),
         ("evaluate --data d --seeds 0", "seeds: found 0, expected at least 1"),
-        ("evaluate --data d --batch-size 0", "batch size: found 0"),
+        ("evaluate --data d --batch-size 0", "batch.size: found 0"),
         ("evaluate --data d --seed -1", "seed: found -1"),
         ("extract --weights w --images d --out f.txt", r"f\.txt: suffix.*\.h5, \.npy"),
         ("extract --weights w --images d --out f.npy --grouping all", "grouping: found 'all'"),
@@ -313,18 +316,6 @@ def test_a_run_from_the_command_line_and_the_same_command_again(
     assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == log
 
 
-def without_column(city: pathlib.Path) -> pathlib.Path:
-    table = city / "Dataframes" / "Brill.csv"
-    rows = [line.split(",") for line in table.read_text().splitlines()]
-    table.write_text("\n".join(",".join(row[:3] + row[4:]) for row in rows))
-    return table
-
-
-def without_file(city: pathlib.Path) -> pathlib.Path:
-    sorted((city / "Images" / "Brill").iterdir())[4].unlink()
-    return city / "Dataframes" / "Brill.csv"
-
-
 def few_images(city: pathlib.Path) -> pathlib.Path:
     for table in (city / "Dataframes").iterdir():
         header, *rows = table.read_text().splitlines()
@@ -339,27 +330,11 @@ def few_places(city: pathlib.Path) -> pathlib.Path:
     return city
 
 
-def no_tables(city: pathlib.Path) -> pathlib.Path:
-    for table in (city / "Dataframes").iterdir():
-        table.unlink()
-    return city / "Dataframes"
-
-
-def no_number(city: pathlib.Path) -> pathlib.Path:
-    table = city / "Dataframes" / "Aston.csv"
-    table.write_text(table.read_text().replace(",2020,", ",MMXX,", 1))
-    return table
-
-
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (without_column, "missing northdeg"),
-        (without_file, "Brill_0000001_2020_05_001_1.5_2.5_pano.jpg"),
         (few_images, "found no place with at least 2 images; the largest has 1"),
         (few_places, "found 2 places, expected places_per_batch 3"),
-        (no_tables, "found no CSV file"),
-        (no_number, "MMXX"),
     ],
 )
 def test_bad_places(capfd, tmp_path, shared, city, damage, words):
@@ -403,18 +378,6 @@ def test_a_bad_training_image_stops_the_run_until_it_is_repaired(
     assert f"{STEPS} steps" in succeeds(capfd, *arguments)
 
 
-def test_bad_training_images_are_skipped_and_counted(capfd, tmp_path, shared, city):
-    paths = sorted((city / "Images").rglob("*_000000[01]_*.jpg"))
-    for path, how in zip(paths, ["empty", "cut", "text"] * 4, strict=True):
-        spoil(path, how)
-    arguments = train(shared, city, tmp_path / "run", "--on-bad-image", "skip")
-    out = succeeds(capfd, *arguments)
-    log = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
-    skipped = sum(json.loads(line)["skipped_images"] for line in log)
-    assert skipped > 0
-    assert f"{skipped} unreadable images skipped" in out
-
-
 def test_a_loss_that_is_not_finite_names_the_step_and_saves_the_state(
     capfd, tmp_path, shared, params
 ):
@@ -432,44 +395,7 @@ def test_a_loss_that_is_not_finite_names_the_step_and_saves_the_state(
     assert (tmp_path / "run" / "metrics.jsonl").read_text() == ""
 
 
-def test_a_folder_of_other_files_or_of_another_run_is_left_alone(capfd, tmp_path, shared, run):
-    (tmp_path / "notes.txt").write_text("mine")
-    fails(
-        capfd,
-        *train(shared, shared / "city", tmp_path),
-        words=(f"crisalad: {tmp_path}: found files but no run",),
-    )
-    assert files_in(tmp_path) == {"notes.txt"}
-    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
-    fails(
-        capfd,
-        *train(shared, shared / "city", run, "--seed", "6"),
-        words=(f"crisalad: {run}: holds a run of another configuration", "seed: found 6, expected"),
-    )
-    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
-
-
-def test_too_few_patches_for_the_clusters(capfd, tmp_path, shared):
-    fails(
-        capfd,
-        *train(shared, shared / "city", tmp_path / "run", "--image-size", "28", "28"),
-        words=("found 28 x 28, which is 4 patches for 4 clusters", "works: 42 x 42"),
-    )
-    assert not (tmp_path / "run").exists()
-
-
 # Weights
-
-
-def test_weights_of_another_configuration(capfd, tmp_path, shared, weights):
-    fails(
-        capfd,
-        *("train", "--data", shared / "city", "--out", tmp_path / "run", "--min-images", "2"),
-        *("--places-per-batch", "2", "--images-per-place", "2"),
-        *("--weights", weights, "--model.backbone.dim", "128"),
-        words=(f"crisalad: {weights}: ", "another model", "backbone.dim: found 32, expected 128"),
-    )
-    assert not (tmp_path / "run").exists()
 
 
 def test_extract_computes_in_the_type_that_is_asked_for(capfd, tmp_path, shared):
@@ -485,23 +411,15 @@ def test_extract_computes_in_the_type_that_is_asked_for(capfd, tmp_path, shared)
     assert (narrow * wide).sum(axis=-1).min() > 0.999
 
 
-@pytest.mark.parametrize("kind", ["missing", "empty", "cut", "foreign", "shape", "nan"])
+@pytest.mark.parametrize("kind", ["missing", "cut", "foreign"])
 def test_bad_weights_are_named_by_every_command(capfd, tmp_path, shared, kind):
     weights = tmp_path / "w.safetensors"
     whole = shared / "weights.safetensors"
-    arrays = safetensors.numpy.load_file(whole)
     if kind == "cut":
         weights.write_bytes(whole.read_bytes()[:-100])
-    elif kind == "empty":
-        weights.write_bytes(b"")
     elif kind == "foreign":
+        arrays = safetensors.numpy.load_file(whole)
         safetensors.numpy.save_file(arrays, weights, metadata={"format": "pt"})
-    elif kind != "missing":
-        arrays["aggregator.dust_bin"] = (
-            np.zeros(2, np.float32) if kind == "shape" else np.array(np.nan, np.float32)
-        )
-        value, _ = read_sealed(whole, FORMAT, "weights")
-        write_sealed(weights, arrays, FORMAT, value)
     before = files_in(tmp_path)
     start = ("--weights", weights)
     town = shared / "town"
@@ -630,18 +548,6 @@ def test_evaluate_prints_and_writes_the_table(capfd, tmp_path, shared, params, b
     assert written == {key: value for key, value in table.items() if key != "results"}
 
 
-def test_without_an_encoder_there_is_one_row(capfd, tmp_path, shared):
-    save_weights(tmp_path / "w.safetensors", Model(random_params(WITHOUT_ENCODER), WITHOUT_ENCODER))
-    out = succeeds(
-        capfd,
-        *("evaluate", "--weights", tmp_path / "w.safetensors", "--data", shared / "town"),
-        *("--batch-size", BATCH, "--json", tmp_path / "table.json", "--quiet"),
-    )
-    assert "No cross-image encoder: no descriptor depends on its batch." in out
-    (row,) = json.loads((tmp_path / "table.json").read_text())["results"]
-    assert row["grouping"] == "any"
-
-
 @SPOILT
 def test_a_bad_image_stops_an_evaluation(capfd, tmp_path, town, how, weights):
     bad = sorted((town / "images" / "test" / "database").iterdir())[5]
@@ -742,69 +648,6 @@ def test_extract_writes_descriptors_names_and_configuration(
         "model": to_plain(MODEL),
     }
 
-    succeeds(capfd, *extract(shared, town, tmp_path / "h" / "d.h5"))
-    assert files_in(tmp_path / "h") == {"d.h5", "d.h5.json"}
-    with h5py.File(tmp_path / "h" / "d.h5", "r") as file:
-        for name, row in zip(names, found, strict=True):
-            np.testing.assert_array_equal(file[name]["global_descriptor"][()], row)
-
-    succeeds(capfd, *extract(shared, town, tmp_path / "s.npy", "--grouping", "sequential"))
-    database = np.stack([resize_image(read_image(town / name), (42, 56)) for name in names[:BATCH]])
-    np.testing.assert_allclose(
-        np.load(tmp_path / "s.npy")[:BATCH],
-        describe(params, database, MODEL),
-        atol=TOLERANCE,
-        rtol=0,
-    )
-
-
-def write_odd_images(folder: pathlib.Path) -> None:
-    """Pairs: NAME.odd.SUFFIX, and NAME.plain.png, the same picture as Pillow turns it to RGB."""
-    folder.mkdir()
-
-    def picture(seed: int, channels: int = 3) -> np.ndarray:
-        coarse = np.random.default_rng(seed).integers(0, 256, (4, 5, 4), dtype=np.uint8)
-        return cv2.resize(coarse, (90, 60), interpolation=cv2.INTER_CUBIC)[..., :channels]
-
-    def save(name: str, odd: PIL.Image.Image, plain: PIL.Image.Image | None = None, **how) -> None:
-        odd.save(folder / name, quality=95, **how)
-        with PIL.Image.open(folder / name) as saved:
-            plain = saved if plain is None else plain
-            plain.convert("RGB").save(folder / f"{name.split('.')[0]}.plain.png")
-
-    grey = picture(0)[..., 0].copy()
-    deep = PIL.Image.fromarray((grey.astype(np.uint16) << 8) + 37)
-    save("deep.odd.png", deep, plain=PIL.Image.fromarray(grey))
-    save("grey.odd.png", PIL.Image.fromarray(picture(1)[..., 0].copy()))
-    save("alpha.odd.png", PIL.Image.fromarray(picture(2, channels=4)))
-    save("cmyk.odd.jpg", PIL.Image.fromarray(picture(3)).convert("CMYK"))
-    exif = PIL.Image.Exif()
-    exif[0x0112] = 6  # to be turned a quarter clockwise
-    sideways = PIL.Image.fromarray(picture(4))
-    upright = sideways.transpose(PIL.Image.Transpose.ROTATE_270)
-    save("turned.odd.jpg", sideways, plain=upright, exif=exif)
-    dot = PIL.Image.new("RGB", (1, 1), (200, 90, 30))
-    save("dot.odd.png", dot, plain=dot.resize((56, 42)))
-    wide = PIL.Image.fromarray(picture(5)).resize((20_000, 30))
-    save("wide.odd.png", wide, plain=wide.resize((56, 42), PIL.Image.Resampling.BILINEAR))
-
-
-def test_odd_images_are_described_as_their_plain_twins(capfd, tmp_path, shared):
-    write_odd_images(tmp_path / "images")
-    succeeds(capfd, *extract(shared, tmp_path / "images", tmp_path / "d.npy"))
-    names = (tmp_path / "d.names.txt").read_text().splitlines()
-    rows = dict(zip(names, np.load(tmp_path / "d.npy"), strict=True))
-    odd = {name.split(".")[0]: row for name, row in rows.items() if ".odd." in name}
-    plain = {name.split(".")[0]: row for name, row in rows.items() if ".plain." in name}
-    assert odd.keys() == plain.keys()
-    assert len(odd) == 7
-    for name, row in odd.items():
-        similarities = {other: float(row @ plain[other]) for other in plain}
-        # Decoders, JPEG and resizing move a pixel by a few grey levels of 255, which turns a unit
-        # vector by little; other pictures are far.
-        assert similarities.pop(name) > 0.999, (name, similarities)
-        assert max(similarities.values()) < 0.99, (name, similarities)
-
 
 @SPOILT
 def test_extract_stops_at_a_bad_image_and_leaves_nothing(capfd, tmp_path, shared, town, how):
@@ -836,58 +679,19 @@ def test_extract_skips_bad_images_and_says_so(capfd, tmp_path, shared, town, par
     assert [town / name for name in skipped] == [paths[0], paths[6], paths[11]]
 
 
-def test_extract_with_no_readable_image(capfd, tmp_path, shared):
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images" / "a.jpg").write_text("no image")
-    fails(
-        capfd,
-        *extract(shared, tmp_path / "images", tmp_path / "d.npy", "--on-bad-image", "skip"),
-        words=(f"crisalad: {tmp_path / 'images'}: found 1 images, none of them readable",),
-    )
-    assert files_in(tmp_path) == {"images/a.jpg"}
-
-
-def test_an_output_that_cannot_be_written_is_named(capfd, tmp_path, shared):
-    (tmp_path / "file").write_text("")
-    fails(
-        capfd,
-        *extract(shared, shared / "town", tmp_path / "file" / "d.npy"),
-        words=(f"crisalad: {tmp_path / 'file' / 'd.npy'}: cannot be made",),
-    )
-    (tmp_path / "d.h5").mkdir()
-    fails(
-        capfd,
-        *extract(shared, shared / "town", tmp_path / "d.h5"),
-        words=(f"crisalad: {tmp_path / 'd.h5'}: found a folder",),
-    )
-    assert files_in(tmp_path) == {"file"}
-
-
 # info
 
 
 def test_info_gives_the_papers_numbers(capfd, tmp_path):
+    """Table 3: 741,504 parameters and 39.223 M multiply-accumulates an adapter."""
     out = succeeds(capfd, "info", "--preset", "b14", "--json", tmp_path / "info.json")
     for number in ("741,504", "39,223,296", "8,448"):
         assert number in out
     summary = json.loads((tmp_path / "info.json").read_text())
-    assert summary["descriptor"] == 8448
-    # Table 3: 741,504 parameters and 39.223 M multiply-accumulates an adapter.
-    assert summary["one_adapter"]["parameters"] == 741_504
-    assert summary["one_adapter"]["paper_macs"] == 39_223_296
     # The two linears at all 257 tokens; the convolutions as the paper counts them.
     assert summary["one_adapter"]["macs"] == 257 * 589_824 + 256 * 150_912
-    parts = {part["part"]: part for part in summary["parts"]}
-    assert parts["adapters"]["parameters"] == 12 * 741_504
     # DINOv2 ViT-B/14: 86.58 M parameters, of which its mask token (768) is not part of our model.
-    backbone = (
-        parts["backbone blocks"]["parameters"] + parts["backbone embedding, norm"]["parameters"]
-    )
-    assert backbone == 86_580_480 - 768
-    assert summary["frozen_parameters"] == backbone
-    assert (
-        summary["trainable_parameters"] == sum(p["parameters"] for p in parts.values()) - backbone
-    )
+    assert summary["frozen_parameters"] == 86_580_480 - 768
 
 
 def test_info_of_a_file_and_of_other_choices(capfd, tmp_path, params, weights):
@@ -909,5 +713,4 @@ def test_a_plug_in_without_a_name_is_refused(capfd):
 
 
 def test_the_version_is_that_of_the_package(capfd):
-    assert main(["--version"]) == 0
-    assert capfd.readouterr().out == f"crisalad-jax {crisalad_jax.__version__}\n"
+    assert runs(capfd, "--version") == (f"crisalad-jax {crisalad_jax.__version__}\n", "")

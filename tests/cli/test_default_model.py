@@ -7,25 +7,22 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.load import load
-from crisalad_jax.cli import main
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.model import describe
 from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.map import Map
-from tests.cli.test_cli import Capture, fails
+from tests.cli.test_cli import Capture, fails, runs
 
 NOTE = "crisalad: note: no --weights: taking starter"
 
 
 def said(capfd: Capture, *arguments: object) -> tuple[str, list[str]]:
     """Run; the words on stdout, and the notes."""
-    code = main([str(a) for a in arguments])
-    printed = capfd.readouterr()
-    assert code == 0, printed.err
-    notes = [line for line in printed.err.splitlines() if line.startswith("crisalad: note")]
-    return " ".join(printed.out.split()), notes
+    out, err = runs(capfd, *arguments)
+    notes = [line for line in err.splitlines() if line.startswith("crisalad: note")]
+    return " ".join(out.split()), notes
 
 
 def test_extract_takes_it(shared, tmp_path, capfd):
@@ -78,16 +75,6 @@ def test_a_map_grows_by_its_own_model(shared, tmp_path, capfd):
     count = len(list_images(images / "queries"))
     assert f"{count} images added" in words
     assert notes == []
-
-
-def test_a_map_whose_weights_have_gone_names_itself_and_the_flag(shared, tmp_path, capfd):
-    images, out = shared / "town" / "images" / "test" / "database", tmp_path / "map"
-    weights = tmp_path / "mine.safetensors"
-    shutil.copy(shared / "weights.safetensors", weights)
-    said(capfd, "index", "--images", images, "--weights", weights, "--out", out, "--quiet")
-    weights.unlink()
-    words = (f"{out}: found no {weights}, which made this map", "--weights")
-    fails(capfd, "index", "--images", images, "--out", out, "--quiet", words=words)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 import json
 
-from tests.cli.test_cli import fails, succeeds
+from tests.cli.test_cli import succeeds
 from tests.conftest import BATCH
 from tests.experiments.report.test_page import Page
 
@@ -44,10 +44,3 @@ def test_the_page_holds_the_numbers_of_the_json(shared, tmp_path, capfd, weights
     names = {e["id"] for e in page.all("section")}
     assert {"recall", "map", "transport", "similarities", "settings"} <= names
     assert json.loads(page.all("pre")[0]["text"])["model"]["image_size"] == [42, 56]
-
-
-def test_a_folder_that_cannot_be_is_found_before_the_work(shared, tmp_path, capfd, weights):
-    (tmp_path / "file").write_text("")
-    given = ("evaluate", "--data", shared / "town", "--weights", weights)
-    words = (f"{tmp_path}/file", "cannot be made")
-    fails(capfd, *given, "--report", tmp_path / "file", words=words)

@@ -9,7 +9,7 @@ import pytest
 import crisalad_jax as cj
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
-from crisalad_jax.cli import main, train
+from crisalad_jax.cli import train
 from crisalad_jax.config.io import differences
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
@@ -17,6 +17,7 @@ from crisalad_jax.nn.model import Model
 from crisalad_jax.training.config import MiningConfig
 from crisalad_jax.training.start import read_start
 from crisalad_jax.utils.output import Note
+from tests.cli.test_cli import fails, runs
 from tests.conftest import MODEL, RECIPE
 
 STARTER = cj.load("starter").config
@@ -59,9 +60,9 @@ def test_a_configuration_comes_before_the_file():
 
 
 def test_a_part_that_the_recipe_puts_in_place_is_told_not_ignored(shared, tmp_path, capfd):
-    flags = ("--weights", "starter", "--recipe", "crisalad+gem", "--out", str(tmp_path / "run"))
-    assert main(["train", "--data", str(shared / "city"), *flags]) == 2
-    assert "aggregator: found conv-ap, expected gem" in capfd.readouterr().err
+    flags = ("--weights", "starter", "--recipe", "crisalad+gem", "--out", tmp_path / "run")
+    words = ("aggregator: found conv-ap, expected gem",)
+    fails(capfd, "train", "--data", shared / "city", *flags, words=words)
 
 
 def test_what_is_saved_has_the_files_images(shared, tmp_path, capfd, weights):
@@ -71,8 +72,7 @@ def test_what_is_saved_has_the_files_images(shared, tmp_path, capfd, weights):
     flags = ["--preset", "tiny", "--epochs", "1", "--places-per-batch", "3", "--quiet"]
     files = ("--data", shared / "city", "--out", tmp_path / "run")
     arguments = ["train", "--weights", tmp_path / "w.safetensors", *files, *flags]
-    assert main(list(map(str, arguments))) == 0
-    out, err = capfd.readouterr()
+    out, err = runs(capfd, *arguments)
     assert load_weights(tmp_path / "run" / "last.safetensors")[1] == model
     saved = json.loads((tmp_path / "run" / "config.json").read_text())
     assert saved["model"]["image_size"] == [28, 42]

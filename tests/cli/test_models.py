@@ -11,10 +11,10 @@ from crisalad_jax.checkpoints.cache import cached_weights
 from crisalad_jax.checkpoints.formats import FORMATS
 from crisalad_jax.checkpoints.published import PUBLISHED, Licence, Published
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli import main
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.training.start import read_start
 from tests.checkpoints.test_cache import CONFIG, DATA, FILE
+from tests.cli.test_cli import fails, runs
 from tests.conftest import RECIPE, assert_equal, write_picture
 
 
@@ -40,12 +40,6 @@ def _mirror(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
         note="in an archive",
     )
     monkeypatch.setitem(PUBLISHED, model.name, model)
-
-
-def runs(capfd: pytest.CaptureFixture[str], *arguments: object) -> tuple[str, str]:
-    assert main([str(a) for a in arguments]) == 0
-    printed = capfd.readouterr()
-    return printed.out, printed.err
 
 
 def test_the_table_has_every_model_and_marks_those_in_the_cache(capfd, tmp_path):
@@ -107,11 +101,8 @@ def test_the_model_in_the_package_is_told_of_in_the_same_words(capfd):
 @pytest.mark.parametrize(("name", "nearest"), [("megalok", "megaloc"), ("startr", "starter")])
 def test_an_unknown_name_is_one_line(capfd, name, nearest):
     for arguments in (["models", name], ["info", "--weights", name]):
-        assert main(arguments) == 2
-        error = capfd.readouterr().err
-        assert error.count("\n") == 1
-        assert error.startswith(f"crisalad: {name}: found no ")
-        assert f"nearest: {nearest}" in error
+        words = (f"crisalad: {name}: found no ", f"nearest: {nearest}")
+        fails(capfd, *arguments, words=words)
 
 
 def test_weights_by_name(capfd, tmp_path):

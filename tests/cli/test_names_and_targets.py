@@ -1,12 +1,12 @@
 """Odd names of files and folders, and outputs that would overwrite each other."""
 
+import importlib
 import os
+import shlex
 import shutil
 
-import numpy as np
 import pytest
 
-from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, save_pca
 from tests.cli.test_cli import extract, fails, files_in, succeeds
 
 
@@ -35,23 +35,30 @@ def test_a_name_that_is_no_line_of_text_is_refused_before_the_work(
     assert files_in(tmp_path / "out") == set()
 
 
-@pytest.mark.parametrize("name", ["d.npy", "d.names.txt", "d.npy.json"])
-def test_pairs_do_not_overwrite_what_extract_writes(capfd, tmp_path, shared, name):
-    start = extract(shared, shared / "town", tmp_path / "d.npy", "--pairs", tmp_path / name)
-    fails(capfd, *start, words=(f"--pairs: found {tmp_path / name}, which --out writes",))
-    assert files_in(tmp_path) == set()
+OUTPUTS = (
+    *(f"{verb} --out" for verb in ("train", "evaluate", "extract", "index", "pca", "export")),
+    *(f"{verb} --out" for verb in ("vocabulary", "compare", "ablate", "demo", "render")),
+    *(f"{verb} --json" for verb in ("evaluate", "query", "info", "models", "calibrate")),
+    *("evaluate --report", "extract --pairs", "query --gallery", "convert DST"),
+)
+SUFFIXES = {"--json": ".json", "--gallery": ".png", "--pairs": ".txt", "extract --out": ".npy"}
 
 
-def test_pairs_of_descriptors_that_are_no_unit_vectors_are_refused_before_the_work(
-    capfd, tmp_path, shared
-):
-    rows = np.random.default_rng(0).standard_normal((60, 48)).astype(np.float32)
-    components = tmp_path / "pca.safetensors"
-    save_pca(components, fit_pca(rows, 5, PcaConfig(renormalise=False)))
-    more = "--pca", components, "--pairs", tmp_path / "pairs.txt"
-    start = extract(shared, shared / "town", tmp_path / "d.npy", *more)
-    fails(capfd, *start, words=("--pairs: found components that leave lengths",))
-    assert files_in(tmp_path) == {"pca.safetensors"}
+@pytest.mark.parametrize("output", OUTPUTS)
+@pytest.mark.parametrize("folder", ["/proc", "file"])
+def test_every_output_is_checked_before_any_work(capfd, tmp_path, monkeypatch, output, folder):
+    """In /proc no file can be made, though its permissions let root write there."""
+    (tmp_path / "file").write_text("")
+    monkeypatch.chdir(tmp_path)
+    verb, flag = output.split()
+    module = importlib.import_module(f"crisalad_jax.cli.{verb}")
+    monkeypatch.setattr(module, "run", lambda _: pytest.fail("the work began"))
+    suffix = SUFFIXES.get(output, SUFFIXES.get(flag, ".safetensors"))
+    target = os.path.join(folder, f"x{suffix}")
+    example = shlex.split(module.EXAMPLE)[1:]
+    given = [*example[:-1], target] if flag == "DST" else [*example, flag, target]
+    fails(capfd, *given, words=(f"crisalad: {target}: cannot be made: found {folder[:5]}, exp",))
+    assert files_in(tmp_path) == {"file"}
 
 
 def test_verify_needs_a_map(capfd):

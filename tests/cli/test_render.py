@@ -2,17 +2,15 @@
 
 import json
 
-from crisalad_jax.cli import main
-from tests.cli.test_cli import fails
+from tests.cli.test_cli import fails, succeeds
 
 SMALL = ("--scenes", "3", "--stations", "2", "--test-scenes", "2", "--image-size", "30", "40")
 
 
 def test_it_says_what_it_wrote(tmp_path, capfd):
     out = tmp_path / "world"
-    given = ["render", "--out", str(out), *SMALL, "--quiet", "--json", str(tmp_path / "said.json")]
-    assert main(given) == 0
-    said = " ".join(capfd.readouterr().out.split())
+    given = ("render", "--out", out, *SMALL, "--quiet", "--json", tmp_path / "said.json")
+    said = succeeds(capfd, *given)
     assert said == (
         f"{out}: 6 places with 4 images each in {out / 'train'}; 4 other places in {out / 'test'}"
     )
@@ -23,12 +21,10 @@ def test_it_says_what_it_wrote(tmp_path, capfd):
 
 
 def test_a_world_that_is_there_stays_and_another_is_refused_by_what_differs(tmp_path, capfd):
-    given = ("render", "--out", tmp_path / "world", *SMALL)
-    assert main([*map(str, given)]) == 0
+    given = ("render", "--out", tmp_path / "world", *SMALL, "--quiet")
+    succeeds(capfd, *given)
     written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-    capfd.readouterr()
-    assert main([*map(str, given)]) == 0
-    assert "there already, 6 places with 4 images each" in " ".join(capfd.readouterr().out.split())
+    assert "there already, 6 places with 4 images each" in succeeds(capfd, *given)
     for flag, value, words in (
         ("--repaint", "0.2", "another configuration (repaint: 0.3, not 0.2)"),
         ("--varied", "season", "another configuration (varied: ['stand', "),
@@ -50,5 +46,12 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capfd):
         fails(capfd, "render", "--out", out, *SMALL, flag, value, words=(words,))
     assert not list(tmp_path.iterdir())
     (tmp_path / "file").write_text("mine")
-    fails(capfd, "render", "--out", tmp_path / "file", *SMALL, words=("found a file",))
+    fails(
+        capfd,
+        "render",
+        "--out",
+        tmp_path / "file",
+        *SMALL,
+        words=("found a file, expected a folder",),
+    )
     assert (tmp_path / "file").read_text() == "mine"

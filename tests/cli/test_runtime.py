@@ -11,11 +11,10 @@ import pytest
 
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
-from crisalad_jax.cli import main
 from crisalad_jax.data.images import read_image
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.retrieval.describe import prepare_image
-from tests.cli.test_cli import Capture, fails
+from tests.cli.test_cli import Capture, fails, runs
 from tests.conftest import MODEL
 
 pytestmark = pytest.mark.usefixtures("symbolic_shapes")
@@ -31,10 +30,7 @@ def town(shared: pathlib.Path) -> pathlib.Path:
 
 def succeeds(capfd: Capture, *arguments: object) -> str:
     """Run; the words on stdout. The first run of an engine tells that it exports the weights."""
-    code = main([str(a) for a in arguments])
-    printed = capfd.readouterr()
-    assert code == 0, printed.err
-    return " ".join(printed.out.split())
+    return " ".join(runs(capfd, *arguments)[0].split())
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -187,8 +183,8 @@ def test_an_int8_program_is_a_model_of_its_own(params, shared, tmp_path, capfd, 
     succeeds(capfd, *index, "--weights", weights, "--out", of_floats)
     succeeds(capfd, *index, "--weights", eight, "--out", of_bytes, *engine)
     query = ("query", photographs, "--quiet")
-    assert main([str(a) for a in (*query, "--map", of_floats, "--weights", eight, *engine)]) == 0
-    assert f"{eight}: an int8 program of the model that made {of_floats}" in capfd.readouterr().err
+    _, notes = runs(capfd, *query, "--map", of_floats, "--weights", eight, *engine)
+    assert f"{eight}: an int8 program of the model that made {of_floats}" in notes
     fails(capfd, *query, "--map", of_bytes, "--weights", weights, words=(of_bytes, "made by model"))
-    assert main([str(a) for a in (*query, "--map", of_bytes, "--weights", eight, *engine)]) == 0
-    assert "int8" not in capfd.readouterr().err
+    _, notes = runs(capfd, *query, "--map", of_bytes, "--weights", eight, *engine)
+    assert "int8" not in notes

@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.weights import save_weights
-from crisalad_jax.cli import main
 from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.descriptor_files import read_descriptors
 from crisalad_jax.retrieval.maps.map import Map
-from tests.cli.test_cli import fails, succeeds
+from tests.cli.test_cli import fails, runs, succeeds
 from tests.cli.test_index import index, query
 from tests.conftest import BATCH, random_params, write_video
 from tests.data.test_sources import write_jpeg
@@ -65,9 +64,7 @@ def test_positions_are_of_the_flag_the_table_names_or_exif(shared, images, tmp_p
     succeeds(capfd, *index(shared, work / "names.csv", tmp_path / "names"))
     assert positions(tmp_path / "names") == {"b.jpg": exif["b.jpg"]}
     shutil.copy(work / "a.jpg", work / "new.jpg")
-    given = map(str, index(shared, work / "new.jpg", tmp_path / "table"))
-    assert main(list(given)) == 0
-    error = capfd.readouterr().err
+    _, error = runs(capfd, *index(shared, work / "new.jpg", tmp_path / "table"))
     assert "left out the EXIF positions of 1 images, expected x, y as in the map" in error
     assert positions(tmp_path / "table")["new.jpg"] is None
 
@@ -96,11 +93,6 @@ def test_one_image_is_one(shared, images, tmp_path, capfd):
     answers = tmp_path / "answers.jsonl"
     said = succeeds(capfd, *query(tmp_path / "map", images / "a.jpg", "--json", answers))
     assert said == f"{answers}: 1 query in a map of 1 image"
-
-
-def test_a_folder_that_is_no_map_is_not_asked(images, capfd):
-    words = f"{images}: found a.jpg and no map.json, expected a map or an empty folder\n"
-    assert fails(capfd, *query(images, images), words=()).endswith(words)
 
 
 def test_a_video_is_extracted_and_described_as_its_frames(tmp_path, capfd, weights):
@@ -165,13 +157,12 @@ def test_the_default_rate_of_a_video_is_said(shared, town_map, tmp_path, capfd):
         ),
     )
     for verb in verbs:
-        assert main(list(map(str, verb))) == 0
-        assert capfd.readouterr().err == said
+        assert runs(capfd, *verb)[1] == said
     # Of two videos in a list, together; nothing where a rate is given, or all are taken.
     write_video(tmp_path / "slow.avi", 3, rate=1)
     (tmp_path / "list.txt").write_text("walk.avi\nslow.avi\n")
-    assert main(list(map(str, query(town_map, tmp_path / "list.txt")))) == 0
-    assert "list.txt: 6 of 24 frames, 1 per second: --fps\n" in capfd.readouterr().err
+    _, error = runs(capfd, *query(town_map, tmp_path / "list.txt"))
+    assert "list.txt: 6 of 24 frames, 1 per second: --fps\n" in error
     succeeds(capfd, *query(town_map, video, "--fps", 1))
     succeeds(capfd, *query(town_map, tmp_path / "slow.avi"))
     succeeds(capfd, *query(town_map, f"{video}#t=0.5"))
@@ -180,8 +171,7 @@ def test_the_default_rate_of_a_video_is_said(shared, town_map, tmp_path, capfd):
 def test_a_camera_of_a_video(town_map, tmp_path, capfd):
     video = write_video(tmp_path / "walk.avi", 5)
     given = query(town_map, "--camera", video, "--k", 1, "--window", 3)
-    assert main([str(part) for part in given]) == 0
-    out, error = capfd.readouterr()
+    out, error = runs(capfd, *given)
     lines = [json.loads(line) for line in out.splitlines()]
     assert lines[-1]["query"] == "walk.avi#t=0.400"
     assert lines[-1]["time"] == 0.4

@@ -73,7 +73,7 @@ def test_bad_input_is_one_line(capfd, shared, tmp_path):
         ((out, "--weights", weights), "aggregator: found salad, which has no vocabulary"),
         ((out, "--weights", weights, "--backbone", weights), "--backbone: found with --weights"),
         ((out, "--weights", weights, "--preset", "b14"), "--preset: found with --weights"),
-        ((out, "--weights", weights, "--layer", 1), "--layer: found with --weights"),
+        ((out, "--weights", weights, "--layer", 0), "--layer: found with --weights"),
         ((out, "--preset", "tiny", "--layer", 4), "layer: found 4, expected -4 to 3"),
         (
             (out, "--preset", "tiny", "--aggregator", "netvlad", "--facet", "key"),

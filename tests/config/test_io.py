@@ -20,28 +20,20 @@ CHANGED = dataclasses.replace(
     recipe("tiny"), cities=("Aston", "Brill"), patience=4, augmentation=recipe("b14").augmentation
 )
 VIT = {"name": "vit"}
-RECIPES_OF_PRESETS = {
+RECIPES_OF_PRESETS = {"changed": CHANGED} | {
     f"{preset} {name}": recipe(preset, name)
     for preset in PRESETS
     for name in sorted({*RECIPES, *AGGREGATORS, *LOSSES})
 }
 
 
-@pytest.mark.parametrize("config", [*map(recipe, PRESETS), CHANGED], ids=[*PRESETS, "changed"])
-def test_every_recipe_survives_a_file(tmp_path, config):
-    write_json(tmp_path / "config.json", to_plain(config))
+@pytest.mark.parametrize("config", RECIPES_OF_PRESETS.values(), ids=RECIPES_OF_PRESETS)
+def test_every_recipe_of_every_preset_survives_a_file(tmp_path, config):
+    plain = to_plain(config)
+    write_json(tmp_path / "config.json", plain)
     found = read_config(TrainConfig, tmp_path / "config.json")
     assert found == config
     assert hash(found) == hash(config)  # tuples have not become lists
-
-
-@pytest.mark.parametrize("config", RECIPES_OF_PRESETS.values(), ids=RECIPES_OF_PRESETS)
-def test_every_recipe_of_every_preset_survives_json(config):
-    plain = to_plain(config)
-    assert json.loads(json.dumps(plain)) == plain
-    found = from_plain(TrainConfig, plain, source="here")
-    assert found == config
-    assert hash(found) == hash(config)
     assert to_plain(found) == plain
     model = from_plain(ModelConfig, plain["model"], source="here")
     assert model == config.model
@@ -72,10 +64,7 @@ def test_fields_left_out_take_their_defaults():
         ({"model": {"imag_size": [98, 98]}}, ["imag_size", "config.model"]),
         ({"model": {"image_size": [100, 98]}}, ["found 100 x 98", "nearest: 98 x 98"]),
         ({"model": {"image_size": [98]}}, ["config.model.image_size"]),
-        (
-            {"model": {"backbone": VIT | {"dim": "32"}}},
-            ["'32'", "expected a whole", "backbone.dim"],
-        ),
+        ({"model": {"backbone": VIT | {"dim": "32"}}}, ["'32'", "a whole", "backbone.dim"]),
         ({"model": {"backbone": VIT | {"ffn": "relu"}}}, ["relu", "swiglu", "model.backbone.ffn"]),
         ({"model": {"backbone": {"dim": 32}}}, ["None", "config.model.backbone"]),
         ({"model": 3}, ["config.model"]),
@@ -140,24 +129,19 @@ def test_a_configuration_that_a_user_wrote_is_read(tmp_path):
     assert read_config(TrainConfig, path) == TrainConfig(seed=7)
 
 
+UNKNOWN_STEP = {"name": "salad", "sinkhorn": {"step": {"name": "x"}}}
+
+
 @pytest.mark.parametrize(
     ("value", "words", "place"),
     [
+        ({"model": {"backbone": "x"}}, "backbone: found 'x', expected one of d", "model.backbone"),
         (
-            {"model": {"backbone": "x"}},
-            "backbone: found 'x', expected one of dinov3, ",
-            "model.backbone",
-        ),
-        (
-            {"model": {"aggregator": {"name": "salad", "sinkhorn": {"step": {"name": "x"}}}}},
+            {"model": {"aggregator": UNKNOWN_STEP}},
             "step: found 'x', expected one of dual-softmax, newton, ",
             "model.aggregator.sinkhorn.step",
         ),
-        (
-            {"loss": {"kind": {"name": "x", "size": 3}}},
-            "loss: found 'x', expected one of circle, ",
-            "loss.kind",
-        ),
+        ({"loss": {"kind": {"name": "x", "size": 3}}}, "loss: found 'x', ", "loss.kind"),
     ],
 )
 def test_an_unknown_part_is_named_and_may_be_a_plug_ins(value, words, place):

@@ -1,6 +1,7 @@
 """Settings and notes of evaluations: what was asked stands beside what was found."""
 
 import json
+import pathlib
 
 import numpy as np
 import pytest
@@ -16,28 +17,25 @@ from tests.conftest import BATCH, MODEL
 NEIGHBOURS = Neighbours(np.zeros((1, 1), np.int64), np.ones((1, 1), np.float32))
 
 
+ASKED = {"weights": pathlib.Path("w.safetensors"), "batch_size": BATCH, "seeds": 2, "pca": None}
+
+
 def result(grouping: str, rerank: str | None = None) -> GroupingResult:
     return GroupingResult(grouping, {1: 0.5}, NEIGHBOURS, rerank=rerank)
 
 
 @pytest.fixture
 def settings(benchmark: Benchmark) -> dict:
-    return evaluation_settings(benchmark, MODEL, weights="w.safetensors", batch_size=BATCH, seeds=2)
+    return evaluation_settings(benchmark, MODEL, **ASKED)
 
 
 def test_settings_are_what_was_asked(settings, benchmark):
     assert settings == json.loads(json.dumps(settings))
-    assert settings == {
+    assert settings == ASKED | {
         "weights": "w.safetensors",
         "benchmark": benchmark.name,
         "rule": benchmark.rule,
         "same_place": "a distance of at most 25 m",
-        "batch_size": BATCH,
-        "seed": 0,
-        "seeds": 2,
-        "pca": None,
-        "rerank": None,
-        "rerank_weights": None,
         "model": to_plain(MODEL),
     }
 

@@ -30,16 +30,15 @@ RANKINGS = {
 }
 
 
-def summary(grouping: str, rankings, **changes) -> GroupingResult:
-    arguments = {"query_share": None, "database_share": None, "is_random": False} | changes
-    return summarise(grouping, rankings, POSITIVES, KS, **arguments)
+def summary(grouping: str, rankings, **known) -> GroupingResult:
+    return summarise(grouping, rankings, POSITIVES, KS, is_random=grouping == "shuffled", **known)
 
 
 @pytest.fixture
 def results() -> list[GroupingResult]:
     return [
         summary("single", {3: RANKINGS[3]}),
-        summary("shuffled", RANKINGS, query_share=0.25, database_share=1.0, is_random=True),
+        summary("shuffled", RANKINGS, query_share=0.25, database_share=1.0),
         summary("window/single", {3: RANKINGS[5]}, query_share=0.5),
     ]
 
@@ -77,12 +76,8 @@ def test_several_rankings_by_hand(results):
 
 
 def test_without_a_positive_there_is_no_curve():
-    result = summarise(
-        *("shuffled", RANKINGS, [np.array([], np.int64)] * 5, KS),
-        query_share=None,
-        database_share=None,
-        is_random=True,
-    )
+    nothing = [np.array([], np.int64)] * 5
+    result = summarise("shuffled", RANKINGS, nothing, KS, is_random=True)
     assert result.recalls == {1: 0, 2: 0}
     assert result.precision_recall is result.average_precision is None
     assert result.spread.recall_at_full_precision is None
