@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from crisalad_jax.config.checks import fits
+from crisalad_jax.config.checks import kind_of
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.msls import msls_title
 from crisalad_jax.data.benchmarks.on_disk import find_images, list_part
@@ -204,7 +204,7 @@ def _rows(path: pathlib.Path, rows: Iterable[Any]) -> _Matches:
     for number, row in enumerate(rows):
         items = row.reshape(-1).tolist() if isinstance(row, np.ndarray) else row
         items = items if isinstance(items, list | tuple) else [items]
-        wrong = [item for item in items if not fits(int, item) or not -_MOST < item < _MOST]
+        wrong = [item for item in items if not kind_of(int).fits(item) or not -_MOST < item < _MOST]
         if wrong:
             raise InputError(
                 f"{path}: row {number}: found values of type {type(wrong[0]).__name__}, expected "
