@@ -152,9 +152,10 @@ def test_the_licence_is_told_each_time(model, monkeypatch, licence, words):
 
 
 def test_a_file_of_the_same_name_is_taken(model, server, tmp_path):
-    pathlib.Path("tiny-model").write_bytes(state_bytes(1))
-    with pytest.warns(Note, match="tiny-model: found a file of this name here"):
-        assert find_weights("tiny-model") == pathlib.Path("tiny-model")
+    for name in ("tiny-model", "starter"):
+        pathlib.Path(name).write_bytes(state_bytes(1))
+        with pytest.warns(Note, match=f"{name}: found a file of this name here, and took that"):
+            assert find_weights(name) == pathlib.Path(name)
     pathlib.Path("tiny-model").unlink()
     pathlib.Path("tiny-model").mkdir()  # no file of weights
     with pytest.warns(Note, match="licence MIT"):
@@ -166,22 +167,6 @@ def test_a_file_of_the_same_name_is_taken(model, server, tmp_path):
 def test_an_unknown_name_is_told_with_the_nearest(server):
     fails("tiny-modell", r"found no such file, and no published model .*nearest: tiny-model\)$")
     assert server.asked == []
-
-
-@pytest.mark.parametrize(
-    ("asked", "nearest"),
-    [
-        ("MegaLoc.pth", "megaloc"),  # a file that is not here
-        ("boq dinov2", "boq-dinov2"),
-        ("cliquemining", "salad-cm"),  # the name of its file
-        ("hloc", "netvlad-hloc"),  # a part of a name
-        ("Indoor-VPR", "salad-indoor-gb1-10-25"),  # a repository
-        ("cosplace", "cosplace-resnet50-2048"),  # a family: its longest descriptors
-    ],
-)
-def test_names_of_files_repositories_and_families_are_near(asked: str, nearest: str) -> None:
-    with pytest.raises(InputError, match=rf"^{asked}: found no such file, .*\b{nearest}\b"):
-        find_weights(asked)
 
 
 def test_what_is_told_is_of_the_callers_line(model, monkeypatch):

@@ -212,7 +212,7 @@ class Graph:
     ) -> onnx.ModelProto:
         """Return the program of what the outputs need.
 
-        The arrays of large constants are left out: `write_model` puts them beside it or into it.
+        The arrays of constants are left out: `write_onnx` puts them beside it or into it.
         """
         for name, value in outputs:
             self.nodes.append(helper.make_node("Identity", [self.name(value)], [name]))
