@@ -114,41 +114,6 @@ def test_any_model_survives_the_reference_format_bit_for_bit(name: str) -> None:
         assert array.dtype == wanted[key].dtype
 
 
-# As they are in the public checkpoints, of torch's modules in the public order.
-PUBLIC_HEADS = {
-    "GeM": {"aggregation.1.p": (1,)},
-    "Conv-AP": {
-        "aggregator.channel_pool.weight": (16, 32, 1, 1),
-        "aggregator.channel_pool.bias": (16,),
-    },
-    "CosPlace": {
-        "aggregation.1.p": (1,),
-        "aggregation.3.weight": (16, 32),
-        "aggregation.3.bias": (16,),
-    },
-    "MixVPR": {
-        **{
-            f"aggregator.mix.{i}.mix.{j}.{leaf}": (12, 12) if j and leaf == "weight" else (12,)
-            for i in (0, 1)
-            for j in (0, 1, 3)
-            for leaf in ("weight", "bias")
-        },
-        "aggregator.channel_proj.weight": (16, 32),
-        "aggregator.channel_proj.bias": (16,),
-        "aggregator.row_proj.weight": (3, 12),
-        "aggregator.row_proj.bias": (3,),
-    },
-}
-
-
-@pytest.mark.parametrize("name", PUBLIC_HEADS)
-def test_heads_have_their_public_names(name: str) -> None:
-    """BoQ's are tested beside torch's modules in tests/nn/aggregators."""
-    shapes = public_shapes(MODELS[name], "reference")
-    head = {key: shape for key, shape in shapes.items() if key.startswith("aggregat")}
-    assert list(head.items()) == list(PUBLIC_HEADS[name].items())
-
-
 def test_every_number_has_its_own_place() -> None:
     """Numbered numbers come back as a permutation: nothing is dropped, doubled or made up."""
     config = dataclasses.replace(MODELS["multi-resolution"], aggregator="gem-pyramid")
