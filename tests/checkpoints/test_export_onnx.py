@@ -35,6 +35,7 @@ from tests.checkpoints.test_export import (
     check_manifest,
     pictures,
 )
+from tests.checkpoints.test_weights import put
 from tests.conftest import BATCH, MODEL
 
 pytestmark = pytest.mark.usefixtures("symbolic_shapes")
@@ -245,8 +246,7 @@ def refused(config: ModelConfig, how: ExportConfig, out: pathlib.Path) -> str:
 
 
 def with_sinkhorn(**fields: Any) -> ModelConfig:
-    aggregator = dataclasses.replace(MODEL.aggregator, sinkhorn=SinkhornConfig(**fields))
-    return dataclasses.replace(MODEL, aggregator=aggregator)
+    return put(MODEL, "aggregator.sinkhorn", SinkhornConfig(**fields))
 
 
 @pytest.mark.parametrize(
