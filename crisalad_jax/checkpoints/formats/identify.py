@@ -72,6 +72,8 @@ def identify(state: State, *, source: str) -> tuple[str, ModelConfig, State]:
         return name, config, reading.state
     if problems:
         raise InputError(f"{source}: {problems[0]}")
+    for reading in _readings(state):
+        _check_halves(reading.state, source)
     names = ", ".join(sorted(state)[:3]) or "none"
     raise InputError(
         f"{source}: found no checkpoint that we know (its first names: {names}), expected one of "
@@ -120,3 +122,19 @@ def _tell_left_out(reading: _Reading, source: str) -> None:
             f"{source}: took the model under {reading.inside.removesuffix('.')}, and left out "
             f"{len(reading.left_out)} tensors of {', '.join(kinds)}"
         )
+
+
+def _check_halves(state: State, source: str) -> None:
+    """Raise InputError where a state is the head of a family without its backbone, or the reverse.
+
+    Families share the names of their parts: the message has all that it may be of.
+    """
+    formats = [each for each in FORMATS.values() if not each.has_head({})]
+    heads = [each.holds for each in formats if each.has_head(state)]
+    backbones = [each.holds for each in formats if each.has_backbone(state)]
+    for here, families, missing in (("head", heads, "backbone"), ("backbone", backbones, "head")):
+        if families:
+            raise InputError(
+                f"{source}: found a {here} without its {missing}, expected both in one file, as in "
+                f"{' or '.join(families)}"
+            )
