@@ -227,8 +227,8 @@ def test_anylocs_vocabularies_have_their_backbone():
         assert bool(model.backbone) == (model.format == VOCABULARY) == name.startswith("anyloc-")
         if model.backbone:
             depth = stored(model.backbone)[1].backbone.depth
-            # As the file's name says.
-            assert inferred(name)[1].aggregator.block(depth) == 31
+            # The file's name has 31, counted from 0.
+            assert inferred(name)[1].aggregator.features(depth).levels == (32,)
 
 
 def resized(name: str, **settings: Any) -> tuple[str, ModelConfig]:
