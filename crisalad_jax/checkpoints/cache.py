@@ -15,7 +15,7 @@ import jax
 
 from crisalad_jax.checkpoints.download import MissingFileError, download
 from crisalad_jax.checkpoints.matlab_io import MATLAB_SUFFIX
-from crisalad_jax.checkpoints.public import Checkpoint, read_checkpoint, read_vocabulary
+from crisalad_jax.checkpoints.public import read_checkpoint, read_vocabulary
 from crisalad_jax.checkpoints.published import PUBLISHED, Published
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.utils.checksums import sha256_of
@@ -71,20 +71,28 @@ def cached_weights(model: Published, *, quiet: bool = False) -> pathlib.Path:
 
 
 def _make(model: Published, *, quiet: bool) -> None:
-    """Download a published model if need be, and convert it."""
+    """Download a published model if need be, and convert it.
+
+    What was downloaded just now is removed if it is not the model.
+    """
     published = _folder(model) / model.file
-    if not published.is_file():
-        _addresses(model)  # before a folder is made
     needs_none = published.suffix in (MATLAB_SUFFIX, ".safetensors")
     if not needs_none and importlib.util.find_spec("torch") is None:
         raise InputError(
             f"found no torch, expected it to read {model.file}: pip install 'crisalad-jax[convert]'"
         )
+    if not published.is_file():
+        _addresses(model)  # before a folder is made
     with lock(_folder(model), wait=True):
-        if not _is_ready(model):
-            is_here = published.is_file()
-            address = None if is_here else _download(model, published, quiet=quiet)
+        if _is_ready(model):
+            return
+        address = None if published.is_file() else _download(model, quiet=quiet)
+        try:
             _convert(model, published, address, quiet=quiet)
+        except InputError:
+            if address is not None:
+                published.unlink()
+            raise
 
 
 def _folder(model: Published) -> pathlib.Path:
@@ -137,8 +145,9 @@ def _addresses(model: Published) -> list[str]:
     return addresses
 
 
-def _download(model: Published, target: pathlib.Path, *, quiet: bool) -> str:
+def _download(model: Published, *, quiet: bool) -> str:
     """Download the published file, from the mirror if that has it; return its address."""
+    target = _folder(model) / model.file
     *mirrors, last = _addresses(model)
     for address in mirrors:
         with contextlib.suppress(MissingFileError):
@@ -164,37 +173,28 @@ def _convert(
         quiet: no progress bar.
 
     Raises:
-        InputError: the file is not the one of the record, or not the model. Then it is removed, if
-            it was downloaded just now.
+        InputError: the file is not the one of the record, or not the model.
     """
     record, digest = _record(model), sha256_of(published)
-    try:
-        if digest != record.get("sha256", digest):
-            raise InputError(
-                f"{published}: found SHA-256 {digest[:12]}..., expected "
-                f"{record['sha256'][:12]}... as at the first download: the file was changed "
-                f"(without {published.parent} it is downloaded again)"
-            )
-        checkpoint = _read(model, published, quiet=quiet)
-        parameters = sum(leaf.size for leaf in jax.tree.leaves(checkpoint.params))
-        found = checkpoint.config.descriptor_dim, parameters
-        if found != (model.descriptor, model.parameters):
-            raise InputError(
-                f"{published}: found descriptors of {found[0]} numbers and {found[1]} parameters "
-                f"({checkpoint.format}), expected {model.descriptor} and {model.parameters}"
-            )
-    except InputError:
-        if address is not None:
-            published.unlink()
-        raise
+    if digest != record.get("sha256", digest):
+        raise InputError(
+            f"{published}: found SHA-256 {digest[:12]}..., expected {record['sha256'][:12]}... as "
+            f"at the first download: the file was changed (without {published.parent} it is "
+            "downloaded again)"
+        )
+    if model.backbone:  # a vocabulary, whose backbone is in the cache too
+        backbone = cached_weights(PUBLISHED[model.backbone], quiet=quiet)
+        checkpoint = read_vocabulary(published, backbone)
+    else:
+        checkpoint = read_checkpoint(published)
+    parameters = sum(leaf.size for leaf in jax.tree.leaves(checkpoint.params))
+    found = checkpoint.config.descriptor_dim, parameters
+    if found != (model.descriptor, model.parameters):
+        raise InputError(
+            f"{published}: found descriptors of {found[0]} numbers and {found[1]} parameters "
+            f"({checkpoint.format}), expected {model.descriptor} and {model.parameters}"
+        )
     save_weights(_weights(model), checkpoint.model, extras=checkpoint.extras)
     url = address or record.get("url")
     known = {"url": url, "file": model.file, "sha256": digest, "version": VERSION}
     write_json(_folder(model) / _RECORD, known)
-
-
-def _read(model: Published, published: pathlib.Path, *, quiet: bool) -> Checkpoint:
-    """Read the published file; a vocabulary with its backbone, which is in the cache too."""
-    if not model.backbone:
-        return read_checkpoint(published)
-    return read_vocabulary(published, cached_weights(PUBLISHED[model.backbone], quiet=quiet))

@@ -4,7 +4,7 @@ import importlib
 import pathlib
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,33 @@ EngineName = Literal["onnxruntime", "openvino"]
 Precision = Literal["float32", "bfloat16"]
 Program = Callable[..., np.ndarray]
 """A loaded program: its inputs, in their order, to its output."""
+
+
+class ProgramFormat(NamedTuple):
+    """The files of a program that engines run, and the engine that they are of."""
+
+    engine: EngineName
+    suffixes: tuple[str, str]
+    """Suffixes of a program and of its weights."""
+    call: str
+    """How to run a program, with {file} for its file."""
+
+
+FORMATS: Mapping[str, ProgramFormat] = {
+    "onnx": ProgramFormat(
+        "onnxruntime",
+        (".onnx", ".onnx.data"),
+        "onnxruntime.InferenceSession({file!r}).run(None, {{'images': images}})",
+    ),
+    "openvino": ProgramFormat(
+        "openvino", (".xml", ".bin"), "openvino.Core().compile_model({file!r}, 'CPU')(images)"
+    ),
+}
+READS: Mapping[str, tuple[str, ...]] = {
+    "onnxruntime": ("onnx",),
+    "openvino": ("openvino", "onnx"),
+}
+"""Formats that an engine reads, its own first."""
 _TOOLS = "openvino.tools.ovc"
 _CAPABILITIES = "OPTIMIZATION_CAPABILITIES"
 

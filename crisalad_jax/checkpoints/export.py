@@ -10,8 +10,8 @@ import dataclasses
 import hashlib
 import os
 import pathlib
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Literal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,15 +19,9 @@ import numpy as np
 from jax import export
 from jaxtyping import Array, Bool, Float
 
-from crisalad_jax.checkpoints.engines import EngineName, convert_to_openvino, load_program
-from crisalad_jax.checkpoints.runtime import (
-    ATTEND,
-    DESCRIBE,
-    FORMAT,
-    MANIFEST,
-    SUFFIXES,
-    TOKENS,
-)
+from crisalad_jax.checkpoints import engines
+from crisalad_jax.checkpoints.engines import convert_to_openvino, load_program
+from crisalad_jax.checkpoints.runtime import ATTEND, DESCRIBE, FORMAT, MANIFEST, TOKENS
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
 from crisalad_jax.config.checks import PATH, check_count, check_types, takes
 from crisalad_jax.config.io import to_plain
@@ -54,7 +48,7 @@ from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.target import PORTABLE, STRAIGHT, lowering_for
 
 PROGRAM, WEIGHTS = "describe.jax_export", "weights.safetensors"
-FORMATS = ("stablehlo", "onnx", "openvino")
+FORMATS = ("stablehlo", *engines.FORMATS)
 TOLERANCE = 1e-5
 """Largest difference of an exported program's descriptors from those of `describe`, of length 1."""
 GROUPINGS = {
@@ -66,10 +60,6 @@ _SOURCES = "jax_traceback_in_locations_limit"
 """JAX's setting: how many lines of source a program has beside each operation."""
 _LARGEST = 2**31
 """Largest size of a program in bytes: offsets of a flatbuffer and of a protobuf have 31 bits."""
-_CALLS = {
-    "onnx": "onnxruntime.InferenceSession({!r}).run(None, {{'images': images}})",
-    "openvino": "openvino.Core().compile_model({!r}, 'CPU')(images)",
-}
 _PROBES = 3
 """Images that a program of any number of images is checked with."""
 
@@ -160,7 +150,8 @@ def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> ex
     names. Nothing in the program depends on the platform that exports it, nor on who calls this.
     `check_exportable` says what can be exported.
     """
-    run, weights, images = _program(params, config, how)
+    program = _whole_program(Model(params, config), how)
+    run, weights, (images,) = program.run, program.weights, program.inputs.values()
     with number_types([config]), lowering_for(PORTABLE), _without_sources():
         if how.weights_inside:
             whole = jax.jit(lambda images: run(weights, images))
@@ -169,20 +160,54 @@ def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> ex
         return export.export(jax.jit(run), platforms=how.platforms)(shapes, images)
 
 
-def _program(
-    params: Crisalad, config: ModelConfig, how: ExportConfig
-) -> tuple[Callable[..., Any], dict[str, Any], jax.ShapeDtypeStruct]:
-    """Return a function of weights and images, the weights by name, and the images' shape."""
+class _Program(NamedTuple):
+    """What becomes a program."""
+
+    run: Callable[..., Any]
+    """A function of the weights and the inputs."""
+    weights: dict[str, Any]
+    """The arrays by their dotted names."""
+    inputs: dict[str, jax.ShapeDtypeStruct]
+    """Shapes and types of the inputs by name."""
+    output: str
+    """Name of the output."""
+
+
+def _whole_program(model: Model, how: ExportConfig) -> _Program:
+    """Return the program of images to descriptors."""
+    config = model.config
 
     def run(params: Crisalad, images: Images) -> Float[Array, "image descriptor"]:
         mask = self_mask(images.shape[0]) if how.grouping == "single" else None
         return describe(params, images, config, mask=mask)
 
+    images = {"images": _images_shape(config, how)}
+    return _program(run, model.params, images, "descriptors")
+
+
+def _program(
+    function: Callable[..., Any],
+    params: Crisalad,
+    inputs: dict[str, jax.ShapeDtypeStruct],
+    output: str,
+) -> _Program:
+    """Make a function of parameters one of the weights by name."""
+    # A dictionary's leaves come in the order of its keys, not in that of the fields.
+    weights, tree = named_leaves(params), jax.tree.structure(params)
+
+    def run(weights: Mapping[str, Array], *inputs: Array) -> Array:
+        leaves = [weights[name] for name in named_leaves(params)]
+        return function(jax.tree.unflatten(tree, leaves), *inputs)
+
+    return _Program(run, weights, inputs, output)
+
+
+def _images_shape(config: ModelConfig, how: ExportConfig) -> jax.ShapeDtypeStruct:
     batch = how.batch_size
     if batch is None:
         (batch,) = export.symbolic_shape("batch")
     dtype = jnp.uint8 if _takes_bytes(config, how) else jnp.float32
-    return *_of_weights(run, params), jax.ShapeDtypeStruct((batch, *config.input_size, 3), dtype)
+    return jax.ShapeDtypeStruct((batch, *config.input_size, 3), dtype)
 
 
 def _takes_bytes(config: ModelConfig, how: ExportConfig) -> bool:
@@ -256,9 +281,9 @@ def write_export(
         )
     with atomic_folder(out) as folder:
         if how.format == "stablehlo":
-            own = _write_stablehlo(folder, params, config, how)
+            own = _write_stablehlo(folder, model, how)
         else:
-            own = _write_onnx(folder, params, config, how, os.fspath(out), calibration)
+            own = _write_onnx(folder, model, how, calibration, os.fspath(out))
         digest = model_hash(params, config)
         if calibration is not None:  # its descriptors are its own
             own |= {"quantised_from": digest}
@@ -284,15 +309,13 @@ def write_export(
     return manifest
 
 
-def _write_stablehlo(
-    folder: pathlib.Path, params: Crisalad, config: ModelConfig, how: ExportConfig
-) -> dict[str, Any]:
+def _write_stablehlo(folder: pathlib.Path, model: Model, how: ExportConfig) -> dict[str, Any]:
     """Write the files of `jax.export`, and return what the manifest says of them."""
-    exported = export_model(params, config, how)
+    exported = export_model(*model, how)
     (folder / PROGRAM).write_bytes(exported.serialize(vjp_order=0))
     weights = None
     if not how.weights_inside:
-        save_weights(folder / WEIGHTS, Model(params, config))
+        save_weights(folder / WEIGHTS, model)
         words = {"argument": "a dictionary of all arrays in the file by their names"}
         weights = _file(folder / WEIGHTS) | words
     called = "images" if how.weights_inside else "weights, images"
@@ -306,30 +329,22 @@ def _write_stablehlo(
 
 
 def _write_onnx(
-    folder: pathlib.Path,
-    params: Crisalad,
-    config: ModelConfig,
-    how: ExportConfig,
-    out: str,
-    calibration: np.ndarray | None,
+    folder: pathlib.Path, model: Model, how: ExportConfig, calibration: np.ndarray | None, out: str
 ) -> dict[str, Any]:
     """Write the files of ONNX or OpenVINO, check them, and return what the manifest says."""
     from crisalad_jax.checkpoints.onnx_format.program import OPSET, write_onnx
 
-    run, weights, images = _program(params, config, how)
-    parts = {DESCRIBE: (run, weights, {"images": images}, "descriptors")}
     if how.grouping == "any":
-        parts = _halves(params, config, images)
-    suffixes = SUFFIXES[how.format]
+        programs = _halves(model, how)
+    else:
+        programs = {DESCRIBE: _whole_program(model, how)}
+    form, beside = engines.FORMATS[how.format], not how.weights_inside
     files: dict[str, Any] = {}
-    for name, (function, arrays, inputs, output) in parts.items():
+    for name, program in programs.items():
         path = folder / f"{name}.onnx"
-        words = f"{', '.join(inputs)} to {output}; {GROUPINGS[how.grouping]}"
-        beside = not how.weights_inside
-        with number_types([config]), lowering_for(STRAIGHT):
-            products = write_onnx(
-                path, function, arrays, inputs, output, words=words, beside=beside
-            )
+        words = f"{', '.join(program.inputs)} to {program.output}; {GROUPINGS[how.grouping]}"
+        with number_types([model.config]), lowering_for(STRAIGHT):
+            products = write_onnx(path, *program, words=words, beside=beside)
         if calibration is not None:
             from crisalad_jax.checkpoints.onnx_format.quantise import quantise
 
@@ -337,37 +352,36 @@ def _write_onnx(
             quantise(path, calibration, products, per_channel=how.format == "onnx")
         if how.format == "openvino":
             convert_to_openvino(path, path.with_suffix(".xml"))
-            for suffix in SUFFIXES["onnx"]:
+            for suffix in engines.FORMATS["onnx"].suffixes:
                 path.with_name(name + suffix).unlink()
-        program, data = (folder / f"{name}{suffix}" for suffix in suffixes)
-        files[name] = {"program": _file(program), "weights": _file(data) if beside else None}
-    engine: EngineName = "onnxruntime" if how.format == "onnx" else "openvino"
-    difference = _difference(folder, engine, params, config, how)
+        file, data = (folder / f"{name}{suffix}" for suffix in form.suffixes)
+        files[name] = {"program": _file(file), "weights": _file(data) if beside else None}
+    difference = _difference(folder, list(files), model, how)
     if calibration is None and not difference <= TOLERANCE:
         raise InputError(
-            f"{out}: found descriptors of {engine} that differ from those of `describe` by "
+            f"{out}: found descriptors of {form.engine} that differ from those of `describe` by "
             f"{difference:.2g}, expected at most {TOLERANCE:g}: nothing was written"
         )
     first, *others = files
     return {
-        "call": _CALLS[how.format].format(first + suffixes[0]),
+        "call": form.call.format(file=first + form.suffixes[0]),
         **files[first],
         **{name: files[name] for name in others},
-        "side_multiple": config.side_multiple,
+        "side_multiple": model.config.side_multiple,
         "opset": OPSET,
         "products": "float32" if calibration is None else "int8",
-        "checked": {"engine": engine, "largest_difference": difference},
+        "checked": {"engine": form.engine, "largest_difference": difference},
     }
 
 
-def _halves(
-    params: Crisalad, config: ModelConfig, images: jax.ShapeDtypeStruct
-) -> dict[str, tuple[Callable[..., Any], dict[str, Any], dict[str, Any], str]]:
-    """Return two functions: of images to tokens, and of tokens and a mask to descriptors.
+def _halves(model: Model, how: ExportConfig) -> dict[str, _Program]:
+    """Return two programs: of images to tokens, and of tokens and a mask to descriptors.
 
     An image's tokens are one row of numbers: the global token, and then the local ones.
     """
-    shape, count = config.token_shape, images.shape[0]
+    params, config = model
+    images, shape = _images_shape(config, how), config.token_shape
+    count = images.shape[0]
     width = shape.global_dim + shape.tokens * shape.token_dim
 
     def extract(backbone: Any, images: Images) -> Float[Array, "image number"]:
@@ -384,40 +398,24 @@ def _halves(
     rows = jax.ShapeDtypeStruct((count, width), jnp.float32)
     mask = jax.ShapeDtypeStruct((count, count), jnp.bool_)
     return {
-        TOKENS: (*_of_weights(extract, params), {"images": images}, "tokens"),
-        ATTEND: (*_of_weights(attend, params), {"tokens": rows, "mask": mask}, "descriptors"),
+        TOKENS: _program(extract, params, {"images": images}, "tokens"),
+        ATTEND: _program(attend, params, {"tokens": rows, "mask": mask}, "descriptors"),
     }
 
 
-def _of_weights(
-    function: Callable[..., Any], params: Crisalad
-) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Make a function of parameters one of the weights by name, and return these."""
-    # A dictionary's leaves come in the order of its keys, not in that of the fields.
-    weights, tree = named_leaves(params), jax.tree.structure(params)
-
-    def run(weights: Mapping[str, Array], *inputs: Array) -> Array:
-        leaves = [weights[name] for name in named_leaves(params)]
-        return function(jax.tree.unflatten(tree, leaves), *inputs)
-
-    return run, weights
-
-
 def _difference(
-    folder: pathlib.Path,
-    engine: EngineName,
-    params: Crisalad,
-    config: ModelConfig,
-    how: ExportConfig,
+    folder: pathlib.Path, names: Sequence[str], model: Model, how: ExportConfig
 ) -> float:
     """Run a program on images of noise, and compare it with `describe`."""
+    params, config = model
     count = how.batch_size or _PROBES
     images = np.random.default_rng(0).integers(0, 256, (count, *config.input_size, 3), np.uint8)
     if not _takes_bytes(config, how):
         images = normalised(images, config.preprocessing)
-    suffix = SUFFIXES[how.format][0]
-    names = (TOKENS, ATTEND) if how.grouping == "any" else (DESCRIBE,)
-    first, *second = (load_program(engine, folder / f"{name}{suffix}") for name in names)
+    form = engines.FORMATS[how.format]
+    first, *second = (
+        load_program(form.engine, folder / f"{name}{form.suffixes[0]}") for name in names
+    )
     alone, together = np.eye(count, dtype=bool), np.ones((count, count), bool)
     masks = {"single": [alone], "batch": [together], "any": [alone, together]}[how.grouping]
     found = first(images)

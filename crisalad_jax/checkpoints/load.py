@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @takes(path=PATH)
-def load(path: str | os.PathLike[str], *, verify: bool = True) -> "Model":
+def load(path: str | os.PathLike[str], *, verify: bool = True, quiet: bool = False) -> "Model":
     """Load a model from a file of this package, a public checkpoint, or a published one by name.
 
     Args:
@@ -24,6 +24,7 @@ def load(path: str | os.PathLike[str], *, verify: bool = True) -> "Model":
             the name of a published model, as `crisalad models` lists them: it is downloaded once
             into the cache. Or "starter", the small model in this package, or "hog", a baseline.
         verify: whether to check the bytes of a file of this package against its checksum.
+        quiet: no progress of a download.
 
     Returns:
         The model: parameters and configuration.
@@ -43,7 +44,7 @@ def load(path: str | os.PathLike[str], *, verify: bool = True) -> "Model":
     # Imported here: the formats of public checkpoints take a tenth of a second, and few need them.
     from crisalad_jax.checkpoints.public import read_checkpoint
 
-    return read_checkpoint(find_weights(path), verify=verify).model
+    return read_checkpoint(find_weights(path, quiet=quiet), verify=verify).model
 
 
 def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False) -> pathlib.Path:

@@ -24,7 +24,11 @@ from crisalad_jax.checkpoints.formats import (
     to_state,
 )
 from crisalad_jax.checkpoints.matlab_io import MATLAB_SUFFIX, read_matlab
-from crisalad_jax.checkpoints.safetensors_io import read_safetensors, write_safetensors
+from crisalad_jax.checkpoints.safetensors_io import (
+    read_metadata,
+    read_safetensors,
+    write_safetensors,
+)
 from crisalad_jax.checkpoints.torch_io import (
     DECLARED,
     Content,
@@ -36,8 +40,8 @@ from crisalad_jax.checkpoints.weights import (
     FORMAT,
     Checkpoint,
     check_sizes,
+    read_weights,
     save_weights,
-    unpack_weights,
     with_metadata,
 )
 from crisalad_jax.config.checks import PATH, choose, takes
@@ -87,9 +91,9 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
     if path.suffix == MATLAB_SUFFIX:
         content = read_matlab(path)
     elif start[8:9] == b"{" or (path.suffix == ".safetensors" and not start.startswith(b"PK")):
+        if FORMAT in read_metadata(path, "a checkpoint"):
+            return read_weights(path, verify=verify)
         metadata, state = read_safetensors(path, "a checkpoint")
-        if FORMAT in metadata:
-            return unpack_weights(path, metadata, state, verify=verify)
         content = Content(state, metadata.get(DECLARED))
     else:
         content = read_torch(path)

@@ -102,19 +102,13 @@ def published_model(name: str) -> Published:
 def nearest_names(name: str) -> str:
     """Return the published names most like this one, as the end of a message."""
     plain = _plain(name)
-    near = [plain] if plain in PUBLISHED else []
-    # No published one, but --weights takes its name, too.
-    near += difflib.get_close_matches(plain, starter.FILES, n=1, cutoff=0.75)
+    words = {each: _plain(f"{each} {m.file} {m.repository}") for each, m in PUBLISHED.items()}
+    near = [each for each, own in words.items() if plain in own or plain.replace("-", "") in own]
     # Of a family that is named alone the longest descriptors, which recall the most.
-    family = [each for each in PUBLISHED if each.startswith(f"{plain}-")]
-    near += sorted(family, key=lambda each: -PUBLISHED[each].descriptor)
-    near += difflib.get_close_matches(plain, PUBLISHED, n=3, cutoff=0.6)
+    near.sort(key=lambda each: (each != plain, -PUBLISHED[each].descriptor))
+    near += difflib.get_close_matches(plain, [*starter.FILES, *PUBLISHED])
     # The first part of a name is its family, which is what a user is most likely to know.
     near += [each for each in PUBLISHED if each.startswith(plain.partition("-")[0])]
-    for model in PUBLISHED.values():
-        known = _plain(f"{model.name} {model.file} {model.repository}")
-        if plain in known or plain.replace("-", "") in known:
-            near.append(model.name)
     near = list(dict.fromkeys(near))[:3]
     return f"; nearest: {', '.join(near)}" if near else ""
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crisalad_jax.checkpoints import safetensors_io
-from crisalad_jax.checkpoints.engines import EngineName, Precision, Program, load_program
+from crisalad_jax.checkpoints.engines import READS, EngineName, Precision, Program, load_program
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
@@ -38,13 +38,6 @@ MANIFEST = "manifest.json"
 _EXPECTED = "the manifest of `crisalad export`"
 DESCRIBE, TOKENS, ATTEND = "describe", "tokens", "attend"
 """Names of programs: of images to descriptors, or of the two halves of that."""
-SUFFIXES = {"onnx": (".onnx", ".onnx.data"), "openvino": (".xml", ".bin")}
-"""Suffixes of a program and of its weights, by format."""
-_READS: Mapping[str, tuple[str, ...]] = {
-    "onnxruntime": ("onnx",),
-    "openvino": ("openvino", "onnx"),
-}
-"""Formats that an engine reads, its own first."""
 
 
 @brief
@@ -214,7 +207,7 @@ def open_runtime(
         >>> runtime.describe(np.zeros((2, 98, 98, 3), np.uint8)).shape
         (2, 576)
     """
-    choose("runtime", engine, _READS)
+    choose("runtime", engine, READS)
     path = pathlib.Path(source)
     if preprocessing is not None and not isinstance(preprocessing, PreprocessingConfig):
         preprocessing = from_plain(PreprocessingConfig, preprocessing, source="preprocessing")
@@ -226,11 +219,11 @@ def open_runtime(
             f"{path / MANIFEST}: found format {manifest.get('format')!r}, expected {FORMAT!r}: "
             f"{_EXPECTED}"
         )
-    if manifest["program_format"] not in _READS[engine]:
+    if manifest["program_format"] not in READS[engine]:
         raise InputError(
             f"{path}: found a program of format {manifest['program_format']}, expected "
-            f"{' or '.join(_READS[engine])} for {engine}: `crisalad export --format "
-            f"{_READS[engine][0]}`"
+            f"{' or '.join(READS[engine])} for {engine}: `crisalad export --format "
+            f"{READS[engine][0]}`"
         )
     preparation = _preparation(path, manifest, image_size, preprocessing)
     first, *second = _load(path, manifest, engine, precision, verify=verify)
@@ -338,7 +331,7 @@ def _exported(
         "model": header["model_sha256"],
         "image_size": list(image_size or config["image_size"]),
         "preprocessing": chain,
-        "format": _READS[engine][0],
+        "format": READS[engine][0],
         "grouping": "any" if any_grouping else "single",
         "version": VERSION,
     }
@@ -346,7 +339,9 @@ def _exported(
     folder = user_cache() / "exports" / key[:32]
     if not (folder / MANIFEST).is_file():
         _check_fixed(weights, chain["size_rule"])
-        _export(weights, settings, folder)
+        with lock(folder.parent, wait=True):
+            if not (folder / MANIFEST).is_file():
+                _export(weights, settings, folder)
     return folder
 
 
@@ -354,19 +349,16 @@ def _export(weights: pathlib.Path, settings: Mapping[str, Any], folder: pathlib.
     from crisalad_jax.checkpoints.export import ExportConfig, write_export
     from crisalad_jax.checkpoints.weights import load_weights
 
+    warn(f"{weights}: exporting it for --runtime, once; into {folder}")
     model = load_weights(weights)
-    chain = from_plain(PreprocessingConfig, settings["preprocessing"], source=str(weights))
-    config = dataclasses.replace(
-        model.config,
-        image_size=tuple(settings["image_size"]),
-        preprocessing=chain,
-        compute_dtype="float32",
-    )
-    with lock(folder.parent, wait=True):
-        if not (folder / MANIFEST).is_file():
-            warn(f"{weights}: exporting it for --runtime, once; into {folder}")
-            how = ExportConfig(settings["grouping"], format=settings["format"])
-            write_export(folder, model._replace(config=config), how)
+    plain = to_plain(model.config) | {
+        "image_size": settings["image_size"],
+        "preprocessing": settings["preprocessing"],
+        "compute_dtype": "float32",
+    }
+    config = from_plain(type(model.config), plain, source=str(weights))
+    how = ExportConfig(settings["grouping"], format=settings["format"])
+    write_export(folder, model._replace(config=config), how)
 
 
 def read_header(weights: str | os.PathLike[str]) -> dict[str, Any]:

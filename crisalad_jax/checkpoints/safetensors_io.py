@@ -123,15 +123,19 @@ def read_safetensors(
         return file.metadata() or {}, arrays
 
 
+def read_metadata(path: str | os.PathLike[str], expected: str) -> dict[str, str]:
+    """Read the texts of any safetensors file, and no array; see `read_safetensors`."""
+    with _opened(path, expected) as file:
+        return file.metadata() or {}
+
+
 def read_header(path: str | os.PathLike[str], form: str, expected: str) -> dict[str, Any]:
     """Read the object of a file that `write_sealed` wrote, without its arrays.
 
     Raises:
         InputError: what `read_sealed` raises, but nothing is compared with the checksum.
     """
-    with _opened(path, expected) as file:
-        metadata = file.metadata() or {}
-    return _value(path, metadata, form, expected)[0]
+    return _value(path, read_metadata(path, expected), form, expected)[0]
 
 
 def _other_kind(path: pathlib.Path) -> str | None:
@@ -158,23 +162,6 @@ def read_sealed(
         InputError: the file is missing, not whole, changed or of another format.
     """
     metadata, arrays = read_safetensors(path, expected)
-    return unseal(path, metadata, arrays, form, expected, verify=verify)
-
-
-def unseal(
-    path: str | os.PathLike[str],
-    metadata: Mapping[str, str],
-    arrays: dict[str, np.ndarray],
-    form: str,
-    expected: str,
-    *,
-    verify: bool = True,
-) -> Contents:
-    """Check what `read_safetensors` read; see `read_sealed`.
-
-    Raises:
-        InputError: it is of another format, or changed.
-    """
     value, checksum = _value(path, metadata, form, expected)
     if verify and checksum != _checksum(value, arrays):
         raise ChangedFileError(path)

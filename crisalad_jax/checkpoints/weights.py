@@ -14,7 +14,7 @@ import numpy as np
 
 from crisalad_jax.checkpoints.safetensors_io import EXPECTED_WEIGHTS as EXPECTED
 from crisalad_jax.checkpoints.safetensors_io import WEIGHTS as FORMAT
-from crisalad_jax.checkpoints.safetensors_io import read_safetensors, unseal, write_sealed
+from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.part import fingerprint_fields, with_non_semantic_fields_of
@@ -129,26 +129,32 @@ def _halved(leaf: Any) -> np.ndarray:
 
 
 def load_weights(
-    path: str | os.PathLike[str], expected: ModelConfig | None = None, *, verify: bool = True
+    weights: str | os.PathLike[str],
+    expected: ModelConfig | None = None,
+    *,
+    verify: bool = True,
+    quiet: bool = False,
 ) -> Model:
     """Read the model that `save_weights` wrote.
 
     A note tells if a part's source has changed since the weights were written.
 
     Args:
-        path: the file.
+        weights: the file, or a name that `find_weights` knows.
         expected: if given, the configuration that the file must have, except for what parameters
             do not depend on: image size (but MixVPR's do), dropout, compute type, remat.
         verify: whether to check that the file's bytes are those that were written.
+        quiet: no progress of a download.
 
     Returns:
         The model.
 
     Raises:
-        InputError: the file is missing, changed, cut short or no such file; it needs a part that is
-            not registered; its parameters do not fit its configuration or are not finite (the first
-            that are missing, unknown or wrong are listed); its configuration is not `expected` (all
-            fields that differ are listed); or AnyLoc's vocabulary is of another backbone.
+        InputError: what `find_weights` raises; the file is missing, changed, cut short or no such
+            file; it needs a part that is not registered; its parameters do not fit its
+            configuration or are not finite (the first that are missing, unknown or wrong are
+            listed); its configuration is not `expected` (all fields that differ are listed); or
+            AnyLoc's vocabulary is of another backbone.
 
     Example:
         >>> load_weights("none.safetensors")
@@ -156,11 +162,14 @@ def load_weights(
         ...
         crisalad_jax.utils.errors.InputError: none.safetensors: found no such file, expected ...
     """
-    found = read_weights(path, verify=verify)
+    # Imported here: for a name it makes a file of weights, by this module.
+    from crisalad_jax.checkpoints.load import find_weights
+
+    found = read_weights(find_weights(weights, quiet=quiet), verify=verify)
     if expected is not None:
         wrong = differences(_as_free_as(expected, found.config), expected)
         if wrong:
-            raise InputError(f"{path}: these weights are of another model: {'; '.join(wrong)}")
+            raise InputError(f"{weights}: these weights are of another model: {'; '.join(wrong)}")
     return found.model
 
 
@@ -170,23 +179,8 @@ def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkp
     Raises:
         InputError: what `load_weights` raises.
     """
-    return unpack_weights(path, *read_safetensors(path, EXPECTED), verify=verify)
-
-
-def unpack_weights(
-    path: str | os.PathLike[str],
-    metadata: Mapping[str, str],
-    arrays: dict[str, np.ndarray],
-    *,
-    verify: bool = True,
-) -> Checkpoint:
-    """Make a model of what `read_safetensors` read; the arrays are used up.
-
-    Raises:
-        InputError: what `load_weights` raises.
-    """
     try:
-        value, arrays = unseal(path, metadata, arrays, FORMAT, EXPECTED, verify=verify)
+        value, arrays = read_sealed(path, FORMAT, EXPECTED, verify=verify)
     except ChangedFileError as error:
         is_cached = user_cache() in pathlib.Path(path).parents
         advice = "; remove it, and the same command makes it again" if is_cached else ""

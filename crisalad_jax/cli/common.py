@@ -181,11 +181,11 @@ def load_model(weights: pathlib.Path, flags: SizeFlags, *, quiet: bool = False) 
     """Load a model of JAX's by its file or name, changed by flags.
 
     Raises:
-        InputError: what `find_weights`, `load_weights` and `ModelConfig.resized` raise.
+        InputError: what `load_weights` and `ModelConfig.resized` raise.
     """
     from crisalad_jax.checkpoints.weights import load_weights
 
-    model = load_weights(find_weights(weights, quiet=quiet))
+    model = load_weights(weights, quiet=quiet)
     return model._replace(config=flags.applied_to(model.config))
 
 

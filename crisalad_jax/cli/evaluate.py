@@ -5,7 +5,6 @@ import dataclasses
 import pathlib
 from typing import Annotated
 
-from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
     echo,
@@ -160,7 +159,8 @@ def _reranking(arguments: Evaluate) -> Reranking | None:
         return None
     rerank = parse_reranking(arguments.rerank)
     if arguments.rerank_weights is not None:
-        weights = find_weights(arguments.rerank_weights, quiet=arguments.quiet)
-        params, config = load_weights(weights, verify=arguments.verify)
+        params, config = load_weights(
+            arguments.rerank_weights, verify=arguments.verify, quiet=arguments.quiet
+        )
         rerank = dataclasses.replace(rerank, params=params, config=config)
     return rerank

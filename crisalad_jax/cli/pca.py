@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 from typing import Annotated, Any
 
-from crisalad_jax.checkpoints.load import find_weights, load
+from crisalad_jax.checkpoints.load import load
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.cli.common import echo, pick
 from crisalad_jax.cli.flags import WEIGHTS, JsonFlag, QuietFlag
@@ -44,8 +44,8 @@ def run(arguments: Pca) -> dict[str, Any]:
     """Fit components, write them, and print their share of the variance."""
     model = None
     if arguments.weights is not None:
-        weights = find_weights(arguments.weights, quiet=arguments.quiet)
-        model = load(weights, verify=arguments.verify)
+        weights = arguments.weights
+        model = load(weights, verify=arguments.verify, quiet=arguments.quiet)
         dim = model.config.projection.dim
         require(not dim, f"{weights}: found a model with a projection to {dim} numbers already")
     descriptors = open_npy(arguments.descriptors, verify=arguments.verify)

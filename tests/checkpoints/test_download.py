@@ -1,5 +1,6 @@
 """Downloads from a server on loopback that fails as real ones do."""
 
+import copy
 import os
 import pathlib
 import resource
@@ -62,18 +63,49 @@ def cut_short(server: FileServer, folder: pathlib.Path, size: int) -> None:
     server.asked.clear()
 
 
-def test_a_whole_file_is_asked_for_once(server, tmp_path):
-    assert fetch(server, tmp_path).read_bytes() == DATA
-    assert server.asked == [("/file", None)]
+CUT = {"cuts": [100_000]}
+REST = "bytes=100000-"
 
 
-@pytest.mark.parametrize("known_by", ["etag", "modified"])
-def test_a_cut_is_gone_on_from(server, tmp_path, known_by):
-    if known_by == "modified":
-        server.etag, server.modified = None, "Mon, 01 Jan 2024 00:00:00 GMT"
-    server.cuts = [100_000]
+@pytest.mark.parametrize(
+    ("answers", "asked"),
+    [
+        ({}, [None]),
+        (CUT, [None, REST]),
+        (CUT | {"etag": None, "modified": "Mon, 01 Jan 2024 00:00:00 GMT"}, [None, REST]),
+        (CUT | {"ranges": False}, [None, REST]),
+        # Without a strong tag and a time another file would not be noticed.
+        (CUT | {"etag": None}, [None, None]),
+        (CUT | {"etag": 'W/"1"'}, [None, None]),
+        ({"statuses": [503]}, [None, None]),
+    ],
+)
+def test_a_file_arrives_and_a_cut_is_gone_on_from(server, tmp_path, answers, asked):
+    vars(server).update(copy.deepcopy(answers))
     assert fetch(server, tmp_path).read_bytes() == DATA
-    assert server.asked == [("/file", None), ("/file", "bytes=100000-")]
+    assert server.asked == [("/file", wanted) for wanted in asked]
+
+
+@pytest.mark.parametrize(
+    ("answers", "words", "count"),
+    [
+        ({"files": {}}, "found HTTP 404 Not Found, expected the file", 1),
+        ({"statuses": [403]}, "found HTTP 403 Forbidden", 1),
+        ({"statuses": [500, 429]}, "found HTTP 429 Too Many Requests, .*attempts: 2", 2),
+        (
+            {"files": {"/file": b"\n<!DOCTYPE html><title>Quota exceeded</title>"}},
+            "found a page of HTML, expected the file here",
+            1,
+        ),
+        ({"kind": "text/html; charset=utf-8"}, "found a page of HTML", 1),
+    ],
+)
+def test_what_does_not_arrive_is_told_and_nothing_stays(server, tmp_path, answers, words, count):
+    vars(server).update(copy.deepcopy(answers))
+    error = fails(server, tmp_path, words)
+    assert isinstance(error, MissingFileError) == ("404" in words)
+    assert os.listdir(tmp_path) == []
+    assert len(server.asked) == count
 
 
 def test_the_next_call_goes_on(server, tmp_path):
@@ -88,19 +120,6 @@ def test_a_whole_unfinished_file_is_not_asked_for(server, tmp_path):
         file.write(DATA[200_000:])
     assert fetch(server, tmp_path).read_bytes() == DATA
     assert server.asked == []
-
-
-def test_a_server_without_ranges_starts_again(server, tmp_path):
-    server.ranges, server.cuts = False, [100_000]
-    assert fetch(server, tmp_path).read_bytes() == DATA
-    assert [path for path, _ in server.asked] == ["/file", "/file"]
-
-
-@pytest.mark.parametrize("etag", [None, 'W/"1"'])
-def test_without_strong_tag_and_time_a_cut_starts_again(server, tmp_path, etag):
-    server.etag, server.cuts = etag, [100_000]
-    assert fetch(server, tmp_path).read_bytes() == DATA
-    assert server.asked == [("/file", None), ("/file", None)]
 
 
 @pytest.mark.parametrize("obeys", [True, False])
@@ -138,43 +157,12 @@ def test_a_megabyte_begins_the_count_again(server, tmp_path):
     assert fetch(server, tmp_path).read_bytes() == large
 
 
-def test_no_such_file_is_told_at_once(server, tmp_path):
-    server.files.clear()
-    error = fails(server, tmp_path, "found HTTP 404 Not Found, expected the file")
-    assert isinstance(error, MissingFileError)
-    assert os.listdir(tmp_path) == []
-    assert len(server.asked) == 1
-
-
-def test_passing_faults_are_tried_again(server, tmp_path):
-    server.statuses = [503]
-    assert fetch(server, tmp_path).read_bytes() == DATA
-    server.statuses = [500, 429]
-    (tmp_path / "here").unlink()
-    fails(server, tmp_path, "found HTTP 429 Too Many Requests, .*attempts: 2")
-
-
-def test_a_refusal_is_told_at_once(server, tmp_path):
-    server.statuses = [403]
-    fails(server, tmp_path, "found HTTP 403 Forbidden")
-    assert len(server.asked) == 1
-
-
 def test_a_stalled_server_is_given_up_and_asked_again(server, tmp_path, monkeypatch):
     monkeypatch.setattr(downloads, "_TIMEOUT", 0.3)
     server.stalls = 2
     fails(server, tmp_path, "found a broken connection .*attempts: 2")
     assert server.asked == [("/file", None), ("/file", "bytes=10-")]
     assert fetch(server, tmp_path).read_bytes() == DATA
-
-
-def test_a_page_in_place_of_the_file(server, tmp_path):
-    server.files["/file"] = b"\n<!DOCTYPE html><title>Quota exceeded</title>"
-    fails(server, tmp_path, "found a page of HTML, expected the file here")
-    server.files["/file"], server.kind = DATA, "text/html; charset=utf-8"
-    fails(server, tmp_path, "found a page of HTML")
-    assert os.listdir(tmp_path) == []
-    assert len(server.asked) == 2
 
 
 def test_redirects_are_followed_with_the_range(server, tmp_path):

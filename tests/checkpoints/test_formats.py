@@ -17,10 +17,6 @@ from crisalad_jax.checkpoints.formats import (
 )
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
-from crisalad_jax.nn.aggregators.gem import CosPlaceConfig
-from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
-from crisalad_jax.nn.aggregators.queries import BoqConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -28,6 +24,7 @@ from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
+from tests.checkpoints.test_export import OTHERS
 from tests.conftest import MODEL, random_params
 from tests.random_checkpoints import LAYOUTS as FOLDER
 from tests.random_checkpoints import UNDER, as_arrays, bare_vit, public_layout, random_state
@@ -90,15 +87,6 @@ BACKBONES = {
     "side": {"adapter": AdapterConfig(kind="side")},
     "bias of the up-projection": {"adapter": AdapterConfig(bias="up")},
 }
-AGGREGATORS = {
-    "netvlad": "netvlad",
-    "pyramid": "gem-pyramid",
-    "GeM": "gem",
-    "Conv-AP": ConvApConfig(16),
-    "CosPlace": CosPlaceConfig(16),
-    "MixVPR": MixVprConfig(16, 3, 2),
-    "BoQ": BoqConfig(16, 3, 2, 5),
-}
 MODELS = {
     "crisalad": MODEL,
     "anyloc": dataclasses.replace(MODEL, aggregator=AnyLocConfig(layer=0), cross_image=BARE),
@@ -106,7 +94,8 @@ MODELS = {
         name: dataclasses.replace(MODEL, backbone=dataclasses.replace(MODEL.backbone, **fields))
         for name, fields in BACKBONES.items()
     },
-    **{name: dataclasses.replace(MODEL, aggregator=each) for name, each in AGGREGATORS.items()},
+    "netvlad": dataclasses.replace(MODEL, aggregator="netvlad"),
+    **OTHERS,
 }
 
 
@@ -123,41 +112,6 @@ def test_any_model_survives_the_reference_format_bit_for_bit(name: str) -> None:
     for key, array in found.items():
         np.testing.assert_array_equal(array, wanted[key])
         assert array.dtype == wanted[key].dtype
-
-
-# As they are in the public checkpoints, of torch's modules in the public order.
-PUBLIC_HEADS = {
-    "GeM": {"aggregation.1.p": (1,)},
-    "Conv-AP": {
-        "aggregator.channel_pool.weight": (16, 32, 1, 1),
-        "aggregator.channel_pool.bias": (16,),
-    },
-    "CosPlace": {
-        "aggregation.1.p": (1,),
-        "aggregation.3.weight": (16, 32),
-        "aggregation.3.bias": (16,),
-    },
-    "MixVPR": {
-        **{
-            f"aggregator.mix.{i}.mix.{j}.{leaf}": (12, 12) if j and leaf == "weight" else (12,)
-            for i in (0, 1)
-            for j in (0, 1, 3)
-            for leaf in ("weight", "bias")
-        },
-        "aggregator.channel_proj.weight": (16, 32),
-        "aggregator.channel_proj.bias": (16,),
-        "aggregator.row_proj.weight": (3, 12),
-        "aggregator.row_proj.bias": (3,),
-    },
-}
-
-
-@pytest.mark.parametrize("name", PUBLIC_HEADS)
-def test_heads_have_their_public_names(name: str) -> None:
-    """BoQ's are tested beside torch's modules in tests/nn/aggregators."""
-    shapes = public_shapes(MODELS[name], "reference")
-    head = {key: shape for key, shape in shapes.items() if key.startswith("aggregat")}
-    assert list(head.items()) == list(PUBLIC_HEADS[name].items())
 
 
 def test_every_number_has_its_own_place() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.formats import FORMATS, VOCABULARY, infer, public_shapes
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.public import vocabulary_model
 from crisalad_jax.checkpoints.published import PUBLISHED, published_model
 from crisalad_jax.nn.adapter import AdapterConfig
@@ -226,8 +227,8 @@ def test_anylocs_vocabularies_have_their_backbone():
         assert bool(model.backbone) == (model.format == VOCABULARY) == name.startswith("anyloc-")
         if model.backbone:
             depth = stored(model.backbone)[1].backbone.depth
-            # As the file's name says.
-            assert range(depth)[inferred(name)[1].aggregator.layer] == 31
+            # The file's name has 31, counted from 0.
+            assert inferred(name)[1].aggregator.features(depth).levels == (32,)
 
 
 def resized(name: str, **settings: Any) -> tuple[str, ModelConfig]:
@@ -336,17 +337,29 @@ def test_the_table_is_sound():
 
 
 @pytest.mark.parametrize(
-    ("name", "nearest"),
+    ("asked", "nearest"),
     [
-        ("megalok", "megaloc, megaloc-v1"),
-        ("MegaLoc", "megaloc, megaloc-v1"),
-        ("dinov2_vitb14", "dinov2-vitb14, "),
-        ("supervlad-cross-image", "supervlad-crossimage, "),
+        ("megalok", "^megaloc, megaloc-v1"),
+        ("MegaLoc", "^megaloc, megaloc-v1"),
+        ("dinov2_vitb14", "^dinov2-vitb14, "),
+        ("supervlad-cross-image", "^supervlad-crossimage, "),
+        ("startr", r"\bstarter\b"),  # of the package
+        ("boq dinov2", r"\bboq-dinov2\b"),
+        ("cliquemining", r"\bsalad-cm\b"),  # the name of its file
+        ("hloc", r"\bnetvlad-hloc\b"),  # a part of a name
+        ("Indoor-VPR", r"\bsalad-indoor-gb1-10-25\b"),  # a repository
+        ("cosplace", r"^cosplace-resnet50-2048\b"),  # a family: its longest descriptors
     ],
 )
-def test_an_unknown_name_is_told_with_the_nearest(name, nearest):
-    with pytest.raises(InputError, match=f"^{name}: found no published model .*nearest: {nearest}"):
-        published_model(name)
+def test_an_unknown_name_is_told_with_the_nearest(asked: str, nearest: str) -> None:
+    for look_up, words in (
+        (published_model, "found no published model of this name"),
+        (find_weights, "found no such file"),
+        (lambda name: find_weights(f"{name}.pth"), "found no such file"),
+    ):
+        with pytest.raises(InputError, match=f"^{asked}.*{words}") as error:
+            look_up(asked)
+        assert re.search(nearest, str(error.value).partition("nearest: ")[2])
 
 
 def test_a_name_like_no_other_has_no_nearest():

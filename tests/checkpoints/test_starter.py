@@ -55,15 +55,6 @@ def test_its_name_is_its_file_and_no_weights_mean_it_with_a_note() -> None:
         assert find_weights(None) == starter.FILE
 
 
-def test_a_file_of_its_name_is_taken_instead(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "starter").write_bytes(b"mine")
-    with pytest.warns(Note, match="starter: found a file of this name here, and took that"):
-        assert find_weights("starter") == pathlib.Path("starter")
-
-
 def test_the_names_are_of_different_models() -> None:
     assert starter.BEST in PUBLISHED
     assert starter.NAME not in PUBLISHED

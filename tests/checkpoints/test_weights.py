@@ -27,9 +27,15 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import MODEL, assert_equal, random_params
 
-WITHOUT_ENCODER = dataclasses.replace(
-    MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=0)
-)
+
+def put(config: Any, name: str, value: Any) -> Any:
+    """Replace a field by its dotted name."""
+    head, _, rest = name.partition(".")
+    inner = put(getattr(config, head), rest, value) if rest else value
+    return dataclasses.replace(config, **{head: inner})
+
+
+WITHOUT_ENCODER = put(MODEL, "cross_image.layers", 0)
 REGISTERS = dataclasses.replace(
     MODEL, backbone=dataclasses.replace(MODEL.backbone, registers=4, ffn="swiglu")
 )
@@ -98,12 +104,8 @@ def test_half_precision_is_half_the_room_and_every_number_rounded(tmp_path, shar
 
 
 def test_what_half_precision_cannot_hold_is_named(tmp_path, params):
-    score = params.aggregator.score
-    large = dataclasses.replace(score.fc1, weight=score.fc1.weight.at[0, 0].set(1e5))
-    score = dataclasses.replace(score, fc1=large)
-    wrong = dataclasses.replace(
-        params, aggregator=dataclasses.replace(params.aggregator, score=score)
-    )
+    large = params.aggregator.score.fc1.weight.at[0, 0].set(1e5)
+    wrong = put(params, "aggregator.score.fc1.weight", large)
     with pytest.raises(InputError, match=r"aggregator\.score\.fc1\.weight"):
         save_weights(tmp_path / "half.safetensors", Model(wrong, MODEL), half=True)
     assert not list(tmp_path.iterdir())
@@ -300,15 +302,7 @@ def other_values(config: Any, field: dataclasses.Field[Any]) -> Iterator[Any]:
 
 
 SINKHORN = dataclasses.replace(MODEL.aggregator.sinkhorn, tolerance=1e-3, gradient="stop")
-CONVERGING = dataclasses.replace(
-    MODEL, aggregator=dataclasses.replace(MODEL.aggregator, sinkhorn=SINKHORN)
-)
-
-
-def put(config: Any, name: str, value: Any) -> Any:
-    head, _, rest = name.partition(".")
-    inner = put(getattr(config, head), rest, value) if rest else value
-    return dataclasses.replace(config, **{head: inner})
+CONVERGING = put(MODEL, "aggregator.sinkhorn", SINKHORN)
 
 
 def test_the_hash_is_read_with_the_weights(shared, monkeypatch):

@@ -15,6 +15,7 @@ import numpy as np
 from crisalad_jax.checkpoints.formats.format import BackboneNames, Format, Head, parts_of
 from crisalad_jax.checkpoints.formats.rows import SAME, Extra, Row, Rows, read_table, read_tables
 from crisalad_jax.checkpoints.formats.sizes import Reader, State, square_side
+from crisalad_jax.config.io import from_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
@@ -30,24 +31,6 @@ VOCABULARY = "anyloc-words"
 """Name of the format of AnyLoc's vocabularies (Keetha et al., RA-L 2023): the words alone."""
 REFERENCE = "reference"
 """Name of the format of our torch reference."""
-_CHAINS = {
-    "pillow": PreprocessingConfig(),
-    "native": PreprocessingConfig(size_rule="native"),
-    # Tensors at a torchvision that does not antialias them unasked: before 0.17.
-    "plain": PreprocessingConfig(antialias=False, pixels="floats"),
-    "rounded": PreprocessingConfig(pixels="floats", round_to_patch=True),
-    "bicubic": PreprocessingConfig(filter="bicubic", pixels="floats"),
-    # Sides of at most 1,024, and pixels of 0 to 255 less the mean of VGG-16 of MatConvNet, from
-    # which NetVLAD starts.
-    "hloc": PreprocessingConfig(
-        size_rule="longer-side",
-        filter="area",
-        pixels="floats",
-        mean=(123.68 / 255, 116.779 / 255, 103.939 / 255),
-        deviation=(1 / 255, 1 / 255, 1 / 255),
-    ),
-}
-"""How images are prepared, by the name in formats.toml."""
 
 
 def _with_squares(state: State, config: ModelConfig) -> ModelConfig:
@@ -125,6 +108,10 @@ class _Reference(Format):
 
 
 _FACTS = tomllib.loads(pathlib.Path(__file__).with_name("formats.toml").read_text(encoding="utf-8"))
+_CHAINS = {
+    name: from_plain(PreprocessingConfig, fields, source=f"formats.toml (chains.{name})")
+    for name, fields in _FACTS["chains"].items()
+}
 TABLES = read_tables(_FACTS["tables"])
 """Tables of layers by name."""
 _BACKBONES = {

@@ -22,15 +22,6 @@ _CHUNKS = r"(?<![^.])(blocks\.)\d+\.(?=\d+\.)"
 _HEADS = ("dino_head.", "ibot_head.")
 
 
-class Inferred(NamedTuple):
-    """What a state is."""
-
-    format: str
-    config: ModelConfig
-    state: State
-    """The arrays by the format's own names."""
-
-
 class _Reading(NamedTuple):
     """A way to read a state."""
 
@@ -46,17 +37,20 @@ def infer(state: State, *, source: str) -> tuple[str, ModelConfig]:
     return identify(state, source=source)[:2]
 
 
-def identify(state: State, *, source: str) -> Inferred:
+def identify(state: State, *, source: str) -> tuple[str, ModelConfig, State]:
     """Infer the format and the configuration of a state, from its names and shapes.
 
     Settings that no shape shows are the published ones: heads of width 64 in the backbone, 16 heads
     in the encoder, alpha 0.2, three Sinkhorn iterations, the family's image size and resize. Names
     of wrappers are taken away; a note says what else is left out.
 
+    Returns:
+        (format, configuration, the arrays by the format's own names).
+
     Raises:
         InputError: naming `source`, if the names are of no format or the widths of no model.
     """
-    found: list[tuple[int, Inferred, _Reading]] = []
+    found: list[tuple[int, str, ModelConfig, _Reading]] = []
     problems: list[str] = []
     for reading in _readings(state):
         for each in FORMATS.values():
@@ -67,15 +61,15 @@ def identify(state: State, *, source: str) -> Inferred:
                 except InputError as error:
                     problems.append(f"{error}, as in {each.holds}")
                 else:
-                    inferred = Inferred(each.name, config, reading.state)
-                    found.append((len(names ^ reading.state.keys()), inferred, reading))
+                    unlike = len(names ^ reading.state.keys())
+                    found.append((unlike, each.name, config, reading))
         if any(unlike == 0 for unlike, *_ in found):
             break
     if found:
         # Families share names: the one that holds most of them, and the first of equals.
-        _, inferred, reading = min(found, key=lambda each: each[0])
+        _, name, config, reading = min(found, key=lambda each: each[0])
         _tell_left_out(reading, source)
-        return inferred
+        return name, config, reading.state
     if problems:
         raise InputError(f"{source}: {problems[0]}")
     for reading in _readings(state):

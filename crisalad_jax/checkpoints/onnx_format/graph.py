@@ -116,15 +116,10 @@ class Graph:
         """Return the name of a vector of one int64: a side's number, computed where symbolic."""
         if is_known(size):
             return self.ints(int(size))
-        if size not in self.symbolic:
-            for unit, name in list(self.symbolic.items()):
-                factor = size // unit
-                if factor * unit == size:
-                    (product,) = self.node("Mul", [name, self.side(factor)])
-                    self.symbolic[size] = product
-                    break
-            else:
-                raise ValueError(f"a side of {size}")
+        if size not in self.symbolic:  # a multiple of one that is there
+            unit = next(unit for unit in self.symbolic if size // unit * unit == size)
+            factor = self.side(size // unit)
+            (self.symbolic[size],) = self.node("Mul", [self.symbolic[unit], factor])
         return self.symbolic[size]
 
     def sides(self, shape: Shape) -> str:
@@ -212,7 +207,7 @@ class Graph:
     ) -> onnx.ModelProto:
         """Return the program of what the outputs need.
 
-        The arrays of large constants are left out: `write_model` puts them beside it or into it.
+        The arrays of constants are left out: `write_onnx` puts them beside it or into it.
         """
         for name, value in outputs:
             self.nodes.append(helper.make_node("Identity", [self.name(value)], [name]))

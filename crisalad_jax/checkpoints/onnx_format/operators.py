@@ -39,41 +39,21 @@ def converts(*names: str) -> Callable[[Converter], Converter]:
 
 # Number by number, which nodes broadcast as numpy does.
 
-_PLAIN = {
-    "abs": "Abs",
-    "add": "Add",
+_SAME_NAMES = (
+    *("abs", "add", "and", "ceil", "cos", "div", "erf", "exp", "floor", "log", "max", "min"),
+    *("mul", "neg", "not", "or", "pow", "sign", "sin", "sqrt", "sub", "tanh", "xor"),
+)
+"""Primitives that have the operators' names, but for the capital letter."""
+_PLAIN = {name: name.capitalize() for name in _SAME_NAMES} | {
     "add_any": "Add",
-    "and": "And",
-    "ceil": "Ceil",
-    "cos": "Cos",
-    "div": "Div",
     "eq": "Equal",
-    "erf": "Erf",
-    "exp": "Exp",
-    "floor": "Floor",
     "ge": "GreaterOrEqual",
     "gt": "Greater",
     "le": "LessOrEqual",
-    "log": "Log",
     "logistic": "Sigmoid",
     "lt": "Less",
-    "max": "Max",
-    "min": "Min",
-    "mul": "Mul",
-    "neg": "Neg",
-    "not": "Not",
-    "or": "Or",
-    "pow": "Pow",
-    "sign": "Sign",
-    "sin": "Sin",
-    "sqrt": "Sqrt",
-    "sub": "Sub",
-    "tanh": "Tanh",
-    "xor": "Xor",
 }
 """Operators by the primitives that they are the same as."""
-_TRUTH = {"Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual", "Not", "And", "Or", "Xor"}
-"""Operators whose results are true or false."""
 _COMPOSED: Mapping[str, Callable[..., Value]] = {
     "clamp": lambda add, params, least, x, most: add("Min", add("Max", x, least), most),
     "exp2": lambda add, params, x: add("Pow", 2, x),
@@ -113,10 +93,13 @@ def _elementwise(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]
 
 
 def _node(graph: Graph, shape: Shape, operator: str, *inputs: Value | float) -> Value:
-    """Append a node; numbers among the inputs are of the other inputs' type."""
+    """Append a node; numbers among the inputs are of the other inputs' type.
+
+    Its own type may be another: that of the last node of an equation is set by the caller.
+    """
     dtype = next(each.dtype for each in reversed(inputs) if isinstance(each, Value))
     values = [x if isinstance(x, Value) else Value.of(np.array(x, dtype)) for x in inputs]
-    return graph.add(operator, values, shape, np.bool_ if operator in _TRUTH else dtype)
+    return graph.add(operator, values, shape, dtype)
 
 
 # Moving numbers, and computing none.

@@ -8,51 +8,16 @@ from typing import Any
 import jax
 import numpy as np
 import onnx
-from onnx import TensorProto, numpy_helper
+from onnx import external_data_helper, numpy_helper
 
 from crisalad_jax.checkpoints.onnx_format.convert import convert
 from crisalad_jax.checkpoints.onnx_format.graph import OPSET as OPSET
-from crisalad_jax.checkpoints.onnx_format.graph import Graph, Value, is_known, tensor_type
+from crisalad_jax.checkpoints.onnx_format.graph import Graph, Value, is_known
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import wrap_os_errors
 
 _PAGE = 4096
 """Bytes that arrays next to a program begin at multiples of, so that they can be mapped."""
-
-
-def onnx_graph(
-    run: Callable[..., Any],
-    weights: Mapping[str, Any],
-    inputs: Mapping[str, jax.ShapeDtypeStruct],
-) -> tuple[Graph, list[Value], Value]:
-    """Convert a function of weights and other arrays, with the weights as constants.
-
-    Args:
-        run: the function, of a dictionary of arrays and the inputs in their order.
-        weights: the arrays.
-        inputs: shapes and types of the inputs by name. Their first sides are the number of images,
-            which may be symbolic.
-
-    Returns:
-        (graph, inputs, output).
-
-    Raises:
-        InputError: the function has an operation that no operator of ONNX is made of; named.
-    """
-    traced: Any = jax.make_jaxpr(run)(weights, *inputs.values())
-    graph = Graph()
-    values = [Value(each.shape, np.dtype(each.dtype), name) for name, each in inputs.items()]
-    count = values[0].shape[0]
-    if not is_known(count):
-        (graph.symbolic[count],) = graph.node("Shape", [values[0].name], start=0, end=1)
-    arguments = [Value.of(leaf) for leaf in jax.tree.leaves(weights)]
-    (output,) = convert(graph, traced, [*arguments, *values])
-    if output.missing:
-        raise InputError(
-            f"format onnx or openvino: found the operation {output.missing}, which is not "
-            "converted, expected format stablehlo or a model without it (docs/export.md)"
-        )
-    return graph, values, graph.full(output, traced.out_avals[0].shape)
 
 
 def write_onnx(
@@ -67,11 +32,14 @@ def write_onnx(
 ) -> list[str]:
     """Write a function of weights and other arrays as an ONNX program.
 
+    The weights are constants of the program.
+
     Args:
         path: the file.
-        run: as `onnx_graph`.
-        weights: as `onnx_graph`.
-        inputs: as `onnx_graph`.
+        run: the function, of a dictionary of arrays and the inputs in their order.
+        weights: the arrays.
+        inputs: shapes and types of the inputs by name. Their first sides are the number of images,
+            which may be symbolic.
         output: name of the output.
         words: what the file says of itself.
         beside: whether large weights go to a file of its own, `path` with .data appended.
@@ -80,52 +48,38 @@ def write_onnx(
         Names of the nodes that multiply by weights.
 
     Raises:
-        InputError: as `onnx_graph`, or the disk is full.
+        InputError: the function has an operation that no operator of ONNX is made of; named. Or
+            the disk is full.
     """
-    graph, values, result = onnx_graph(run, weights, inputs)
+    traced: Any = jax.make_jaxpr(run)(weights, *inputs.values())
+    graph = Graph()
+    values = [Value(each.shape, np.dtype(each.dtype), name) for name, each in inputs.items()]
+    count = values[0].shape[0]
+    if not is_known(count):
+        (graph.symbolic[count],) = graph.node("Shape", [values[0].name], start=0, end=1)
+    arguments = [Value.of(leaf) for leaf in jax.tree.leaves(weights)]
+    (result,) = convert(graph, traced, [*arguments, *values])
+    if result.missing:
+        raise InputError(
+            f"format onnx or openvino: found the operation {result.missing}, which is not "
+            "converted, expected format stablehlo or a model without it (docs/export.md)"
+        )
+    result = graph.full(result, traced.out_avals[0].shape)
     model = graph.model(values, [(output, result)], words)
-    data = path.with_name(f"{path.name}.data")
-    places = _place_constants(model, graph.constants, data.name if beside else None)
-    with wrap_os_errors(path):
-        if beside:
-            _write_constants(data, places)
-        path.write_bytes(model.SerializeToString(deterministic=True))
-    return _products(model, graph.constants, [np.asarray(each) for each in weights.values()])
-
-
-def _place_constants(
-    model: onnx.ModelProto, constants: Mapping[str, np.ndarray], beside: str | None
-) -> list[tuple[int, np.ndarray]]:
-    """Put constants into a program, or tell it where they lie in a file beside it.
-
-    Args:
-        model: the program, which is changed.
-        constants: the arrays by name.
-        beside: name of the file for those of a page or more; None puts all into the program.
-
-    Returns:
-        Where each array begins in the file, in order.
-    """
-    places, end = [], 0
-    for name, array in constants.items():
-        if beside is None or array.nbytes < _PAGE:
-            # A view of transposed numbers is written in the order of its axes.
-            tensor = numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name)
-        else:
-            tensor = TensorProto(
-                name=name,
-                data_type=tensor_type(array.dtype),
-                dims=array.shape,
-                data_location=TensorProto.EXTERNAL,
-            )
-            start = math.ceil(end / _PAGE) * _PAGE
-            where = {"location": beside, "offset": str(start), "length": str(array.nbytes)}
-            for key, value in where.items():
-                tensor.external_data.add(key=key, value=value)
-            places.append((start, array))
-            end = start + array.nbytes
+    end = 0
+    for name, array in graph.constants.items():
+        # A view of transposed numbers is written in the order of its axes.
+        tensor = numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name)
+        if beside and array.nbytes >= _PAGE:
+            external_data_helper.set_external_data(tensor, f"{path.name}.data", offset=end)
+            end += math.ceil(array.nbytes / _PAGE) * _PAGE
         model.graph.initializer.append(tensor)
-    return places
+    products = _products(model, graph.constants, [np.asarray(each) for each in weights.values()])
+    with wrap_os_errors(path):
+        if beside:  # however small its arrays are
+            path.with_name(f"{path.name}.data").touch()
+        onnx.save_model(model, path)
+    return products
 
 
 def _products(
@@ -139,11 +93,3 @@ def _products(
         and node.input[1] in constants
         and any(np.may_share_memory(constants[node.input[1]], weight) for weight in weights)
     ]
-
-
-def _write_constants(path: pathlib.Path, places: Sequence[tuple[int, np.ndarray]]) -> None:
-    """Write arrays to a file, each at its place."""
-    with path.open("wb") as file:
-        for start, array in places:
-            file.seek(start)
-            file.write(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
