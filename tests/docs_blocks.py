@@ -22,6 +22,7 @@ import crisalad_jax as cj
 from crisalad_jax import cli
 from crisalad_jax.config import plugins
 from crisalad_jax.config import registry as registries
+from crisalad_jax.config.flags import flag_values
 from crisalad_jax.training.recipes import RECIPES
 
 BLOCK = re.compile(
@@ -62,7 +63,9 @@ def parse(command: str) -> None:
     # What follows is the shell's: a pipe, or a file for the output.
     given = list(itertools.takewhile(lambda argument: argument not in ("|", ">"), given))
     given = [argument for argument in given if argument not in ("--help", "--help-all")]
-    cli._load_plugins(given)
+    for files in flag_values(given, "--plugin"):
+        for file in files:
+            cj.load_plugin(file)
     if given:
         cli._parse(
             verb, importlib.import_module(f"crisalad_jax.cli.{verb.replace('-', '_')}"), given

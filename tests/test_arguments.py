@@ -50,7 +50,7 @@ CALLS = {
     "save_weights": (lambda: cj.save_weights("w", PARAMS), "model: found Crisalad, expected Model"),
     "init_crisalad": (
         lambda: cj.init_crisalad(PRESET, KEY),
-        "config: found PRNGKeyArray, expected ModelConfig",
+        "key: found ModelConfig, expected Array",
     ),
     "prepare_image": (
         lambda: cj.prepare_image(PRESET, IMAGES[0]),

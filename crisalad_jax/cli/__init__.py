@@ -49,7 +49,9 @@ _COMMANDS = {
 }
 """Summaries of the commands in the order of the help; each command is a module here.
 
-Its function `run` takes the parsed flags, and may return what --json writes or prints.
+Its function `run` takes the parsed flags, and may return what --json writes or prints. It may also
+have `COMMON`, the flags of the short help; `needs_jax(flags)`; and `SEVERAL`, a hint where a flag
+got several values.
 """
 
 

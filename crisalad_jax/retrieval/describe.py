@@ -376,7 +376,8 @@ class FrameDescriber:
         Raises:
             InputError: what `check_window` raises.
         """
-        check_window(describer.config, window)
+        if window != 1:  # an engine's configuration needs JAX, which takes a second to import
+            check_window(describer.config, window)
         self._describer, self._window = describer, window
         self.forget()
 

@@ -18,7 +18,8 @@ def test_an_occupied_place_is_refused_and_left_alone(tmp_path, capsys, kind):
         out.write_text("mine")
     assert main(["demo", "--out", str(out), "--quiet"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"crisalad: {out}: found files but no demo")
+    found = "files but no demo" if kind == "folder" else "a file, expected a folder"
+    assert line.startswith(f"crisalad: {out}: found {found}")
     assert [path.name for path in tmp_path.rglob("*.txt")] == ["letter.txt"] * (kind == "folder")
 
 

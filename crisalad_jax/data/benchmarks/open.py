@@ -29,6 +29,7 @@ class Layout(NamedTuple):
 
     words: str
     read: Callable[..., Benchmark]
+    """Takes a path, then any of `open_benchmark`'s options by their names."""
 
     @property
     def options(self) -> tuple[str, ...]:

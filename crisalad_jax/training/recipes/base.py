@@ -110,7 +110,7 @@ def model_of(
     model: ModelConfig,
     preset: str,
     backbone: Any,
-    aggregator: str,
+    aggregator: str | None,
     *,
     head: Mapping[str, Any] | None = None,
     image_size: tuple[int, int] | None = None,
@@ -127,7 +127,7 @@ def model_of(
         model: the preset's.
         preset: its name.
         backbone: the method's.
-        aggregator: name of the head, which comes in the preset's size.
+        aggregator: name of the head, which comes in the preset's size; None keeps the model's.
         head: settings of the head that are other than the preset's.
         image_size: height and width over a convolutional backbone, which for `tiny` is a small
             ResNet with its images; None is the preset's.
@@ -142,7 +142,9 @@ def model_of(
     """
     if preset == "tiny" and image_size is not None:
         backbone, image_size = BACKBONES.make("resnet", preset), None
-    chain = model.preprocessing
+    chain, part = model.preprocessing, model.aggregator
+    if aggregator is not None:
+        part = AGGREGATORS.make(aggregator, preset, **(head or {}))
     if chain.normalisation == "local-contrast":
         preprocessing = {name: each for name, each in preprocessing.items() if name == "filter"}
     return dataclasses.replace(
@@ -150,7 +152,7 @@ def model_of(
         image_size=image_size or model.image_size,
         preprocessing=dataclasses.replace(chain, **preprocessing),
         backbone=backbone,
-        aggregator=AGGREGATORS.make(aggregator, preset, **(head or {})),
+        aggregator=part,
         cross_image=dataclasses.replace(model.cross_image, layers=0),
         compute_dtype=compute_dtype,
     )

@@ -69,7 +69,7 @@ def salad(model: ModelConfig, preset: str) -> TrainConfig:
     learning rate lower by less than 1 part in 1,000.
     """
     return TrainConfig(
-        model=model_of(model, preset, _vit(model), "salad", compute_dtype="bfloat16"),
+        model=model_of(model, preset, _vit(model), None, compute_dtype="bfloat16"),
         optimiser=OptimiserConfig(weight_decay=9.5e-9, end_lr_fraction=0.2, decay_steps=4000),
         trainable="last-4-blocks+head",
         places_per_batch=60,

@@ -1,5 +1,6 @@
 """Which layout is found, and which options it takes."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from tests.data.benchmarks.trees import (
     write_vpr_bench,
 )
 
+FLAGS = Path(__file__).parents[3] / "crisalad_jax" / "cli" / "flags.py"
 REAL = Path(__file__).parents[3].parent / "shared" / "data"
 
 
@@ -149,6 +151,13 @@ def test_options_that_a_layout_lacks_are_refused(tmp_path, layout):
         known = ", ".join(options) or "no option"
         with refused(f"^{tmp_path}: found {option} for .*, which takes {known}$"):
             open_benchmark(tmp_path, layout=layout, **{option: OPTIONS[option]})
+
+
+def test_the_help_names_every_layout():
+    """Its words are written by hand."""
+    written = r'layout: str \| None = None\n    """(.*?);'
+    (text,) = re.findall(written, FLAGS.read_text(), re.DOTALL)
+    assert re.findall(r"[\w-]+", text.replace(" or ", " ")) == [*LAYOUTS]
 
 
 def test_an_unknown_layout_is_refused(tmp_path):
