@@ -115,10 +115,16 @@ def prepare(arguments: Sequence[str]) -> Sequence[str]:
     if given is None or asked_for(arguments):
         return arguments
     compiler.configure()
-    if find_flag(arguments, "--coordinator-address") is not None:
+    several = find_flag(arguments, "--coordinator-address") is not None
+    if several:
         _check_cached(given)
-    weights = find_weights(given, quiet="--quiet" in arguments)
-    read_model(weights)
+    try:
+        weights = find_weights(given, quiet="--quiet" in arguments)
+        read_model(weights)
+    except InputError:
+        if several:  # `train` raises it once all processes have met: the others would wait
+            return arguments
+        raise
     return [*arguments, "--weights", str(weights)]
 
 

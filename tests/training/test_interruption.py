@@ -137,7 +137,9 @@ def test_a_signal_during_a_validation_does_not_wait_for_its_end(start, whole, tm
         "real = crisalad_jax.training.validation.evaluate\n"
         "def evaluate(*arguments, **more):\n"
         "    print('validating', flush=True)\n"
-        "    import time; time.sleep(60)\n"
+        "    import time\n"
+        # One long sleep would miss a signal that comes just before it.
+        "    for _ in range(600): time.sleep(0.1)\n"
         "crisalad_jax.training.validation.evaluate = evaluate"
     )
     out = tmp_path / "run"
