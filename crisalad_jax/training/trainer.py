@@ -198,7 +198,8 @@ def run_keys(seed: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
     """Make the keys that draw a run's first parameters, its dropout, and its classifiers."""
     key = jax.random.key(seed)
     # Folds in 2, because folding in 0 or 1 may repeat the keys of the split.
-    return *jax.random.split(key), jax.random.fold_in(key, 2)
+    params, dropout = jax.random.split(key)
+    return params, dropout, jax.random.fold_in(key, 2)
 
 
 @jax.jit

@@ -106,11 +106,11 @@ class Map:
 
     Example:
         >>> import jax
-        >>> from crisalad_jax import PRESETS, Model, index, init_crisalad, save_weights
+        >>> from crisalad_jax import PRESETS, Model, Reading, index, init_crisalad, save_weights
         >>> model = Model(init_crisalad(jax.random.key(0), PRESETS["tiny"]), PRESETS["tiny"])
         >>> weights = folder / "weights.safetensors"
         >>> save_weights(weights, model)
-        >>> _ = index(model, pictures, folder / "map", weights=weights, quiet=True)
+        >>> _ = index(model, pictures, folder / "map", weights=weights, reading=Reading(quiet=True))
         >>> places = Map.open(folder / "map")
         >>> len(places)
         4
