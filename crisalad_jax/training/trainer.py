@@ -197,8 +197,8 @@ class Trainer:
 def run_keys(seed: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
     """Make the keys that draw a run's first parameters, its dropout, and its classifiers."""
     key = jax.random.key(seed)
-    # Folds in 2, because folding in 0 or 1 may repeat the keys of the split.
     params, dropout = jax.random.split(key)
+    # Folds in 2, because folding in 0 or 1 may repeat the keys of the split.
     return params, dropout, jax.random.fold_in(key, 2)
 
 
