@@ -732,7 +732,7 @@ def test_a_field_or_a_preset_of_another_name_is_refused() -> None:
     with pytest.raises(InputError, match=r"found a field 'apply', which has another meaning here$"):
         cj.register_loss("odd")(made)
     made = dataclasses.make_dataclass("Odd", [("scale", int, 1)], bases=(base,), frozen=True)
-    with pytest.raises(InputError, match=r"unexpected keyword argument 'scal'.*; expected all meth"):
+    with pytest.raises(InputError, match=r"unexpected keyword argument 'scal'.*; expected all"):
         cj.register_loss("odd", tiny={"scal": 2})(made)
 
 
