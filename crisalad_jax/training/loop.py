@@ -328,10 +328,12 @@ class _Loop:
 
     def _validate(self) -> RunRecord:
         """Log the recalls, save the best weights, and decide on an early stop."""
-        record, params = self.files.record, self.trainer.params()
+        record = self.files.record
         epoch = record.step // self.data.steps_per_epoch
+        trainable = self.trainer.gather(self.trainer.state.trainable)
 
         def validate() -> tuple[str, dict[str, Any]]:
+            params = self.trainer.params(trainable)
             with self.signals.at_once():
                 found = self.validator.validate(params)
             line = {"step": record.step, "epoch": epoch, **found.metrics}
@@ -347,9 +349,11 @@ class _Loop:
 
     def _mine(self, miner: Miner) -> None:
         """Mine the tuples of the round that begins, by the model as it is."""
-        describe = functools.partial(self.validator.describe, self.trainer.params())
+        trainable = self.trainer.gather(self.trainer.state.trainable)
 
         def mine() -> str:
+            params = self.trainer.params(trainable)
+            describe = functools.partial(self.validator.describe, params)
             with self.signals.at_once():
                 return miner.mine(self.files.record.step, describe)
 
@@ -360,7 +364,8 @@ class _Loop:
         """Write the weights and the state to resume from."""
 
         def save() -> None:
-            state = RunState(self.trainer.gather(), self.data.mined)
-            self.files.save(state, self.trainer.params)
+            state = self.trainer.gather(self.trainer.state)
+            params = functools.partial(self.trainer.params, state.trainable)
+            self.files.save(RunState(state, self.data.mined), params)
 
         distributed.raise_together(save)

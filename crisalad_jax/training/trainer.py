@@ -4,7 +4,7 @@ import collections
 import math
 import time
 from collections.abc import Generator, Iterator, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ from crisalad_jax.utils.devices import Devices, devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 
+_T = TypeVar("_T")
 Batch = tuple[jax.Array, jax.Array, jax.Array]
 """Images, labels, and which images are valid, on the devices."""
 
@@ -80,13 +81,12 @@ class Trainer:
         """Metrics of the steps that the devices may still be computing, number of their images, and
         seconds of waiting for these."""
         self._finished_at = 0.0
-        self._gathered: TrainState | None = None
         distributed.raise_together(self._check_memory)
 
     def resume(self, state: TrainState) -> None:
         """Go on from a state, which has to be the same in all processes."""
         # Copied, because a step donates the buffers of its state.
-        self.state, self._gathered = _copied(self._place(state)), None
+        self.state = _copied(self._place(state))
 
     def on_devices(self, batches: Iterator[ImageBatch]) -> Generator[Batch, None, None]:
         """Yield batches on the devices, each copied while they compute the one before."""
@@ -105,7 +105,7 @@ class Trainer:
         """
         if not self._running:
             self._finished_at = time.monotonic() - waited
-        batch, self._gathered = batch or self._no_images(), None
+        batch = batch or self._no_images()
         arguments = self.state, self._frozen_on_devices, *batch, self._step_key, self._step_config
         self.state, metrics = train_step(*arguments, self._proceed)
         self._proceed = metrics.updated
@@ -147,16 +147,15 @@ class Trainer:
                 "skipped_images": skipped,
             }
 
-    def gather(self) -> TrainState:
-        """Gather the state; all processes call it together, and then any may call it again."""
-        if self._gathered is None:
-            self._gathered = self._devices.gather(self.state)
-        return self._gathered
+    def gather(self, tree: _T) -> _T:
+        """Gather the state, or a part of it; all processes call it together."""
+        return self._devices.gather(tree)
 
-    def params(self) -> Crisalad:
-        """Join the whole model in float32; without a `gather` before, all processes call it."""
-        frozen = jax.tree.map(jnp.asarray, self._frozen)
-        return merge_params(self.gather().trainable, frozen, self._config.model)
+    def params(self, trainable: PyTree = None) -> Crisalad:
+        """Join the whole model in float32, with what trains as it was gathered; None gathers it."""
+        if trainable is None:
+            trainable = self.gather(self.state.trainable)
+        return merge_params(trainable, jax.tree.map(jnp.asarray, self._frozen), self._config.model)
 
     def _batch(self, *parts: np.ndarray) -> Batch:
         images, labels, valid = map(self._devices.shard_batch, parts)
