@@ -13,13 +13,6 @@ from tests.conftest import MODEL, read_options
 
 
 @pytest.fixture(scope="session")
-def sides(shared) -> tuple[pathlib.Path, pathlib.Path]:
-    """The town's database and queries."""
-    images = shared / "town" / "images" / "test"
-    return images / "database", images / "queries"
-
-
-@pytest.fixture(scope="session")
 def town_map(shared, params, sides, tmp_path_factory) -> pathlib.Path:
     """Of the database, in segments of four and three images; to read only."""
     out, weights = tmp_path_factory.mktemp("maps") / "map", shared / "weights.safetensors"

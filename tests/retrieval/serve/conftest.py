@@ -83,13 +83,6 @@ def serving(
 
 
 @pytest.fixture(scope="session")
-def sides(shared) -> tuple[pathlib.Path, pathlib.Path]:
-    """The town's database and queries."""
-    images = shared / "town" / "images" / "test"
-    return images / "database", images / "queries"
-
-
-@pytest.fixture(scope="session")
 def folder(shared, params, sides, tmp_path_factory) -> pathlib.Path:
     out = tmp_path_factory.mktemp("serve") / "town.map"
     weights = shared / "weights.safetensors"
