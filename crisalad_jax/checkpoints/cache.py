@@ -122,7 +122,7 @@ def _addresses(model: Published) -> list[str]:
     """Return where to look for the file: the mirror, if there is one, and its published address.
 
     Raises:
-        InputError: there is no place to look.
+        InputError: downloads are disabled.
     """
     if is_offline():
         raise InputError(

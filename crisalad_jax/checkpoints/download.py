@@ -31,7 +31,7 @@ _PAUSE = 1.0
 
 
 class MissingFileError(InputError):
-    """There is no file at an address."""
+    """No file exists at an address."""
 
 
 class _PassingFault(Exception):
@@ -58,7 +58,7 @@ def download(url: str, target: pathlib.Path, *, label: str, quiet: bool = False)
         quiet: no progress bar.
 
     Raises:
-        MissingFileError: there is no such file.
+        MissingFileError: the file does not exist.
         InputError: the server refuses, stalls or fails in every attempt, or sends a page of HTML;
             or the disk is full. Only then the unfinished file does not stay.
 
@@ -82,7 +82,7 @@ def download(url: str, target: pathlib.Path, *, label: str, quiet: bool = False)
             if failures >= _ATTEMPTS:
                 raise InputError(
                     f"{url}: {fault}, expected the whole file (attempts: {failures}; the same "
-                    "command goes on from there)"
+                    "command resumes)"
                 ) from fault
             time.sleep(_PAUSE * 2 ** (failures - 1))
     with wrap_os_errors(target):

@@ -118,7 +118,7 @@ def load_program(
 
 
 def convert_to_openvino(program: pathlib.Path, out: pathlib.Path) -> None:
-    """Convert an ONNX program to OpenVINO's two files, `out` and the weights beside it (.bin)."""
+    """Convert an ONNX program to OpenVINO's two files, `out` and its weights (.bin)."""
     openvino = import_openvino()
     model = openvino.Core().read_model(program)
     # By default the weights lose half of their bits.

@@ -146,7 +146,7 @@ def _backbone(text: str) -> BackboneNames:
 
 
 def _classifier(layers: Mapping[str, tuple[int, int]]) -> Rows:
-    """Return the rows of torchvision's classifier; 0 stands for the width of features."""
+    """Return the rows of torchvision's classifier; 0 means the width of features."""
 
     def blank(shape: tuple[int, ...], config: ModelConfig) -> np.ndarray:
         return np.zeros([size or config.backbone.dim for size in shape], np.float32)

@@ -157,7 +157,7 @@ def read_tables(texts: Mapping[str, str]) -> dict[str, Rows]:
 
 
 def read_table(text: str, tables: Mapping[str, Rows]) -> Rows:
-    """Read a table, line by line; "+" stands for all rows of another one."""
+    """Read a table line by line; "+" means all rows of another table."""
     kinds = {**FORMS, **EXTRAS, **ABSENT, **tables}
     rows: list[Row] = []
     for line in filter(None, text.splitlines()):

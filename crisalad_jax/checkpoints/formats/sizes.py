@@ -36,7 +36,7 @@ class Reader(NamedTuple):
     prefix: str = ""
 
     def size(self, name: str, axis: int, default: int | None = None) -> int:
-        """Return the size of an axis, or the default where there is no such name.
+        """Return the size of an axis, or the default if the name does not exist.
 
         Raises:
             InputError: there is neither, or the array has no such axis.
