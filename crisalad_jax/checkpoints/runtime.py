@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from crisalad_jax.checkpoints import safetensors_io
 from crisalad_jax.checkpoints.engines import READS, EngineName, Precision, Program, load_program
+from crisalad_jax.checkpoints.safetensors_io import read_header
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
@@ -359,25 +359,6 @@ def _export(weights: pathlib.Path, settings: Mapping[str, Any], folder: pathlib.
     config = from_plain(type(model.config), plain, source=str(weights))
     how = ExportConfig(settings["grouping"], format=settings["format"])
     write_export(folder, model._replace(config=config), how)
-
-
-def read_header(weights: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read what a file of weights says of its model, without its arrays.
-
-    Its bytes are not compared with its checksum: the export is, and it was made of bytes that were.
-
-    Args:
-        weights: the file.
-
-    Returns:
-        The metadata, with "model_sha256" and "config", a `ModelConfig` as JSON values.
-
-    Raises:
-        InputError: what `load_weights` raises, for a file without such metadata.
-    """
-    return safetensors_io.read_header(
-        weights, safetensors_io.WEIGHTS, safetensors_io.EXPECTED_WEIGHTS
-    )
 
 
 def read_model(source: str | os.PathLike[str]) -> "ModelConfig":

@@ -185,7 +185,7 @@ def load_model(weights: pathlib.Path, flags: SizeFlags, *, quiet: bool = False) 
     """
     from crisalad_jax.checkpoints.weights import load_weights
 
-    model = load_weights(weights, quiet=quiet)
+    model = load_weights(find_weights(weights, quiet=quiet))
     return model._replace(config=flags.applied_to(model.config))
 
 

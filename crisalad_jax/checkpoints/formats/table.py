@@ -60,7 +60,7 @@ def check_holds(config: ModelConfig, name: str) -> ModelConfig:
         InputError: what `table` raises; or a setting that no shape tells and that differs from the
             published one, which reading would take for it.
     """
-    state = _theirs(_blank(config), table(config, name), config, {})
+    state = _blank_state(config, name)
     if name in (REFERENCE, VOCABULARY):  # which have the configuration, or no model
         return config
     read_back = FORMATS[name].infer(state)
@@ -95,8 +95,11 @@ def public_shapes(config: ModelConfig, name: str) -> dict[str, tuple[int, ...]]:
     Raises:
         InputError: what `table` raises.
     """
-    state = _theirs(_blank(config), table(config, name), config, {})
-    return {theirs: array.shape for theirs, array in state.items()}
+    return {theirs: array.shape for theirs, array in _blank_state(config, name).items()}
+
+
+def _blank_state(config: ModelConfig, name: str) -> dict[str, np.ndarray]:
+    return _theirs(_blank(config), table(config, name), config, {})
 
 
 def to_params(

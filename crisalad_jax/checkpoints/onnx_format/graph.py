@@ -91,13 +91,11 @@ class Graph:
         """Return the name of a constant vector of int64, as nodes take sides and axes."""
         return self.constant(np.array(numbers, np.int64))
 
-    def node(
-        self, operator: str, inputs: Sequence[str], outputs: int = 1, **attributes: Any
-    ) -> list[str]:
-        """Append a node, and return its outputs' names."""
-        names = [f"{operator}_{len(self.nodes)}{f'_{i}' if i else ''}" for i in range(outputs)]
-        self.nodes.append(helper.make_node(operator, inputs, names, name=names[0], **attributes))
-        return names
+    def node(self, operator: str, inputs: Sequence[str], **attributes: Any) -> str:
+        """Append a node of one output, and return its name."""
+        name = f"{operator}_{len(self.nodes)}"
+        self.nodes.append(helper.make_node(operator, inputs, [name], name=name, **attributes))
+        return name
 
     def add(
         self,
@@ -109,8 +107,7 @@ class Graph:
     ) -> Value:
         """Append a node of one output, and return it."""
         names = [each if isinstance(each, str) else self.name(each) for each in inputs]
-        (name,) = self.node(operator, names, **attributes)
-        return Value(tuple(shape), np.dtype(dtype), name)
+        return Value(tuple(shape), np.dtype(dtype), self.node(operator, names, **attributes))
 
     def side(self, size: Size) -> str:
         """Return the name of a vector of one int64: a side's number, computed where symbolic."""
@@ -119,14 +116,14 @@ class Graph:
         if size not in self.symbolic:  # a multiple of one that is there
             unit = next(unit for unit in self.symbolic if size // unit * unit == size)
             factor = self.side(size // unit)
-            (self.symbolic[size],) = self.node("Mul", [self.symbolic[unit], factor])
+            self.symbolic[size] = self.node("Mul", [self.symbolic[unit], factor])
         return self.symbolic[size]
 
     def sides(self, shape: Shape) -> str:
         """Return the name of an int64 vector of a shape's numbers."""
         if all(map(is_known, shape)):
             return self.ints(*map(int, shape))
-        return self.node("Concat", [self.side(size) for size in shape], axis=0)[0]
+        return self.node("Concat", [self.side(size) for size in shape], axis=0)
 
     def full(self, value: Value, shape: Shape, axes: Sequence[int] | None = None) -> Value:
         """Broadcast a value to the whole shape of its array, or along some axes."""

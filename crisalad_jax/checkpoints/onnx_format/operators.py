@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -127,8 +128,6 @@ def _broadcast(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
 def _reshape(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     (x,) = inputs
     before, after = eqn.invars[0].aval.shape, eqn.outvars[0].aval.shape
-    if eqn.params.get("dimensions") is not None and eqn.primitive.name == "reshape":
-        raise Unsupported("reshape of permuted axes")
     own = _with_other_ones(x.shape, before, after)
     return [graph.reshape(x, own) if own else graph.reshape(graph.full(x, before), after)]
 
@@ -182,12 +181,12 @@ def _cut(
 @converts("split")
 def _split(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     (x,), axis, sizes = inputs, eqn.params["axis"], eqn.params["sizes"]
-    parts, start = [], 0
-    for size in sizes:
-        lazy = is_one(x.shape[axis])
-        parts.append(x if lazy else graph.slice(x, {axis: (start, start + size, 1)}))
-        start += size
-    return parts
+    if is_one(x.shape[axis]):
+        return [x] * len(sizes)
+    ends = itertools.accumulate(sizes)
+    return [
+        graph.slice(x, {axis: (end - size, end, 1)}) for size, end in zip(sizes, ends, strict=True)
+    ]
 
 
 @converts("concatenate")
@@ -247,11 +246,12 @@ def _side(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
 
 @converts("gather")
 def _gather(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    """Convert a gather of one slice at a known place, as an index of `x[:, 0]` makes it."""
     x, places = inputs
     whole, shape = eqn.invars[0].aval.shape, eqn.invars[1].aval.shape
     how, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
     if how.operand_batching_dims or places.constant is None or len(shape) > 1:
-        return [_take(graph, x, places, eqn)]
+        raise Unsupported("gather at several places, or at computed ones")
     numbers = np.broadcast_to(places.constant, shape)
     starts, ends = [0] * len(whole), list(sizes)
     for axis, number in zip(how.start_index_map, numbers.tolist(), strict=True):
@@ -263,82 +263,39 @@ def _gather(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     return [graph.reshape(part, tuple(part.shape[axis] for axis in kept))]
 
 
-def _take(graph: Graph, x: Value, places: Value, eqn: Any) -> Value:
-    """Convert a gather that takes whole slices of one axis."""
-    whole, shape = eqn.invars[0].aval.shape, eqn.invars[1].aval.shape
-    how, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
-    axes = how.start_index_map
-    others = [size for axis, size in enumerate(sizes) if axis not in axes]
-    fits = (
-        len(axes) == 1
-        and how.collapsed_slice_dims == axes
-        and not how.operand_batching_dims
-        and others == [size for axis, size in enumerate(whole) if axis not in axes]
-        and is_known(whole[axes[0]])
-    )
-    if not fits:
-        raise Unsupported("gather at places that are computed, of several axes")
-    (axis,) = axes
-    x, places = graph.full(x, whole, [axis]), graph.full(places, shape)
-    indices = graph.reshape(places, shape[:-1])
-    # A place beyond the ends is the end's, as JAX's programs of indices have it.
-    least, most = (Value.of(np.array(each, indices.dtype)) for each in (0, whole[axis] - 1))
-    if indices.constant is not None:
-        indices = Value.of(np.clip(indices.constant, 0, whole[axis] - 1))
-    else:
-        indices = graph.add("Max", [indices, least], indices.shape, indices.dtype)
-        indices = graph.add("Min", [indices, most], indices.shape, indices.dtype)
-    taken_shape = (*x.shape[:axis], *indices.shape, *x.shape[axis + 1 :])
-    taken = graph.add("Gather", [x, indices], taken_shape, x.dtype, axis=axis)
-    # There the places' axes stand where the axis was; JAX says where the others go.
-    count, rank = len(indices.shape), len(taken_shape)
-    of_places = iter(range(axis, axis + count))
-    of_others = iter([each for each in range(rank) if not axis <= each < axis + count])
-    order = [next(of_others if each in how.offset_dims else of_places) for each in range(rank)]
-    return graph.transpose(taken, order)
-
-
 # Reductions of axes, and of windows of images.
 
 
-_BY_ATTRIBUTE = {"reduce_max": "ReduceMax", "reduce_min": "ReduceMin", "reduce_prod": "ReduceProd"}
+_REDUCTIONS = {
+    "reduce_and": "ReduceMin",
+    "reduce_max": "ReduceMax",
+    "reduce_min": "ReduceMin",
+    "reduce_or": "ReduceMax",
+    "reduce_prod": "ReduceProd",
+    "reduce_sum": "ReduceSum",
+}
 
 
-def _whole(graph: Graph, inputs: Sequence[Value], eqn: Any, axes: Sequence[int]) -> Value:
-    return graph.full(inputs[0], eqn.invars[0].aval.shape, axes)
-
-
-@converts("reduce_sum")
-def _sum(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
-    axes = eqn.params["axes"]
-    x = _whole(graph, inputs, eqn, axes)
-    shape = tuple(size for axis, size in enumerate(x.shape) if axis not in axes)
-    return [graph.add("ReduceSum", [x, graph.ints(*axes)], shape, x.dtype, keepdims=0)]
-
-
-def _extreme(graph: Graph, x: Value, name: str, axes: Sequence[int]) -> Value:
-    shape = tuple(size for axis, size in enumerate(x.shape) if axis not in axes)
-    # Repeated rows have their own extremes.
-    return graph.add(_BY_ATTRIBUTE[name], [x], shape, x.dtype, axes=list(axes), keepdims=0)
-
-
-@converts(*_BY_ATTRIBUTE)
+@converts(*_REDUCTIONS)
 def _reduce(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
-    axes = eqn.params["axes"]
-    return [_extreme(graph, _whole(graph, inputs, eqn, axes), eqn.primitive.name, axes)]
-
-
-@converts("reduce_and", "reduce_or")
-def _logic(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
-    name = {"reduce_and": "reduce_min", "reduce_or": "reduce_max"}[eqn.primitive.name]
-    x = graph.cast(inputs[0], np.float32)  # which TensorRT takes, unlike whole numbers
-    return [graph.cast(_extreme(graph, x, name, eqn.params["axes"]), np.bool_)]
+    (x,), axes = inputs, eqn.params["axes"]
+    if x.dtype == np.bool_:  # repeated rows have their own extremes
+        x = graph.cast(x, np.float32)  # which TensorRT takes, unlike whole numbers
+    else:
+        x = graph.full(x, eqn.invars[0].aval.shape, axes)
+    name = _REDUCTIONS[eqn.primitive.name]
+    shape = tuple(size for axis, size in enumerate(x.shape) if axis not in axes)
+    # The sum alone has its axes as an input, since version 13.
+    is_sum = name == "ReduceSum"
+    given, fields = ([x, graph.ints(*axes)], {}) if is_sum else ([x], {"axes": list(axes)})
+    reduced = graph.add(name, given, shape, x.dtype, keepdims=0, **fields)
+    return [graph.cast(reduced, eqn.outvars[0].aval.dtype)]
 
 
 @converts("argmax")
 def _place(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     (axis,) = eqn.params["axes"]
-    x = _whole(graph, inputs, eqn, [axis])
+    x = graph.full(inputs[0], eqn.invars[0].aval.shape, [axis])
     shape = (*x.shape[:axis], *x.shape[axis + 1 :])
     place = graph.add("ArgMax", [x], shape, np.int64, axis=axis, keepdims=0)
     return [graph.cast(place, eqn.params["index_dtype"])]
@@ -353,7 +310,7 @@ def _largest_of_windows(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list
     if len(others) != 2 or any(map(any, (padding[axis] for axis in others))) or set(dilated) != {1}:
         raise Unsupported("reduce_window_max of other axes than those of an image")
     strides = eqn.params["window_strides"]
-    x = _whole(graph, inputs, eqn, range(len(window)))
+    x = graph.full(inputs[0], eqn.invars[0].aval.shape)
     order = [*others, *axes]
     result = eqn.outvars[0].aval.shape
     pooled = graph.add(
