@@ -76,8 +76,8 @@ def _make(model: Published, *, quiet: bool) -> None:
     What was downloaded just now is removed if it is not the model.
     """
     published = _folder(model) / model.file
-    needs_none = published.suffix in (MATLAB_SUFFIX, ".safetensors")
-    if not needs_none and importlib.util.find_spec("torch") is None:
+    is_torch = published.suffix not in (MATLAB_SUFFIX, ".safetensors")
+    if is_torch and importlib.util.find_spec("torch") is None:
         raise InputError(
             f"found no torch, expected it to read {model.file}: pip install 'crisalad-jax[convert]'"
         )

@@ -93,12 +93,10 @@ class ExportConfig:
     def __post_init__(self) -> None:
         """Check the values."""
         check_types(self)
-        is_lacking = {
-            "stablehlo": self.grouping == "any" or not self.platforms,
-            "onnx": False,
-            "openvino": self.weights_inside,
-        }
-        if is_lacking[self.format]:
+        is_stablehlo = self.format == "stablehlo"
+        if (is_stablehlo and (self.grouping == "any" or not self.platforms)) or (
+            self.format == "openvino" and self.weights_inside
+        ):
             raise InputError(
                 f"format: found {self.format} with grouping {self.grouping}, {len(self.platforms)} "
                 f"platforms and weights inside {self.weights_inside}, expected onnx or openvino "
@@ -434,15 +432,17 @@ def _images(config: ModelConfig, how: ExportConfig) -> dict[str, Any]:
     fixed = dataclasses.replace(chain, size_rule="fixed", round_to_patch=False)
     values = {
         "shape": [how.batch_size or "batch", *size, 3],
-        "dtype": "uint8",
-        "layout": "RGB, rows from the top, not normalised",
         "resize": f"{fixed.in_words(size)}, aspect ratio not kept",
     }
-    if not _takes_bytes(config, how):
-        values["dtype"] = "float32"
-        values["layout"] = "RGB, rows from the top, (pixels / 255 - mean) / deviation"
-        values |= {"mean": list(chain.mean), "deviation": list(chain.deviation)}
-    return values
+    layout = "RGB, rows from the top,"
+    if _takes_bytes(config, how):
+        return values | {"dtype": "uint8", "layout": f"{layout} not normalised"}
+    return values | {
+        "dtype": "float32",
+        "layout": f"{layout} (pixels / 255 - mean) / deviation",
+        "mean": list(chain.mean),
+        "deviation": list(chain.deviation),
+    }
 
 
 def _file(path: pathlib.Path) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import safetensors
@@ -26,14 +26,6 @@ EXPECTED_WEIGHTS = (
     f"a .safetensors file of weights ({WEIGHTS!r}), as this package writes it; `crisalad convert` "
     "reads public checkpoints"
 )
-
-
-class Contents(NamedTuple):
-    """What a file holds."""
-
-    value: Any
-    """The object next to the arrays, without its checksum."""
-    arrays: dict[str, np.ndarray]
 
 
 def write_safetensors(
@@ -145,7 +137,7 @@ def read_header(weights: str | os.PathLike[str]) -> dict[str, Any]:
 
 def read_sealed(
     path: str | os.PathLike[str], form: str, expected: str, *, verify: bool = True
-) -> Contents:
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read a file that `write_sealed` wrote.
 
     Args:
@@ -154,6 +146,9 @@ def read_sealed(
         expected: what kind of file, for messages.
         verify: whether to check that its contents are those that were written.
 
+    Returns:
+        The object next to the arrays, without its checksum, and the arrays by name.
+
     Raises:
         InputError: the file is missing, not whole, changed or of another format.
     """
@@ -161,7 +156,7 @@ def read_sealed(
     value, checksum = _value(path, metadata, form, expected)
     if verify and checksum != _checksum(value, arrays):
         raise ChangedFileError(path)
-    return Contents(value, arrays)
+    return value, arrays
 
 
 def _value(

@@ -178,11 +178,7 @@ def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkp
         is_cached = user_cache() in pathlib.Path(path).parents
         advice = "; remove it, and the same command makes it again" if is_cached else ""
         raise InputError(f"{error}{advice}") from error
-    extras = {
-        name.removeprefix(EXTRA): arrays.pop(name)
-        for name in list(arrays)
-        if name.startswith(EXTRA)
-    }
+    extras = {n.removeprefix(EXTRA): arrays.pop(n) for n in list(arrays) if n.startswith(EXTRA)}
     check_sizes(value.get("config"), arrays.values(), str(path))
     header = from_plain(Header, value, source=f"{path} (metadata)")
     config = header.config

@@ -153,7 +153,7 @@ def test_the_first_of_what_is_wrong_is_listed(layout: str) -> None:
         f"file.pth: does not fit the format {layout} of width 64 and 2 blocks"
     )
     # The others are `head.weight`, unknown, and the norm, missing.
-    first = f"blocks.9.x unknown; blocks.10.x unknown; {token} found (1, 64), expected (1, 1, 64)"
+    first = f"blocks.10.x unknown; blocks.9.x unknown; {token} found (1, 64), expected (1, 1, 64)"
     assert message.endswith(f": {first}; and 2 more")
     assert "\n" not in message
 

@@ -3,7 +3,6 @@
 import dataclasses
 import re
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import numpy as np
@@ -126,7 +125,7 @@ def to_params(
     if problems:
         raise InputError(
             f"{source}: does not fit the format {name} of width {config.backbone.dim} and "
-            f"{config.backbone.depth} blocks: {few(sorted(problems, key=_natural))}"
+            f"{config.backbone.depth} blocks: {few(sorted(problems))}"
         )
     ours, read = {}, {}
     for row in lines:
@@ -175,29 +174,24 @@ def _numbered(leaves: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Split stacks of blocks into single blocks, with numbered names."""
     single: dict[str, np.ndarray] = {}
     for name, leaf in leaves.items():
-        if _STACK.match(name):
-            single |= {_name_of_block(name, i): block for i, block in enumerate(leaf)}
+        if start := _STACK.match(name):
+            rest = name[start.end() :]
+            single |= {f"{start[0]}{i}.{rest}": block for i, block in enumerate(leaf)}
         else:
             single[name] = leaf
     return single
 
 
-def _name_of_block(name: str, number: int) -> str:
-    return _STACK.sub(lambda match: f"{match[0]}{number}.", name)
-
-
 def _from_numbered(ours: State, config: ModelConfig) -> Crisalad:
+    """Undo `_numbered`; empty arrays, such as absent registers, have no line in any table."""
     template = parameter_shapes(config)
     leaves = []
     for name, leaf in named_leaves(template).items():
-        if _STACK.match(name):
-            leaves.append(np.stack([ours[_name_of_block(name, i)] for i in range(leaf.shape[0])]))
+        if not leaf.size:
+            leaves.append(np.zeros(leaf.shape, leaf.dtype))
+        elif start := _STACK.match(name):
+            rest = name[start.end() :]
+            leaves.append(np.stack([ours[f"{start[0]}{i}.{rest}"] for i in range(leaf.shape[0])]))
         else:
-            # Empty arrays, such as absent registers, have no line in any table.
-            leaves.append(ours[name] if leaf.size else np.zeros(leaf.shape, leaf.dtype))
+            leaves.append(ours[name])
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
-
-
-def _natural(text: str) -> list[Any]:
-    """Return a sort key that puts block 10 after block 9."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", text)]

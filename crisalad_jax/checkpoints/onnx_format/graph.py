@@ -98,16 +98,11 @@ class Graph:
         return name
 
     def add(
-        self,
-        operator: str,
-        inputs: Sequence[Value | str],
-        shape: Shape,
-        dtype: Any,
-        **attributes: Any,
+        self, operator: str, inputs: Sequence[Value | str], shape: Shape, dtype: Any, **fields: Any
     ) -> Value:
         """Append a node of one output, and return it."""
         names = [each if isinstance(each, str) else self.name(each) for each in inputs]
-        return Value(tuple(shape), np.dtype(dtype), self.node(operator, names, **attributes))
+        return Value(tuple(shape), np.dtype(dtype), self.node(operator, names, **fields))
 
     def side(self, size: Size) -> str:
         """Return the name of a vector of one int64: a side's number, computed where symbolic."""
@@ -171,20 +166,15 @@ class Graph:
 
     def slice(self, value: Value, ranges: Mapping[int, tuple[int, int, int]]) -> Value:
         """Take some of each axis: start, end and step by axis."""
-        ranges = {
-            axis: (start, end, step)
-            for axis, (start, end, step) in ranges.items()
-            if (start, end, step) != (0, value.shape[axis], 1)
-        }
+        ranges = {axis: cut for axis, cut in ranges.items() if cut != (0, value.shape[axis], 1)}
         if not ranges:
             return value
         if value.constant is not None:
             cuts = [slice(*ranges.get(axis, (None,))) for axis in range(value.constant.ndim)]
             return Value.of(value.constant[tuple(cuts)])
-        shape = [
-            len(range(*ranges[axis])) if axis in ranges else size
-            for axis, size in enumerate(value.shape)
-        ]
+        shape = list(value.shape)
+        for axis, cut in ranges.items():
+            shape[axis] = len(range(*cut))
         starts, ends, steps = zip(*ranges.values(), strict=True)
         vectors = [self.ints(*each) for each in (starts, ends, tuple(ranges), steps)]
         return self.add("Slice", [value, *vectors], tuple(shape), value.dtype)

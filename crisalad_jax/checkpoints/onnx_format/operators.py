@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -81,10 +81,8 @@ def _elementwise(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]
     if all(value.constant is not None for value in inputs):
         arrays = [np.broadcast_to(value.constant, shape) for value in inputs]  # type: ignore
         return [Value.of(eqn.primitive.bind(*map(np.asarray, arrays), **eqn.params))]
-    if name in ("and", "or", "not", "xor") and dtype != np.bool_:
-        raise Unsupported(f"{name} of {dtype}")
-    if name == "select_n" and (inputs[0].dtype != np.bool_ or len(inputs) != 3):
-        raise Unsupported("select_n of more than two cases")
+    if len(inputs) > 3 or (name in ("and", "or", "not", "xor") and dtype != np.bool_):
+        raise Unsupported(f"{name} of {len(inputs)} arrays of {dtype}")
     add = functools.partial(_node, graph, shape)
     if name in _PLAIN:
         value = add(_PLAIN[name], *inputs)
@@ -153,24 +151,15 @@ def _transpose(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
 def _slice(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     starts, ends = eqn.params["start_indices"], eqn.params["limit_indices"]
     steps = eqn.params["strides"] or (1,) * len(starts)
-    return [_cut(graph, inputs[0], eqn.invars[0].aval.shape, starts, ends, steps)]
+    cuts = zip(starts, ends, steps, strict=True)
+    return [_cut(graph, inputs[0], eqn.invars[0].aval.shape, cuts)]
 
 
-def _cut(
-    graph: Graph,
-    x: Value,
-    whole: Shape,
-    starts: Sequence[Any],
-    ends: Sequence[Any],
-    steps: Sequence[int],
-) -> Value:
-    """Take a part of each axis, where the array is not broadcast along it."""
+def _cut(graph: Graph, x: Value, whole: Shape, parts: Iterable[tuple[Any, Any, int]]) -> Value:
+    """Take a part of each axis, from a start to an end, where the array is not broadcast."""
     cuts = {}
-    for axis, cut in enumerate(zip(starts, ends, steps, strict=True)):
-        start, end, step = cut
-        if (is_known(start) and start == 0 and end == whole[axis] and step == 1) or is_one(
-            x.shape[axis]
-        ):
+    for axis, cut in enumerate(parts):
+        if cut == (0, whole[axis], 1) or is_one(x.shape[axis]):
             continue
         if not all(map(is_known, cut)):
             raise Unsupported("slice of some of the images")
@@ -217,10 +206,7 @@ def _pad(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
         raise Unsupported("pad between numbers, or by less than none")
     axes = [axis for axis, sides in enumerate(config) if any(sides)]
     x = graph.full(x, eqn.invars[0].aval.shape, axes)
-    shape = [
-        low + size + high if axis in axes else size
-        for axis, (size, (low, high, _)) in enumerate(zip(x.shape, config, strict=True))
-    ]
+    shape = [low + size + high for size, (low, high, _) in zip(x.shape, config, strict=True)]
     widths = graph.ints(*(low for low, _, _ in config), *(high for _, high, _ in config))
     filling = graph.reshape(filling, ())
     return [graph.add("Pad", [x, widths, filling], tuple(shape), x.dtype)]
@@ -238,12 +224,6 @@ def _iota(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     return [graph.cast(graph.reshape(numbers, own), dtype)]
 
 
-@converts("dim_as_value")
-def _side(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
-    number = graph.add("Squeeze", [graph.side(eqn.params["dim"])], (), np.int64)
-    return [graph.cast(number, eqn.outvars[0].aval.dtype)]
-
-
 @converts("gather")
 def _gather(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     """Convert a gather of one slice at a known place, as an index of `x[:, 0]` makes it."""
@@ -253,12 +233,12 @@ def _gather(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     if how.operand_batching_dims or places.constant is None or len(shape) > 1:
         raise Unsupported("gather at several places, or at computed ones")
     numbers = np.broadcast_to(places.constant, shape)
-    starts, ends = [0] * len(whole), list(sizes)
+    parts = [(0, size, 1) for size in sizes]
     for axis, number in zip(how.start_index_map, numbers.tolist(), strict=True):
         if sizes[axis] != whole[axis]:
-            starts[axis] = min(max(number, 0), whole[axis] - sizes[axis])
-            ends[axis] = starts[axis] + sizes[axis]
-    part = _cut(graph, x, whole, starts, ends, [1] * len(whole))
+            start = min(max(number, 0), whole[axis] - sizes[axis])
+            parts[axis] = (start, start + sizes[axis], 1)
+    part = _cut(graph, x, whole, parts)
     kept = [axis for axis in range(len(whole)) if axis not in how.collapsed_slice_dims]
     return [graph.reshape(part, tuple(part.shape[axis] for axis in kept))]
 
@@ -331,25 +311,17 @@ def _largest_of_windows(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list
 @converts("dot_general")
 def _product(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     (summed_a, summed_b), (batch_a, batch_b) = eqn.params["dimension_numbers"]
-    shapes = [var.aval.shape for var in eqn.invars]
-    free_a, free_b = (
-        [axis for axis in range(len(shape)) if axis not in (*summed, *batch)]
-        for shape, summed, batch in zip(
-            shapes, (summed_a, summed_b), (batch_a, batch_b), strict=True
-        )
-    )
+    (shape_a, shape_b), dtype = (var.aval.shape for var in eqn.invars), eqn.outvars[0].aval.dtype
+    free_a = [axis for axis in range(len(shape_a)) if axis not in (*summed_a, *batch_a)]
+    free_b = [axis for axis in range(len(shape_b)) if axis not in (*summed_b, *batch_b)]
     # MatMul broadcasts the batch; all other axes are needed as they are.
-    a, b = (
-        graph.full(x, shape, [axis for axis in range(len(shape)) if axis not in batch])
-        for x, shape, batch in zip(inputs, shapes, (batch_a, batch_b), strict=True)
-    )
-    dtype = eqn.outvars[0].aval.dtype
-    a, b = graph.cast(a, dtype), graph.cast(b, dtype)
+    a = graph.cast(graph.full(inputs[0], shape_a, [*free_a, *summed_a]), dtype)
+    b = graph.cast(graph.full(inputs[1], shape_b, [*free_b, *summed_b]), dtype)
     a = graph.transpose(a, [*batch_a, *free_a, *summed_a])
     b = graph.transpose(b, [*batch_b, *summed_b, *free_b])
     count = len(batch_a)
-    rows, columns = ([shapes[i][axis] for axis in free] for i, free in ((0, free_a), (1, free_b)))
-    sums = [shapes[0][axis] for axis in summed_a]
+    rows, columns = [shape_a[axis] for axis in free_a], [shape_b[axis] for axis in free_b]
+    sums = [shape_a[axis] for axis in summed_a]
     a_batch, b_batch = a.shape[:count], b.shape[:count]
     # Rows in several axes stay so where one matrix is common to all of them.
     if count or len(columns) != 1 or not rows:
