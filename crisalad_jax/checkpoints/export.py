@@ -117,26 +117,16 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
     check_params(params, config)
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(params))
     if how.weights_inside and size >= _LARGEST:
-        raise InputError(
-            f"weights inside: found {size / 2**30:.1f} GiB of parameters, expected less than "
-            f"{_LARGEST / 2**30:g} GiB, all that a program can hold; leave them beside it"
-        )
+        found = f"{size / 2**30:.1f} GiB of parameters"
+        raise InputError(f"weights inside: found {found}, expected less than 2 GiB")
     sinkhorn = getattr(config.aggregator, "sinkhorn", None)
     if sinkhorn is not None and sinkhorn.throw:
-        raise InputError(
-            "SinkhornConfig.throw: found True, expected False: an exported program cannot "
-            "stop with an error"
-        )
-    if how.pixels == "floats" and config.preprocessing.normalisation != "mean-deviation":
-        raise InputError(
-            f"pixels: found floats for a model whose normalisation is "
-            f"{config.preprocessing.normalisation}, expected bytes, which the program normalises"
-        )
-    if how.format != "stablehlo" and config.compute_dtype != "float32":
-        raise InputError(
-            f"compute dtype: found {config.compute_dtype} with format {how.format}, expected "
-            "float32: an engine chooses its own (docs/export.md)"
-        )
+        raise InputError("SinkhornConfig.throw: found True, expected False in a program")
+    normalisation, dtype = config.preprocessing.normalisation, config.compute_dtype
+    if how.pixels == "floats" and normalisation != "mean-deviation":
+        raise InputError(f"pixels: found floats with normalisation {normalisation}, expected bytes")
+    if how.format != "stablehlo" and dtype != "float32":
+        raise InputError(f"compute dtype: found {dtype} with {how.format}, expected float32")
 
 
 def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> export.Exported:

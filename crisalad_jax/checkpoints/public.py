@@ -202,9 +202,7 @@ def write_checkpoint(
     form = choose("format", format, FORMATS)
     wanted = SUFFIXES[form.stored]
     if path.suffix not in wanted:
-        raise InputError(
-            f"{path}: found suffix {path.suffix!r}, expected {' or '.join(wanted)} for {format}"
-        )
+        raise InputError(f"{path}: found suffix {path.suffix!r}, expected {' or '.join(wanted)}")
     shown = check_holds(config, format)
     is_shown = format != REFERENCE and with_non_semantic_fields_of(config, shown) == shown
     declared = {

@@ -122,9 +122,8 @@ class Runtime:
         expected = (*self.input_size, 3)
         if images.shape[1:] != expected or images.dtype != self.preparation.dtype:
             raise InputError(
-                f"images: found {images.dtype} {images.shape}, expected "
-                f"{np.dtype(self.preparation.dtype)} (image, {', '.join(map(str, expected))}) for "
-                f"{self.folder}"
+                f"{self.folder}: found images of {images.dtype} {images.shape}, expected "
+                f"{np.dtype(self.preparation.dtype)} (image, *{expected})"
             )
         size = self.fixed_batch
         if size is None:
@@ -198,15 +197,12 @@ def open_runtime(
         path = _exported(path, engine, changes, any_grouping)
     manifest = read_json(path / MANIFEST, _EXPECTED)
     if manifest.get("format") != FORMAT:
-        raise InputError(
-            f"{path / MANIFEST}: found format {manifest.get('format')!r}, expected {FORMAT!r}: "
-            f"{_EXPECTED}"
-        )
+        found = manifest.get("format")
+        raise InputError(f"{path / MANIFEST}: found format {found!r}, expected {FORMAT!r}")
     if manifest["program_format"] not in READS[engine]:
         raise InputError(
             f"{path}: found a program of format {manifest['program_format']}, expected "
-            f"{' or '.join(READS[engine])} for {engine}: `crisalad export --format "
-            f"{READS[engine][0]}`"
+            f"{' or '.join(READS[engine])} for {engine} (`crisalad export --format`)"
         )
     model = manifest["model"] | {"compute_dtype": "float32"} | changes
     preparation = _preparation(path, manifest, model)
@@ -265,10 +261,7 @@ def _words(size: Sequence[int], dtype: object, chain: PreprocessingConfig) -> st
 def _check_fixed(source: pathlib.Path, rule: str) -> None:
     """Check that images have one size, as a program takes them."""
     if rule != "fixed":
-        raise InputError(
-            f"{source}: found images of size rule {rule}, expected fixed: a program takes one size "
-            "(--resize fixed)"
-        )
+        raise InputError(f"{source}: found images of size rule {rule}, expected --resize fixed")
 
 
 def _load(

@@ -106,10 +106,7 @@ def _kind(value: Any) -> str:
     if isinstance(value, dict):
         return getattr(value, "stands_for", "nothing")
     if hasattr(value, "shape"):
-        return (
-            f"one tensor by itself, of shape {tuple(value.shape)} (a vocabulary needs its "
-            "backbone: `crisalad convert --backbone`)"
-        )
+        return f"one tensor by itself, of shape {tuple(value.shape)} (see `convert --backbone`)"
     return type(value).__name__
 
 
@@ -149,10 +146,7 @@ def _load(path: pathlib.Path) -> Any:
             # Torch's message is a page of advice on how to run the code anyway: shorten it.
             refused = re.search(r"(?:GLOBAL|Unsupported \w+) ([a-zA-Z_][\w.]*)", str(error))
             what = f"asks for {refused[1]}" if refused else "is no plain pickle of tensors"
-            problem = (
-                f"refused: it {what}, expected nothing but tensors (loading anything else could "
-                f"run code): {HOW}"
-            )
+            problem = f"refused: it {what}, expected nothing but tensors, which run no code: {HOW}"
         raise InputError(f"{path}: {problem}") from error
 
 

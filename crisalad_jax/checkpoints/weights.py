@@ -204,8 +204,6 @@ def with_metadata(
     Raises:
         InputError: it is a vocabulary of another backbone.
     """
-    if not metadata:
-        return params
     own = config.aggregator.with_metadata(params.aggregator, metadata)
     config.aggregator.check_backbone(own, params.backbone, source)
     return dataclasses.replace(params, aggregator=own)

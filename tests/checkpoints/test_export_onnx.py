@@ -267,12 +267,12 @@ def with_sinkhorn(**fields: Any) -> ModelConfig:
         (
             dataclasses.replace(MODEL, compute_dtype="bfloat16"),
             ExportConfig(format="openvino"),
-            "compute dtype: found bfloat16 with format openvino, expected float32",
+            "compute dtype: found bfloat16 with openvino, expected float32",
         ),
         (
             PRESETS["tiny"],
             ExportConfig(pixels="floats"),
-            "pixels: found floats for a model whose normalisation is local-contrast",
+            "pixels: found floats with normalisation local-contrast",
         ),
     ],
 )

@@ -91,9 +91,7 @@ def _infer_vit(kind: type[_V], theirs: dict[str, str], read: Reader) -> _V:
     hidden = read.size(theirs[f"blocks.0.mlp.{'w3' if gated else 'fc2'}.weight"], 1)
     width = _check_periods(read) if _PERIODS in theirs else _HEAD_WIDTH
     if dim % width:
-        raise InputError(
-            f"found a backbone of width {dim}, expected a multiple of {width}, a head's"
-        )
+        raise InputError(f"found a backbone of width {dim}, expected a multiple of {width}")
     fields: dict[str, Any] = {}
     if "pos_embed_cls" in theirs:
         positions = read.size(theirs["pos_embed_cls"], 1)
@@ -187,8 +185,6 @@ def _infer_transvpr(read: Reader) -> TransVprNetConfig:
 def infer_encoder(state: State) -> CrossImageConfig:
     """Infer the encoder's sizes; the number of heads is the published one."""
     read = Reader(state)
-    layers = read.count("encoder.layers.")
-    if not layers:
-        return CrossImageConfig(layers=0, heads=_ENCODER_HEADS)
-    feedforward = read.size("encoder.layers.0.linear1.weight", 0)
-    return CrossImageConfig(layers, _ENCODER_HEADS, feedforward)
+    first = "encoder.layers.0.linear1.weight"
+    feedforward = read.size(first, 0, CrossImageConfig.feedforward)
+    return CrossImageConfig(read.count("encoder.layers."), _ENCODER_HEADS, feedforward)

@@ -33,10 +33,7 @@ def table(config: ModelConfig, name: str) -> list[Row]:
     rows = list(form.lines(config, names))
     left_out = names.keys() - {ours for row in rows for ours in row.ours}
     if left_out and not form.bare:
-        raise InputError(
-            f"format {name}: found {few(sorted(left_out))}, expected a model without: it has no "
-            "name for that"
-        )
+        raise InputError(f"format {name}: found {few(sorted(left_out))}, expected a model without")
     return rows
 
 

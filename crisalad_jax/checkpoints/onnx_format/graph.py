@@ -141,10 +141,10 @@ class Graph:
             return value
         if value.constant is not None:
             return Value.of(value.constant.reshape(shape))
-        unknown = [size for size in shape if not is_known(size)]
-        if len(unknown) > 1:
-            return self.add("Reshape", [value, self.sides(shape)], shape, value.dtype)
-        numbers = self.ints(*(int(size) if is_known(size) else -1 for size in shape))
+        if sum(not is_known(size) for size in shape) > 1:
+            numbers = self.sides(shape)
+        else:
+            numbers = self.ints(*(int(size) if is_known(size) else -1 for size in shape))
         return self.add("Reshape", [value, numbers], shape, value.dtype)
 
     def transpose(self, value: Value, axes: Sequence[int]) -> Value:
