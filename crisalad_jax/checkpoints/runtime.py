@@ -123,7 +123,7 @@ class Runtime:
         if images.shape[1:] != expected or images.dtype != self.preparation.dtype:
             raise InputError(
                 f"{self.folder}: found images of {images.dtype} {images.shape}, expected "
-                f"{np.dtype(self.preparation.dtype)} (image, *{expected})"
+                f"{np.dtype(self.preparation.dtype)} (image, {', '.join(map(str, expected))})"
             )
         size = self.fixed_batch
         if size is None:
