@@ -415,7 +415,7 @@ DECLARED = json.dumps({"format": "reference", "config": DEEP, "aggregator": {}})
 COUNT = next(name for name in SMALL["cricavpr"] if name.endswith("num_batches_tracked"))
 BAD: dict[str, tuple[Callable[[], Any], str]] = {
     "empty": (lambda: b"", "not a whole torch checkpoint"),
-    "cut": (lambda: whole()[:9999], "not a whole torch checkpoint: RuntimeError"),
+    "cut": (lambda: whole()[:9999], "not a whole torch checkpoint: "),
     "old, cut": (lambda: whole(new=False)[:338], "not a whole torch checkpoint"),
     "text": (lambda: b"no checkpoint", "not a whole torch checkpoint|refused"),
     "a list": (lambda: [1, 2], "found list, expected nothing but tensors by name"),
