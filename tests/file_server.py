@@ -19,7 +19,6 @@ class FileServer:
     modified: str | None = None
     length: int | None = None
     """Length that it says, in place of the file's own."""
-    kind: str = "application/octet-stream"
     statuses: list[int] = dataclasses.field(default_factory=list)
     """Codes of the next answers, in place of the file."""
     cuts: list[int] = dataclasses.field(default_factory=list)
@@ -75,7 +74,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         if start:
             self.send_header("Content-Range", f"bytes {start}-{len(data) - 1}/{length}")
         for name, value in (
-            ("Content-Type", state.kind),
+            ("Content-Type", "application/octet-stream"),
             ("Content-Length", str(length - start)),
             ("ETag", state.etag),
             ("Last-Modified", state.modified),

@@ -76,10 +76,10 @@ def _make(model: Published, *, quiet: bool) -> None:
     What was downloaded just now is removed if it is not the model.
     """
     published = _folder(model) / model.file
-    needs_none = published.suffix in (MATLAB_SUFFIX, ".safetensors")
-    if not needs_none and importlib.util.find_spec("torch") is None:
+    is_torch = published.suffix not in (MATLAB_SUFFIX, ".safetensors")
+    if is_torch and importlib.util.find_spec("torch") is None:
         raise InputError(
-            f"found no torch, expected it to read {model.file}: pip install 'crisalad-jax[convert]'"
+            f"found no torch to read {model.file}: pip install 'crisalad-jax[convert]'"
         )
     if not published.is_file():
         _addresses(model)  # before a folder is made
@@ -125,15 +125,10 @@ def _addresses(model: Published) -> list[str]:
         InputError: downloads are disabled.
     """
     if is_offline():
-        raise InputError(
-            f"found none in the cache {user_cache()}, expected it there: {OFFLINE} forbids the "
-            "network"
-        )
+        raise InputError(f"found none in the cache {user_cache()}: {OFFLINE} forbids the network")
     mirror = os.environ.get(MIRROR)
     if mirror and not mirror.startswith(("http://", "https://", "file://")):
-        raise InputError(
-            f"{MIRROR}: found {mirror!r}, expected https://HOST/PATH or file:///FOLDER"
-        )
+        raise InputError(f"{MIRROR}: found {mirror!r}, expected https://HOST or file:///FOLDER")
     mirrors = [f"{mirror.rstrip('/')}/{urllib.parse.quote(model.file)}"] if mirror else []
     addresses = mirrors + ([] if model.url is None else [model.url])
     if not addresses:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import http.client
-import itertools
 import os
 import pathlib
 import time
@@ -12,16 +11,16 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import is_html, read_json, wrap_os_errors, write_json
+from crisalad_jax.utils.files import read_json, wrap_os_errors, write_json
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.version import VERSION
 
 _CHUNK = 2**18
 _MEGABYTE = 1e6
-_PASSING = (408, 425, 429, 500, 502, 503, 504)
-"""Codes of HTTP after which the same request may succeed."""
-_GONE = (404, 410)
 _PARTIAL, _NO_SUCH_RANGE = 206, 416
+_PASSING = (408, _NO_SUCH_RANGE, 425, 429, 500, 502, 503, 504)
+"""Codes of HTTP after which the same request, or one for the whole file, may succeed."""
+_GONE = (404, 410)
 _TIMEOUT = 30.0
 """Seconds without an answer before a server is given up."""
 _ATTEMPTS = 5
@@ -36,10 +35,6 @@ class MissingFileError(InputError):
 
 class _PassingFault(Exception):
     """A fault after which the same request may succeed."""
-
-
-class _OtherFile(Exception):
-    """What is at an address is not the file whose beginning is here."""
 
 
 def download(url: str, target: pathlib.Path, *, label: str, quiet: bool = False) -> None:
@@ -59,8 +54,8 @@ def download(url: str, target: pathlib.Path, *, label: str, quiet: bool = False)
 
     Raises:
         MissingFileError: the file does not exist.
-        InputError: the server refuses, stalls or fails in every attempt, or sends a page of HTML;
-            or the disk is full. Only then the unfinished file does not stay.
+        InputError: the server refuses, stalls or fails in every attempt; or the disk is full. Only
+            then the unfinished file does not stay.
 
     Example:
         >>> _ = (folder / "there.txt").write_text("all of it")
@@ -75,8 +70,6 @@ def download(url: str, target: pathlib.Path, *, label: str, quiet: bool = False)
         try:
             _fetch(url, part, label, quiet)
             break
-        except _OtherFile:
-            part.discard()
         except _PassingFault as fault:
             failures = 1 if part.size() - before >= _MEGABYTE else failures + 1
             if failures >= _ATTEMPTS:
@@ -133,8 +126,7 @@ def _fetch(url: str, part: _Part, label: str, quiet: bool) -> None:
     """Fetch the file, or what is missing after its beginning.
 
     Raises:
-        _PassingFault: it did not all arrive.
-        _OtherFile: the server has another file than the one that was begun.
+        _PassingFault: it did not all arrive, or is not the file that was begun.
         InputError: what `download` raises.
     """
     begun = part.begun(url)
@@ -144,20 +136,17 @@ def _fetch(url: str, part: _Part, label: str, quiet: bool) -> None:
     headers = {"User-Agent": f"crisalad-jax/{VERSION}", "Accept-Encoding": "identity"}
     if begun:
         headers |= {"Range": f"bytes={start}-", "If-Range": str(begun.validator)}
-    with _open(url, headers) as response:
-        if begun and response.status == _PARTIAL:
-            _check_continues(response.headers, begun, start)
-            remote = begun
-        else:  # the whole file, whether or not its beginning is here
-            start, remote = 0, _remote(url, response.headers)
-        chunks = _chunks(response)
-        first = next(chunks, b"")
-        is_page = response.headers.get_content_type() == "text/html" or is_html(first)
-        if start == 0 and is_page:
-            raise InputError(
-                f"{url}: found a page of HTML, expected the file {part.target.name} (some hosts "
-                "send one after too many downloads, or where a file was removed)"
-            )
+    with _open(url, headers, part) as response:
+        remote, span = _remote(url, response.headers), response.headers.get("Content-Range", "")
+        if not begun or response.status != _PARTIAL:
+            start = 0  # the whole file, whether or not its beginning is here
+        # An answer to `If-Range` need not repeat the time of change.
+        elif not span.startswith(f"bytes {start}-") or remote not in (
+            begun,
+            dataclasses.replace(begun, validator=None),
+        ):
+            part.discard()
+            raise _PassingFault("found another file than the one that was begun")
         whole, done = (remote.length or 0) / _MEGABYTE, start / _MEGABYTE
         try:
             with wrap_os_errors(part.target):
@@ -167,7 +156,7 @@ def _fetch(url: str, part: _Part, label: str, quiet: bool) -> None:
                     part.path.open("ab") as file,
                     progress_bar(label, whole, "MB", quiet=quiet, done=done) as bar,
                 ):
-                    for chunk in itertools.chain((first,), chunks):
+                    for chunk in _chunks(response):
                         file.write(chunk)
                         file.flush()  # what has arrived outlives a kill
                         bar.advance(len(chunk) / _MEGABYTE)
@@ -182,31 +171,18 @@ def _fetch(url: str, part: _Part, label: str, quiet: bool) -> None:
 
 
 def _remote(url: str, headers: Mapping[str, str]) -> _Remote:
-    """Read what a server says of the whole file."""
-    length, etag = headers.get("Content-Length", ""), headers.get("ETag", "W/")
+    """Read what a server says of the whole file, in an answer with all or a part of it."""
+    length = headers.get("Content-Range", headers.get("Content-Length", "")).rpartition("/")[2]
+    etag = headers.get("ETag", "W/")
     validator = headers.get("Last-Modified") if etag.startswith("W/") else etag
     return _Remote(url, int(length) if length.isdecimal() else None, validator)
 
 
-def _check_continues(headers: Mapping[str, str], begun: _Remote, start: int) -> None:
-    """Check that a partial answer resumes the file that was begun.
-
-    Raises:
-        _OtherFile: it does not.
-    """
-    span = headers.get("Content-Range", "")
-    same = span.startswith(f"bytes {start}-") and span.endswith(f"/{begun.length}")
-    # An answer to `If-Range` need not repeat the time of change.
-    if not same or _remote(begun.url, headers).validator not in (None, begun.validator):
-        raise _OtherFile
-
-
-def _open(url: str, headers: dict[str, str]) -> Any:
+def _open(url: str, headers: dict[str, str], part: _Part) -> Any:
     """Open an address, and sort what may go wrong there.
 
     Raises:
-        _PassingFault: the same request may succeed.
-        _OtherFile: the file is shorter than its beginning here.
+        _PassingFault: the same request may succeed, or one for the whole file.
         InputError: it will not succeed.
     """
     # A new opener reads the environment's proxies of today.
@@ -216,10 +192,10 @@ def _open(url: str, headers: dict[str, str]) -> Any:
     except urllib.error.HTTPError as error:
         error.close()
         said = f"HTTP {error.code} {error.reason}"
+        if error.code == _NO_SUCH_RANGE:  # the file is shorter than its beginning here
+            part.discard()
         if error.code in _PASSING:
             raise _PassingFault(f"found {said}") from error
-        if error.code == _NO_SUCH_RANGE and "Range" in headers:
-            raise _OtherFile from error
         kind = MissingFileError if error.code in _GONE else InputError
         raise kind(f"{url}: found {said}, expected the file") from error
     except (OSError, http.client.HTTPException) as error:

@@ -8,7 +8,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.checks import choose
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 
@@ -38,10 +37,7 @@ FORMATS: Mapping[str, ProgramFormat] = {
         "openvino", (".xml", ".bin"), "openvino.Core().compile_model({file!r}, 'CPU')(images)"
     ),
 }
-READS: Mapping[str, tuple[str, ...]] = {
-    "onnxruntime": ("onnx",),
-    "openvino": ("openvino", "onnx"),
-}
+READS: Mapping[str, tuple[str, ...]] = {"onnxruntime": ("onnx",), "openvino": ("openvino", "onnx")}
 """Formats that an engine reads, its own first."""
 _TOOLS = "openvino.tools.ovc"
 _CAPABILITIES = "OPTIMIZATION_CAPABILITIES"
@@ -51,9 +47,7 @@ def _onnxruntime(path: pathlib.Path, precision: Precision) -> Program:
     import onnxruntime
 
     if precision != "float32":
-        raise InputError(
-            f"compute dtype: found {precision} with onnxruntime, expected float32 (or openvino)"
-        )
+        raise InputError(f"compute dtype: found {precision} with onnxruntime, expected float32")
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
@@ -84,12 +78,6 @@ def _openvino(path: pathlib.Path, precision: Precision) -> Program:
     return lambda *inputs: np.array(compiled(list(inputs))[0])
 
 
-_ENGINES: Mapping[str, Callable[[pathlib.Path, Precision], Program]] = {
-    "onnxruntime": _onnxruntime,
-    "openvino": _openvino,
-}
-
-
 def load_program(
     engine: EngineName, path: pathlib.Path, precision: Precision = "float32"
 ) -> Program:
@@ -104,10 +92,10 @@ def load_program(
         A function of the program's inputs.
 
     Raises:
-        InputError: the engine is unknown, or cannot read the file.
+        InputError: the engine cannot read the file.
         ModuleNotFoundError: it is not installed.
     """
-    load = choose("runtime", engine, _ENGINES)
+    load = {"onnxruntime": _onnxruntime, "openvino": _openvino}[engine]
     try:
         return load(path, precision)
     except (ModuleNotFoundError, InputError):

@@ -93,12 +93,10 @@ class ExportConfig:
     def __post_init__(self) -> None:
         """Check the values."""
         check_types(self)
-        is_lacking = {
-            "stablehlo": self.grouping == "any" or not self.platforms,
-            "onnx": False,
-            "openvino": self.weights_inside,
-        }
-        if is_lacking[self.format]:
+        is_stablehlo = self.format == "stablehlo"
+        if (is_stablehlo and (self.grouping == "any" or not self.platforms)) or (
+            self.format == "openvino" and self.weights_inside
+        ):
             raise InputError(
                 f"format: found {self.format} with grouping {self.grouping}, {len(self.platforms)} "
                 f"platforms and weights inside {self.weights_inside}, expected onnx or openvino "
@@ -119,26 +117,16 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
     check_params(params, config)
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(params))
     if how.weights_inside and size >= _LARGEST:
-        raise InputError(
-            f"weights inside: found {size / 2**30:.1f} GiB of parameters, expected less than "
-            f"{_LARGEST / 2**30:g} GiB, all that a program can hold; leave them beside it"
-        )
+        found = f"{size / 2**30:.1f} GiB of parameters"
+        raise InputError(f"weights inside: found {found}, expected less than 2 GiB")
     sinkhorn = getattr(config.aggregator, "sinkhorn", None)
     if sinkhorn is not None and sinkhorn.throw:
-        raise InputError(
-            "SinkhornConfig.throw: found True, expected False: an exported program cannot "
-            "stop with an error"
-        )
-    if how.pixels == "floats" and config.preprocessing.normalisation != "mean-deviation":
-        raise InputError(
-            f"pixels: found floats for a model whose normalisation is "
-            f"{config.preprocessing.normalisation}, expected bytes, which the program normalises"
-        )
-    if how.format != "stablehlo" and config.compute_dtype != "float32":
-        raise InputError(
-            f"compute dtype: found {config.compute_dtype} with format {how.format}, expected "
-            "float32: an engine chooses its own (docs/export.md)"
-        )
+        raise InputError("SinkhornConfig.throw: found True, expected False in a program")
+    normalisation, dtype = config.preprocessing.normalisation, config.compute_dtype
+    if how.pixels == "floats" and normalisation != "mean-deviation":
+        raise InputError(f"pixels: found floats with normalisation {normalisation}, expected bytes")
+    if how.format != "stablehlo" and dtype != "float32":
+        raise InputError(f"compute dtype: found {dtype} with {how.format}, expected float32")
 
 
 def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> export.Exported:
@@ -434,15 +422,17 @@ def _images(config: ModelConfig, how: ExportConfig) -> dict[str, Any]:
     fixed = dataclasses.replace(chain, size_rule="fixed", round_to_patch=False)
     values = {
         "shape": [how.batch_size or "batch", *size, 3],
-        "dtype": "uint8",
-        "layout": "RGB, rows from the top, not normalised",
         "resize": f"{fixed.in_words(size)}, aspect ratio not kept",
     }
-    if not _takes_bytes(config, how):
-        values["dtype"] = "float32"
-        values["layout"] = "RGB, rows from the top, (pixels / 255 - mean) / deviation"
-        values |= {"mean": list(chain.mean), "deviation": list(chain.deviation)}
-    return values
+    layout = "RGB, rows from the top,"
+    if _takes_bytes(config, how):
+        return values | {"dtype": "uint8", "layout": f"{layout} not normalised"}
+    return values | {
+        "dtype": "float32",
+        "layout": f"{layout} (pixels / 255 - mean) / deviation",
+        "mean": list(chain.mean),
+        "deviation": list(chain.deviation),
+    }
 
 
 def _file(path: pathlib.Path) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 import os
 import pathlib
-import re
 from typing import TYPE_CHECKING
 
 from crisalad_jax.checkpoints import starter
@@ -73,7 +72,11 @@ def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False)
         crisalad_jax.utils.errors.InputError: megalok: found no such file, ...; nearest: megaloc...
     """
     if weights is None:
-        starter.tell_taken()
+        warn(
+            f"no --weights: taking {starter.NAME}, the small model in this package, trained on "
+            f"rendered pictures alone (docs/{starter.NAME}.md); for the best recall: --weights "
+            f"{starter.BEST}"
+        )
         return starter.FILE
     path = pathlib.Path(weights)
     name = os.fspath(weights)
@@ -96,10 +99,9 @@ def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False)
             warn(f"{each.name}: {each.licence.words} ({each.repository})")
         return cached_weights(model, quiet=quiet)
     near = nearest_names(path.stem)
-    is_name = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", name) is not None
-    # A file that looks like a published model's: MegaLoc.pth.
-    is_like_one = path.parent == pathlib.Path() and bool(near)
-    if (is_name or is_like_one) and not os.path.lexists(path):
+    # A name, or a file that looks like a published model's: MegaLoc.pth.
+    is_name = path.parent == pathlib.Path() and (not path.suffix or bool(near))
+    if is_name and not os.path.lexists(path):
         raise InputError(
             f"{name}: found no such file, and no published model of this name, expected one of the "
             f"two (`crisalad models` lists them{near})"

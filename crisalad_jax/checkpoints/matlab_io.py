@@ -28,11 +28,7 @@ def read_matlab(path: pathlib.Path) -> Content:
         InputError: the file is cut short, or no such network.
     """
     content = load_mat(
-        path,
-        _EXPECTED,
-        damaged="not a whole MATLAB file",
-        struct_as_record=False,
-        squeeze_me=True,
+        path, _EXPECTED, damaged="not a whole MATLAB file", struct_as_record=False, squeeze_me=True
     )
     try:
         network = content["net"]

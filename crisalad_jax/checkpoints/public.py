@@ -97,11 +97,7 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
         content = Content(state, metadata.get(DECLARED))
     else:
         content = read_torch(path)
-    return _model_of(content, str(path))
-
-
-def _model_of(content: Content, source: str) -> Checkpoint:
-    """Make a model of the arrays of a public checkpoint."""
+    source = str(path)
     if content.declared is None:
         name, config, state = identify(content.state, source=source)
         own: Mapping[str, Any] = {}
@@ -156,10 +152,8 @@ def read_vocabulary(
     base = read_checkpoint(backbone)
     width = base.config.backbone.dim
     if words.ndim != 2 or words.shape[1] != width or not len(words):
-        raise InputError(
-            f"{path}: found a tensor of shape {words.shape}, expected (words, {width}): the "
-            f"backbone's features have {width} numbers"
-        )
+        found = f"found a tensor of shape {words.shape}"
+        raise InputError(f"{path}: {found}, expected (words, {width}), for the backbone's width")
     config = vocabulary_model(len(words), base.config, fields or {})
     aggregator = AnyLoc(jnp.asarray(words))
     aggregator = config.aggregator.attach_backbone_hash(aggregator, base.params.backbone)
@@ -193,11 +187,7 @@ def format_for(config: ModelConfig, target: str | os.PathLike[str]) -> str:
 
 
 def write_checkpoint(
-    path: str | os.PathLike[str],
-    params: Crisalad,
-    config: ModelConfig,
-    format: str,
-    extras: State,
+    path: str | os.PathLike[str], params: Crisalad, config: ModelConfig, format: str, extras: State
 ) -> None:
     """Write a model under public names, as published: nested, prefixed, in the public order.
 
@@ -212,9 +202,7 @@ def write_checkpoint(
     form = choose("format", format, FORMATS)
     wanted = SUFFIXES[form.stored]
     if path.suffix not in wanted:
-        raise InputError(
-            f"{path}: found suffix {path.suffix!r}, expected {' or '.join(wanted)} for {format}"
-        )
+        raise InputError(f"{path}: found suffix {path.suffix!r}, expected {' or '.join(wanted)}")
     shown = check_holds(config, format)
     is_shown = format != REFERENCE and with_non_semantic_fields_of(config, shown) == shown
     declared = {
@@ -279,8 +267,6 @@ def convert(
         >>> load(folder / "public.pth").config == config
         True
     """
-    if format is not None:
-        choose("format", format, FORMATS)
     check_target(target)
     if backbone is None:
         checkpoint = read_checkpoint(source)

@@ -107,8 +107,6 @@ def nearest_names(name: str) -> str:
     # Of a family that is named alone the longest descriptors, which recall the most.
     near.sort(key=lambda each: (each != plain, -PUBLISHED[each].descriptor))
     near += difflib.get_close_matches(plain, [*starter.FILES, *PUBLISHED])
-    # The first part of a name is its family, which is what a user is most likely to know.
-    near += [each for each in PUBLISHED if each.startswith(plain.partition("-")[0])]
     near = list(dict.fromkeys(near))[:3]
     return f"; nearest: {', '.join(near)}" if near else ""
 

@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from crisalad_jax.checkpoints import safetensors_io
 from crisalad_jax.checkpoints.engines import READS, EngineName, Precision, Program, load_program
+from crisalad_jax.checkpoints.safetensors_io import read_header
 from crisalad_jax.config.checks import choose
-from crisalad_jax.config.io import from_plain, to_plain
+from crisalad_jax.config.io import from_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.loader import ImageBatch
 from crisalad_jax.data.prepare import Preparation
-from crisalad_jax.utils.checksums import sha256_of
+from crisalad_jax.utils.checksums import ChangedFileError, sha256_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, user_cache
 from crisalad_jax.utils.locks import lock
@@ -65,35 +65,23 @@ class Runtime:
     """Number of images of every call; None is any."""
     preparation: Preparation
     """How photographs are prepared."""
-    precision: Precision
-    """Type of the matrix products."""
     model: Mapping[str, Any]
-    """The configuration of the model that was exported, as JSON values."""
+    """The configuration, at the size and in the type that this engine computes, as JSON values."""
     _first: Program
     _second: Program | None
+    row_dtype = "float32"
 
     @functools.cached_property
     def config(self) -> "ModelConfig":
         """The model's configuration, at the size and in the type that this engine computes."""
         from crisalad_jax.nn.config import ModelConfig
 
-        config = from_plain(ModelConfig, self.model, source=str(self.folder))
-        return dataclasses.replace(
-            config,
-            image_size=self.preparation.image_size,
-            preprocessing=self.preparation.preprocessing,
-            compute_dtype=self.precision,
-        )
+        return from_plain(ModelConfig, self.model, source=str(self.folder))
 
     @property
     def row_length(self) -> int:
         """Number of values in the row of an image's tokens."""
         return self.dim if self._second is None else self.config.unprojected_dim
-
-    @property
-    def row_dtype(self) -> str:
-        """Type of the values in rows of tokens."""
-        return "float32"
 
     def check_groupings(self, groupings: Iterable[str]) -> None:
         """Check that the program can describe images under these groupings.
@@ -105,11 +93,9 @@ class Runtime:
             return
         wanted = {kind for grouping in groupings for kind in grouping.split("/")}
         if self.grouping == "batch" or wanted != {"single"}:
-            others = ", ".join(sorted(wanted))
             raise InputError(
-                f"{self.folder}: found a program of grouping {self.grouping}, expected "
-                f"{'single or any' if wanted == {'single'} else 'any'}, for images of grouping "
-                f"{others} (`crisalad export --grouping`)"
+                f"{self.folder}: found a program of grouping {self.grouping}, expected any, for "
+                f"images of grouping {', '.join(sorted(wanted))} (`crisalad export --grouping`)"
             )
 
     def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[np.ndarray, ImageBatch]]:
@@ -136,12 +122,11 @@ class Runtime:
         expected = (*self.input_size, 3)
         if images.shape[1:] != expected or images.dtype != self.preparation.dtype:
             raise InputError(
-                f"images: found {images.dtype} {images.shape}, expected "
-                f"{np.dtype(self.preparation.dtype)} (image, {', '.join(map(str, expected))}) for "
-                f"{self.folder}"
+                f"{self.folder}: found images of {images.dtype} {images.shape}, expected "
+                f"{np.dtype(self.preparation.dtype)} (image, {', '.join(map(str, expected))})"
             )
         size = self.fixed_batch
-        if size is None or len(images) == size:
+        if size is None:
             return self._first(images)
         parts = [images[start : start + size] for start in range(0, len(images), size)]
         filled = (np.resize(part, (size, *expected)) for part in parts)
@@ -166,10 +151,8 @@ class Runtime:
 def open_runtime(
     source: str | os.PathLike[str],
     engine: EngineName,
+    config: Mapping[str, Any] | None = None,
     *,
-    image_size: Size | None = None,
-    preprocessing: PreprocessingConfig | Mapping[str, Any] | None = None,
-    precision: Precision = "float32",
     any_grouping: bool = False,
     verify: bool = True,
 ) -> Runtime:
@@ -181,9 +164,8 @@ def open_runtime(
         source: a folder of `crisalad export` in a format that the engine reads, or a file of
             weights of this package.
         engine: "onnxruntime" or "openvino".
-        image_size: height and width; None is the model's.
-        preprocessing: how images are resized; None is the model's way.
-        precision: type of the matrix products: bfloat16 is OpenVINO's alone.
+        config: a `ModelConfig` as JSON values, whose images and type of matrix products are taken;
+            None is the model's own, in float32. bfloat16 is OpenVINO's alone.
         any_grouping: whether images are to look at each other in other ways than `source`, a file,
             would be exported for: each alone.
         verify: whether to compare files with their checksums.
@@ -209,24 +191,22 @@ def open_runtime(
     """
     choose("runtime", engine, READS)
     path = pathlib.Path(source)
-    if preprocessing is not None and not isinstance(preprocessing, PreprocessingConfig):
-        preprocessing = from_plain(PreprocessingConfig, preprocessing, source="preprocessing")
+    names = ("image_size", "preprocessing", "compute_dtype")
+    changes = {} if config is None else {name: config[name] for name in names}
     if not path.is_dir():
-        path = _exported(path, engine, image_size, preprocessing, any_grouping)
+        path = _exported(path, engine, changes, any_grouping)
     manifest = read_json(path / MANIFEST, _EXPECTED)
     if manifest.get("format") != FORMAT:
-        raise InputError(
-            f"{path / MANIFEST}: found format {manifest.get('format')!r}, expected {FORMAT!r}: "
-            f"{_EXPECTED}"
-        )
+        found = manifest.get("format")
+        raise InputError(f"{path / MANIFEST}: found format {found!r}, expected {FORMAT!r}")
     if manifest["program_format"] not in READS[engine]:
         raise InputError(
             f"{path}: found a program of format {manifest['program_format']}, expected "
-            f"{' or '.join(READS[engine])} for {engine}: `crisalad export --format "
-            f"{READS[engine][0]}`"
+            f"{' or '.join(READS[engine])} for {engine} (`crisalad export --format`)"
         )
-    preparation = _preparation(path, manifest, image_size, preprocessing)
-    first, *second = _load(path, manifest, engine, precision, verify=verify)
+    model = manifest["model"] | {"compute_dtype": "float32"} | changes
+    preparation = _preparation(path, manifest, model)
+    first, *second = _load(path, manifest, engine, model["compute_dtype"], verify=verify)
     count, height, width, _ = manifest["images"]["shape"]
     return Runtime(
         folder=path,
@@ -238,29 +218,26 @@ def open_runtime(
         input_size=(height, width),
         fixed_batch=count if isinstance(count, int) else None,
         preparation=preparation,
-        precision=precision,
-        model=manifest["model"],
+        model=model,
         _first=first,
         _second=second[0] if second else None,
     )
 
 
 def _preparation(
-    folder: pathlib.Path,
-    manifest: Mapping[str, Any],
-    image_size: Size | None,
-    preprocessing: PreprocessingConfig | None,
+    folder: pathlib.Path, manifest: Mapping[str, Any], model: Mapping[str, Any]
 ) -> Preparation:
     """Return how images are prepared, as asked for or as the model says, if the program takes them.
 
     Raises:
         InputError: it does not.
     """
-    model, images = manifest["model"], manifest["images"]
-    own = from_plain(PreprocessingConfig, model["preprocessing"], source=str(folder))
-    chain = preprocessing or own
+    own, chain = (
+        from_plain(PreprocessingConfig, each["preprocessing"], source=str(folder))
+        for each in (manifest["model"], model)
+    )
     _check_fixed(folder, chain.size_rule)
-    height, width = image_size or model["image_size"]
+    images, (height, width) = manifest["images"], model["image_size"]
     wanted = Preparation((height, width), chain, int(manifest["side_multiple"]))
     taken = _words(images["shape"][1:3], images["dtype"], own)
     given = _words(wanted.size_of(wanted.image_size), np.dtype(wanted.dtype), chain)
@@ -284,10 +261,7 @@ def _words(size: Sequence[int], dtype: object, chain: PreprocessingConfig) -> st
 def _check_fixed(source: pathlib.Path, rule: str) -> None:
     """Check that images have one size, as a program takes them."""
     if rule != "fixed":
-        raise InputError(
-            f"{source}: found images of size rule {rule}, expected fixed: a program takes one size "
-            "(--resize fixed)"
-        )
+        raise InputError(f"{source}: found images of size rule {rule}, expected --resize fixed")
 
 
 def _load(
@@ -301,83 +275,47 @@ def _load(
     """Load the programs, while the bytes of their files are compared with their checksums."""
     parts = [manifest, manifest[ATTEND]] if ATTEND in manifest else [manifest]
     entries = [part[name] for part in parts for name in ("program", "weights") if part[name]]
+    files = {folder / entry["file"]: entry["sha256"] for entry in entries}
     with concurrent.futures.ThreadPoolExecutor() as pool:
-        digests = [pool.submit(sha256_of, folder / entry["file"]) for entry in entries if verify]
+        digests = pool.map(sha256_of, files if verify else ())
         try:
             return [
                 load_program(engine, folder / part["program"]["file"], precision) for part in parts
             ]
         finally:  # a changed file explains best why an engine cannot load it
-            for entry, digest in zip(entries, digests, strict=False):
-                if digest.result() != entry["sha256"]:
-                    raise InputError(
-                        f"{folder / entry['file']}: found other bytes than {MANIFEST} says, "
-                        "expected the file as it was exported"
-                    )
+            for file, digest in zip(files, digests, strict=False):
+                if digest != files[file]:
+                    raise ChangedFileError(file)
 
 
 def _exported(
-    weights: pathlib.Path,
-    engine: EngineName,
-    image_size: Size | None,
-    preprocessing: PreprocessingConfig | None,
-    any_grouping: bool,
+    weights: pathlib.Path, engine: EngineName, changes: Mapping[str, Any], any_grouping: bool
 ) -> pathlib.Path:
     """Return the exported folder of a file of weights in the cache; export it the first time."""
     header = read_header(weights)
-    config = header["config"]
-    chain = config["preprocessing"] if preprocessing is None else to_plain(preprocessing)
-    settings = {
-        "model": header["model_sha256"],
-        "image_size": list(image_size or config["image_size"]),
-        "preprocessing": chain,
-        "format": READS[engine][0],
-        "grouping": "any" if any_grouping else "single",
-        "version": VERSION,
-    }
+    model = header["config"] | changes | {"compute_dtype": "float32"}
+    how = {"grouping": "any" if any_grouping else "single", "format": READS[engine][0]}
+    settings = {"weights": header["model_sha256"], "model": model, **how, "version": VERSION}
     key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
     folder = user_cache() / "exports" / key[:32]
     if not (folder / MANIFEST).is_file():
-        _check_fixed(weights, chain["size_rule"])
+        _check_fixed(weights, model["preprocessing"]["size_rule"])
         with lock(folder.parent, wait=True):
             if not (folder / MANIFEST).is_file():
-                _export(weights, settings, folder)
+                _export(weights, model, how, folder)
     return folder
 
 
-def _export(weights: pathlib.Path, settings: Mapping[str, Any], folder: pathlib.Path) -> None:
+def _export(
+    weights: pathlib.Path, model: Mapping[str, Any], how: Any, folder: pathlib.Path
+) -> None:
     from crisalad_jax.checkpoints.export import ExportConfig, write_export
     from crisalad_jax.checkpoints.weights import load_weights
+    from crisalad_jax.nn.config import ModelConfig
 
     warn(f"{weights}: exporting it for --runtime, once; into {folder}")
-    model = load_weights(weights)
-    plain = to_plain(model.config) | {
-        "image_size": settings["image_size"],
-        "preprocessing": settings["preprocessing"],
-        "compute_dtype": "float32",
-    }
-    config = from_plain(type(model.config), plain, source=str(weights))
-    how = ExportConfig(settings["grouping"], format=settings["format"])
-    write_export(folder, model._replace(config=config), how)
-
-
-def read_header(weights: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read what a file of weights says of its model, without its arrays.
-
-    Its bytes are not compared with its checksum: the export is, and it was made of bytes that were.
-
-    Args:
-        weights: the file.
-
-    Returns:
-        The metadata, with "model_sha256" and "config", a `ModelConfig` as JSON values.
-
-    Raises:
-        InputError: what `load_weights` raises, for a file without such metadata.
-    """
-    return safetensors_io.read_header(
-        weights, safetensors_io.WEIGHTS, safetensors_io.EXPECTED_WEIGHTS
-    )
+    config = from_plain(ModelConfig, model, source=str(weights))
+    write_export(folder, load_weights(weights)._replace(config=config), ExportConfig(**how))
 
 
 def read_model(source: str | os.PathLike[str]) -> "ModelConfig":

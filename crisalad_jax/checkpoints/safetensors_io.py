@@ -7,10 +7,9 @@ import contextlib
 import hashlib
 import json
 import os
-import pathlib
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import safetensors
@@ -18,7 +17,7 @@ import safetensors.numpy
 
 from crisalad_jax.utils.checksums import CHECKSUM, ChangedFileError
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path, check_source, is_html, parse_json
+from crisalad_jax.utils.files import atomic_path, check_source, parse_json
 
 WEIGHTS = "crisalad-jax 4"
 """Format of a weight file, the only key of its metadata. Its value is JSON: the file's checksum,
@@ -27,16 +26,6 @@ EXPECTED_WEIGHTS = (
     f"a .safetensors file of weights ({WEIGHTS!r}), as this package writes it; `crisalad convert` "
     "reads public checkpoints"
 )
-_OTHERS = {b"PK\3\4": "a torch file", b"\x80\2": "a torch file", b"MATLAB": "a MATLAB file"}
-"""What files of other kinds begin with; torch's are archives, older ones pickles."""
-
-
-class Contents(NamedTuple):
-    """What a file holds."""
-
-    value: Any
-    """The object next to the arrays, without its checksum."""
-    arrays: dict[str, np.ndarray]
 
 
 def write_safetensors(
@@ -101,9 +90,9 @@ def _opened(path: str | os.PathLike[str], expected: str) -> Iterator[Any]:
     except AttributeError as error:  # safetensors' error for a type that numpy lacks
         raise InputError(f"{path}: found a type that numpy does not know: {error}") from error
     except (safetensors.SafetensorError, OSError) as error:
-        found = _other_kind(pathlib.Path(path))
-        problem = f"found {found}" if found else f"not a whole safetensors file ({error})"
-        raise InputError(f"{path}: {problem}, expected {expected}") from error
+        raise InputError(
+            f"{path}: not a whole safetensors file ({error}), expected {expected}"
+        ) from error
 
 
 def read_safetensors(
@@ -129,27 +118,26 @@ def read_metadata(path: str | os.PathLike[str], expected: str) -> dict[str, str]
         return file.metadata() or {}
 
 
-def read_header(path: str | os.PathLike[str], form: str, expected: str) -> dict[str, Any]:
-    """Read the object of a file that `write_sealed` wrote, without its arrays.
+def read_header(weights: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read what a file of weights says of its model, without its arrays.
+
+    Nothing is compared with the checksum.
+
+    Args:
+        weights: the file.
+
+    Returns:
+        The metadata, with "model_sha256" and "config", a `ModelConfig` as JSON values.
 
     Raises:
-        InputError: what `read_sealed` raises, but nothing is compared with the checksum.
+        InputError: the file is missing, not whole, or no file of weights of this package.
     """
-    return _value(path, read_metadata(path, expected), form, expected)[0]
-
-
-def _other_kind(path: pathlib.Path) -> str | None:
-    """Return what a file is that is plainly not of safetensors."""
-    with path.open("rb") as file:
-        start = file.read(512)
-    if is_html(start):
-        return "a page of HTML"
-    return next((kind for mark, kind in _OTHERS.items() if start.startswith(mark)), None)
+    return _value(weights, read_metadata(weights, EXPECTED_WEIGHTS), WEIGHTS, EXPECTED_WEIGHTS)[0]
 
 
 def read_sealed(
     path: str | os.PathLike[str], form: str, expected: str, *, verify: bool = True
-) -> Contents:
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read a file that `write_sealed` wrote.
 
     Args:
@@ -158,6 +146,9 @@ def read_sealed(
         expected: what kind of file, for messages.
         verify: whether to check that its contents are those that were written.
 
+    Returns:
+        The object next to the arrays, without its checksum, and the arrays by name.
+
     Raises:
         InputError: the file is missing, not whole, changed or of another format.
     """
@@ -165,7 +156,7 @@ def read_sealed(
     value, checksum = _value(path, metadata, form, expected)
     if verify and checksum != _checksum(value, arrays):
         raise ChangedFileError(path)
-    return Contents(value, arrays)
+    return value, arrays
 
 
 def _value(

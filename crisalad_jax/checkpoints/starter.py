@@ -9,7 +9,6 @@ import os
 import pathlib
 
 from crisalad_jax.utils.files import real_path
-from crisalad_jax.utils.output import warn
 
 NAME = "starter"
 """Its name, for `--weights` and `load`."""
@@ -18,14 +17,6 @@ FILES = {NAME: FILE, "hog": FILE.with_stem("hog")}
 """The files of all models in this package by their names."""
 BEST = "megaloc"
 """The published model that recalls the most, which a note names."""
-
-
-def tell_taken() -> None:
-    """Tell that the model in this package was taken."""
-    warn(
-        f"no --weights: taking {NAME}, the small model in this package, trained on rendered "
-        f"pictures alone (docs/{NAME}.md); for the best recall: --weights {BEST}"
-    )
 
 
 def named(weights: str | os.PathLike[str]) -> str:

@@ -86,15 +86,15 @@ def read_torch(path: pathlib.Path) -> Content:
     if isinstance(state, Mapping):
         inside = (state[key] for key in _UNDER if isinstance(state.get(key), Mapping))
         state = next(inside, state)
-    found = _kind(state)
+    strange = [_kind(state)]
     if isinstance(state, dict) and state:
         strange = [
             str(name)
             for name, each in state.items()
             if not (isinstance(name, str) and torch.is_tensor(each))
         ]
-        found = few(sorted(strange)) if strange else None
-    if found is not None:
+    if strange:
+        found = few(sorted(strange))
         raise InputError(f"{path}: found {found}, expected nothing but tensors by name: {HOW}")
     metadata = getattr(state, "_metadata", None)  # as of any module's state_dict
     declared = metadata.get(DECLARED) if isinstance(metadata, dict) else None
@@ -106,10 +106,7 @@ def _kind(value: Any) -> str:
     if isinstance(value, dict):
         return getattr(value, "stands_for", "nothing")
     if hasattr(value, "shape"):
-        return (
-            f"one tensor by itself, of shape {tuple(value.shape)} (a vocabulary needs its "
-            "backbone: `crisalad convert --backbone`)"
-        )
+        return f"one tensor by itself, of shape {tuple(value.shape)} (see `convert --backbone`)"
     return type(value).__name__
 
 
@@ -126,17 +123,20 @@ def _load(path: pathlib.Path) -> Any:
     """Read a file, with stand-ins for all classes and functions that it names."""
     import torch
 
-    is_archive, others = _is_archive(path), []
+    others: list[str] = []
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about deprecated formats
-            if is_archive:
+            if zipfile.is_zipfile(path):  # as torch's files have been since 1.6
+                _check_uncompressed(path)
                 named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
                 others = sorted(set(named) - set(_NUMPY))
             stand_ins: list[Any] = [(_stand_in(name), name) for name in others]
             stand_ins += [(_Unread, name) for name in _NUMPY]
             with torch.serialization.safe_globals(stand_ins):
                 return torch.load(path, map_location="cpu", weights_only=True)
+    except InputError:
+        raise
     except Exception as error:  # a damaged pickle may raise any exception
         reason = " ".join([type(error).__name__, *str(error).splitlines()[:1]])[:200]
         problem = f"not a whole torch checkpoint: {reason}"
@@ -146,41 +146,24 @@ def _load(path: pathlib.Path) -> Any:
             # Torch's message is a page of advice on how to run the code anyway: shorten it.
             refused = re.search(r"(?:GLOBAL|Unsupported \w+) ([a-zA-Z_][\w.]*)", str(error))
             what = f"asks for {refused[1]}" if refused else "is no plain pickle of tensors"
-            problem = (
-                f"refused: it {what}, expected nothing but tensors (loading anything else could "
-                f"run code): {HOW}"
-            )
+            problem = f"refused: it {what}, expected nothing but tensors, which run no code: {HOW}"
         raise InputError(f"{path}: {problem}") from error
 
 
-def _is_archive(path: pathlib.Path) -> bool:
-    """Return whether a file is an archive, as torch's have been since 1.6.
+def _check_uncompressed(path: pathlib.Path) -> None:
+    """Check that an archive does not unpack to more than its size, as one of torch never does.
 
     Torch stores tensors as they are, but reads compressed ones too: some kilobytes could fill any
     memory.
-
-    Raises:
-        InputError: it is cut short, or unpacks to more than its own size.
     """
-    with path.open("rb") as file:
-        if file.read(4) != b"PK\3\4":
-            return False
     size = path.stat().st_size
-    try:
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(each.file_size for each in archive.infolist())
-    except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
-        # Its table of contents is at the end; torch's own message is a page.
-        raise InputError(
-            f"{path}: not a whole torch checkpoint: found the beginning of one, {size} bytes "
-            "without an end, as an unfinished download leaves it"
-        ) from error
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(each.file_size for each in archive.infolist())
     if unpacked > size:
         raise InputError(
             f"{path}: found an archive of {size} bytes that unpacks to {unpacked}, expected a "
             "torch checkpoint, whose tensors are not compressed"
         )
-    return True
 
 
 def _array(path: pathlib.Path, name: str, tensor: Any) -> np.ndarray:

@@ -21,10 +21,9 @@ from crisalad_jax.config.part import fingerprint_fields, with_non_semantic_field
 from crisalad_jax.config.plugins import changed_sources, sources_of
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.diff_trees import diff_trees, not_finite
-from crisalad_jax.nn.model import Crisalad, Model, check_params, parameter_shapes
+from crisalad_jax.nn.model import Crisalad, Model, check_params, params_of
 from crisalad_jax.utils.checksums import ChangedFileError
-from crisalad_jax.utils.errors import InputError, few
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.pytree import named_leaves
@@ -129,32 +128,26 @@ def _halved(leaf: Any) -> np.ndarray:
 
 
 def load_weights(
-    weights: str | os.PathLike[str],
-    expected: ModelConfig | None = None,
-    *,
-    verify: bool = True,
-    quiet: bool = False,
+    path: str | os.PathLike[str], expected: ModelConfig | None = None, *, verify: bool = True
 ) -> Model:
     """Read the model that `save_weights` wrote.
 
     A note tells if a part's source has changed since the weights were written.
 
     Args:
-        weights: the file, or a name that `find_weights` knows.
+        path: the file; `find_weights` returns that of a name.
         expected: if given, the configuration that the file must have, except for what parameters
             do not depend on: image size (but MixVPR's do), dropout, compute type, remat.
         verify: whether to check that the file's bytes are those that were written.
-        quiet: no progress of a download.
 
     Returns:
         The model.
 
     Raises:
-        InputError: what `find_weights` raises; the file is missing, changed, cut short or no such
-            file; it needs a part that is not registered; its parameters do not fit its
-            configuration or are not finite (the first that are missing, unknown or wrong are
-            listed); its configuration is not `expected` (all fields that differ are listed); or
-            AnyLoc's vocabulary is of another backbone.
+        InputError: the file is missing, changed, cut short or no such file; it needs a part that is
+            not registered; its parameters do not fit its configuration or are not finite (the first
+            that are missing, unknown or wrong are listed); its configuration is not `expected` (all
+            fields that differ are listed); or AnyLoc's vocabulary is of another backbone.
 
     Example:
         >>> load_weights("none.safetensors")
@@ -162,14 +155,14 @@ def load_weights(
         ...
         crisalad_jax.utils.errors.InputError: none.safetensors: found no such file, expected ...
     """
-    # Imported here: for a name it makes a file of weights, by this module.
-    from crisalad_jax.checkpoints.load import find_weights
-
-    found = read_weights(find_weights(weights, quiet=quiet), verify=verify)
+    found = read_weights(path, verify=verify)
     if expected is not None:
-        wrong = differences(_as_free_as(expected, found.config), expected)
+        config = with_non_semantic_fields_of(expected, found.config)
+        if config.aggregator.fixed_grid:
+            config = dataclasses.replace(config, image_size=found.config.image_size)
+        wrong = differences(config, expected)
         if wrong:
-            raise InputError(f"{weights}: these weights are of another model: {'; '.join(wrong)}")
+            raise InputError(f"{path}: these weights are of another model: {'; '.join(wrong)}")
     return found.model
 
 
@@ -185,15 +178,15 @@ def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkp
         is_cached = user_cache() in pathlib.Path(path).parents
         advice = "; remove it, and the same command makes it again" if is_cached else ""
         raise InputError(f"{error}{advice}") from error
-    extras = {
-        name.removeprefix(EXTRA): arrays.pop(name)
-        for name in list(arrays)
-        if name.startswith(EXTRA)
-    }
+    extras = {n.removeprefix(EXTRA): arrays.pop(n) for n in list(arrays) if n.startswith(EXTRA)}
     check_sizes(value.get("config"), arrays.values(), str(path))
     header = from_plain(Header, value, source=f"{path} (metadata)")
     config = header.config
-    params = with_metadata(_fill(config, arrays, path), config, header.aggregator, str(path))
+    for name, array in arrays.items():
+        if array.dtype == np.float16:
+            arrays[name] = array.astype(np.float32)
+    params = params_of(arrays, config, source=str(path))
+    params = with_metadata(params, config, header.aggregator, str(path))
     changed = changed_sources(config, header.parts)
     if changed:
         warn(
@@ -211,32 +204,9 @@ def with_metadata(
     Raises:
         InputError: it is a vocabulary of another backbone.
     """
-    if not metadata:
-        return params
     own = config.aggregator.with_metadata(params.aggregator, metadata)
     config.aggregator.check_backbone(own, params.backbone, source)
     return dataclasses.replace(params, aggregator=own)
-
-
-def _as_free_as(expected: ModelConfig, config: ModelConfig) -> ModelConfig:
-    free = with_non_semantic_fields_of(expected, config)
-    if config.aggregator.fixed_grid:
-        free = dataclasses.replace(free, image_size=config.image_size)
-    return free
-
-
-def _fill(
-    config: ModelConfig, arrays: dict[str, np.ndarray], path: str | os.PathLike[str]
-) -> Crisalad:
-    template = parameter_shapes(config)
-    wanted = named_leaves(template)
-    halves = {name: array for name, array in arrays.items() if array.dtype == np.float16}
-    arrays |= {name: array.astype(np.float32) for name, array in halves.items()}
-    problems = diff_trees(arrays, wanted) or not_finite(arrays)
-    if problems:
-        raise InputError(f"{path}: weights do not fit: {few(problems)}")
-    leaves = jax.device_put([arrays.pop(name) for name in wanted])
-    return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
 def check_sizes(plain: Any, arrays: Collection[np.ndarray], source: str) -> None:

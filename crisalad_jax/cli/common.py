@@ -13,6 +13,7 @@ import rich.table
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.cli.flags import ModelFlags, RuntimeName, SetFlags, SizeFlags, Target
+from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_format, write_json
@@ -185,7 +186,7 @@ def load_model(weights: pathlib.Path, flags: SizeFlags, *, quiet: bool = False) 
     """
     from crisalad_jax.checkpoints.weights import load_weights
 
-    model = load_weights(weights, quiet=quiet)
+    model = load_weights(find_weights(weights, quiet=quiet))
     return model._replace(config=flags.applied_to(model.config))
 
 
@@ -242,9 +243,7 @@ def open_model(
     model = open_runtime(
         file,
         flags.runtime,
-        image_size=config.image_size,
-        preprocessing=config.preprocessing,
-        precision=config.compute_dtype,
+        to_plain(config),
         any_grouping=attends and set("/".join(groupings).split("/")) != {"single"},
         verify=flags.verify,
     )

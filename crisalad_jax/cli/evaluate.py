@@ -5,6 +5,7 @@ import dataclasses
 import pathlib
 from typing import Annotated
 
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
     echo,
@@ -159,8 +160,7 @@ def _reranking(arguments: Evaluate) -> Reranking | None:
         return None
     rerank = parse_reranking(arguments.rerank)
     if arguments.rerank_weights is not None:
-        params, config = load_weights(
-            arguments.rerank_weights, verify=arguments.verify, quiet=arguments.quiet
-        )
+        file = find_weights(arguments.rerank_weights, quiet=arguments.quiet)
+        params, config = load_weights(file, verify=arguments.verify)
         rerank = dataclasses.replace(rerank, params=params, config=config)
     return rerank

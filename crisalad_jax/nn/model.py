@@ -7,7 +7,7 @@ import contextlib
 import dataclasses
 import functools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
@@ -621,3 +621,31 @@ def valid_mask(valid: Bool[Array, " image"]) -> Bool[Array, "image image"]:
         [[True, False], [False, True]]
     """
     return valid[None, :] & valid[:, None] | jnp.eye(len(valid), dtype=bool)
+
+
+def params_of(arrays: Mapping[str, np.ndarray], config: ModelConfig, *, source: str) -> Crisalad:
+    """Make parameters of stored arrays by their dotted names.
+
+    Args:
+        arrays: whole, finite float32 arrays.
+        config: the model.
+        source: the file, for messages.
+
+    Raises:
+        InputError: they are not all parameters of the model, and no others; the first differences
+            are listed.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS
+        >>> params = init_crisalad(jax.random.key(0), PRESETS["tiny"])
+        >>> again = params_of(named_leaves(params), PRESETS["tiny"], source="")
+        >>> jax.tree.structure(again) == jax.tree.structure(params)
+        True
+    """
+    template = parameter_shapes(config)
+    names = named_leaves(template)
+    problems = diff_trees(arrays, names) or not_finite(arrays)
+    require(not problems, f"{source}: weights do not fit: {few(problems)}")
+    leaves = jax.device_put([arrays[name] for name in names])
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)

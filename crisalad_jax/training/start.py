@@ -46,7 +46,8 @@ def read_start(
     if weights is not None:
         if backbone is not None:
             raise InputError("--backbone: found beside --weights, expected only one of the two")
-        params, theirs = load_weights(weights, expected=config.model, quiet=quiet)
+        file = find_weights(weights, quiet=quiet)
+        params, theirs = load_weights(file, expected=config.model)
         if theirs.images_in_words != config.model.images_in_words:
             warn(
                 f"{weights}: found weights for images at {theirs.images_in_words}; this run trains "

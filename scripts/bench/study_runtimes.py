@@ -21,6 +21,7 @@ from crisalad_jax.checkpoints.export import ExportConfig, write_export
 from crisalad_jax.checkpoints.runtime import Runtime, open_runtime
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.export import read_calibration
+from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.model import Model
@@ -48,10 +49,7 @@ def models(
         write_export(folder / f"{format}-int8", model, how, calibration=some)
         yield f"{engine}, float32", open_runtime(folder / format, engine)
         yield f"{engine}, int8", open_runtime(folder / f"{format}-int8", engine)
-    yield (
-        "openvino, bfloat16",
-        open_runtime(folder / "openvino", "openvino", precision="bfloat16"),
-    )
+    yield "openvino, bfloat16", open_runtime(folder / "openvino", "openvino", to_plain(bfloat16))
 
 
 def first_answers(model: Model | Runtime, data: Benchmark) -> np.ndarray:

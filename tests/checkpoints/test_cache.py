@@ -209,6 +209,7 @@ def test_faults_leave_no_model(model, server, tmp_path):
     [
         (DATA[:-100], "not a whole safetensors file"),
         (b"", "not a whole safetensors file"),
+        (b"\n<!DOCTYPE html><title>Quota exceeded</title>", "found a page of HTML, expected a"),
         (safetensors.numpy.save({"x": np.zeros(3, np.float32)}), "found no checkpoint that we"),
         (
             state_bytes(
@@ -220,7 +221,7 @@ def test_faults_leave_no_model(model, server, tmp_path):
             r"found descriptors of 128 numbers and \d+ parameters \(huggingface\), expected 64 and",
         ),
     ],
-    ids=["cut", "empty", "of no layout", "of another size"],
+    ids=["cut", "empty", "a page", "of no layout", "of another size"],
 )
 def test_a_file_that_is_not_the_model_is_not_kept(model, server, tmp_path, data, words):
     server.files[f"/{FILE}"] = data  # a server that says it is whole
@@ -380,7 +381,7 @@ def test_torch_is_asked_for_before_a_download(model, server, monkeypatch, tmp_pa
     register(model, monkeypatch, format="dinov2", file="tiny.pth")
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.setattr(cache.importlib.util, "find_spec", lambda name: None)
-    fails("tiny-model", r"found no torch, expected it to read tiny\.pth: pip install")
+    fails("tiny-model", r"found no torch to read tiny\.pth: pip install")
     assert server.asked == []
     assert not (tmp_path / "cache").exists()
 

@@ -92,12 +92,6 @@ def test_a_file_arrives_and_a_cut_is_gone_on_from(server, tmp_path, answers, ask
         ({"files": {}}, "found HTTP 404 Not Found, expected the file", 1),
         ({"statuses": [403]}, "found HTTP 403 Forbidden", 1),
         ({"statuses": [500, 429]}, "found HTTP 429 Too Many Requests, .*attempts: 2", 2),
-        (
-            {"files": {"/file": b"\n<!DOCTYPE html><title>Quota exceeded</title>"}},
-            "found a page of HTML, expected the file here",
-            1,
-        ),
-        ({"kind": "text/html; charset=utf-8"}, "found a page of HTML", 1),
     ],
 )
 def test_what_does_not_arrive_is_told_and_nothing_stays(server, tmp_path, answers, words, count):

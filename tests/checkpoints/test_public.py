@@ -415,7 +415,7 @@ DECLARED = json.dumps({"format": "reference", "config": DEEP, "aggregator": {}})
 COUNT = next(name for name in SMALL["cricavpr"] if name.endswith("num_batches_tracked"))
 BAD: dict[str, tuple[Callable[[], Any], str]] = {
     "empty": (lambda: b"", "not a whole torch checkpoint"),
-    "cut": (lambda: whole()[:9999], "found the beginning of one, .* unfinished downl"),
+    "cut": (lambda: whole()[:9999], "not a whole torch checkpoint: "),
     "old, cut": (lambda: whole(new=False)[:338], "not a whole torch checkpoint"),
     "text": (lambda: b"no checkpoint", "not a whole torch checkpoint|refused"),
     "a list": (lambda: [1, 2], "found list, expected nothing but tensors by name"),
@@ -506,7 +506,6 @@ def test_targets_and_layouts_that_do_not_fit(tmp_path: pathlib.Path) -> None:
     for target, layout, words in (
         ("x.pth", None, "x.pth: found the suffix '.pth', expected .safetensors"),
         ("x.safetensors", "dinov2", "found a public checkpoint .dino-salad. and format dinov2"),
-        ("x.safetensors", "timm", "format: found 'timm'"),
         (".", None, "found a folder, expected a file"),
     ):
         with pytest.raises(InputError, match=words):
@@ -514,11 +513,12 @@ def test_targets_and_layouts_that_do_not_fit(tmp_path: pathlib.Path) -> None:
     convert(public, ours)
     for target, layout, words in (
         ("x.pth", "dinov2", "format dinov2: found a model of aggregator salad"),
-        ("x.onnx", None, "x.onnx: found suffix '.onnx', expected .pth or .pt or .ckpt for dino"),
+        ("x.pth", "timm", "format: found 'timm'"),
+        ("x.onnx", None, "x.onnx: found suffix '.onnx', expected .pth or .pt or .ckpt$"),
         ("x", None, "x: found suffix '', expected .pth"),
         ("x\0.pth", None, "cannot be made"),
         ("x" * 300 + ".pth", None, "too long"),
-        ("x.pth", "huggingface", "x.pth: found suffix '.pth', expected .safetensors for hugging"),
+        ("x.pth", "huggingface", "x.pth: found suffix '.pth', expected .safetensors$"),
         ("x.safetensors", None, "format huggingface: found a model of aggregator salad"),
         ("x.safetensors", "reference", "suffix '.safetensors', expected .pth or .pt or .ckpt"),
     ):

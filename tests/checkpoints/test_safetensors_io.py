@@ -66,7 +66,7 @@ def test_one_other_byte_is_refused(path):
         refused += CHANGED in str(error.value)
     assert refused > 40  # the others are no safetensors
     path.write_bytes(whole)
-    assert load(path).value == VALUE
+    assert load(path)[0] == VALUE
 
 
 @pytest.mark.parametrize("place", [b'"none\\":', b'"crisalad-jax some 2"', b'"rows":', b'"F32"'])
@@ -83,9 +83,12 @@ def test_one_other_byte_of_a_header_is_refused_whatever_the_byte(path, place):
 
 def test_files_that_are_cut_or_longer_are_refused(path):
     whole = path.read_bytes()
-    for data in (whole[:-1], whole[:-60], whole + b"\0", whole[:100], whole[:7], b""):
+    other = b"PK\3\4" + bytes(1000)  # a torch file begins so
+    for data in (whole[:-1], whole[:-60], whole + b"\0", whole[:100], whole[:7], b"", other):
         path.write_bytes(data)
-        with pytest.raises(InputError, match=r"a\.safetensors: not a whole safetensors file"):
+        with pytest.raises(
+            InputError, match=r"not a whole safetensors file .*, expected a file of"
+        ):
             load(path)
 
 
@@ -95,7 +98,7 @@ def test_another_checksum_is_refused_unless_it_is_not_verified(path, digest):
     safetensors.numpy.save_file(ARRAYS, path, metadata=metadata)
     with pytest.raises(InputError, match=rf"a\.safetensors: {CHANGED}"):
         load(path)
-    assert load(path, verify=False).value == VALUE
+    assert load(path, verify=False)[0] == VALUE
 
 
 @pytest.mark.parametrize("verify", [True, False])
@@ -107,22 +110,6 @@ def test_another_format_or_none_is_refused(path, verify):
         safetensors.numpy.save_file(ARRAYS, path, metadata={FORM: json.dumps(value)})
         with pytest.raises(InputError, match=r"\(metadata\): found no checksum, expected one in"):
             load(path, verify=verify)
-
-
-@pytest.mark.parametrize(
-    ("start", "words"),
-    [
-        (b"PK\3\4", "found a torch file"),
-        (b"\x80\2", "found a torch file"),
-        (b"MATLAB 5.0", "found a MATLAB file"),
-        (b"\n<!DOCTYPE html>", "found a page of HTML"),
-        (b"\x89PNG", "not a whole safetensors file"),
-    ],
-)
-def test_a_file_of_another_kind_is_named(path, start, words):
-    path.write_bytes(start + bytes(1000))
-    with pytest.raises(InputError, match=rf"a\.safetensors: {words}.*, expected a file of some"):
-        load(path)
 
 
 def test_an_array_in_another_order_is_written_as_it_reads(path):

@@ -91,5 +91,5 @@ def test_vgg_16s_names_and_shapes() -> None:
 def test_another_resnet_is_told(tmp_path: pathlib.Path) -> None:
     _, state = resnet(counts=True)
     torch.save({n: x for n, x in state.items() if "layer2.1" not in n}, tmp_path / "odd.pth")
-    with pytest.raises(InputError, match=r"found a ResNet with \(2, 1, 2, 2\) blocks of two conv"):
+    with pytest.raises(InputError, match=r"found a ResNet of \(2, 1, 2, 2\) blocks of two conv"):
         read_checkpoint(tmp_path / "odd.pth")

@@ -151,7 +151,7 @@ def test_bad_input_is_one_line(exported, shared, tmp_path, capfd, monkeypatch):
     fails(capfd, *extract, words=("no module onnxruntime", "pip install 'crisalad-jax[onnx]'"))
     data = (exported / "describe.onnx.data").read_bytes()
     (exported / "describe.onnx.data").write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-    words = ("describe.onnx.data: found other bytes than manifest.json says",)
+    words = ("describe.onnx.data: found other bytes than were written",)
     fails(capfd, *extract[:-1], "openvino", words=words)
     assert not (tmp_path / "d.npy").exists()
 

@@ -10,8 +10,10 @@ from torch.nn import functional as F
 
 from crisalad_jax import describe, init_crisalad, load, save_weights
 from crisalad_jax.checkpoints.formats import check_holds
+from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.costs import part_costs
+from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.training.trainable import split_params
@@ -65,8 +67,10 @@ def test_a_file_keeps_it(tmp_path) -> None:
 
 
 def test_layouts_without_a_place_for_it_refuse_it() -> None:
-    with pytest.raises(InputError, match=r"found a model of .*, projection yes, expected aggr"):
-        check_holds(CONFIG, "dino-salad")
+    backbone = dataclasses.replace(CONFIG.backbone, adapter=AdapterConfig(kind="none"))
+    config = dataclasses.replace(CONFIG, backbone=backbone, cross_image=CrossImageConfig(layers=0))
+    with pytest.raises(InputError, match="found a model of projection yes, expected no"):
+        check_holds(config, "dino-salad")
 
 
 def test_a_width_below_zero_is_refused() -> None:

@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple
 
 from crisalad_jax.checkpoints.formats.rows import Row, Rows, expand
 from crisalad_jax.checkpoints.formats.sizes import Reader, State, infer_backbone, infer_encoder
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators import Aggregator
 from crisalad_jax.nn.backbones.base import Backbone
@@ -13,7 +14,6 @@ from crisalad_jax.nn.backbones.vit import VisionTransformer
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.projection import ProjectionConfig
-from crisalad_jax.utils.errors import InputError
 
 
 class BackboneNames(NamedTuple):
@@ -97,13 +97,12 @@ class Format:
         Raises:
             InputError: it has another.
         """
-        found, allowed = parts_of(config), self.parts()
-        if not all({found[part], "any"} & set(some) for part, some in allowed.items()):
-            has = ", ".join(f"{part} {word}" for part, word in found.items())
-            wanted = ", ".join(f"{part} {' or '.join(some)}" for part, some in allowed.items())
-            raise InputError(
-                f"format {self.name}: found a model of {has}, expected {wanted} (format reference "
-                "holds any)"
+        allowed = self.parts()
+        for part, found in parts_of(config).items():
+            require(
+                found in allowed[part] or "any" in allowed[part],
+                f"format {self.name}: found a model of {part} {found}, expected "
+                f"{' or '.join(allowed[part])} (format reference holds any)",
             )
 
     def lines(self, config: ModelConfig, names: Iterable[str]) -> Iterator[Row]:

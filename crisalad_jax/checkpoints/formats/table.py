@@ -3,7 +3,6 @@
 import dataclasses
 import re
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import numpy as np
@@ -34,10 +33,7 @@ def table(config: ModelConfig, name: str) -> list[Row]:
     rows = list(form.lines(config, names))
     left_out = names.keys() - {ours for row in rows for ours in row.ours}
     if left_out and not form.bare:
-        raise InputError(
-            f"format {name}: found {few(sorted(left_out))}, expected a model without: it has no "
-            "name for that"
-        )
+        raise InputError(f"format {name}: found {few(sorted(left_out))}, expected a model without")
     return rows
 
 
@@ -60,7 +56,7 @@ def check_holds(config: ModelConfig, name: str) -> ModelConfig:
         InputError: what `table` raises; or a setting that no shape tells and that differs from the
             published one, which reading would take for it.
     """
-    state = _theirs(_blank(config), table(config, name), config, {})
+    state = _blank_state(config, name)
     if name in (REFERENCE, VOCABULARY):  # which have the configuration, or no model
         return config
     read_back = FORMATS[name].infer(state)
@@ -95,8 +91,11 @@ def public_shapes(config: ModelConfig, name: str) -> dict[str, tuple[int, ...]]:
     Raises:
         InputError: what `table` raises.
     """
-    state = _theirs(_blank(config), table(config, name), config, {})
-    return {theirs: array.shape for theirs, array in state.items()}
+    return {theirs: array.shape for theirs, array in _blank_state(config, name).items()}
+
+
+def _blank_state(config: ModelConfig, name: str) -> dict[str, np.ndarray]:
+    return _theirs(_blank(config), table(config, name), config, {})
 
 
 def to_params(
@@ -123,7 +122,7 @@ def to_params(
     if problems:
         raise InputError(
             f"{source}: does not fit the format {name} of width {config.backbone.dim} and "
-            f"{config.backbone.depth} blocks: {few(sorted(problems, key=_natural))}"
+            f"{config.backbone.depth} blocks: {few(sorted(problems))}"
         )
     ours, read = {}, {}
     for row in lines:
@@ -172,29 +171,24 @@ def _numbered(leaves: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Split stacks of blocks into single blocks, with numbered names."""
     single: dict[str, np.ndarray] = {}
     for name, leaf in leaves.items():
-        if _STACK.match(name):
-            single |= {_name_of_block(name, i): block for i, block in enumerate(leaf)}
+        if start := _STACK.match(name):
+            rest = name[start.end() :]
+            single |= {f"{start[0]}{i}.{rest}": block for i, block in enumerate(leaf)}
         else:
             single[name] = leaf
     return single
 
 
-def _name_of_block(name: str, number: int) -> str:
-    return _STACK.sub(lambda match: f"{match[0]}{number}.", name)
-
-
 def _from_numbered(ours: State, config: ModelConfig) -> Crisalad:
+    """Undo `_numbered`; empty arrays, such as absent registers, have no line in any table."""
     template = parameter_shapes(config)
     leaves = []
     for name, leaf in named_leaves(template).items():
-        if _STACK.match(name):
-            leaves.append(np.stack([ours[_name_of_block(name, i)] for i in range(leaf.shape[0])]))
+        if not leaf.size:
+            leaves.append(np.zeros(leaf.shape, leaf.dtype))
+        elif start := _STACK.match(name):
+            rest = name[start.end() :]
+            leaves.append(np.stack([ours[f"{start[0]}{i}.{rest}"] for i in range(leaf.shape[0])]))
         else:
-            # Empty arrays, such as absent registers, have no line in any table.
-            leaves.append(ours[name] if leaf.size else np.zeros(leaf.shape, leaf.dtype))
+            leaves.append(ours[name])
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
-
-
-def _natural(text: str) -> list[Any]:
-    """Return a sort key that puts block 10 after block 9."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", text)]

@@ -1,7 +1,7 @@
 """Walk through a traced program, and convert it equation by equation."""
 
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -49,35 +49,32 @@ def _equation(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
     """Convert an equation. What it lacks is remembered, and raised only if it turns out needed."""
     name = eqn.primitive.name
     called = next((eqn.params[key] for key in _CALLED if key in eqn.params), None)
-    if name == "scan":
-        return _unrolled(graph, inputs, eqn)
-    if name == "cond" and inputs[0].constant is not None:
-        which = int(inputs[0].constant.item())
-        branch = eqn.params["branches"][min(max(which, 0), len(eqn.params["branches"]) - 1)]
-        return convert(graph, branch, inputs[1:])
-    if called is not None and not name.startswith(("while", "custom_linear")):
-        constants = [Value.of(each) for each in getattr(called, "consts", ())]
-        return _run(graph, getattr(called, "jaxpr", called), constants, inputs)
-    missing = next((value.missing for value in inputs if value.missing), "")
-    if not missing and all(0 in var.aval.shape for var in eqn.outvars):
-        # Of arrays without numbers engines cannot tell the symbolic side.
-        return [_nothing(var.aval) for var in eqn.outvars]
-    if not missing:
-        try:
-            if name in CONVERTERS:
-                return CONVERTERS[name](graph, inputs, eqn)
-            return _folded(inputs, eqn)
-        except Unsupported as error:
-            missing = str(error)
-    nothing = np.dtype(np.float32)  # of types of JAX's own, such as a key's, there is no other
-    return [Value(var.aval.shape, nothing, missing=missing) for var in eqn.outvars]
+    try:
+        if name == "scan":
+            return _unrolled(graph, inputs, eqn)
+        if name == "cond" and inputs[0].constant is not None:
+            which = int(inputs[0].constant.item())
+            branch = eqn.params["branches"][min(max(which, 0), len(eqn.params["branches"]) - 1)]
+            return convert(graph, branch, inputs[1:])
+        if called is not None and not name.startswith(("while", "custom_linear")):
+            constants = [Value.of(each) for each in getattr(called, "consts", ())]
+            return _run(graph, getattr(called, "jaxpr", called), constants, inputs)
+        if missing := next((value.missing for value in inputs if value.missing), ""):
+            raise Unsupported(missing)
+        if all(0 in var.aval.shape for var in eqn.outvars):
+            return [_nothing(var.aval) for var in eqn.outvars]
+        return CONVERTERS.get(name, _folded)(graph, inputs, eqn)
+    except Unsupported as error:
+        nothing = np.dtype(np.float32)  # of types of JAX's own, such as a key's, there is no other
+        return [Value(var.aval.shape, nothing, missing=str(error)) for var in eqn.outvars]
 
 
 def _nothing(aval: Any) -> Value:
+    """Return an array without numbers, of which engines cannot tell the symbolic side."""
     return Value.of(np.zeros([s if is_known(s) else 1 for s in aval.shape], aval.dtype))
 
 
-def _folded(inputs: list[Value], eqn: Any) -> list[Value]:
+def _folded(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     """Compute what has constant inputs, by any primitive."""
     arrays = [value.constant for value in inputs]
     wholes = [var.aval.shape for var in eqn.invars]
@@ -98,35 +95,22 @@ def _unrolled(graph: Graph, inputs: list[Value], eqn: Any) -> list[Value]:
     # passes on comes first, and what it stacks has a side less inside.
     count = sum(map(operator.eq, _ranks(eqn.outvars), _ranks(body.jaxpr.outvars)))
     stacked = sum(map(operator.gt, _ranks(eqn.invars), _ranks(body.jaxpr.invars)))
-    fixed, carry, rows = _parts(inputs, len(inputs) - count - stacked, count)
+    first = len(inputs) - stacked
+    fixed, carry, rows = inputs[: first - count], inputs[first - count : first], inputs[first:]
     if not is_known(length):
-        return [
-            Value(var.aval.shape, np.dtype(np.float32), missing="scan over the images")
-            for var in eqn.outvars
-        ]
-    results: list[list[Value]] = []
+        raise Unsupported("scan over the images")
     order = range(length)[::-1] if params["reverse"] else range(length)
+    results: dict[int, list[Value]] = {}
     for number in order:
         own = [_row(graph, x, number) for x in rows]
         outputs = convert(graph, body, [*fixed, *carry, *own])
-        carry, made = outputs[:count], outputs[count:]
-        results.append(made)
-    if params["reverse"]:
-        results.reverse()
-    stacks = [_stack(graph, each) for each in zip(*results, strict=True)]
-    return [*carry, *stacks]
+        carry, results[number] = outputs[:count], outputs[count:]
+    turns = (results[number] for number in range(length))
+    return [*carry, *(_stack(graph, each) for each in zip(*turns, strict=True))]
 
 
 def _ranks(variables: Sequence[Any]) -> list[int]:
     return [each.aval.ndim for each in variables]
-
-
-def _parts(values: list[Value], *ends: int) -> Iterator[list[Value]]:
-    """Yield the first so many values, then the next, and the rest."""
-    for count in ends:
-        yield values[:count]
-        values = values[count:]
-    yield values
 
 
 def _row(graph: Graph, x: Value, number: int) -> Value:

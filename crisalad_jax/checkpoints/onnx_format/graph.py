@@ -91,26 +91,18 @@ class Graph:
         """Return the name of a constant vector of int64, as nodes take sides and axes."""
         return self.constant(np.array(numbers, np.int64))
 
-    def node(
-        self, operator: str, inputs: Sequence[str], outputs: int = 1, **attributes: Any
-    ) -> list[str]:
-        """Append a node, and return its outputs' names."""
-        names = [f"{operator}_{len(self.nodes)}{f'_{i}' if i else ''}" for i in range(outputs)]
-        self.nodes.append(helper.make_node(operator, inputs, names, name=names[0], **attributes))
-        return names
+    def node(self, operator: str, inputs: Sequence[str], **attributes: Any) -> str:
+        """Append a node of one output, and return its name."""
+        name = f"{operator}_{len(self.nodes)}"
+        self.nodes.append(helper.make_node(operator, inputs, [name], name=name, **attributes))
+        return name
 
     def add(
-        self,
-        operator: str,
-        inputs: Sequence[Value | str],
-        shape: Shape,
-        dtype: Any,
-        **attributes: Any,
+        self, operator: str, inputs: Sequence[Value | str], shape: Shape, dtype: Any, **fields: Any
     ) -> Value:
         """Append a node of one output, and return it."""
         names = [each if isinstance(each, str) else self.name(each) for each in inputs]
-        (name,) = self.node(operator, names, **attributes)
-        return Value(tuple(shape), np.dtype(dtype), name)
+        return Value(tuple(shape), np.dtype(dtype), self.node(operator, names, **fields))
 
     def side(self, size: Size) -> str:
         """Return the name of a vector of one int64: a side's number, computed where symbolic."""
@@ -119,14 +111,14 @@ class Graph:
         if size not in self.symbolic:  # a multiple of one that is there
             unit = next(unit for unit in self.symbolic if size // unit * unit == size)
             factor = self.side(size // unit)
-            (self.symbolic[size],) = self.node("Mul", [self.symbolic[unit], factor])
+            self.symbolic[size] = self.node("Mul", [self.symbolic[unit], factor])
         return self.symbolic[size]
 
     def sides(self, shape: Shape) -> str:
         """Return the name of an int64 vector of a shape's numbers."""
         if all(map(is_known, shape)):
             return self.ints(*map(int, shape))
-        return self.node("Concat", [self.side(size) for size in shape], axis=0)[0]
+        return self.node("Concat", [self.side(size) for size in shape], axis=0)
 
     def full(self, value: Value, shape: Shape, axes: Sequence[int] | None = None) -> Value:
         """Broadcast a value to the whole shape of its array, or along some axes."""
@@ -149,10 +141,10 @@ class Graph:
             return value
         if value.constant is not None:
             return Value.of(value.constant.reshape(shape))
-        unknown = [size for size in shape if not is_known(size)]
-        if len(unknown) > 1:
-            return self.add("Reshape", [value, self.sides(shape)], shape, value.dtype)
-        numbers = self.ints(*(int(size) if is_known(size) else -1 for size in shape))
+        if sum(not is_known(size) for size in shape) > 1:
+            numbers = self.sides(shape)
+        else:
+            numbers = self.ints(*(int(size) if is_known(size) else -1 for size in shape))
         return self.add("Reshape", [value, numbers], shape, value.dtype)
 
     def transpose(self, value: Value, axes: Sequence[int]) -> Value:
@@ -174,20 +166,15 @@ class Graph:
 
     def slice(self, value: Value, ranges: Mapping[int, tuple[int, int, int]]) -> Value:
         """Take some of each axis: start, end and step by axis."""
-        ranges = {
-            axis: (start, end, step)
-            for axis, (start, end, step) in ranges.items()
-            if (start, end, step) != (0, value.shape[axis], 1)
-        }
+        ranges = {axis: cut for axis, cut in ranges.items() if cut != (0, value.shape[axis], 1)}
         if not ranges:
             return value
         if value.constant is not None:
             cuts = [slice(*ranges.get(axis, (None,))) for axis in range(value.constant.ndim)]
             return Value.of(value.constant[tuple(cuts)])
-        shape = [
-            len(range(*ranges[axis])) if axis in ranges else size
-            for axis, size in enumerate(value.shape)
-        ]
+        shape = list(value.shape)
+        for axis, cut in ranges.items():
+            shape[axis] = len(range(*cut))
         starts, ends, steps = zip(*ranges.values(), strict=True)
         vectors = [self.ints(*each) for each in (starts, ends, tuple(ranges), steps)]
         return self.add("Slice", [value, *vectors], tuple(shape), value.dtype)

@@ -2,8 +2,9 @@
 
 import dataclasses
 import functools
+import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -80,10 +81,8 @@ def _elementwise(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]
     if all(value.constant is not None for value in inputs):
         arrays = [np.broadcast_to(value.constant, shape) for value in inputs]  # type: ignore
         return [Value.of(eqn.primitive.bind(*map(np.asarray, arrays), **eqn.params))]
-    if name in ("and", "or", "not", "xor") and dtype != np.bool_:
-        raise Unsupported(f"{name} of {dtype}")
-    if name == "select_n" and (inputs[0].dtype != np.bool_ or len(inputs) != 3):
-        raise Unsupported("select_n of more than two cases")
+    if len(inputs) > 3 or (name in ("and", "or", "not", "xor") and dtype != np.bool_):
+        raise Unsupported(f"{name} of {len(inputs)} arrays of {dtype}")
     add = functools.partial(_node, graph, shape)
     if name in _PLAIN:
         value = add(_PLAIN[name], *inputs)
@@ -127,8 +126,6 @@ def _broadcast(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
 def _reshape(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     (x,) = inputs
     before, after = eqn.invars[0].aval.shape, eqn.outvars[0].aval.shape
-    if eqn.params.get("dimensions") is not None and eqn.primitive.name == "reshape":
-        raise Unsupported("reshape of permuted axes")
     own = _with_other_ones(x.shape, before, after)
     return [graph.reshape(x, own) if own else graph.reshape(graph.full(x, before), after)]
 
@@ -154,24 +151,15 @@ def _transpose(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
 def _slice(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     starts, ends = eqn.params["start_indices"], eqn.params["limit_indices"]
     steps = eqn.params["strides"] or (1,) * len(starts)
-    return [_cut(graph, inputs[0], eqn.invars[0].aval.shape, starts, ends, steps)]
+    cuts = zip(starts, ends, steps, strict=True)
+    return [_cut(graph, inputs[0], eqn.invars[0].aval.shape, cuts)]
 
 
-def _cut(
-    graph: Graph,
-    x: Value,
-    whole: Shape,
-    starts: Sequence[Any],
-    ends: Sequence[Any],
-    steps: Sequence[int],
-) -> Value:
-    """Take a part of each axis, where the array is not broadcast along it."""
+def _cut(graph: Graph, x: Value, whole: Shape, parts: Iterable[tuple[Any, Any, int]]) -> Value:
+    """Take a part of each axis, from a start to an end, where the array is not broadcast."""
     cuts = {}
-    for axis, cut in enumerate(zip(starts, ends, steps, strict=True)):
-        start, end, step = cut
-        if (is_known(start) and start == 0 and end == whole[axis] and step == 1) or is_one(
-            x.shape[axis]
-        ):
+    for axis, cut in enumerate(parts):
+        if cut == (0, whole[axis], 1) or is_one(x.shape[axis]):
             continue
         if not all(map(is_known, cut)):
             raise Unsupported("slice of some of the images")
@@ -182,12 +170,12 @@ def _cut(
 @converts("split")
 def _split(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     (x,), axis, sizes = inputs, eqn.params["axis"], eqn.params["sizes"]
-    parts, start = [], 0
-    for size in sizes:
-        lazy = is_one(x.shape[axis])
-        parts.append(x if lazy else graph.slice(x, {axis: (start, start + size, 1)}))
-        start += size
-    return parts
+    if is_one(x.shape[axis]):
+        return [x] * len(sizes)
+    ends = itertools.accumulate(sizes)
+    return [
+        graph.slice(x, {axis: (end - size, end, 1)}) for size, end in zip(sizes, ends, strict=True)
+    ]
 
 
 @converts("concatenate")
@@ -218,10 +206,7 @@ def _pad(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
         raise Unsupported("pad between numbers, or by less than none")
     axes = [axis for axis, sides in enumerate(config) if any(sides)]
     x = graph.full(x, eqn.invars[0].aval.shape, axes)
-    shape = [
-        low + size + high if axis in axes else size
-        for axis, (size, (low, high, _)) in enumerate(zip(x.shape, config, strict=True))
-    ]
+    shape = [low + size + high for size, (low, high, _) in zip(x.shape, config, strict=True)]
     widths = graph.ints(*(low for low, _, _ in config), *(high for _, high, _ in config))
     filling = graph.reshape(filling, ())
     return [graph.add("Pad", [x, widths, filling], tuple(shape), x.dtype)]
@@ -239,106 +224,58 @@ def _iota(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     return [graph.cast(graph.reshape(numbers, own), dtype)]
 
 
-@converts("dim_as_value")
-def _side(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
-    number = graph.add("Squeeze", [graph.side(eqn.params["dim"])], (), np.int64)
-    return [graph.cast(number, eqn.outvars[0].aval.dtype)]
-
-
 @converts("gather")
 def _gather(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
+    """Convert a gather of one slice at a known place, as an index of `x[:, 0]` makes it."""
     x, places = inputs
     whole, shape = eqn.invars[0].aval.shape, eqn.invars[1].aval.shape
     how, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
     if how.operand_batching_dims or places.constant is None or len(shape) > 1:
-        return [_take(graph, x, places, eqn)]
+        raise Unsupported("gather at several places, or at computed ones")
     numbers = np.broadcast_to(places.constant, shape)
-    starts, ends = [0] * len(whole), list(sizes)
+    parts = [(0, size, 1) for size in sizes]
     for axis, number in zip(how.start_index_map, numbers.tolist(), strict=True):
         if sizes[axis] != whole[axis]:
-            starts[axis] = min(max(number, 0), whole[axis] - sizes[axis])
-            ends[axis] = starts[axis] + sizes[axis]
-    part = _cut(graph, x, whole, starts, ends, [1] * len(whole))
+            start = min(max(number, 0), whole[axis] - sizes[axis])
+            parts[axis] = (start, start + sizes[axis], 1)
+    part = _cut(graph, x, whole, parts)
     kept = [axis for axis in range(len(whole)) if axis not in how.collapsed_slice_dims]
     return [graph.reshape(part, tuple(part.shape[axis] for axis in kept))]
-
-
-def _take(graph: Graph, x: Value, places: Value, eqn: Any) -> Value:
-    """Convert a gather that takes whole slices of one axis."""
-    whole, shape = eqn.invars[0].aval.shape, eqn.invars[1].aval.shape
-    how, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
-    axes = how.start_index_map
-    others = [size for axis, size in enumerate(sizes) if axis not in axes]
-    fits = (
-        len(axes) == 1
-        and how.collapsed_slice_dims == axes
-        and not how.operand_batching_dims
-        and others == [size for axis, size in enumerate(whole) if axis not in axes]
-        and is_known(whole[axes[0]])
-    )
-    if not fits:
-        raise Unsupported("gather at places that are computed, of several axes")
-    (axis,) = axes
-    x, places = graph.full(x, whole, [axis]), graph.full(places, shape)
-    indices = graph.reshape(places, shape[:-1])
-    # A place beyond the ends is the end's, as JAX's programs of indices have it.
-    least, most = (Value.of(np.array(each, indices.dtype)) for each in (0, whole[axis] - 1))
-    if indices.constant is not None:
-        indices = Value.of(np.clip(indices.constant, 0, whole[axis] - 1))
-    else:
-        indices = graph.add("Max", [indices, least], indices.shape, indices.dtype)
-        indices = graph.add("Min", [indices, most], indices.shape, indices.dtype)
-    taken_shape = (*x.shape[:axis], *indices.shape, *x.shape[axis + 1 :])
-    taken = graph.add("Gather", [x, indices], taken_shape, x.dtype, axis=axis)
-    # There the places' axes stand where the axis was; JAX says where the others go.
-    count, rank = len(indices.shape), len(taken_shape)
-    of_places = iter(range(axis, axis + count))
-    of_others = iter([each for each in range(rank) if not axis <= each < axis + count])
-    order = [next(of_others if each in how.offset_dims else of_places) for each in range(rank)]
-    return graph.transpose(taken, order)
 
 
 # Reductions of axes, and of windows of images.
 
 
-_BY_ATTRIBUTE = {"reduce_max": "ReduceMax", "reduce_min": "ReduceMin", "reduce_prod": "ReduceProd"}
+_REDUCTIONS = {
+    "reduce_and": "ReduceMin",
+    "reduce_max": "ReduceMax",
+    "reduce_min": "ReduceMin",
+    "reduce_or": "ReduceMax",
+    "reduce_prod": "ReduceProd",
+    "reduce_sum": "ReduceSum",
+}
 
 
-def _whole(graph: Graph, inputs: Sequence[Value], eqn: Any, axes: Sequence[int]) -> Value:
-    return graph.full(inputs[0], eqn.invars[0].aval.shape, axes)
-
-
-@converts("reduce_sum")
-def _sum(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
-    axes = eqn.params["axes"]
-    x = _whole(graph, inputs, eqn, axes)
-    shape = tuple(size for axis, size in enumerate(x.shape) if axis not in axes)
-    return [graph.add("ReduceSum", [x, graph.ints(*axes)], shape, x.dtype, keepdims=0)]
-
-
-def _extreme(graph: Graph, x: Value, name: str, axes: Sequence[int]) -> Value:
-    shape = tuple(size for axis, size in enumerate(x.shape) if axis not in axes)
-    # Repeated rows have their own extremes.
-    return graph.add(_BY_ATTRIBUTE[name], [x], shape, x.dtype, axes=list(axes), keepdims=0)
-
-
-@converts(*_BY_ATTRIBUTE)
+@converts(*_REDUCTIONS)
 def _reduce(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
-    axes = eqn.params["axes"]
-    return [_extreme(graph, _whole(graph, inputs, eqn, axes), eqn.primitive.name, axes)]
-
-
-@converts("reduce_and", "reduce_or")
-def _logic(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
-    name = {"reduce_and": "reduce_min", "reduce_or": "reduce_max"}[eqn.primitive.name]
-    x = graph.cast(inputs[0], np.float32)  # which TensorRT takes, unlike whole numbers
-    return [graph.cast(_extreme(graph, x, name, eqn.params["axes"]), np.bool_)]
+    (x,), axes = inputs, eqn.params["axes"]
+    if x.dtype == np.bool_:  # repeated rows have their own extremes
+        x = graph.cast(x, np.float32)  # which TensorRT takes, unlike whole numbers
+    else:
+        x = graph.full(x, eqn.invars[0].aval.shape, axes)
+    name = _REDUCTIONS[eqn.primitive.name]
+    shape = tuple(size for axis, size in enumerate(x.shape) if axis not in axes)
+    # The sum alone has its axes as an input, since version 13.
+    is_sum = name == "ReduceSum"
+    given, fields = ([x, graph.ints(*axes)], {}) if is_sum else ([x], {"axes": list(axes)})
+    reduced = graph.add(name, given, shape, x.dtype, keepdims=0, **fields)
+    return [graph.cast(reduced, eqn.outvars[0].aval.dtype)]
 
 
 @converts("argmax")
 def _place(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     (axis,) = eqn.params["axes"]
-    x = _whole(graph, inputs, eqn, [axis])
+    x = graph.full(inputs[0], eqn.invars[0].aval.shape, [axis])
     shape = (*x.shape[:axis], *x.shape[axis + 1 :])
     place = graph.add("ArgMax", [x], shape, np.int64, axis=axis, keepdims=0)
     return [graph.cast(place, eqn.params["index_dtype"])]
@@ -353,7 +290,7 @@ def _largest_of_windows(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list
     if len(others) != 2 or any(map(any, (padding[axis] for axis in others))) or set(dilated) != {1}:
         raise Unsupported("reduce_window_max of other axes than those of an image")
     strides = eqn.params["window_strides"]
-    x = _whole(graph, inputs, eqn, range(len(window)))
+    x = graph.full(inputs[0], eqn.invars[0].aval.shape)
     order = [*others, *axes]
     result = eqn.outvars[0].aval.shape
     pooled = graph.add(
@@ -374,25 +311,17 @@ def _largest_of_windows(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list
 @converts("dot_general")
 def _product(graph: Graph, inputs: Sequence[Value], eqn: Any) -> list[Value]:
     (summed_a, summed_b), (batch_a, batch_b) = eqn.params["dimension_numbers"]
-    shapes = [var.aval.shape for var in eqn.invars]
-    free_a, free_b = (
-        [axis for axis in range(len(shape)) if axis not in (*summed, *batch)]
-        for shape, summed, batch in zip(
-            shapes, (summed_a, summed_b), (batch_a, batch_b), strict=True
-        )
-    )
+    (shape_a, shape_b), dtype = (var.aval.shape for var in eqn.invars), eqn.outvars[0].aval.dtype
+    free_a = [axis for axis in range(len(shape_a)) if axis not in (*summed_a, *batch_a)]
+    free_b = [axis for axis in range(len(shape_b)) if axis not in (*summed_b, *batch_b)]
     # MatMul broadcasts the batch; all other axes are needed as they are.
-    a, b = (
-        graph.full(x, shape, [axis for axis in range(len(shape)) if axis not in batch])
-        for x, shape, batch in zip(inputs, shapes, (batch_a, batch_b), strict=True)
-    )
-    dtype = eqn.outvars[0].aval.dtype
-    a, b = graph.cast(a, dtype), graph.cast(b, dtype)
+    a = graph.cast(graph.full(inputs[0], shape_a, [*free_a, *summed_a]), dtype)
+    b = graph.cast(graph.full(inputs[1], shape_b, [*free_b, *summed_b]), dtype)
     a = graph.transpose(a, [*batch_a, *free_a, *summed_a])
     b = graph.transpose(b, [*batch_b, *summed_b, *free_b])
     count = len(batch_a)
-    rows, columns = ([shapes[i][axis] for axis in free] for i, free in ((0, free_a), (1, free_b)))
-    sums = [shapes[0][axis] for axis in summed_a]
+    rows, columns = [shape_a[axis] for axis in free_a], [shape_b[axis] for axis in free_b]
+    sums = [shape_a[axis] for axis in summed_a]
     a_batch, b_batch = a.shape[:count], b.shape[:count]
     # Rows in several axes stay so where one matrix is common to all of them.
     if count or len(columns) != 1 or not rows:

@@ -56,7 +56,7 @@ def write_onnx(
     values = [Value(each.shape, np.dtype(each.dtype), name) for name, each in inputs.items()]
     count = values[0].shape[0]
     if not is_known(count):
-        (graph.symbolic[count],) = graph.node("Shape", [values[0].name], start=0, end=1)
+        graph.symbolic[count] = graph.node("Shape", [values[0].name], start=0, end=1)
     arguments = [Value.of(leaf) for leaf in jax.tree.leaves(weights)]
     (result,) = convert(graph, traced, [*arguments, *values])
     if result.missing:

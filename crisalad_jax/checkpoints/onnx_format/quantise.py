@@ -1,10 +1,9 @@
 """Quantise a program's products with weights to int8, by onnxruntime's own calibration."""
 
-import contextlib
 import logging
 import pathlib
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from onnxruntime import quantization
@@ -16,20 +15,14 @@ class _Images(quantization.CalibrationDataReader):
     """Images one by one, for the ranges of what layers give."""
 
     def __init__(self, images: np.ndarray) -> None:
-        self._images: Iterator[dict[str, np.ndarray]] = (
-            {"images": images[number : number + 1]} for number in range(len(images))
-        )
+        self._images = ({"images": image[None]} for image in images)
 
     def get_next(self) -> dict[str, np.ndarray] | None:  # type: ignore[override]
         return next(self._images, None)
 
 
 def quantise(
-    program: pathlib.Path,
-    images: np.ndarray,
-    nodes: Sequence[str],
-    *,
-    per_channel: bool,
+    program: pathlib.Path, images: np.ndarray, nodes: Sequence[str], *, per_channel: bool
 ) -> None:
     """Quantise a program of images in its place.
 
@@ -45,7 +38,9 @@ def quantise(
     whole.mkdir()
     for each in (program, program.with_name(f"{program.name}.data")):
         each.rename(whole / each.name)
-    with _quiet():
+    # Leave out the advice to optimise the program first, which was done as it was made.
+    logging.disable(logging.WARNING)
+    try:
         quantization.quantize_static(
             whole / program.name,
             program,
@@ -63,15 +58,6 @@ def quantise(
                 "OpTypesToExcludeOutputQuantization": _OPERATORS,
             },
         )
-    shutil.rmtree(whole)
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Leave out the advice to optimise the program first, which was done as it was made."""
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        yield
     finally:
-        logging.disable(before)
+        logging.disable(logging.NOTSET)
+    shutil.rmtree(whole)

@@ -521,13 +521,10 @@ class Map:
             check_model(self.metadata, self.folder, found.digest, file)
             model = Model(found.params, self.config)
         else:
-            config = self.metadata.config
             model = open_runtime(
                 file,
                 engine,
-                image_size=tuple(config["image_size"]),
-                preprocessing=config["preprocessing"],
-                precision=config["compute_dtype"],
+                self.metadata.config,
                 any_grouping=set(groupings) != {"single"},
                 verify=verify,
             )
