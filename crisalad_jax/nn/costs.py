@@ -70,13 +70,9 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
 
     single, double = (_count_traced(extract, params, pixels(count)) for count in (1, 2))
     macs = {part: double[part] - single[part] for part in _SCOPES.values()}
-    if params.cross_image is not None:
-        tokens = jax.eval_shape(extract, params, pixels(images))
-        attend = functools.partial(attend_across_images, config=config, mask=self_mask(images))
-        attended = _count_traced(attend, params, tokens)
-        macs["cross-image encoder"] = attended["cross-image encoder"] // images
-    if params.projection is not None:
-        macs["projection"] = math.prod(params.projection.weight.shape)
+    attend = functools.partial(attend_across_images, config=config, mask=self_mask(images))
+    attended = _count_traced(attend, params, jax.eval_shape(extract, params, pixels(images)))
+    macs |= {part: count // images for part, count in attended.items()}
     counts = collections.Counter[str]()
     for name, leaf in named_leaves(params).items():
         counts[_part_of(name)] += math.prod(leaf.shape)

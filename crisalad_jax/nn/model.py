@@ -40,7 +40,7 @@ from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import IMAGE, image_mesh, over_images
 from crisalad_jax.utils.errors import few
-from crisalad_jax.utils.pytree import check_drawn, named_leaves, pytree_dataclass
+from crisalad_jax.utils.pytree import check_drawn, pytree_dataclass
 
 _ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
 """Names of linear layers' weights, which `layers.linear` casts to the type of its input."""
@@ -144,7 +144,11 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
     if stored:
         problems = diff_trees(params, template) or not_finite(params)
     else:
-        _check_64_bit_mode(config)
+        require(
+            config.compute_dtype != "float64" or jax.config.jax_enable_x64,  # pyright: ignore
+            "ModelConfig.compute_dtype: found float64 in JAX's 32-bit mode, expected "
+            "JAX_ENABLE_X64=1 in the environment, or jax.config.update('jax_enable_x64', True)",
+        )
         dtypes = {jnp.dtype(config.compute_dtype)}
         problems = diff_trees(params, template, dtypes)
         if problems:
@@ -153,14 +157,6 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
                 joined = dataclasses.replace(params, backbone=backbone)
                 problems = diff_trees(joined, template, dtypes)
     require(not problems, f"params: not of this configuration: {few(problems)}")
-
-
-def _check_64_bit_mode(config: ModelConfig) -> None:
-    require(
-        config.compute_dtype != "float64" or jax.config.jax_enable_x64,  # pyright: ignore
-        "ModelConfig.compute_dtype: found float64 in JAX's 32-bit mode, expected JAX_ENABLE_X64=1 "
-        "in the environment, or jax.config.update('jax_enable_x64', True)",
-    )
 
 
 @takes(config=ModelConfig)
@@ -187,14 +183,13 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
         dtype(bfloat16)
     """
     dtype = jnp.dtype(config.compute_dtype)
-    names = iter(named_leaves(params))
-    if dtype == jnp.float64:
-        return jax.tree.map(lambda leaf: leaf.astype(dtype), params)
 
-    def cast(leaf: Any) -> Any:
-        return leaf.astype(dtype) if _ONLY_MULTIPLIED.fullmatch(next(names)) else leaf
+    def cast(path: Any, leaf: Any) -> Any:
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        is_cast = dtype == jnp.float64 or _ONLY_MULTIPLIED.fullmatch(name)
+        return leaf.astype(dtype) if is_cast else leaf
 
-    return jax.tree.map(cast, params)
+    return jax.tree_util.tree_map_with_path(cast, params)
 
 
 def _of_images(function: _F) -> _F:
@@ -208,7 +203,6 @@ def _of_images(function: _F) -> _F:
     @functools.wraps(spread)
     def call(params: Any, images: Any, config: Any, **options: Any) -> Any:
         check_pixels(images, config.preprocessing)
-        _check_64_bit_mode(config)
         return spread(params, images, config, **options)
 
     return cast(_F, call)
@@ -459,9 +453,7 @@ def _extract_features(
         images = jax.vmap(functools.partial(normalise, how=config.preprocessing))(images)
     params = _widened(params, config)
     request = config.aggregator.features(config.backbone.depth)
-    if not with_insertion:
-        request = dataclasses.replace(request, insertion=None)
-    elif request.insertion is not None:
+    if with_insertion:
         inserted = config.aggregator.inserted(params.aggregator)
         request = dataclasses.replace(request, inserted=inserted)
     with jax.named_scope("backbone"):
@@ -553,16 +545,14 @@ def attend_across_images(
             )
             mask = jnp.asarray(mask) | (self_mask(count) & ~mask.any(axis=1, keepdims=True))
         options = config.cross_image
-        enter = functools.partial(as_sequence, global_token=options.global_token)
-        leave = functools.partial(from_sequence, global_token=options.global_token)
         with jax.named_scope("cross_image"):
-            sequence = jax.vmap(enter)(tokens).astype(config.compute_dtype)
+            sequence = as_sequence(tokens, global_token=options.global_token)
+            sequence = sequence.astype(config.compute_dtype)
             sequence = cross_image_encoder(
                 params.cross_image, sequence, options, mask=mask, key=key
-            )
-        tokens = jax.vmap(leave)(sequence.astype(tokens.local.dtype), tokens)
-    make = functools.partial(to_descriptor, aggregator=config.aggregator)
-    descriptors = jax.vmap(make)(tokens)
+            ).astype(tokens.local.dtype)
+        tokens = from_sequence(sequence, tokens, global_token=options.global_token)
+    descriptors = to_descriptor(tokens, config.aggregator)
     if params.projection is None:
         return descriptors
     with jax.named_scope("projection"):

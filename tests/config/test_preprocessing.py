@@ -98,8 +98,8 @@ def test_a_backbone_of_any_size_is_not_rounded():
     )
     assert (config.side_multiple, config.input_size, config.grid) == (1, (512, 512), (32, 32))
     assert config.images_in_words == "shorter side 512, bilinear, antialiased, on bytes"
-    with pytest.raises(InputError, match="--resize: found round for backbone any-size, which"):
-        config.resized(None, ["round"])
+    rounding = config.resized(None, ["round"])
+    assert (rounding.side_multiple, rounding.input_size, rounding.grid) == (1, (512, 512), (32, 32))
 
 
 def test_a_size_beside_a_native_rule_is_told():
@@ -113,11 +113,13 @@ def test_a_size_beside_a_native_rule_is_told():
     assert native.resized((56, 84), ["native"]).image_size == (56, 84)
 
 
-def test_parameters_for_every_patch_need_a_fixed_size():
+def test_parameters_for_every_patch_need_images_of_one_size():
     config = dataclasses.replace(
         MODEL,
         aggregator=MixVprConfig(channels=8, rows=2, depth=1),
         cross_image=CrossImageConfig(layers=0),
     )
-    with pytest.raises(InputError, match=r"size_rule: found .native., expected fixed: .* mixvpr"):
-        config.resized(None, ["native"])
+    native = config.resized(None, ["native"])
+    native.check_image_size(config.image_size)
+    with pytest.raises(InputError, match=r"found 84 x 112, expected .* mixvpr has parameters for"):
+        native.check_image_size((84, 112))

@@ -107,19 +107,15 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "a step's tuple": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-tuple")),
-        r"^step test-input-tuple: found to return \(\(float32.*, expected \(Potentials\(row",
+        r"^step test-input-tuple, step: found to return \(\(float32.*, expected \(Potentials\(row",
     ),
     "a step's state": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-state")),
-        "^step test-input-state: found to return .*, float32.*, expected .*, int32",
+        "^step test-input-state, step: found to return .*, float32.*, expected .*, int32",
     ),
     "a step without a state": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-alone")),
-        "^step test-input-alone: found to return Potentials.*expected \\(Potentials.*, None\\)",
-    ),
-    "appended": (
-        lambda: append_dustbin(jnp.zeros((6, 3)), jnp.ones(5)),
-        r"dustbin: found shape \(5,\), expected \(\) or \(6,\)",
+        r"^step test-input-alone, step: found to return P.*expected \(Potentials.*, None\)",
     ),
     "assign": (
         lambda: assign_with_dustbin(jnp.zeros(6), jnp.float32(1)),
@@ -300,7 +296,7 @@ def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
         (
             SinkhornConfig,
             {"gradient": "optimistix", "tolerance": 1e-3, "anderson_memory": 3},
-            "anderson_memory: found 3, expected 0 with gradient 'optimistix'",
+            "anderson_memory: found 3, expected 0; or a whole number from 2, with",
         ),
         (
             SinkhornConfig,
@@ -395,7 +391,7 @@ def test_a_dustbin_of_ones_own() -> None:
             Potentials(jnp.zeros(5), jnp.zeros(3)),
             r"init.row .* \(5,\), expected \(6,\)",
         ),
-        (jnp.zeros(6), r"init.column found of shape \(6,\), expected \(3,\)"),
+        ((jnp.zeros(6), jnp.zeros(6)), r"init.column found of shape \(6,\), expected \(3,\)"),
     ],
 )
 def test_potentials_to_start_from_that_do_not_fit_are_refused(init, words):
