@@ -3,7 +3,6 @@
 On an accelerator self-attention is fused where a kernel takes it (`attention_fused`).
 """
 
-import dataclasses
 import functools
 import math
 from typing import Any, NamedTuple
@@ -105,15 +104,6 @@ def rotate(x: Heads, rotation: Rotation, *, length: int | None = None) -> Heads:
     first, second = jnp.split(wide, 2, axis=-1)
     turned = first * cosines - second * sines, second * cosines + first * sines
     return jnp.concatenate(turned, axis=-1).astype(x.dtype)
-
-
-def without_key_bias(params: Attention) -> Attention:
-    """Return the parameters with the keys' bias 0, which then has no gradient."""
-    bias = params.qkv.bias
-    assert bias is not None
-    queries, keys, values = jnp.split(bias, 3, axis=-1)
-    bias = jnp.concatenate([queries, jnp.zeros_like(keys), values], axis=-1)
-    return dataclasses.replace(params, qkv=dataclasses.replace(params.qkv, bias=bias))
 
 
 def cross_attention(

@@ -68,10 +68,10 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
     def pixels(count: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((count, *config.input_size, 3), jnp.uint8)
 
-    single, double = (_count_traced(extract, params, pixels(count)) for count in (1, 2))
+    single, double = (count_macs(extract, params, pixels(count)) for count in (1, 2))
     macs = {part: double[part] - single[part] for part in _SCOPES.values()}
     attend = functools.partial(attend_across_images, config=config, mask=self_mask(images))
-    attended = _count_traced(attend, params, jax.eval_shape(extract, params, pixels(images)))
+    attended = count_macs(attend, params, jax.eval_shape(extract, params, pixels(images)))
     macs |= {part: count // images for part, count in attended.items()}
     counts = collections.Counter[str]()
     for name, leaf in named_leaves(params).items():
@@ -90,7 +90,7 @@ def _part_of(text: str) -> str:
 
 
 @lowering_for(CPU)  # whose products are all seen: a fused attention is one operation
-def count_macs(function: Any, *arguments: Any) -> int:
+def count_macs(function: Any, *arguments: Any) -> "collections.Counter[str]":
     """Count the multiply-accumulates of a function's program, in products and convolutions.
 
     Args:
@@ -98,17 +98,14 @@ def count_macs(function: Any, *arguments: Any) -> int:
         arguments: arrays, or their shapes.
 
     Returns:
-        The count; of the branches of a conditional, the cheapest counts.
+        The counts of each part of a model, and of all else under an empty name. Of the branches of
+        a conditional, the cheapest counts.
 
     Example:
         >>> import jax.numpy as jnp
-        >>> count_macs(jnp.matmul, jnp.zeros((2, 3)), jnp.zeros((3, 4)))
+        >>> count_macs(jnp.matmul, jnp.zeros((2, 3)), jnp.zeros((3, 4))).total()
         24
     """
-    return _count_traced(function, *arguments).total()
-
-
-def _count_traced(function: Any, *arguments: Any) -> "collections.Counter[str]":
     return _count(jax.make_jaxpr(function)(*arguments).jaxpr)
 
 

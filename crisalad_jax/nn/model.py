@@ -192,24 +192,28 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
     return jax.tree_util.tree_map_with_path(cast, params)
 
 
-def _of_images(function: _F) -> _F:
-    """Check the pixels' values, which a trace does not know, before a compiled function is called.
+def _of_images(*static: str) -> Callable[[_F], _F]:
+    """Make a decorator that compiles a function of images, which knows the devices they are on.
 
-    The function knows the devices that its images are sharded over.
+    The pixels' values, which a trace does not know, are checked before the compiled function runs.
     """
-    spread = over_images("images", 1)(function)
 
-    @takes(params=Crisalad, config=ModelConfig)
-    @functools.wraps(spread)
-    def call(params: Any, images: Any, config: Any, **options: Any) -> Any:
-        check_pixels(images, config.preprocessing)
-        return spread(params, images, config, **options)
+    def decorate(function: _F) -> _F:
+        compiled = compiler.jit(function, static_argnames=("config", *static))
+        spread = over_images("images", 1)(compiled)
 
-    return cast(_F, call)
+        @takes(params=Crisalad, config=ModelConfig)
+        @functools.wraps(spread)
+        def call(params: Any, images: Any, config: Any, **options: Any) -> Any:
+            check_pixels(images, config.preprocessing)
+            return spread(params, images, config, **options)
+
+        return cast(_F, call)
+
+    return decorate
 
 
-@_of_images
-@functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
+@_of_images("micro_batch")
 def describe(
     params: Crisalad,
     images: Images,
@@ -261,8 +265,7 @@ def describe(
     return attend_across_images(params, tokens, config, mask=mask, key=cross_key)
 
 
-@_of_images
-@functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
+@_of_images("micro_batch")
 def extract_tokens(
     params: Crisalad,
     images: Images,
@@ -402,8 +405,7 @@ def _tokens_in_parts(
     return jax.tree.map(join, tokens), statistics
 
 
-@_of_images
-@functools.partial(compiler.jit, static_argnames="config")
+@_of_images()
 def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> Features:
     """Extract the features of every image that the aggregator requests.
 
@@ -472,8 +474,7 @@ def _widened(params: Crisalad, config: ModelConfig) -> Crisalad:
     return cast_params(params, config) if config.compute_dtype == "float64" else params
 
 
-@_of_images
-@functools.partial(compiler.jit, static_argnames="config")
+@_of_images()
 def unit_features(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image patch dim"]:
@@ -544,14 +545,13 @@ def attend_across_images(
                 "for each image",
             )
             mask = jnp.asarray(mask) | (self_mask(count) & ~mask.any(axis=1, keepdims=True))
-        options = config.cross_image
+        options, whole = config.cross_image, config.cross_image.global_token
         with jax.named_scope("cross_image"):
-            sequence = as_sequence(tokens, global_token=options.global_token)
-            sequence = sequence.astype(config.compute_dtype)
+            sequence = as_sequence(tokens, global_token=whole).astype(config.compute_dtype)
             sequence = cross_image_encoder(
                 params.cross_image, sequence, options, mask=mask, key=key
             ).astype(tokens.local.dtype)
-        tokens = from_sequence(sequence, tokens, global_token=options.global_token)
+        tokens = from_sequence(sequence, tokens, global_token=whole)
     descriptors = to_descriptor(tokens, config.aggregator)
     if params.projection is None:
         return descriptors
@@ -559,8 +559,7 @@ def attend_across_images(
         return project(params.projection, descriptors, config.projection)
 
 
-@_of_images
-@functools.partial(compiler.jit, static_argnames="config")
+@_of_images()
 def transport_masses(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image patch column"]:
@@ -571,13 +570,12 @@ def transport_masses(
     Raises:
         InputError: the model's aggregator has no transport, or as `describe`.
     """
-    features = extract_features(params, images, config)
     require(
         config.aggregator.transports,
         f"aggregator: found {config.aggregator.part_name}, expected one that transports, such as "
         "salad",
     )
-    return config.aggregator.plan(params.aggregator, features)
+    return config.aggregator.plan(params.aggregator, extract_features(params, images, config))
 
 
 def self_mask(count: Any) -> Bool[Array, "image image"]:

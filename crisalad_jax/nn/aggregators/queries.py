@@ -117,7 +117,12 @@ class BoqConfig(Aggregator):
         for block in params.boqs:
             attended = attention(block.encoder.attn, x, self.heads)
             x = encoder_layer(block.encoder, x, attended, jax.nn.relu)
-            answers.append(ask(block, x, self.heads))
+            # The queries' self-attention depends on no image: it runs once for a whole batch.
+            queries = block.queries.astype(x.dtype)
+            queries = queries + attention(block.self_attn, queries, self.heads)
+            queries = layer_norm(block.norm_q, queries)
+            answer = cross_attention(block.cross_attn, queries, x, self.heads)
+            answers.append(layer_norm(block.norm_out, answer))
         rows = linear(params.fc, jnp.concatenate(answers, axis=-2).swapaxes(-2, -1))
         return Tokens.of_local(at_least_float32(rows).swapaxes(-2, -1))
 
@@ -132,20 +137,6 @@ def _init_block(key: PRNGKeyArray, channels: int, queries: int) -> BoqBlock:
         cross_attn=init_torch_attention(keys[2], keys[3], channels),
         norm_out=init_layer_norm(channels),
     )
-
-
-def ask(
-    params: BoqBlock, x: Float[Array, "*batch patch channel"], heads: int
-) -> Float[Array, "*batch query channel"]:
-    """Attend from the queries to the patches, and normalise the answers.
-
-    The queries' self-attention does not depend on the image: it runs once for a whole batch.
-    """
-    queries = params.queries.astype(x.dtype)
-    queries = queries + attention(params.self_attn, queries, heads)
-    queries = layer_norm(params.norm_q, queries)
-    answers = cross_attention(params.cross_attn, queries, x, heads)
-    return layer_norm(params.norm_out, answers)
 
 
 @pytree_dataclass

@@ -43,9 +43,8 @@ class TransVprConfig(Aggregator):
     def features(self, depth: int) -> FeatureSpec:
         """Request the patches after several numbers of blocks."""
         require_range(self, 1, depth, "levels")
-        return FeatureSpec(
-            tuple(depth * (level + 1) // self.levels for level in range(self.levels))
-        )
+        numbers = range(1, self.levels + 1)
+        return FeatureSpec(tuple(depth * number // self.levels for number in numbers))
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of a global token."""

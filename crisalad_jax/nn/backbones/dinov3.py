@@ -9,12 +9,14 @@ import dataclasses
 import functools
 from typing import ClassVar
 
+import jax.numpy as jnp
 import numpy as np
 
 from crisalad_jax.config.checks import NonNegativeInt, require_field
-from crisalad_jax.nn.attention import Attention, Rotation, without_key_bias
+from crisalad_jax.nn.attention import Attention, Rotation
 from crisalad_jax.nn.backbones.base import BACKBONES, Grid
 from crisalad_jax.nn.backbones.vit import Block, VisionTransformer
+from crisalad_jax.nn.layers import Linear
 
 PERIOD_BASE = 100.0
 """Ratio that the longest period approaches; the shortest is 1, half the side of an image."""
@@ -51,11 +53,15 @@ class DinoV3Config(VisionTransformer):
         return _rotation(grid, self.dim // self.heads)
 
     def attention_of(self, layer: Block) -> Attention:
-        """Return a block's attention, in which keys have no bias.
+        """Return a block's attention with a bias of 0 for keys, which then has no gradient.
 
         Among rotated keys a bias would not cancel in the softmax.
         """
-        return without_key_bias(layer.attn)
+        qkv = layer.attn.qkv
+        assert qkv.bias is not None
+        queries, keys, values = jnp.split(qkv.bias, 3, axis=-1)
+        bias = jnp.concatenate([queries, jnp.zeros_like(keys), values], axis=-1)
+        return Attention(Linear(qkv.weight, bias), layer.attn.proj)
 
 
 def rotary_periods(head_dim: int) -> np.ndarray:

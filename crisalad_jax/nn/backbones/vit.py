@@ -138,8 +138,8 @@ class VisionTransformer(Backbone):
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        fits = self.dim % self.heads == 0
-        require_field(self, "dim", fits, f"a multiple of the {self.heads} heads")
+        words = f"a multiple of the {self.heads} heads"
+        require_field(self, "dim", self.dim % self.heads == 0, words)
         self.adapter.width(self.dim)
 
     @property
@@ -502,15 +502,13 @@ def run_blocks(
     statistics = []
     with jax.named_scope("blocks"):
         for stack in stacks:
-            if count is None:
-                carry, measured = jax.lax.scan(body, carry, stack)
-                statistics.append(measured)
-            else:
-                carry, _ = jax.lax.scan(
-                    lambda carry, number, stack=stack: body(carry, _layer_at(stack, number)),
-                    carry,
-                    jnp.arange(count),
-                )
+
+            def run(carry: Any, at: Any, stack: Block = stack) -> tuple[Any, Block]:
+                return body(carry, at if count is None else _layer_at(stack, at))
+
+            layers = stack if count is None else jnp.arange(count)
+            carry, measured = jax.lax.scan(run, carry, layers)
+            statistics.append(measured)
     tokens, side = carry
     return (tokens if side is None else side)[:, :length], statistics
 
@@ -596,8 +594,7 @@ def interpolate_positions(
     antialias = config.registers and config.position_resize == "dinov2"
     weights = _antialias_weights if antialias else _bicubic_weights
     rows, columns = (jnp.asarray(weights(side, size), positions.dtype) for size in grid)
-    precision = jax.lax.Precision.HIGHEST
-    return jnp.einsum("ri,cj,ijd->rcd", rows, columns, positions, precision=precision)
+    return jnp.einsum("ri,cj,ijd->rcd", rows, columns, positions, precision="highest")
 
 
 def _cubic(x: np.ndarray, a: float) -> np.ndarray:

@@ -86,10 +86,8 @@ class NoDustbin(Dustbin):
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Return the scores as they are."""
         rows, clusters = scores.shape[-2:]
-        each = math.log(rows / clusters)
-        return Marginals(
-            scores, jnp.zeros(rows, scores.dtype), jnp.full(clusters, each, scores.dtype)
-        )
+        log_nu = jnp.full(clusters, math.log(rows / clusters), scores.dtype)
+        return Marginals(scores, jnp.zeros(rows, scores.dtype), log_nu)
 
 
 @DUSTBINS.register("column")

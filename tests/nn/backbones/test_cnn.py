@@ -48,7 +48,7 @@ def macs(backbone: StagedBackbone) -> int:
     params = jax.eval_shape(backbone.init, jax.random.key(0))
     image = jax.ShapeDtypeStruct((1, 224, 224, 3), jnp.float32)
     apply = lambda p, x: backbone.apply(p, x, FeatureSpec(), remat="none")[0].patches  # noqa: E731
-    return count_macs(apply, params, image)
+    return count_macs(apply, params, image).total()
 
 
 def count_learnt(backbone: StagedBackbone) -> int:

@@ -61,7 +61,7 @@ MU, NU = jnp.zeros(6), jnp.log(jnp.array([1.0, 2.0, 3.0]))
 BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "one axis": (
         lambda: solve(jnp.zeros(3), MU, NU),
-        r"float32 and shape \(3,\), expected",
+        r"found scores of shape \(3,\), expected",
     ),
     "rows": (
         lambda: solve(jnp.zeros((5, 3)), MU, NU),
@@ -99,11 +99,7 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "no columns": (
         lambda: solve(jnp.zeros((6, 0)), MU, MU[:0]),
-        r"and shape \(6, 0\), expected real numbers",
-    ),
-    "complex": (
-        lambda: solve(jnp.zeros((6, 3), complex), MU, NU),
-        "found scores of complex64 and shape .*, expected real numbers",
+        r"found scores of shape \(6, 0\), expected",
     ),
     "a step's tuple": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-tuple")),
