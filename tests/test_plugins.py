@@ -367,6 +367,38 @@ def test_a_plug_in_that_raises_while_it_runs_is_named_in_one_line(
         succeeds(capfd, "info")
 
 
+def test_a_dustbin_that_returns_something_else_is_named() -> None:
+    @cj.sinkhorn.register_dustbin("wrong")
+    @dataclasses.dataclass(frozen=True)
+    class Wrong(cj.sinkhorn.Dustbin):
+        def marginals(self, params: Any, scores: Any, patches: Any) -> Any:
+            return scores
+
+    with pytest.raises(InputError, match=r"^dustbin wrong: found \w+, expected Marginals"):
+        cj.sinkhorn.assign_with_dustbin(jnp.zeros((6, 3)), None, "wrong")
+
+
+@pytest.mark.parametrize("returned", [None, "potentials", "short"])
+def test_a_gradient_that_returns_something_else_is_named(returned: str | None) -> None:
+    @cj.sinkhorn.register_gradient("wrong")
+    @dataclasses.dataclass(frozen=True)
+    class Wrong(cj.sinkhorn.Gradient):
+        def solve(self, problem: Any, config: Any, params: Any, init: Any) -> Any:
+            short = init._replace(row=init.row[1:])
+            one = jnp.zeros((), jnp.int32)
+            solution = cj.sinkhorn.Solution(short, one, one > 0)
+            return {None: None, "potentials": init, "short": solution}[returned]
+
+    found = {
+        None: "None",
+        "potentials": r"Potentials\(row=float32\[6\], column=float32\[3\]\)",
+        "short": r"Solution\(potentials=Potentials\(row=float32\[5\], .*\)",
+    }[returned]
+    log_nu = jnp.log(jnp.full(3, 2.0))
+    with pytest.raises(InputError, match=f"^gradient wrong: found to return {found}, expected S"):
+        solve(jnp.zeros((6, 3)), jnp.zeros(6), log_nu, config=SinkhornConfig(gradient="wrong"))
+
+
 def test_a_plug_in_that_ends_the_program_is_refused(tmp_path: pathlib.Path) -> None:
     file = tmp_path / "ends.py"
     file.write_text("import sys\n\nsys.exit(0)\n")

@@ -77,6 +77,9 @@ class ModelConfig:
                 has or not is_asked,
                 f"backbone: found {backbone.part_name} for {aggregator}, expected one with {what}",
             )
+        fits = self.preprocessing.size_rule == "fixed" or not self.aggregator.fixed_grid
+        words = f"fixed: {aggregator} has parameters for every patch, of images of one size alone"
+        require_field(self.preprocessing, "size_rule", fits, words)
         self.check_image_size(self.input_size)
         encoder, (global_dim, tokens, dim) = self.cross_image, self.token_shape
         if not encoder.layers:
@@ -93,7 +96,7 @@ class ModelConfig:
     @property
     def token_shape(self) -> TokenShape:
         """Shape of an image's tokens."""
-        return self.aggregator.token_shape(self.backbone.dim)
+        return TokenShape(*self.aggregator.token_shape(self.backbone.dim))
 
     @property
     def descriptor_dim(self) -> int:

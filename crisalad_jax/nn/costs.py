@@ -116,7 +116,9 @@ def _count(program: Any, scope: str = "", times: int = 1) -> "collections.Counte
         here = f"{scope}/{equation.source_info.name_stack}"
         name = equation.primitive.name
         inside = times * equation.params["length"] if name == "scan" else times
-        inner = [_count(each, here, inside) for each in _inner_programs(equation)]
+        # Programs are among the parameters, closed or not, and branches are a tuple of them.
+        inner = [getattr(value, "jaxpr", value) for value in jax.tree.leaves(equation.params)]
+        inner = [_count(each, here, inside) for each in inner if isinstance(each, core.Jaxpr)]
         if name == "cond":
             inner = [min(inner, key=collections.Counter.total)]
         for each in inner:
@@ -125,13 +127,6 @@ def _count(program: Any, scope: str = "", times: int = 1) -> "collections.Counte
         if macs:
             totals[_part_of(here)] += macs
     return totals
-
-
-def _inner_programs(equation: Any) -> list[Any]:
-    """Return the programs in an equation's parameters, of which one may be a tuple of branches."""
-    values = jax.tree.leaves(equation.params)
-    programs = (getattr(value, "jaxpr", value) for value in values)  # a closed one has it
-    return [each for each in programs if isinstance(each, core.Jaxpr)]
 
 
 def _macs(equation: Any, name: str, scope: str) -> int:

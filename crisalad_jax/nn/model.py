@@ -570,11 +570,6 @@ def transport_masses(
     Raises:
         InputError: the model's aggregator has no transport, or as `describe`.
     """
-    require(
-        config.aggregator.transports,
-        f"aggregator: found {config.aggregator.part_name}, expected one that transports, such as "
-        "salad",
-    )
     return config.aggregator.plan(params.aggregator, extract_features(params, images, config))
 
 

@@ -113,13 +113,11 @@ def test_a_size_beside_a_native_rule_is_told():
     assert native.resized((56, 84), ["native"]).image_size == (56, 84)
 
 
-def test_parameters_for_every_patch_need_images_of_one_size():
+def test_parameters_for_every_patch_need_a_fixed_size():
     config = dataclasses.replace(
         MODEL,
         aggregator=MixVprConfig(channels=8, rows=2, depth=1),
         cross_image=CrossImageConfig(layers=0),
     )
-    native = config.resized(None, ["native"])
-    native.check_image_size(config.image_size)
-    with pytest.raises(InputError, match=r"found 84 x 112, expected .* mixvpr has parameters for"):
-        native.check_image_size((84, 112))
+    with pytest.raises(InputError, match=r"size_rule: found .native., expected fixed: .* mixvpr"):
+        config.resized(None, ["native"])

@@ -17,6 +17,7 @@ from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
 from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise
 from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import expect_like
 
 Centroids = Float[Array, "cluster dim"]
@@ -175,7 +176,9 @@ class Aggregator(Part, abc.ABC):
         A patch sends a mass of 1. If there is a dustbin, it is the last column. `transports` tells
         whether an aggregator has this.
         """
-        raise NotImplementedError
+        raise InputError(
+            f"aggregator: found {self.part_name}, expected one that transports, such as salad"
+        )
 
 
 def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int, ...]) -> None:
@@ -190,7 +193,7 @@ def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int
     Raises:
         InputError: it has not; the message names the aggregator.
     """
-    shape = aggregator.token_shape(dim)
+    shape = TokenShape(*aggregator.token_shape(dim))
     wide = jnp.result_type(jnp.float32, *jax.tree.leaves(tokens))
     expected = Tokens(
         jax.ShapeDtypeStruct((*batch, shape.global_dim), wide),

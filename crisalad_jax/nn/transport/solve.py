@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.transport.checks import check_inputs, check_step, equal_totals, wide_dtype
-from crisalad_jax.nn.transport.config import SinkhornConfig
+from crisalad_jax.nn.transport.config import SinkhornConfig, Solution
 from crisalad_jax.nn.transport.differentiate import centred
-from crisalad_jax.nn.transport.dustbin import DUSTBINS, Dustbin
+from crisalad_jax.nn.transport.dustbin import DUSTBINS, Dustbin, Marginals
 from crisalad_jax.nn.transport.problem import (
     Matrix,
     Potentials,
@@ -21,6 +21,7 @@ from crisalad_jax.nn.transport.problem import (
     marginal_error,
     zero_potentials,
 )
+from crisalad_jax.utils.pytree import expect_like
 
 
 @brief
@@ -95,7 +96,7 @@ def solve(
         The plan's logarithm, the potentials, and how well the plan meets its marginals.
 
     Raises:
-        InputError: shapes that do not fit, a tau out of range, a solver without its gradient, a
+        InputError: shapes that do not fit, a tau out of range, a
             step that returns anything but such potentials; and where values are known (outside of
             `jit` and `grad`): scores that are not finite, masses that are NaN or infinite or all 0,
             masses that sum to different totals, an epsilon of 0 or less or too small; or
@@ -115,11 +116,6 @@ def solve(
     # Totals may differ for a step of another problem, such as one with column capacities.
     equal = row_tau == column_tau == 1 and config.step.entropic
     check_inputs(scores, log_mu, log_nu, epsilon, init, equal_totals=equal)
-    require(
-        solver is None or config.gradient.takes_solver,
-        f"sinkhorn: found a solver with gradient {config.gradient.part_name!r}, expected one that "
-        "takes it, such as 'optimistix'",
-    )
     arguments = scores, log_mu, log_nu, epsilon, init, step_params, row_tau, column_tau, config
     # A solver need not be hashable, so it cannot be a static argument.
     result = _compiled(*arguments) if solver is None else _solve(*arguments, solver)
@@ -165,6 +161,9 @@ def _solve(
         start = jax.tree.map(lambda x, zero: jnp.asarray(x, wide) + zero, Potentials(*init), zeros)
     options = {} if solver is None else {"solver": solver}
     solution = config.gradient.solve(problem, config, step_params, start, **options)
+    count = jnp.zeros(kernel.shape[:-2], jnp.int32)
+    wanted = Solution(zeros, count, count.astype(bool))
+    expect_like(f"gradient {config.gradient.part_name}", solution, wanted)
     potentials = problem.masked(solution.potentials)
     log_plan = step.log_plan(problem, potentials)
     errors = marginal_error(log_plan, problem.log_mu, problem.log_nu)
@@ -224,6 +223,11 @@ def assign_with_dustbin(
     scores = scores.astype(wide_dtype(scores))
     if isinstance(dustbin, str):
         dustbin = DUSTBINS.make(dustbin)
-    result = solve(*dustbin.marginals(params, scores, patches), **options)
+    marginals = dustbin.marginals(params, scores, patches)
+    require(
+        isinstance(marginals, Marginals),
+        f"dustbin {dustbin.part_name}: found {type(marginals).__name__}, expected Marginals",
+    )
+    result = solve(*marginals, **options)
     # Drop the dustbin's own row.
     return result._replace(log_plan=result.log_plan[..., : scores.shape[-2], :])

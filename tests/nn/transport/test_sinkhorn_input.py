@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 import pytest
 
 from crisalad_jax.nn.aggregators.salad import SaladConfig
@@ -90,12 +89,6 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "dustbin": (
         lambda: assign_with_dustbin(jnp.zeros((6, 3)), 1.0, "row"),
         "^dustbin: found 'row', expected one of column, mass, none, row and column,",
-    ),
-    "solver": (
-        lambda: solve(
-            jnp.zeros((6, 3)), MU, NU, solver=optimistix.FixedPointIteration(rtol=0, atol=1)
-        ),
-        "a solver with gradient 'unrolled', expected one that takes it",
     ),
     "no columns": (
         lambda: solve(jnp.zeros((6, 0)), MU, MU[:0]),
