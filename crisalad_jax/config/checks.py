@@ -173,6 +173,7 @@ class Kind(NamedTuple):
     """The type, for a message."""
 
 
+# Types of fields whose numbers have a range. To all but `check_types` they are int and float.
 PositiveInt = Annotated[int, Kind(lambda value: value >= 1, "a whole number of at least 1")]
 NonNegativeInt = Annotated[int, Kind(lambda value: value >= 0, "a whole number of at least 0")]
 PositiveFloat = Annotated[
