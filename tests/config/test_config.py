@@ -488,7 +488,7 @@ def test_what_does_not_fit_is_refused_in_one_line(kind, fields, words):
         (AdapterConfig, {"kind": None}, "None", "one of depthwise, mlp, multi-resolution, none"),
         (ViTConfig, {"adapter": "mlp"}, "'mlp'", "AdapterConfig"),
         (SaladConfig, {"sinkhorn": 3}, "3", "SinkhornConfig"),
-        (SinkhornConfig, {"tolerance": "1e-3"}, "'1e-3'", "a number, or None"),
+        (SinkhornConfig, {"tolerance": "1e-3"}, "'1e-3'", "a finite number above 0, or None"),
         (ModelConfig, {"image_size": 224}, "224", "a tuple of 2, each a whole number"),
         (ModelConfig, {"image_size": [224, 224]}, "[224, 224]", "a tuple of 2, each a whole num"),
         (ModelConfig, {"image_size": (224, 2.5)}, "(224, 2.5)", "a tuple of 2, each a whole num"),

@@ -6,6 +6,7 @@ parity/test_cnn.py compares outputs and gradients with torch, parity/test_zoo.py
 import dataclasses
 import itertools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
