@@ -501,14 +501,14 @@ def run_blocks(
     carry = tokens, tokens if config.adapter.kind == "side" else None
     statistics = []
     with jax.named_scope("blocks"):
-        for stack in stacks:
-
-            def run(carry: Any, at: Any, stack: Block = stack) -> tuple[Any, Block]:
-                return body(carry, at if count is None else _layer_at(stack, at))
-
-            layers = stack if count is None else jnp.arange(count)
-            carry, measured = jax.lax.scan(run, carry, layers)
+        for stack in stacks if count is None else ():
+            carry, measured = jax.lax.scan(body, carry, stack)
             statistics.append(measured)
+        if count is not None:
+            (stack,) = stacks
+            carry, _ = jax.lax.scan(
+                lambda carry, at: body(carry, _layer_at(stack, at)), carry, jnp.arange(count)
+            )
     tokens, side = carry
     return (tokens if side is None else side)[:, :length], statistics
 
