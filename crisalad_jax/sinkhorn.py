@@ -15,70 +15,39 @@ A step, a dustbin or a gradient of your own is registered as the built-in ones a
     solve(scores, log_mu, log_nu, config=SinkhornConfig(step="capacity"))
 """
 
-from crisalad_jax.nn.transport.config import GRADIENTS, Gradient, SinkhornConfig, Solution
-from crisalad_jax.nn.transport.differentiate import Implicit, Optimistix, Stop, Unrolled
-from crisalad_jax.nn.transport.dustbin import (
-    DUSTBINS,
-    ColumnDustbin,
-    Dustbin,
-    Marginals,
-    MassDustbin,
-    NoDustbin,
-    RowAndColumnDustbin,
-    TokenDustbin,
-    append_dustbin,
-    log_marginals,
-)
-from crisalad_jax.nn.transport.iterate import iterate
-from crisalad_jax.nn.transport.problem import SCALING_RANGE, Potentials, Problem, marginal_error
-from crisalad_jax.nn.transport.solve import SinkhornResult, assign_with_dustbin, solve
-from crisalad_jax.nn.transport.steps import (
-    STEPS,
-    DualSoftmaxStep,
-    NewtonStep,
-    SinkhornStep,
-    SoftmaxStep,
-    Step,
-)
+from crisalad_jax.nn.transport.config import GRADIENTS as GRADIENTS
+from crisalad_jax.nn.transport.config import Gradient as Gradient
+from crisalad_jax.nn.transport.config import SinkhornConfig as SinkhornConfig
+from crisalad_jax.nn.transport.config import Solution as Solution
+from crisalad_jax.nn.transport.differentiate import Implicit as Implicit
+from crisalad_jax.nn.transport.differentiate import Optimistix as Optimistix
+from crisalad_jax.nn.transport.differentiate import Stop as Stop
+from crisalad_jax.nn.transport.differentiate import Unrolled as Unrolled
+from crisalad_jax.nn.transport.dustbin import DUSTBINS as DUSTBINS
+from crisalad_jax.nn.transport.dustbin import ColumnDustbin as ColumnDustbin
+from crisalad_jax.nn.transport.dustbin import Dustbin as Dustbin
+from crisalad_jax.nn.transport.dustbin import Marginals as Marginals
+from crisalad_jax.nn.transport.dustbin import MassDustbin as MassDustbin
+from crisalad_jax.nn.transport.dustbin import NoDustbin as NoDustbin
+from crisalad_jax.nn.transport.dustbin import RowAndColumnDustbin as RowAndColumnDustbin
+from crisalad_jax.nn.transport.dustbin import TokenDustbin as TokenDustbin
+from crisalad_jax.nn.transport.dustbin import append_dustbin as append_dustbin
+from crisalad_jax.nn.transport.dustbin import log_marginals as log_marginals
+from crisalad_jax.nn.transport.iterate import iterate as iterate
+from crisalad_jax.nn.transport.problem import SCALING_RANGE as SCALING_RANGE
+from crisalad_jax.nn.transport.problem import Potentials as Potentials
+from crisalad_jax.nn.transport.problem import Problem as Problem
+from crisalad_jax.nn.transport.problem import marginal_error as marginal_error
+from crisalad_jax.nn.transport.solve import SinkhornResult as SinkhornResult
+from crisalad_jax.nn.transport.solve import assign_with_dustbin as assign_with_dustbin
+from crisalad_jax.nn.transport.solve import solve as solve
+from crisalad_jax.nn.transport.steps import STEPS as STEPS
+from crisalad_jax.nn.transport.steps import DualSoftmaxStep as DualSoftmaxStep
+from crisalad_jax.nn.transport.steps import NewtonStep as NewtonStep
+from crisalad_jax.nn.transport.steps import SinkhornStep as SinkhornStep
+from crisalad_jax.nn.transport.steps import SoftmaxStep as SoftmaxStep
+from crisalad_jax.nn.transport.steps import Step as Step
 
 register_step = STEPS.register
 register_dustbin = DUSTBINS.register
 register_gradient = GRADIENTS.register
-
-__all__ = [
-    "DUSTBINS",
-    "GRADIENTS",
-    "SCALING_RANGE",
-    "STEPS",
-    "ColumnDustbin",
-    "DualSoftmaxStep",
-    "Dustbin",
-    "Gradient",
-    "Implicit",
-    "Marginals",
-    "MassDustbin",
-    "NewtonStep",
-    "NoDustbin",
-    "Optimistix",
-    "Potentials",
-    "Problem",
-    "RowAndColumnDustbin",
-    "SinkhornConfig",
-    "SinkhornResult",
-    "SinkhornStep",
-    "SoftmaxStep",
-    "Solution",
-    "Step",
-    "Stop",
-    "TokenDustbin",
-    "Unrolled",
-    "append_dustbin",
-    "assign_with_dustbin",
-    "iterate",
-    "log_marginals",
-    "marginal_error",
-    "register_dustbin",
-    "register_gradient",
-    "register_step",
-    "solve",
-]

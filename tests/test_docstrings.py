@@ -19,8 +19,8 @@ PUBLIC = {
         module, name
     )
     for module in (crisalad_jax, crisalad_jax.sinkhorn)
-    for name in module.__all__
-    if name not in ("__version__", "sinkhorn")
+    for name in getattr(module, "__all__", vars(module))
+    if name != "sinkhorn" and not name.startswith("_")
 }
 DOCUMENTED = {
     name: value

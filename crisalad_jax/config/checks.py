@@ -8,6 +8,7 @@ import os
 import types
 from collections.abc import Callable, Iterable, Mapping
 from typing import (
+    Annotated,
     Any,
     Literal,
     NamedTuple,
@@ -158,7 +159,7 @@ def check_types(config: Any) -> None:
 @functools.cache
 def _checked_hints(kind: type) -> Mapping[str, Any]:
     """Return the types of the fields that are for no part."""
-    hints = get_type_hints(kind)
+    hints = get_type_hints(kind, include_extras=True)
     fields: Any = dataclasses.fields(kind)
     return {f.name: hints[f.name] for f in fields if REGISTRY not in f.metadata}
 
@@ -172,10 +173,24 @@ class Kind(NamedTuple):
     """The type, for a message."""
 
 
+# Types of fields whose numbers have a range. To all but `check_types` they are int and float.
+PositiveInt = Annotated[int, Kind(lambda value: value >= 1, "a whole number of at least 1")]
+NonNegativeInt = Annotated[int, Kind(lambda value: value >= 0, "a whole number of at least 0")]
+PositiveFloat = Annotated[
+    float, Kind(lambda value: 0 < value < math.inf, "a finite number above 0")
+]
+Fraction = Annotated[
+    float, Kind(lambda value: 0 <= value < 1, "a number of at least 0 and less than 1")
+]
+
+
 @functools.cache
 def kind_of(hint: Any) -> Kind:
     """Return what a type hint says of values."""
     origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        plain, limited = kind_of(arguments[0]), arguments[1]
+        return Kind(lambda value: plain.fits(value) and limited.fits(value), limited.words)
     if origin in (Union, types.UnionType):
         kinds = [kind_of(each) for each in arguments]
         words = ", or ".join(kind.words for kind in kinds)

@@ -63,7 +63,7 @@ class PreprocessingConfig:
     round_to_patch: bool = non_semantic_field(False)
     """Whether images of a fixed size that is no multiple of the patch size are resized once more,
     to the nearest one (halves to the even number), bilinear and antialiased. MegaLoc does so."""
-    bit_depth: BitDepth = non_semantic_field("high-byte")  # noqa: RUF009
+    bit_depth: BitDepth = non_semantic_field("high-byte")
     """How more than 8 bits a colour become 8, before the resize. "high-byte" drops the low byte of
     16. "contrast-stretch" spreads each image's own values, from the 1st to the 99th percentile,
     over 0 to 255: for thermal images, whose values fill a small part of 16 bits, and for floats.

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import check_types, require_field, require_positive
+from crisalad_jax.config.checks import PositiveFloat, PositiveInt, check_types, require_field
 from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.nn import random_init
-from crisalad_jax.nn.convolutions import ConvNorm, conv_norm
+from crisalad_jax.nn.convolutions import ConvNorm, Map, conv_norm
 from crisalad_jax.nn.layers import (
     Conv,
     DepthwiseConv,
@@ -54,9 +54,9 @@ class AdapterConfig:
     """Kind of adapter: the paper's depthwise-separable convolution, CricaVPR's multi-resolution
     one, or a plain MLP; SelaVPR's plain MLPs, one after the attention and one parallel to the MLP;
     or EDTformer's, on a path of their own, parallel to all blocks (side); none leaves it out."""
-    bottleneck: float = 0.5
+    bottleneck: PositiveFloat = 0.5
     """Width of the adapter over the width of the backbone."""
-    kernel_size: int = 3
+    kernel_size: PositiveInt = 3
     """Side of the depthwise filter."""
     alpha: float = 0.2
     """Weight of the adapter's output (paper Eq. 2); a serial one has weight 1."""
@@ -65,13 +65,9 @@ class AdapterConfig:
     The paper prints the count of parameters alone (Table 3), which is 741,504 in both readings."""
 
     def __post_init__(self) -> None:
-        """Check the ranges of the fields in use."""
+        """Check the fields."""
         check_types(self)
-        if self.kind != "none":
-            require_positive(self, "bottleneck")
-        if self.kind == "depthwise":
-            odd = self.kernel_size > 0 and self.kernel_size % 2 == 1
-            require_field(self, "kernel_size", odd, "an odd number above 0")
+        require_field(self, "kernel_size", self.kernel_size % 2 == 1, "an odd number")
 
     def width(self, dim: int) -> int:
         """Return the width of the bottleneck of an adapter in a backbone of width `dim`.
@@ -220,17 +216,13 @@ def adapter(
     return linear(params.up, branch + hidden), params
 
 
-def _separable(
-    params: DepthwiseAdapter, x: Float[Array, "image height width dim"]
-) -> Float[Array, "image height width dim"]:
+def _separable(params: DepthwiseAdapter, x: Map) -> Map:
     # No activation between the two convolutions, as in Xception.
     filtered = jax.vmap(functools.partial(depthwise_conv, params.depthwise))(x)
     return jax.nn.relu(checkpoint_name(linear(params.pointwise, filtered), "mixed"))
 
 
-def _multi_resolution(
-    params: MultiResolutionAdapter, x: Float[Array, "image height width dim"], valid: Valid
-) -> tuple[Float[Array, "image height width dim"], MultiResolutionAdapter]:
+def _multi_resolution(params: MultiResolutionAdapter, x: Map, valid: Valid) -> tuple[Map, Adapter]:
     outputs, updated = [], []
     for branch in ((params.branch1,), params.branch2, params.branch3):
         y, layers = x, []

@@ -3,7 +3,6 @@
 On an accelerator self-attention is fused where a kernel takes it (`attention_fused`).
 """
 
-import dataclasses
 import functools
 import math
 from typing import Any, NamedTuple
@@ -19,6 +18,9 @@ from crisalad_jax.nn.layers import Linear, at_least_float32, columns, init_linea
 from crisalad_jax.nn.products import product_precision, rule_precision
 from crisalad_jax.utils.pytree import pytree_dataclass
 from crisalad_jax.utils.target import target
+
+Heads = Float[Array, "*batch token head dim"]
+"""Queries, keys or values."""
 
 
 @pytree_dataclass
@@ -66,10 +68,9 @@ def attention(
     Returns:
         The tokens' updates. Scores and softmax are float32 for every type of `x`.
     """
-    *batch, tokens, dim = x.shape
+    tokens = x.shape[-2]
     length = tokens if length is None else length
-    qkv = checkpoint_name(linear(params.qkv, x), "qkv")
-    qkv = qkv.reshape(*batch, tokens, 3 * heads, dim // heads)
+    qkv = split_heads(checkpoint_name(linear(params.qkv, x), "qkv"), 3 * heads)
     parts = jnp.split(qkv, 3, axis=-2)
     if rotation is not None:
         parts[:2] = (rotate(part, rotation, length=length) for part in parts[:2])
@@ -82,9 +83,12 @@ def attention(
     return linear(params.proj, mixed.reshape(x.shape))
 
 
-def rotate(
-    x: Float[Array, "*batch token head dim"], rotation: Rotation, *, length: int | None = None
-) -> Float[Array, "*batch token head dim"]:
+def split_heads(x: Float[Array, "*batch dim"], heads: int) -> Float[Array, "*batch head _"]:
+    """Cut the numbers of each token into heads, side by side."""
+    return x.reshape(*x.shape[:-1], heads, x.shape[-1] // heads)
+
+
+def rotate(x: Heads, rotation: Rotation, *, length: int | None = None) -> Heads:
     """Turn queries or keys by their tokens' angles (RoPE: Su et al. 2021), in float32.
 
     Numbers i and i + dim / 2 of a head are a pair. Tokens before those with angles stay as they
@@ -102,15 +106,6 @@ def rotate(
     return jnp.concatenate(turned, axis=-1).astype(x.dtype)
 
 
-def without_key_bias(params: Attention) -> Attention:
-    """Return the parameters with the keys' bias 0, which then has no gradient."""
-    bias = params.qkv.bias
-    assert bias is not None
-    queries, keys, values = jnp.split(bias, 3, axis=-1)
-    bias = jnp.concatenate([queries, jnp.zeros_like(keys), values], axis=-1)
-    return dataclasses.replace(params, qkv=dataclasses.replace(params.qkv, bias=bias))
-
-
 def cross_attention(
     params: Attention,
     queries: Float[Array, "*batch_or_none query dim"],
@@ -121,12 +116,10 @@ def cross_attention(
 
     Scores, softmax and parameters are those of `attention`.
     """
-    *batch, tokens, dim = x.shape
-    asked = linear(columns(params.qkv, 0, dim), queries)
-    asked = asked.reshape(*asked.shape[:-1], heads, dim // heads)
+    *batch, _, dim = x.shape
+    asked = split_heads(linear(columns(params.qkv, 0, dim), queries), heads)
     asked = jnp.broadcast_to(asked, (*batch, *asked.shape[-3:]))
-    offered = linear(columns(params.qkv, dim, 3 * dim), x)
-    offered = offered.reshape(*batch, tokens, 2 * heads, dim // heads)
+    offered = split_heads(linear(columns(params.qkv, dim, 3 * dim), x), 2 * heads)
     mixed = dot_product_attention(asked, *jnp.split(offered, 2, axis=-2))
     return linear(params.proj, mixed.reshape(*batch, queries.shape[-2], dim))
 
@@ -142,11 +135,10 @@ def first_token_attention(
 
     A head's shares sum to 1. `rotation` turns keys; the first token has no angle.
     """
-    *batch, tokens, dim = x.shape
+    dim = x.shape[-1]
     query = linear(columns(params.qkv, 0, dim), x[..., 0, :]) / math.sqrt(dim // heads)
-    query = query.reshape(*batch, heads, dim // heads)
-    keys = linear(columns(params.qkv, dim, 2 * dim), x)
-    keys = keys.reshape(*batch, tokens, heads, dim // heads)
+    query = split_heads(query, heads)
+    keys = split_heads(linear(columns(params.qkv, dim, 2 * dim), x), heads)
     if rotation is not None:
         keys = rotate(keys, rotation)
     scores = _product("...hd,...jhd->...hj", query, keys, product_precision(x.dtype))
@@ -238,14 +230,8 @@ def _softmax(
     return weights, weights.sum(axis=-2, keepdims=True)
 
 
-def _beside_queries(
-    totals: Float[Array, "*batch head 1 query"], axes: _Axes
-) -> Float[Array, "..."]:
+def _beside_queries(totals: Float[Array, "*batch head 1 query"], axes: _Axes) -> Array:
     return totals if axes == _COLUMNS else jnp.moveaxis(totals, -1, -3)
-
-
-def _mix_forward(*inputs: Any) -> tuple[Array, tuple[Any, ...]]:
-    return _mix(*inputs), inputs[:5]
 
 
 def _mix_backward(
@@ -270,4 +256,4 @@ def _mix_backward(
     return to_queries, to_keys, to_values, None, nothing
 
 
-_mix.defvjp(_mix_forward, _mix_backward)
+_mix.defvjp(lambda *inputs: (_mix(*inputs), inputs[:5]), _mix_backward)

@@ -19,8 +19,6 @@ from jax.experimental.pallas import tpu as pltpu
 from jax.sharding import AbstractMesh, Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
-from crisalad_jax.utils.target import traced_mesh
-
 _LANES = 128
 """Numbers in a row of a vector register: heads are read so many numbers at a time."""
 _WIDTH = 512
@@ -46,13 +44,7 @@ def fits(tokens: int, dim: int, heads: int, dtype: Any) -> bool:
     return head >= 32 and whole and tokens <= _TOKENS.get(jnp.dtype(dtype), 0)
 
 
-def shards(batch: int) -> bool:
-    """Return whether the devices are known, and take equally many sequences of a batch each."""
-    mesh = traced_mesh()
-    return mesh is not None and batch % mesh.size == 0
-
-
-def _attend(
+def attend(
     qkv: Float[Array, "batch token three_dims"],
     heads: int,
     length: int,
@@ -73,41 +65,23 @@ def _attend(
         The heads side by side.
     """
 
-    def call(qkv: Array) -> Array:
+    run = functools.partial(_call, heads=heads, length=length, precision=precision)
+
+    def forward(qkv: Array) -> Array:
         batch, tokens, width = qkv.shape
         shape = jax.ShapeDtypeStruct((batch, tokens, width // 3), qkv.dtype)
-        return _call(_forward_kernel, heads, length, precision, shape, qkv, products=2)
+        return run(_forward_kernel, shape, qkv, products=2)
 
-    return _over_batches(call, mesh)(qkv)
+    def backward(qkv: Array, change: Array) -> Array:
+        three = [jax.ShapeDtypeStruct(change.shape, qkv.dtype)] * 3
+        return jnp.concatenate(run(_backward_kernel, three, qkv, change, products=5), axis=-1)
 
-
-attend = jax.custom_vjp(_attend, nondiff_argnums=(1, 2, 3, 4))
-
-
-def _attend_forward(
-    qkv: Array, heads: int, length: int, precision: str | None, mesh: Mesh | AbstractMesh
-) -> tuple[Array, Array]:
-    return attend(qkv, heads, length, precision, mesh), qkv
-
-
-def _attend_backward(
-    heads: int,
-    length: int,
-    precision: str | None,
-    mesh: Mesh | AbstractMesh,
-    qkv: Array,
-    change: Array,
-) -> tuple[Array]:
-    def call(qkv: Array, change: Array) -> Array:
-        shape = jax.ShapeDtypeStruct(change.shape, qkv.dtype)
-        three = [shape] * 3
-        parts = _call(_backward_kernel, heads, length, precision, three, qkv, change, products=5)
-        return jnp.concatenate(parts, axis=-1)
-
-    return (_over_batches(call, mesh)(qkv, change),)
-
-
-attend.defvjp(_attend_forward, _attend_backward)
+    average = jax.custom_vjp(_over_batches(forward, mesh))
+    average.defvjp(
+        lambda qkv: (average(qkv), qkv),
+        lambda qkv, change: (_over_batches(backward, mesh)(qkv, change),),
+    )
+    return average(qkv)
 
 
 def _over_batches(call: Callable[..., Array], mesh: Mesh | AbstractMesh) -> Callable[..., Array]:
@@ -121,12 +95,12 @@ def _over_batches(call: Callable[..., Array], mesh: Mesh | AbstractMesh) -> Call
 
 def _call(
     kernel: Kernel,
-    heads: int,
-    length: int,
-    precision: str | None,
     shapes: Any,
     qkv: Array,
     *others: Array,
+    heads: int,
+    length: int,
+    precision: str | None,
     products: int,
 ) -> Any:
     """Run a kernel for each sequence, and for as many heads at a time as `_WIDTH` holds."""
@@ -146,10 +120,9 @@ def _call(
 
     single = qkv.dtype == jnp.bfloat16 or precision in (None, "default")
     passes = jax.lax.Precision.DEFAULT if single else jax.lax.Precision.HIGHEST
-    run = functools.partial(kernel, head=head, length=length, precision=passes)
     out = part(0)
     return pl.pallas_call(
-        run,
+        functools.partial(kernel, head=head, length=length, precision=passes),
         grid=(batch, steps),
         in_specs=[part(0), part(1), part(2), *(part(0) for _ in others)],
         out_specs=[out] * len(shapes) if isinstance(shapes, list) else out,

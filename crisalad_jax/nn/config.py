@@ -65,10 +65,13 @@ class ModelConfig:
         request = self.aggregator.features(self.backbone.depth)
         backbone, aggregator = self.backbone, f"aggregator {self.aggregator.part_name}"
         attends, inserts = backbone.exposes_cls_attention, backbone.supports_prompt_tokens
+        several = request.levels not in (None, (backbone.depth,))
         for has, is_asked, what in (
             (backbone.class_token, request.class_token, "a class token"),
             (attends, request.class_attention, "a class token that attends to patches, as vit's"),
+            (attends, request.facet != "token", "facets of attention, as vit's"),
             (inserts, request.insertion is not None, "blocks that take tokens, such as vit"),
+            (backbone.exposes_levels, several, "features of other blocks than the last"),
         ):
             require(
                 has or not is_asked,
@@ -78,31 +81,22 @@ class ModelConfig:
         words = f"fixed: {aggregator} has parameters for every patch, of images of one size alone"
         require_field(self.preprocessing, "size_rule", fits, words)
         self.check_image_size(self.input_size)
-        shape = self.token_shape
-        if self.cross_image.layers:
-            self._check_cross_image(shape, aggregator)
-
-    def _check_cross_image(self, shape: TokenShape, aggregator: str) -> None:
-        options, whole, dim = self.cross_image, self.cross_image.global_token, shape.token_dim
-        rest = shape.global_dim % dim
+        encoder, (global_dim, tokens, dim) = self.cross_image, self.token_shape
+        if not encoder.layers:
+            return
+        whole, rest = encoder.global_token, global_dim % dim
         for name, fits, expected in (
             ("layers", self.aggregator.trainable, f"0 for {aggregator}, with which nothing trains"),
-            ("heads", dim % options.heads == 0, f"a divisor of the {dim} numbers of a token"),
+            ("heads", dim % encoder.heads == 0, f"a divisor of the {dim} numbers of a token"),
             ("global_token", not whole or not rest, f"False: its width is no multiple of {dim}"),
-            ("global_token", whole or shape.tokens > 0, "True, or layers 0: it is the only token"),
+            ("global_token", whole or tokens > 0, "True, or layers 0: it is the only token"),
         ):
-            require_field(options, name, fits, expected)
+            require_field(encoder, name, fits, expected)
 
     @property
     def token_shape(self) -> TokenShape:
         """Shape of an image's tokens."""
-        shape = self.aggregator.token_shape(self.backbone.dim)
-        require(
-            isinstance(shape, TokenShape),
-            f"aggregator {self.aggregator.part_name}: token_shape found to return {shape!r}, "
-            "expected TokenShape(global_dim, tokens, token_dim)",
-        )
-        return shape
+        return TokenShape(*self.aggregator.token_shape(self.backbone.dim))
 
     @property
     def descriptor_dim(self) -> int:
@@ -193,18 +187,13 @@ class ModelConfig:
 
         Raises:
             InputError: what `check_image_size` and `PreprocessingConfig.changed_by` raise; a size
-                for a model that takes images at their own; "round" for one that takes any size.
+                for a model that takes images at their own.
 
         Example:
             >>> PRESETS["tiny"].resized((70, 98)).grid
             (5, 7)
         """
         changed = self.preprocessing.changed_by(resize)
-        require(
-            "round" not in resize or self.side_multiple > 1,
-            f"--resize: found round for backbone {self.backbone.part_name}, which takes sides of "
-            "any length, expected it for one whose sides are multiples of a patch's",
-        )
         config = dataclasses.replace(self, preprocessing=changed) if resize else self
         if image_size is None:
             return config

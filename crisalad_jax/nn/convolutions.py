@@ -13,6 +13,8 @@ from crisalad_jax.nn import random_init
 from crisalad_jax.nn.layers import BatchNorm, Conv, Valid, conv, init_batch_norm, train_batch_norm
 from crisalad_jax.utils.pytree import pytree_dataclass
 
+Map = Float[Array, "image _ _ _"]
+"""Features in rows and columns, channels last."""
 BATCH_NORM_EPSILON = 1e-5
 """Epsilon of torch's `nn.BatchNorm2d`, which all published backbones keep."""
 

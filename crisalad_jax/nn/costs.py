@@ -68,15 +68,11 @@ def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
     def pixels(count: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((count, *config.input_size, 3), jnp.uint8)
 
-    single, double = (_count_traced(extract, params, pixels(count)) for count in (1, 2))
+    single, double = (count_macs(extract, params, pixels(count)) for count in (1, 2))
     macs = {part: double[part] - single[part] for part in _SCOPES.values()}
-    if params.cross_image is not None:
-        tokens = jax.eval_shape(extract, params, pixels(images))
-        attend = functools.partial(attend_across_images, config=config, mask=self_mask(images))
-        attended = _count_traced(attend, params, tokens)
-        macs["cross-image encoder"] = attended["cross-image encoder"] // images
-    if params.projection is not None:
-        macs["projection"] = math.prod(params.projection.weight.shape)
+    attend = functools.partial(attend_across_images, config=config, mask=self_mask(images))
+    attended = count_macs(attend, params, jax.eval_shape(extract, params, pixels(images)))
+    macs |= {part: count // images for part, count in attended.items()}
     counts = collections.Counter[str]()
     for name, leaf in named_leaves(params).items():
         counts[_part_of(name)] += math.prod(leaf.shape)
@@ -94,7 +90,7 @@ def _part_of(text: str) -> str:
 
 
 @lowering_for(CPU)  # whose products are all seen: a fused attention is one operation
-def count_macs(function: Any, *arguments: Any) -> int:
+def count_macs(function: Any, *arguments: Any) -> "collections.Counter[str]":
     """Count the multiply-accumulates of a function's program, in products and convolutions.
 
     Args:
@@ -102,17 +98,14 @@ def count_macs(function: Any, *arguments: Any) -> int:
         arguments: arrays, or their shapes.
 
     Returns:
-        The count; of the branches of a conditional, the cheapest counts.
+        The counts of each part of a model, and of all else under an empty name. Of the branches of
+        a conditional, the cheapest counts.
 
     Example:
         >>> import jax.numpy as jnp
-        >>> count_macs(jnp.matmul, jnp.zeros((2, 3)), jnp.zeros((3, 4)))
+        >>> count_macs(jnp.matmul, jnp.zeros((2, 3)), jnp.zeros((3, 4))).total()
         24
     """
-    return _count_traced(function, *arguments).total()
-
-
-def _count_traced(function: Any, *arguments: Any) -> "collections.Counter[str]":
     return _count(jax.make_jaxpr(function)(*arguments).jaxpr)
 
 
@@ -123,7 +116,9 @@ def _count(program: Any, scope: str = "", times: int = 1) -> "collections.Counte
         here = f"{scope}/{equation.source_info.name_stack}"
         name = equation.primitive.name
         inside = times * equation.params["length"] if name == "scan" else times
-        inner = [_count(each, here, inside) for each in _inner_programs(equation)]
+        # Programs are among the parameters, closed or not, and branches are a tuple of them.
+        inner = [getattr(value, "jaxpr", value) for value in jax.tree.leaves(equation.params)]
+        inner = [_count(each, here, inside) for each in inner if isinstance(each, core.Jaxpr)]
         if name == "cond":
             inner = [min(inner, key=collections.Counter.total)]
         for each in inner:
@@ -132,13 +127,6 @@ def _count(program: Any, scope: str = "", times: int = 1) -> "collections.Counte
         if macs:
             totals[_part_of(here)] += macs
     return totals
-
-
-def _inner_programs(equation: Any) -> list[Any]:
-    """Return the programs in an equation's parameters, of which one may be a tuple of branches."""
-    values = jax.tree.leaves(equation.params)
-    programs = (getattr(value, "jaxpr", value) for value in values)  # a closed one has it
-    return [each for each in programs if isinstance(each, core.Jaxpr)]
 
 
 def _macs(equation: Any, name: str, scope: str) -> int:

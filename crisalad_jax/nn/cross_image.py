@@ -4,19 +4,13 @@ Layers are torch's `nn.TransformerEncoderLayer` as CricaVPR uses it: post-norm, 
 """
 
 import dataclasses
-import math
 
 import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import (
-    check_types,
-    require_fraction,
-    require_positive,
-    require_range,
-)
+from crisalad_jax.config.checks import Fraction, NonNegativeInt, PositiveInt, check_types
 from crisalad_jax.config.part import non_semantic_field
 from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.nn.attention import Attention, dot_product_attention
@@ -36,21 +30,17 @@ class CrossImageConfig:
         0
     """
 
-    layers: int = 2
+    layers: NonNegativeInt = 2
     """Number of layers. 0 leaves the encoder out, so that descriptors depend on no other image."""
-    heads: int = 16
-    feedforward: int = 2048
-    dropout: float = non_semantic_field(0.1)
+    heads: PositiveInt = 16
+    feedforward: PositiveInt = 2048
+    dropout: Fraction = non_semantic_field(0.1)
     global_token: bool = True
     """Whether the global token takes part too, cut into tokens of the clusters' width."""
 
     def __post_init__(self) -> None:
-        """Check the ranges of the fields in use."""
+        """Check the fields."""
         check_types(self)
-        require_range(self, 0, math.inf, "layers")
-        if self.layers:
-            require_positive(self, "heads", "feedforward")
-            require_fraction(self, "dropout")
 
 
 @pytree_dataclass
@@ -138,13 +128,9 @@ def _gathered(own: Array) -> Array:
     return jax.lax.all_gather(own, IMAGE, tiled=True)
 
 
-def _gathered_forward(own: Array) -> tuple[Array, None]:
-    return _gathered(own), None
-
-
 def _gathered_backward(_: None, change: Array) -> tuple[Array]:
     total = jax.lax.psum_scatter(at_least_float32(change), IMAGE, tiled=True)
     return (total.astype(change.dtype),)
 
 
-_gathered.defvjp(_gathered_forward, _gathered_backward)
+_gathered.defvjp(lambda own: (_gathered(own), None), _gathered_backward)

@@ -294,24 +294,22 @@ def split_statistics(params: PyTree) -> tuple[PyTree, PyTree]:
         (True, True)
     """
 
-    def choose(*, measured: bool) -> PyTree:
-        def keep(path: Any, leaf: Any) -> Any:
-            name = jax.tree_util.keystr(path[-1:], simple=True)
-            return leaf if (name in STATISTICS) == measured else None
+    def is_measured(path: Any, _: Any) -> bool:
+        return jax.tree_util.keystr(path[-1:], simple=True) in STATISTICS
 
-        return jax.tree_util.tree_map_with_path(keep, params)
-
-    return choose(measured=True), choose(measured=False)
+    measured = jax.tree_util.tree_map_with_path(is_measured, params)
+    statistics = jax.tree.map(lambda leaf, take: leaf if take else None, params, measured)
+    rest = jax.tree.map(lambda leaf, take: None if take else leaf, params, measured)
+    return statistics, rest
 
 
 def merge_statistics(statistics: PyTree, params: PyTree) -> PyTree:
     """Replace the running statistics in parameters by those of `split_statistics`."""
-    return jax.tree.map(
-        lambda new, old: old if new is None else new,
-        statistics,
-        params,
-        is_leaf=lambda leaf: leaf is None,
-    )
+
+    def choose(new: Any, old: Any) -> Any:
+        return old if new is None else new
+
+    return jax.tree.map(choose, statistics, params, is_leaf=lambda leaf: leaf is None)
 
 
 @jax.custom_jvp

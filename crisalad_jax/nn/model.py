@@ -40,7 +40,7 @@ from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import IMAGE, image_mesh, over_images
 from crisalad_jax.utils.errors import few
-from crisalad_jax.utils.pytree import check_drawn, named_leaves, pytree_dataclass
+from crisalad_jax.utils.pytree import check_drawn, pytree_dataclass
 
 _ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
 """Names of linear layers' weights, which `layers.linear` casts to the type of its input."""
@@ -144,7 +144,11 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
     if stored:
         problems = diff_trees(params, template) or not_finite(params)
     else:
-        _check_64_bit_mode(config)
+        require(
+            config.compute_dtype != "float64" or jax.config.jax_enable_x64,  # pyright: ignore
+            "ModelConfig.compute_dtype: found float64 in JAX's 32-bit mode, expected "
+            "JAX_ENABLE_X64=1 in the environment, or jax.config.update('jax_enable_x64', True)",
+        )
         dtypes = {jnp.dtype(config.compute_dtype)}
         problems = diff_trees(params, template, dtypes)
         if problems:
@@ -153,14 +157,6 @@ def check_params(params: Any, config: ModelConfig, *, stored: bool = False) -> N
                 joined = dataclasses.replace(params, backbone=backbone)
                 problems = diff_trees(joined, template, dtypes)
     require(not problems, f"params: not of this configuration: {few(problems)}")
-
-
-def _check_64_bit_mode(config: ModelConfig) -> None:
-    require(
-        config.compute_dtype != "float64" or jax.config.jax_enable_x64,  # pyright: ignore
-        "ModelConfig.compute_dtype: found float64 in JAX's 32-bit mode, expected JAX_ENABLE_X64=1 "
-        "in the environment, or jax.config.update('jax_enable_x64', True)",
-    )
 
 
 @takes(config=ModelConfig)
@@ -187,35 +183,37 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
         dtype(bfloat16)
     """
     dtype = jnp.dtype(config.compute_dtype)
-    names = iter(named_leaves(params))
-    if dtype == jnp.float64:
-        return jax.tree.map(lambda leaf: leaf.astype(dtype), params)
 
-    def cast(leaf: Any) -> Any:
-        return leaf.astype(dtype) if _ONLY_MULTIPLIED.fullmatch(next(names)) else leaf
+    def cast(path: Any, leaf: Any) -> Any:
+        name = jax.tree_util.keystr(path, simple=True, separator=".")
+        is_cast = dtype == jnp.float64 or _ONLY_MULTIPLIED.fullmatch(name)
+        return leaf.astype(dtype) if is_cast else leaf
 
-    return jax.tree.map(cast, params)
+    return jax.tree_util.tree_map_with_path(cast, params)
 
 
-def _of_images(function: _F) -> _F:
-    """Check the pixels' values, which a trace does not know, before a compiled function is called.
+def _of_images(*static: str) -> Callable[[_F], _F]:
+    """Make a decorator that compiles a function of images, which knows the devices they are on.
 
-    The function knows the devices that its images are sharded over.
+    The pixels' values, which a trace does not know, are checked before the compiled function runs.
     """
-    spread = over_images("images", 1)(function)
 
-    @takes(params=Crisalad, config=ModelConfig)
-    @functools.wraps(spread)
-    def call(params: Any, images: Any, config: Any, **options: Any) -> Any:
-        check_pixels(images, config.preprocessing)
-        _check_64_bit_mode(config)
-        return spread(params, images, config, **options)
+    def decorate(function: _F) -> _F:
+        compiled = compiler.jit(function, static_argnames=("config", *static))
+        spread = over_images("images", 1)(compiled)
 
-    return cast(_F, call)
+        @takes(params=Crisalad, config=ModelConfig)
+        @functools.wraps(spread)
+        def call(params: Any, images: Any, config: Any, **options: Any) -> Any:
+            check_pixels(images, config.preprocessing)
+            return spread(params, images, config, **options)
+
+        return cast(_F, call)
+
+    return decorate
 
 
-@_of_images
-@functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
+@_of_images("micro_batch")
 def describe(
     params: Crisalad,
     images: Images,
@@ -267,8 +265,7 @@ def describe(
     return attend_across_images(params, tokens, config, mask=mask, key=cross_key)
 
 
-@_of_images
-@functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
+@_of_images("micro_batch")
 def extract_tokens(
     params: Crisalad,
     images: Images,
@@ -408,8 +405,7 @@ def _tokens_in_parts(
     return jax.tree.map(join, tokens), statistics
 
 
-@_of_images
-@functools.partial(compiler.jit, static_argnames="config")
+@_of_images()
 def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> Features:
     """Extract the features of every image that the aggregator requests.
 
@@ -459,9 +455,7 @@ def _extract_features(
         images = jax.vmap(functools.partial(normalise, how=config.preprocessing))(images)
     params = _widened(params, config)
     request = config.aggregator.features(config.backbone.depth)
-    if not with_insertion:
-        request = dataclasses.replace(request, insertion=None)
-    elif request.insertion is not None:
+    if with_insertion:
         inserted = config.aggregator.inserted(params.aggregator)
         request = dataclasses.replace(request, inserted=inserted)
     with jax.named_scope("backbone"):
@@ -480,8 +474,7 @@ def _widened(params: Crisalad, config: ModelConfig) -> Crisalad:
     return cast_params(params, config) if config.compute_dtype == "float64" else params
 
 
-@_of_images
-@functools.partial(compiler.jit, static_argnames="config")
+@_of_images()
 def unit_features(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image patch dim"]:
@@ -552,25 +545,21 @@ def attend_across_images(
                 "for each image",
             )
             mask = jnp.asarray(mask) | (self_mask(count) & ~mask.any(axis=1, keepdims=True))
-        options = config.cross_image
-        enter = functools.partial(as_sequence, global_token=options.global_token)
-        leave = functools.partial(from_sequence, global_token=options.global_token)
+        options, whole = config.cross_image, config.cross_image.global_token
         with jax.named_scope("cross_image"):
-            sequence = jax.vmap(enter)(tokens).astype(config.compute_dtype)
+            sequence = as_sequence(tokens, global_token=whole).astype(config.compute_dtype)
             sequence = cross_image_encoder(
                 params.cross_image, sequence, options, mask=mask, key=key
-            )
-        tokens = jax.vmap(leave)(sequence.astype(tokens.local.dtype), tokens)
-    make = functools.partial(to_descriptor, aggregator=config.aggregator)
-    descriptors = jax.vmap(make)(tokens)
+            ).astype(tokens.local.dtype)
+        tokens = from_sequence(sequence, tokens, global_token=whole)
+    descriptors = to_descriptor(tokens, config.aggregator)
     if params.projection is None:
         return descriptors
     with jax.named_scope("projection"):
         return project(params.projection, descriptors, config.projection)
 
 
-@_of_images
-@functools.partial(compiler.jit, static_argnames="config")
+@_of_images()
 def transport_masses(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image patch column"]:
@@ -581,13 +570,7 @@ def transport_masses(
     Raises:
         InputError: the model's aggregator has no transport, or as `describe`.
     """
-    features = extract_features(params, images, config)
-    require(
-        config.aggregator.transports,
-        f"aggregator: found {config.aggregator.part_name}, expected one that transports, such as "
-        "salad",
-    )
-    return config.aggregator.plan(params.aggregator, features)
+    return config.aggregator.plan(params.aggregator, extract_features(params, images, config))
 
 
 def self_mask(count: Any) -> Bool[Array, "image image"]:

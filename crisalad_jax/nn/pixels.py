@@ -46,10 +46,9 @@ def check_pixels(images: Any, how: PreprocessingConfig = PreprocessingConfig()) 
         crisalad_jax.utils.errors.InputError: images: found float64 from 255 to 255, ...
     """
     if not isinstance(images, np.ndarray | jax.Array):
-        hint = " (np.stack makes one)" if isinstance(images, list | tuple) else ""
         raise InputError(
             f"images: found {type(images).__name__}, expected an array of shape "
-            f"(image, height, width, 3){hint}"
+            "(image, height, width, 3)"
         )
     is_known = not isinstance(images, Tracer) and getattr(images, "is_fully_addressable", True)
     if not is_known or not images.size or not jnp.issubdtype(images.dtype, jnp.floating):

@@ -29,26 +29,17 @@ def rule_precision(dtype: Any) -> str | None:
 
 def matmul(rows: Float[Array, "row d_in"], weight: Float[Array, "d_in d_out"]) -> Array:
     """Multiply rows by a weight, which is cast to their type."""
-    return _with_wide_gradient(_matmul, _matmul_weight_gradient, rows, weight)
-
-
-def _matmul(rows: Array, weight: Array) -> Array:
     dtype = rows.dtype
-    return jnp.matmul(
-        rows,
-        weight.astype(dtype),
-        precision=product_precision(dtype),
-        preferred_element_type=target().product_dtype(dtype),
-    )
+    multiply = functools.partial(jnp.matmul, precision=product_precision(dtype))
 
+    def product(rows: Array, weight: Array) -> Array:
+        out = target().product_dtype(dtype)
+        return multiply(rows, weight.astype(dtype), preferred_element_type=out)
 
-def _matmul_weight_gradient(rows: Array, change: Array, weight: Array) -> Array:
-    return jnp.matmul(
-        rows.T,
-        change,
-        precision=product_precision(rows.dtype),
-        preferred_element_type=weight.dtype,
-    )
+    def weight_gradient(rows: Array, change: Array, weight: Array) -> Array:
+        return multiply(rows.T, change, preferred_element_type=weight.dtype)
+
+    return _with_wide_gradient(product, weight_gradient, rows, weight)
 
 
 def convolve(
@@ -59,50 +50,36 @@ def convolve(
     margin: int,
 ) -> Float[Array, "image rows columns d_out"]:
     """Convolve images, with zeros around them, by a weight that is cast to their type."""
-    sizes = {"stride": stride, "margin": margin}
-    return _with_wide_gradient(
-        functools.partial(_convolve, **sizes),
-        functools.partial(_convolve_weight_gradient, **sizes),
-        images,
-        weight,
+    convolution = functools.partial(
+        jax.lax.conv_general_dilated, precision=product_precision(images.dtype)
     )
 
-
-def _convolve(images: Array, weight: Array, *, stride: int, margin: int) -> Array:
-    return jax.lax.conv_general_dilated(
-        images,
-        weight.astype(images.dtype),
-        window_strides=(stride, stride),
-        # Not "SAME", which pads less before the image than after it where the stride is 2.
-        padding=((margin, margin), (margin, margin)),
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        precision=product_precision(images.dtype),
-    )
-
-
-def _convolve_weight_gradient(
-    images: Array, change: Array, weight: Array, *, stride: int, margin: int
-) -> Array:
-    """Convolve the images by the cotangent, whose pixels are `stride` apart.
-
-    Images are its channels. What no window reached is cut off at the end.
-    """
-    ends = [
-        size + stride * (side - 1) - length - margin
-        for size, side, length in zip(
-            weight.shape[:2], change.shape[1:3], images.shape[1:3], strict=True
+    def product(images: Array, weight: Array) -> Array:
+        return convolution(
+            images,
+            weight.astype(images.dtype),
+            window_strides=(stride, stride),
+            # Not "SAME", which pads less before the image than after it where the stride is 2.
+            padding=((margin, margin), (margin, margin)),
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
         )
-    ]
-    return jax.lax.conv_general_dilated(
-        images,
-        change,
-        window_strides=(1, 1),
-        padding=[(margin, end) for end in ends],
-        rhs_dilation=(stride, stride),
-        dimension_numbers=("CHWN", "IHWO", "HWNC"),
-        precision=product_precision(images.dtype),
-        preferred_element_type=weight.dtype,
-    )
+
+    def weight_gradient(images: Array, change: Array, weight: Array) -> Array:
+        # By the cotangent, whose pixels are `stride` apart, with the images as channels. What no
+        # window reached is cut off at the end.
+        sides = zip(weight.shape, change.shape[1:3], images.shape[1:3], strict=False)
+        ends = [size + stride * (rows - 1) - length - margin for size, rows, length in sides]
+        return convolution(
+            images,
+            change,
+            window_strides=(1, 1),
+            padding=[(margin, end) for end in ends],
+            rhs_dilation=(stride, stride),
+            dimension_numbers=("CHWN", "IHWO", "HWNC"),
+            preferred_element_type=weight.dtype,
+        )
+
+    return _with_wide_gradient(product, weight_gradient, images, weight)
 
 
 def _with_wide_gradient(

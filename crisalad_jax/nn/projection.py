@@ -1,11 +1,10 @@
 """Project whole descriptors by a linear layer, such as MegaLoc's last one or a stored whitening."""
 
 import dataclasses
-import math
 
 from jaxtyping import Array, Float
 
-from crisalad_jax.config.checks import check_types, require_range
+from crisalad_jax.config.checks import NonNegativeInt, check_types
 from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.nn.layers import Linear, l2_normalise, linear
 
@@ -20,15 +19,14 @@ class ProjectionConfig:
         True
     """
 
-    dim: int = 0
+    dim: NonNegativeInt = 0
     """Width of the projected descriptor. 0 leaves the layer out."""
     renormalise: bool = True
     """Whether projected descriptors are made unit vectors again."""
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
+        """Check the fields."""
         check_types(self)
-        require_range(self, 0, math.inf, "dim")
 
 
 def project(

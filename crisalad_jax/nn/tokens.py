@@ -47,19 +47,21 @@ class Tokens(NamedTuple):
         return cls(tokens[..., 0, :0], tokens)
 
 
-def as_sequence(tokens: Tokens, *, global_token: bool) -> Float[Array, "token dim"]:
+def as_sequence(tokens: Tokens, *, global_token: bool) -> Float[Array, "*batch token dim"]:
     """Return the local tokens, after the global one cut to their width if it takes part."""
     if not global_token:
         return tokens.local
-    pieces = tokens.global_token.reshape(-1, tokens.local.shape[1])
-    return jnp.concatenate([pieces, tokens.local])
+    *batch, _, dim = tokens.local.shape
+    pieces = tokens.global_token.reshape(*batch, tokens.global_token.shape[-1] // dim, dim)
+    return jnp.concatenate([pieces, tokens.local], axis=-2)
 
 
 def from_sequence(
-    sequence: Float[Array, "token dim"], before: Tokens, *, global_token: bool
+    sequence: Float[Array, "*batch token dim"], before: Tokens, *, global_token: bool
 ) -> Tokens:
     """Undo `as_sequence`; a global token that took no part is the one from `before`."""
     if not global_token:
         return Tokens(before.global_token, sequence)
-    pieces = len(sequence) - len(before.local)
-    return Tokens(sequence[:pieces].ravel(), sequence[pieces:])
+    pieces = sequence.shape[-2] - before.local.shape[-2]
+    first, local = sequence[..., :pieces, :], sequence[..., pieces:, :]
+    return Tokens(first.reshape(before.global_token.shape), local)

@@ -74,5 +74,5 @@ def test_layouts_without_a_place_for_it_refuse_it() -> None:
 
 
 def test_a_width_below_zero_is_refused() -> None:
-    with pytest.raises(InputError, match=r"ProjectionConfig\.dim: found -1, expected at least 0"):
+    with pytest.raises(InputError, match=r"ProjectionConfig\.dim: found -1, expected a whole"):
         ProjectionConfig(dim=-1)

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import pytest
 from jax.sharding import AbstractMesh, NamedSharding, PartitionSpec
 
-from crisalad_jax.nn import attention_pallas
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import describe, parameter_shapes
 from crisalad_jax.utils import compiler
@@ -155,8 +154,6 @@ def test_a_kernel_is_told_the_devices_of_the_arguments() -> None:
     with lowering_for(TPU):
         with targets.over_devices_of(leaves):
             assert targets.traced_mesh() == mesh
-            assert attention_pallas.shards(8)
-            assert not attention_pallas.shards(6)
         with targets.over_devices_of(leaves[:1]):
             alone = targets.traced_mesh()
             assert alone is not None
@@ -170,4 +167,3 @@ def test_without_arguments_the_devices_are_the_machines(monkeypatch: pytest.Monk
     for count, known in ((1, True), (8, False)):
         monkeypatch.setattr(jax, "device_count", lambda count=count: count)
         assert (targets.traced_mesh() is not None) == known
-        assert attention_pallas.shards(8) == known

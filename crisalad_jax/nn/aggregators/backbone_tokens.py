@@ -5,7 +5,7 @@ from typing import ClassVar
 
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require_positive, require_range
+from crisalad_jax.config.checks import PositiveInt, require_range
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import (
     AGGREGATORS,
@@ -60,15 +60,11 @@ class AggregationTokensConfig(Aggregator):
     """
 
     centroid_images: ClassVar[int] = 5000
-    tokens: int = 8
+    tokens: PositiveInt = 8
     """Number of learnt tokens."""
     insertion: int = -4
     """Block before which they are put in front of all others, from 0, or from the end where
     negative."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_positive(self, "tokens")
 
     def features(self, depth: int) -> FeatureSpec:
         """Request that the tokens run through the blocks from `insertion`.

@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -175,7 +176,9 @@ class Aggregator(Part, abc.ABC):
         A patch sends a mass of 1. If there is a dustbin, it is the last column. `transports` tells
         whether an aggregator has this.
         """
-        raise NotImplementedError
+        raise InputError(
+            f"aggregator: found {self.part_name}, expected one that transports, such as salad"
+        )
 
 
 def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int, ...]) -> None:
@@ -190,26 +193,15 @@ def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int
     Raises:
         InputError: it has not; the message names the aggregator.
     """
-
-    def wanted(token: Any, *sizes: int) -> Any:
-        is_wide = getattr(token, "dtype", None) == jnp.float64
-        return jax.ShapeDtypeStruct((*batch, *sizes), jnp.float64 if is_wide else jnp.float32)
-
-    shape = aggregator.token_shape(dim)
-    global_token, local = getattr(tokens, "global_token", None), getattr(tokens, "local", None)
+    shape = TokenShape(*aggregator.token_shape(dim))
+    wide = jnp.result_type(jnp.float32, *jax.tree.leaves(tokens))
     expected = Tokens(
-        wanted(global_token, shape.global_dim),
-        wanted(local, shape.tokens, shape.token_dim),
-        getattr(tokens, "transport", None),
-        getattr(tokens, "dense", None),
+        jax.ShapeDtypeStruct((*batch, shape.global_dim), wide),
+        jax.ShapeDtypeStruct((*batch, shape.tokens, shape.token_dim), wide),
     )
+    if isinstance(tokens, Tokens):
+        tokens = Tokens(tokens.global_token, tokens.local)
     expect_like(f"aggregator {aggregator.part_name}", tokens, expected)
-
-
-def _kind(value: Any) -> str:
-    """Name what a plug-in returned, for a message."""
-    is_array = isinstance(value, jax.Array)
-    return f"an array of shape {value.shape}" if is_array else type(value).__name__
 
 
 def require_side(name: str, grid: Grid, regions: int, patch_size: int) -> None:
@@ -245,13 +237,13 @@ def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
         result = function(features)
         if isinstance(result, Tokens):
             return result
-        ndim = getattr(result, "ndim", None)
-        if ndim not in (1, 2):
-            raise InputError(
-                f"aggregator {function.__name__}: found to return {_kind(result)}, expected a "
-                "vector, a matrix of token vectors, or Tokens"
-            )
-        make = Tokens.of_global if ndim == 1 else Tokens.of_local
+        shape = getattr(result, "shape", ())
+        require(
+            len(shape) in (1, 2),
+            f"aggregator {function.__name__}: found to return {shape or result}, expected a "
+            "vector, a matrix of token vectors, or Tokens",
+        )
+        make = Tokens.of_global if len(shape) == 1 else Tokens.of_local
         return make(at_least_float32(result))
 
     def token_shape(self: Aggregator, dim: int) -> TokenShape:
@@ -275,7 +267,10 @@ def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
 AGGREGATORS = Registry("aggregator", Aggregator, of_function=_of_function)
 
 
-def to_descriptor(tokens: Tokens, aggregator: Aggregator) -> Float[Array, " descriptor"]:
-    """Return one unit descriptor: the global token, then the local ones in the published order."""
-    local = tokens.local if aggregator.flatten_order == "token-first" else tokens.local.T
-    return l2_normalise(jnp.concatenate([tokens.global_token, local.ravel()]))
+def to_descriptor(tokens: Tokens, aggregator: Aggregator) -> Float[Array, "*batch descriptor"]:
+    """Return unit descriptors: the global token, then the local ones in the published order."""
+    local = tokens.local
+    if aggregator.flatten_order == "dimension-first":
+        local = local.swapaxes(-2, -1)
+    flat = local.reshape(*local.shape[:-2], math.prod(local.shape[-2:]))
+    return l2_normalise(jnp.concatenate([tokens.global_token, flat], axis=-1))

@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require_positive
+from crisalad_jax.config.checks import PositiveInt
 from crisalad_jax.nn.aggregators.base import (
     AGGREGATORS,
     Aggregator,
@@ -34,14 +34,10 @@ class ConvApConfig(Aggregator):
     """Conv-AP, the baseline of GSV-Cities (Ali-bey et al., Neurocomputing 2022)."""
 
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
-    channels: int = 1024
+    channels: PositiveInt = 1024
     """Channels of the 1 x 1 convolution."""
-    side: int = 2
+    side: PositiveInt = 2
     """Number of regions along each side; means are taken over side x side regions."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_positive(self, "channels", "side")
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of one mean for each region."""

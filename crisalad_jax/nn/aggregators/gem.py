@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require_positive
+from crisalad_jax.config.checks import PositiveInt
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import (
     AGGREGATORS,
@@ -94,12 +94,8 @@ class CosPlace:
 class CosPlaceConfig(Aggregator):
     """The head of CosPlace (Berton et al., CVPR 2022) and EigenPlaces (ICCV 2023)."""
 
-    dim: int = 512
+    dim: PositiveInt = 512
     """Width of the descriptor: CosPlace's 512, EigenPlaces' 2,048."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_positive(self, "dim")
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of a global token."""
@@ -122,7 +118,7 @@ class CosPlaceConfig(Aggregator):
 
 def gem(patches: Patches, p: Float[Array, ""]) -> Float[Array, "*batch dim"]:
     """Compute the generalised mean of all unit patches, in float32 at least."""
-    return generalised_mean(log_units(patches), p, axis=-2)
+    return generalised_mean(log_units(patches), p, axes=(-2,))
 
 
 def log_units(patches: Patches) -> Patches:
@@ -135,16 +131,15 @@ def log_units(patches: Patches) -> Patches:
 
 
 def generalised_mean(
-    logs: Float[Array, "*shape"], p: Float[Array, ""], *, axis: int | tuple[int, ...]
+    logs: Float[Array, "*shape"], p: Float[Array, ""], *, axes: tuple[int, ...]
 ) -> Float[Array, "*rest"]:
-    """Compute (mean of x^p)^(1/p) along `axis` from the logarithms of x (Radenovic et al., Eq. 3).
+    """Compute (mean of x^p)^(1/p) along `axes` from the logarithms of x (Radenovic et al., Eq. 3).
 
     Logarithms avoid an underflow: in float32 the floor's power is 0 from an exponent of 6.4 on, and
     a mean of zeros has no gradient.
     """
-    axes = (axis,) if isinstance(axis, int) else axis
     count = math.prod(logs.shape[i] for i in axes)
-    return jnp.exp((jax.nn.logsumexp(p * logs, axis=axis) - math.log(count)) / p)
+    return jnp.exp((jax.nn.logsumexp(p * logs, axis=axes) - math.log(count)) / p)
 
 
 def gem_pyramid(
@@ -159,5 +154,5 @@ def gem_pyramid(
     for level in PYRAMID_LEVELS:
         edges = ([round(i * n / level) for i in range(level + 1)] for n in grid)
         cuts = map(itertools.pairwise, edges)
-        means += [generalised_mean(x, p, axis=(-3, -2)) for x in regions(logs, grid, *cuts)]
+        means += [generalised_mean(x, p, axes=(-3, -2)) for x in regions(logs, grid, *cuts)]
     return jnp.stack(means, axis=-2)

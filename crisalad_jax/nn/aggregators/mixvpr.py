@@ -10,7 +10,7 @@ from typing import ClassVar
 import jax
 from jaxtyping import PRNGKeyArray
 
-from crisalad_jax.config.checks import require_positive
+from crisalad_jax.config.checks import PositiveInt
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, FlattenOrder, TokenShape
 from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid
@@ -53,18 +53,14 @@ class MixVprConfig(Aggregator):
 
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     fixed_grid: ClassVar[bool] = True
-    channels: int = 1024
+    channels: PositiveInt = 1024
     """Number of channels after the projection."""
-    rows: int = 4
+    rows: PositiveInt = 4
     """Number of values of each channel after the projection."""
-    depth: int = 4
+    depth: PositiveInt = 4
     """Number of feature mixers, as wide inside as there are patches."""
     last_norm: bool = True
     """Whether patches go through the backbone's last layer norm. In DINO-Mix they do not."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_positive(self, "channels", "rows", "depth")
 
     def features(self, depth: int) -> FeatureSpec:
         """Request the last patches."""

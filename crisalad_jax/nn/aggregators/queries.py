@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require_field, require_positive
+from crisalad_jax.config.checks import PositiveInt, require_field
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, FlattenOrder, TokenShape
 from crisalad_jax.nn.attention import Attention, attention, cross_attention, init_torch_attention
@@ -66,20 +66,19 @@ class BoqConfig(Aggregator):
     """Bag of queries (Ali-bey et al., CVPR 2024)."""
 
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
-    channels: int = 384
+    channels: PositiveInt = 384
     """Number of channels after the 3 x 3 convolution."""
-    queries: int = 64
+    queries: PositiveInt = 64
     """Number of learnt queries of a block."""
-    layers: int = 2
+    layers: PositiveInt = 2
     """Number of blocks, each an encoder layer and its queries."""
-    rows: int = 32
+    rows: PositiveInt = 32
     """Number of rows that a linear layer makes of all blocks' answers."""
     last_norm: bool = False
     """Whether patches go through the backbone's last layer norm. In the public code they do not."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require_positive(self, "channels", "queries", "layers", "rows")
         words = f"a multiple of its {self.heads} heads, one for every 64 channels"
         require_field(self, "channels", self.channels % self.heads == 0, words)
 
@@ -118,7 +117,12 @@ class BoqConfig(Aggregator):
         for block in params.boqs:
             attended = attention(block.encoder.attn, x, self.heads)
             x = encoder_layer(block.encoder, x, attended, jax.nn.relu)
-            answers.append(ask(block, x, self.heads))
+            # The queries' self-attention depends on no image: it runs once for a whole batch.
+            queries = block.queries.astype(x.dtype)
+            queries = queries + attention(block.self_attn, queries, self.heads)
+            queries = layer_norm(block.norm_q, queries)
+            answer = cross_attention(block.cross_attn, queries, x, self.heads)
+            answers.append(layer_norm(block.norm_out, answer))
         rows = linear(params.fc, jnp.concatenate(answers, axis=-2).swapaxes(-2, -1))
         return Tokens.of_local(at_least_float32(rows).swapaxes(-2, -1))
 
@@ -133,20 +137,6 @@ def _init_block(key: PRNGKeyArray, channels: int, queries: int) -> BoqBlock:
         cross_attn=init_torch_attention(keys[2], keys[3], channels),
         norm_out=init_layer_norm(channels),
     )
-
-
-def ask(
-    params: BoqBlock, x: Float[Array, "*batch patch channel"], heads: int
-) -> Float[Array, "*batch query channel"]:
-    """Attend from the queries to the patches, and normalise the answers.
-
-    The queries' self-attention does not depend on the image: it runs once for a whole batch.
-    """
-    queries = params.queries.astype(x.dtype)
-    queries = queries + attention(params.self_attn, queries, heads)
-    queries = layer_norm(params.norm_q, queries)
-    answers = cross_attention(params.cross_attn, queries, x, heads)
-    return layer_norm(params.norm_out, answers)
 
 
 @pytree_dataclass
@@ -183,21 +173,20 @@ class EdtFormerConfig(Aggregator):
     """
 
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
-    width: int = 768
+    width: PositiveInt = 768
     """Width of the decoder."""
-    heads: int = 16
+    heads: PositiveInt = 16
     """Number of heads of every attention."""
-    layers: int = 2
-    queries: int = 64
+    layers: PositiveInt = 2
+    queries: PositiveInt = 64
     """Number of learnt queries."""
-    channels: int = 256
+    channels: PositiveInt = 256
     """Number of channels of an answer after its projection."""
-    rows: int = 16
+    rows: PositiveInt = 16
     """Number of rows that a linear layer makes of all answers."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require_positive(self, "width", "heads", "layers", "queries", "channels", "rows")
         fits = self.width % self.heads == 0
         require_field(self, "width", fits, f"a multiple of the {self.heads} heads")
 
@@ -215,7 +204,13 @@ class EdtFormerConfig(Aggregator):
         All layers start equal: torch's `nn.TransformerDecoder` copies the layer that it is given.
         """
         queries, fc, layer_key, channels, rows = random_init.split(key, 5)
-        layer = _init_decoder_layer(layer_key, self.width)
+        keys = random_init.split(layer_key, 4)
+        layer = DecoderLayer(
+            self_attn=init_torch_attention(keys[0], keys[1], self.width),
+            multihead_attn=init_torch_attention(keys[2], keys[3], self.width),
+            norm1=init_layer_norm(self.width),
+            norm2=init_layer_norm(self.width),
+        )
         return EdtFormer(
             queries=random_init.normal(queries, (self.queries, self.width), scale=1e-6),
             fc=init_linear(fc, backbone.dim, self.width),
@@ -228,33 +223,17 @@ class EdtFormerConfig(Aggregator):
     def apply(
         self, params: EdtFormer, features: Features, grid: Grid, *, key: Keys | None
     ) -> Tokens:
-        """Return a token of `channels` numbers for each row."""
-        answers = decode(params, features, self.heads)
-        channels = linear(params.channel_proj, answers).swapaxes(-2, -1)
+        """Return a token of `channels` numbers for each row.
+
+        The first layer's self-attention does not depend on the image: it runs once for a batch.
+        """
+        whole = jnp.concatenate([features.class_token[..., None, :], features.patches], axis=-2)
+        memory = linear(params.fc, whole)
+        queries = params.queries.astype(memory.dtype)
+        for layer in params.layers:
+            queries = queries + attention(layer.self_attn, queries, self.heads)
+            queries = layer_norm(layer.norm1, queries)
+            queries = queries + cross_attention(layer.multihead_attn, queries, memory, self.heads)
+            queries = layer_norm(layer.norm2, queries)
+        channels = linear(params.channel_proj, queries).swapaxes(-2, -1)
         return Tokens.of_local(at_least_float32(linear(params.row_proj, channels)).swapaxes(-2, -1))
-
-
-def _init_decoder_layer(key: PRNGKeyArray, width: int) -> DecoderLayer:
-    keys = random_init.split(key, 4)
-    return DecoderLayer(
-        self_attn=init_torch_attention(keys[0], keys[1], width),
-        multihead_attn=init_torch_attention(keys[2], keys[3], width),
-        norm1=init_layer_norm(width),
-        norm2=init_layer_norm(width),
-    )
-
-
-def decode(params: EdtFormer, features: Features, heads: int) -> Float[Array, "*batch query width"]:
-    """Ask the class token and all patches.
-
-    The first layer's self-attention does not depend on the image: it runs once for a whole batch.
-    """
-    whole = jnp.concatenate([features.class_token[..., None, :], features.patches], axis=-2)
-    memory = linear(params.fc, whole)
-    queries = params.queries.astype(memory.dtype)
-    for layer in params.layers:
-        queries = queries + attention(layer.self_attn, queries, heads)
-        queries = layer_norm(layer.norm1, queries)
-        queries = queries + cross_attention(layer.multihead_attn, queries, memory, heads)
-        queries = layer_norm(layer.norm2, queries)
-    return queries

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_field, require_fraction, require_positive
+from crisalad_jax.config.checks import Fraction, PositiveFloat, PositiveInt, require, require_field
 from crisalad_jax.config.part import OrName, non_semantic_field
 from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.nn import random_init
@@ -70,15 +70,15 @@ class SaladConfig(Aggregator):
     """SALAD aggregation (Izquierdo and Civera, CVPR 2024)."""
 
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
-    clusters: int = 64
-    cluster_dim: int = 128
-    token_dim: int = 256
+    clusters: PositiveInt = 64
+    cluster_dim: PositiveInt = 128
+    token_dim: PositiveInt = 256
     """Width of the global token."""
-    hidden: int = 512
-    dropout: float = non_semantic_field(0.3)
+    hidden: PositiveInt = 512
+    dropout: Fraction = non_semantic_field(0.3)
     dustbin: OrName[Dustbin] = part_field(DUSTBINS, "column")
     """Registered dustbin, or its name; it takes the patches that belong to no cluster."""
-    epsilon: float = 1.0
+    epsilon: PositiveFloat = 1.0
     """Entropic regularisation, by which scores are divided."""
     learn_epsilon: bool = False
     """Whether epsilon is learnt, from `epsilon` as its initial value."""
@@ -94,8 +94,6 @@ class SaladConfig(Aggregator):
     def __post_init__(self) -> None:
         """Check the ranges."""
         resolve_names(self)
-        require_positive(self, "clusters", "cluster_dim", "token_dim", "hidden", "epsilon")
-        require_fraction(self, "dropout")
         for name in ("row_tau", "column_tau"):
             require_field(self, name, 0 < getattr(self, name) <= 1, "more than 0 and at most 1")
 
@@ -213,15 +211,10 @@ class FolConfig(SaladConfig):
     """
 
     dustbin: ClassVar[Dustbin] = TokenDustbin()  # pyright: ignore[reportIncompatibleVariableOverride]
-    local_hidden: int = 256
+    local_hidden: PositiveInt = 256
     """Number of channels between the transposed convolutions."""
-    local: int = 128
+    local: PositiveInt = 128
     """Width of a local feature."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        super().__post_init__()
-        require_positive(self, "local_hidden", "local")
 
     @property
     def scores(self) -> int:

@@ -5,11 +5,12 @@ import dataclasses
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require_positive
+from crisalad_jax.config.checks import PositiveInt
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.gem import START, gem
 from crisalad_jax.nn.backbones.base import Backbone, Features, Grid, Patches
+from crisalad_jax.nn.convolutions import Map
 from crisalad_jax.nn.layers import (
     Conv,
     Keys,
@@ -43,14 +44,10 @@ class SelaVprConfig(Aggregator):
         (61, 61)
     """
 
-    hidden: int = 256
+    hidden: PositiveInt = 256
     """Number of channels between the transposed convolutions."""
-    local: int = 128
+    local: PositiveInt = 128
     """Width of a local feature."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_positive(self, "hidden", "local")
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of a global token as wide as the backbone."""
@@ -95,9 +92,7 @@ def local_features(
     return maps.reshape(*patches.shape[:-2], *maps.shape[1:])
 
 
-def upconv(
-    params: Conv, x: Float[Array, "image height width d_in"]
-) -> Float[Array, "image height2 width2 d_out"]:
+def upconv(params: Conv, x: Map) -> Map:
     """Convolve transposed, as torch's `nn.ConvTranspose2d(3, stride=2, padding=1)`.
 
     It is a convolution by the flipped kernel of `x` with zeros between its pixels. The weight has

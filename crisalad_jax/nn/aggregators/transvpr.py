@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require_positive, require_range
+from crisalad_jax.config.checks import PositiveInt, require_range
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
@@ -35,21 +35,16 @@ class TransVpr:
 class TransVprConfig(Aggregator):
     """TransVPR: patches of several layers, weighed by attention (Wang et al., CVPR 2022)."""
 
-    levels: int = 3
+    levels: PositiveInt = 3
     """Number of the backbone's layers that are used, evenly spaced, with the last one."""
-    dim: int = 256
+    dim: PositiveInt = 256
     """Width of the descriptor."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_positive(self, "levels", "dim")
 
     def features(self, depth: int) -> FeatureSpec:
         """Request the patches after several numbers of blocks."""
         require_range(self, 1, depth, "levels")
-        return FeatureSpec(
-            tuple(depth * (level + 1) // self.levels for level in range(self.levels))
-        )
+        numbers = range(1, self.levels + 1)
+        return FeatureSpec(tuple(depth * number // self.levels for number in numbers))
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of a global token."""
@@ -75,9 +70,7 @@ class TransVprConfig(Aggregator):
         return Tokens.of_global(l2_normalise(linear(params.reduction, pooled)))
 
 
-def attentions(
-    params: TransVpr, patches: Float[Array, "*batch patch wide"]
-) -> Float[Array, "*batch patch level"]:
+def attentions(params: TransVpr, patches: Patches) -> Float[Array, "*batch patch level"]:
     """Compute a softmax over patches for every level, from all levels, in float32 at least."""
     return jax.nn.softmax(at_least_float32(linear(params.attention, patches)), axis=-2)
 

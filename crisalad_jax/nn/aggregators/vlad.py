@@ -15,7 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_field, require_positive, require_range
+from crisalad_jax.config.checks import (
+    NonNegativeInt,
+    PositiveInt,
+    require,
+    require_field,
+    require_range,
+)
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import (
     AGGREGATORS,
@@ -40,11 +46,10 @@ BURST = (8.0, 7.0, 1.0)
 class VladConfig(Aggregator):
     """What these aggregators share: a local token for each cluster, as wide as the backbone."""
 
-    clusters: int = 64
+    clusters: PositiveInt = 64
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require_positive(self, "clusters")
         require_field(self, "clusters", self.count_centroids(0) > 1, "at least 2 to choose from")
 
     def token_shape(self, dim: int) -> TokenShape:
@@ -122,14 +127,9 @@ class SuperVladConfig(VladConfig):
     """
 
     centroid_images: ClassVar[int] = 5000
-    clusters: int = 4
-    ghosts: int = 1
+    clusters: PositiveInt = 4
+    ghosts: NonNegativeInt = 1
     """Number of clusters that take part in the softmax, and are dropped after it."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        super().__post_init__()
-        require_range(self, 0, math.inf, "ghosts")
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> SuperVlad:
         """Draw the scores' layer as torch's convolution."""
@@ -182,13 +182,8 @@ class VladBuffConfig(VladConfig):
         12288
     """
 
-    reduced: int = 192
+    reduced: NonNegativeInt = 192
     """Width of a patch after the reduction; 0 leaves the reduction out."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        super().__post_init__()
-        require_range(self, 0, math.inf, "reduced")
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of one sum of residuals for each cluster."""
@@ -199,10 +194,9 @@ class VladBuffConfig(VladConfig):
         rotation_key, conv_key, centroid_key = random_init.split(key, 3)
         dim = self.reduced or backbone.dim
         rotation = jax.nn.initializers.orthogonal()(rotation_key, (backbone.dim, dim))
+        reduction = Reduction(random_init.zeros(backbone.dim), rotation)
         return VladBuff(
-            reduction=Reduction(random_init.zeros(backbone.dim), rotation)
-            if self.reduced
-            else None,
+            reduction=reduction if self.reduced else None,
             conv=init_linear(conv_key, dim, self.clusters, bias=False),
             centroids=l2_normalise(random_init.normal(centroid_key, (self.clusters, dim))),
             burst=jnp.asarray(BURST),
@@ -250,7 +244,7 @@ class AnyLocConfig(VladConfig):
     """AnyLoc: hard VLAD of a facet of one layer, nothing learnt (Keetha et al., RA-L 2023)."""
 
     trainable: ClassVar[bool] = False
-    clusters: int = 32
+    clusters: PositiveInt = 32
     """Number of words of the vocabulary, which `crisalad vocabulary` builds."""
     layer: int = -9
     """Block of the facet, from 0, or from the end where negative: -9 is block 31 of ViT-g's 40,

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require
+from crisalad_jax.config.checks import PositiveInt, require
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.registry import Registry
 from crisalad_jax.config.short_repr import brief, short_repr
@@ -15,6 +15,8 @@ from crisalad_jax.utils.errors import InputError
 
 Pixels = Float[Array, "image height width 3"]
 """Normalised images."""
+TokenBatch = Float[Array, "image token dim"]
+"""Tokens of a transformer: the class token first, and the patches last."""
 Patches = Float[Array, "*batch patch dim"]
 """Features of patches, in row order."""
 
@@ -80,9 +82,9 @@ class Backbone(Part, abc.ABC):
     A backbone has at least `dim`, `depth` and `patch_size`, and the two methods that are abstract.
     """
 
-    dim: int = 768
+    dim: PositiveInt = 768
     """Width of a feature."""
-    depth: int = 12
+    depth: PositiveInt = 12
     """Number of blocks, or levels."""
     patch_size: ClassVar[int] = 14
     """Side of a patch in pixels; sides of images are multiples of it."""
@@ -93,7 +95,9 @@ class Backbone(Part, abc.ABC):
     supports_prompt_tokens: ClassVar[bool] = False
     """Whether an aggregator's own tokens can run through its blocks."""
     exposes_cls_attention: ClassVar[bool] = False
-    """Whether its features can have the class token's attention."""
+    """Whether its features can have the class token's attention, or facets of attention."""
+    exposes_levels: ClassVar[bool] = True
+    """Whether its features can be those after other blocks than the last."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray) -> Any:

@@ -9,13 +9,14 @@ import dataclasses
 import functools
 from typing import ClassVar
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require_field
-from crisalad_jax.nn.attention import Attention, Rotation, without_key_bias
-from crisalad_jax.nn.backbones.base import BACKBONES, Grid, Patches
-from crisalad_jax.nn.backbones.vit import Block, VisionTransformer, ViT
+from crisalad_jax.config.checks import NonNegativeInt, require_field
+from crisalad_jax.nn.attention import Attention, Rotation
+from crisalad_jax.nn.backbones.base import BACKBONES, Grid
+from crisalad_jax.nn.backbones.vit import Block, VisionTransformer
+from crisalad_jax.nn.layers import Linear
 
 PERIOD_BASE = 100.0
 """Ratio that the longest period approaches; the shortest is 1, half the side of an image."""
@@ -39,7 +40,7 @@ class DinoV3Config(VisionTransformer):
     patch_size: ClassVar[int] = 16
     norm_epsilon: ClassVar[float] = 1e-5
     token_deviation: ClassVar[float] = 0.02
-    registers: int = 4
+    registers: NonNegativeInt = 4
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -47,26 +48,20 @@ class DinoV3Config(VisionTransformer):
         fits = self.dim // self.heads % 4 == 0
         require_field(self, "heads", fits, f"a divisor of a fourth of dim ({self.dim})")
 
-    def init_positions(self, key: PRNGKeyArray) -> tuple[None, None]:
-        """Return no parameters."""
-        return None, None
-
-    def add_positions(
-        self, params: ViT, patches: Patches, grid: Grid
-    ) -> tuple[Float[Array, " dim"], Patches]:
-        """Return the class token and the patches as they are."""
-        return params.cls_token, patches
-
     def rotation(self, grid: Grid) -> Rotation:
         """Return the patches' angles; see `rotary_angles`."""
         return _rotation(grid, self.dim // self.heads)
 
     def attention_of(self, layer: Block) -> Attention:
-        """Return a block's attention, in which keys have no bias.
+        """Return a block's attention with a bias of 0 for keys, which then has no gradient.
 
         Among rotated keys a bias would not cancel in the softmax.
         """
-        return without_key_bias(layer.attn)
+        qkv = layer.attn.qkv
+        assert qkv.bias is not None
+        queries, keys, values = jnp.split(qkv.bias, 3, axis=-1)
+        bias = jnp.concatenate([queries, jnp.zeros_like(keys), values], axis=-1)
+        return Attention(Linear(qkv.weight, bias), layer.attn.proj)
 
 
 def rotary_periods(head_dim: int) -> np.ndarray:

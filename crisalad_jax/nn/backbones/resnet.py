@@ -7,11 +7,11 @@ from typing import Any, Literal
 import jax
 from jaxtyping import PRNGKeyArray
 
-from crisalad_jax.config.checks import require_positive, require_range
+from crisalad_jax.config.checks import PositiveInt, require_range
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.backbones.base import BACKBONES, Grid, Valid
-from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages
-from crisalad_jax.nn.convolutions import ConvNorm, conv_norm, init_conv_norm, max_pool
+from crisalad_jax.nn.backbones.stages import Stage, StagedBackbone, Stages
+from crisalad_jax.nn.convolutions import ConvNorm, Map, conv_norm, init_conv_norm, max_pool
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 Layers = Literal[18, 50, 101, 152]
@@ -44,13 +44,12 @@ class ResNetConfig(StagedBackbone):
     """Number of layers. 18 has blocks of two convolutions, the others of three."""
     stages: int = 4
     """Number of stages that are kept, from the first."""
-    width: int = 64
+    width: PositiveInt = 64
     """Width of the first convolution, and within the blocks of the first stage; as published 64."""
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
+        """Check the range."""
         require_range(self, 1, 4, "stages")
-        require_positive(self, "width")
 
     @property
     def depth(self) -> int:

@@ -7,14 +7,10 @@ from typing import Any, ClassVar
 import jax
 from jaxtyping import Array, Float
 
-from crisalad_jax.config.checks import require
 from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Pixels, Valid
+from crisalad_jax.nn.convolutions import Map
 from crisalad_jax.utils.devices import parts_for_caches
 from crisalad_jax.utils.pytree import pytree_dataclass
-
-Map = Float[Array, "image _ _ _"]
-"""Features in rows and columns, channels last."""
-
 
 _PIXELS = 2**18
 """Pixels of the images that a CPU's core computes at once: of ResNet-50 the largest activation is
@@ -52,6 +48,7 @@ class StagedBackbone(Backbone):
 
     any_size: ClassVar[bool] = True
     class_token: ClassVar[bool] = False
+    exposes_levels: ClassVar[bool] = False
     # Annotated anew so that they are no fields: subclasses compute them.
     dim: ClassVar[int]  # pyright: ignore[reportIncompatibleVariableOverride]
     depth: ClassVar[int]  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -79,15 +76,7 @@ class StagedBackbone(Backbone):
         """Return the last stage's vectors, in row order; there is no class token, and no last norm.
 
         With remat "full" the backward pass computes every stage again from its input.
-
-        Raises:
-            InputError: while tracing, for another level than the last, or a facet of attention.
         """
-        require(
-            request.levels in (None, (self.depth,)) and request.facet == "token",
-            f"features: found a request for levels {request.levels} and facet {request.facet} of "
-            f"backbone {self.part_name}, expected its last stage's",
-        )
         count, height, width, _ = images.shape
         parts = parts_for_caches(count, _PIXELS // (height * width)) if valid is None else 1
         if parts == 1:
@@ -103,8 +92,9 @@ class StagedBackbone(Backbone):
         self, params: Stages, images: Map, remat: str, valid: Valid
     ) -> tuple[Float[Array, "image patch dim"], Stages]:
         x, stem = self.run_stem(params.stem, images, valid)
+        stages, structure = jax.tree.flatten(params.blocks, is_leaf=_is_stage)
         updated = []
-        for number, stage in enumerate(_joined(params.blocks)):
+        for number, stage in enumerate(stages):
 
             def run(stage: Stage, x: Map, number: int = number) -> tuple[Map, Stage]:
                 return self.run_stage(number, stage, x, valid)
@@ -112,24 +102,18 @@ class StagedBackbone(Backbone):
             with jax.named_scope("blocks"):
                 x, stage = jax.checkpoint(run)(stage, x) if remat == "full" else run(stage, x)
             updated.append(stage)
-        blocks: Blocks = tuple(updated)
-        if isinstance(params.blocks[0], tuple):
-            first = len(params.blocks[0])
-            blocks = blocks[:first], blocks[first:]  # pyright: ignore[reportAssignmentType]
+        blocks = structure.unflatten(updated)
         return x.reshape(x.shape[0], -1, x.shape[-1]), Stages(stem, blocks)
 
     def split_blocks(self, params: Stages, first: int) -> Stages:
         """Cut the stages in two."""
-        stages = _joined(params.blocks)
-        return dataclasses.replace(params, blocks=(stages[:first], stages[first:]))
+        return dataclasses.replace(params, blocks=(params.blocks[:first], params.blocks[first:]))
 
     def join_blocks(self, params: Stages) -> Stages:
         """Join the stages into one tuple."""
-        return dataclasses.replace(params, blocks=_joined(params.blocks))
+        stages = jax.tree.leaves(params.blocks, is_leaf=_is_stage)
+        return dataclasses.replace(params, blocks=tuple(stages))
 
 
-def _joined(blocks: Blocks) -> tuple[Stage, ...]:
-    stages: list[Stage] = []
-    for part in blocks:
-        stages += part if isinstance(part, tuple) else (part,)
-    return tuple(stages)
+def _is_stage(tree: Any) -> bool:
+    return isinstance(tree, Stage)

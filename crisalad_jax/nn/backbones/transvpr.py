@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require, require_field, require_positive
+from crisalad_jax.config.checks import PositiveInt, require_field
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.attention import Attention, attention
 from crisalad_jax.nn.backbones.base import (
@@ -21,6 +21,7 @@ from crisalad_jax.nn.backbones.base import (
     Features,
     FeatureSpec,
     Pixels,
+    TokenBatch,
     Valid,
 )
 from crisalad_jax.nn.convolutions import (
@@ -78,15 +79,14 @@ class TransVprNetConfig(Backbone):
     """TransVPR's convolutions and transformer, without positions (Wang et al., CVPR 2022)."""
 
     patch_size: ClassVar[int] = 16
-    dim: int = 256
-    depth: int = 6
-    heads: int = 4
-    hidden: int = 512
+    dim: PositiveInt = 256
+    depth: PositiveInt = 6
+    heads: PositiveInt = 4
+    hidden: PositiveInt = 512
     """Width of the feed-forward networks."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require_positive(self, "dim", "depth", "heads", "hidden")
         fits = self.dim % self.heads == self.dim % len(WIDTHS) == 0
         words = f"a multiple of the {self.heads} heads and of the {len(WIDTHS)} maps"
         require_field(self, "dim", fits, words)
@@ -135,18 +135,11 @@ class TransVprNetConfig(Backbone):
         With remat "full" the backward pass computes every block again from its input.
 
         Raises:
-            InputError: while tracing, for levels out of order, or a facet of attention.
+            InputError: while tracing, for levels out of order.
         """
         levels = request.levels_of(self.depth)
-        require(
-            request.facet == "token",
-            f"features: found a request for facet {request.facet} of backbone {self.part_name}, "
-            "expected its blocks' output",
-        )
 
-        def body(
-            x: Float[Array, "image token dim"], layer: TransVprBlock
-        ) -> tuple[Float[Array, "image token dim"], Float[Array, "image token dim"]]:
+        def body(x: TokenBatch, layer: TransVprBlock) -> tuple[TokenBatch, TokenBatch]:
             y = block(layer, x, self.heads)
             return y, y
 
@@ -167,9 +160,7 @@ def _side(number: int) -> int:
     return TransVprNetConfig.patch_size // 2 ** (number + 1)
 
 
-def embed(
-    params: TransVprNet, images: Pixels, valid: Valid
-) -> tuple[Float[Array, "image token dim"], TransVprNet]:
+def embed(params: TransVprNet, images: Pixels, valid: Valid) -> tuple[TokenBatch, TransVprNet]:
     """Return the class token, and for every patch a vector with a part from each map.
 
     Returns:
@@ -188,9 +179,7 @@ def embed(
     return tokens, dataclasses.replace(params, convs=tuple(convs))
 
 
-def block(
-    params: TransVprBlock, x: Float[Array, "image token dim"], heads: int
-) -> Float[Array, "image token dim"]:
+def block(params: TransVprBlock, x: TokenBatch, heads: int) -> TokenBatch:
     """Add attention to the tokens, normalise them, and add the feed-forward network's output."""
     normed = layer_norm(params.pre_norm, x)
     x = x + attention(params.self_attn, normed, heads)

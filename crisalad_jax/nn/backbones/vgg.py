@@ -9,8 +9,8 @@ from jaxtyping import PRNGKeyArray
 
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.backbones.base import BACKBONES, Grid, Valid
-from crisalad_jax.nn.backbones.stages import Map, Stage, StagedBackbone, Stages
-from crisalad_jax.nn.convolutions import init_he_conv, max_pool
+from crisalad_jax.nn.backbones.stages import Stage, StagedBackbone, Stages
+from crisalad_jax.nn.convolutions import Map, init_he_conv, max_pool
 from crisalad_jax.nn.layers import conv
 
 WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))

@@ -4,7 +4,6 @@ Written from the papers and the behaviour of facebookresearch/dinov2, whose gold
 The blocks are DINOv3's too, whose other parts are in `dinov3.py`.
 """
 
-import abc
 import dataclasses
 import functools
 import itertools
@@ -20,11 +19,11 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import (
-    choose,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
     require,
     require_field,
-    require_positive,
-    require_range,
 )
 from crisalad_jax.config.part import non_semantic_field
 from crisalad_jax.nn import random_init
@@ -45,6 +44,7 @@ from crisalad_jax.nn.backbones.base import (
     Grid,
     Patches,
     Pixels,
+    TokenBatch,
     Valid,
 )
 from crisalad_jax.nn.layers import (
@@ -62,7 +62,6 @@ from crisalad_jax.nn.layers import (
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 NORM_EPSILON = 1e-6
-TokenBatch = Float[Array, "image token dim"]
 _PRODUCTS = ("qkv", "attended", "hidden", "down", "mixed")
 """Results of a block's large products and the tokens between its halves, by their names."""
 _POLICIES = {
@@ -130,20 +129,17 @@ class VisionTransformer(Backbone):
     """Added to the variance in every layer norm."""
     token_deviation: ClassVar[float] = 1e-6
     """Standard deviation of an untrained class token and registers."""
-    heads: int = 12
-    mlp_ratio: float = 4.0
+    heads: PositiveInt = 12
+    mlp_ratio: PositiveFloat = 4.0
     ffn: Literal["mlp", "swiglu"] = "mlp"
-    registers: int = 0
+    registers: NonNegativeInt = 0
     layer_scale_init: float = non_semantic_field(1.0)
     adapter: AdapterConfig = AdapterConfig()
 
     def __post_init__(self) -> None:
         """Check the ranges."""
-        require_positive(self, "dim", "depth", "heads", "mlp_ratio")
-        require_range(self, 0, math.inf, "registers")
-        fits = self.dim % self.heads == 0
-        require_field(self, "dim", fits, f"a multiple of the {self.heads} heads")
-        require_field(self, "mlp_ratio", self.hidden >= 1, "a hidden width of at least 1")
+        words = f"a multiple of the {self.heads} heads"
+        require_field(self, "dim", self.dim % self.heads == 0, words)
         self.adapter.width(self.dim)
 
     @property
@@ -162,17 +158,17 @@ class VisionTransformer(Backbone):
         """Registers and the kind of adapter."""
         return f", {self.registers} registers, adapter {self.adapter.kind}"
 
-    @abc.abstractmethod
     def init_positions(
         self, key: PRNGKeyArray
     ) -> tuple[Float[Array, " dim"] | None, Float[Array, "grid grid dim"] | None]:
-        """Draw `ViT.pos_embed_cls` and `ViT.pos_embed`."""
+        """Draw `ViT.pos_embed_cls` and `ViT.pos_embed`; by default there are none."""
+        return None, None
 
-    @abc.abstractmethod
     def add_positions(
         self, params: ViT, patches: Patches, grid: Grid
     ) -> tuple[Float[Array, " dim"], Patches]:
         """Return the class token and the embedded patches, with their positions added if any."""
+        return params.cls_token, patches
 
     def rotation(self, grid: Grid) -> Rotation | None:
         """Return the patches' angles, by which every block rotates queries and keys; or None."""
@@ -187,13 +183,11 @@ class VisionTransformer(Backbone):
         patch, first, register, position, block = random_init.split(key, 5)
         deviation, normal = self.token_deviation, random_init.normal
         pos_embed_cls, pos_embed = self.init_positions(position)
-        registers = (self.registers, self.dim)
+        registers = normal(register, (self.registers, self.dim), scale=deviation)
         return ViT(
             patch_embed=init_small_linear(patch, 3 * self.patch_size**2, self.dim),
             cls_token=normal(first, (self.dim,), scale=deviation),
-            register_tokens=normal(register, registers, scale=deviation)
-            if self.registers
-            else None,
+            register_tokens=registers if self.registers else None,
             pos_embed_cls=pos_embed_cls,
             pos_embed=pos_embed,
             blocks=random_init.stacked(self._init_block, random_init.split(block, self.depth)),
@@ -284,13 +278,10 @@ class VisionTransformer(Backbone):
             else:
                 attended = _class_attention(_block_at(stacks, end), tokens, grid, self)
         if request.norm:
-            outputs = [
-                layer_norm(params.norm, level, epsilon=self.norm_epsilon) for level in outputs
-            ]
-        patches = [level[:, front + 1 + self.registers :] for level in outputs]
+            outputs = [layer_norm(params.norm, x, epsilon=self.norm_epsilon) for x in outputs]
         features = Features(
             outputs[-1][:, front],
-            patches[0] if len(patches) == 1 else jnp.concatenate(patches, axis=-1),
+            jnp.concatenate([x[:, front + 1 + self.registers :] for x in outputs], axis=-1),
             None if request.inserted is None else outputs[-1][:, :front],
             attended,
         )
@@ -322,7 +313,7 @@ class VisionTransformer(Backbone):
 class ViTConfig(VisionTransformer):
     """A DINOv2 vision transformer with patches of 14 x 14 (Oquab et al. 2023)."""
 
-    position_grid: int = 37
+    position_grid: PositiveInt = 37
     """Side of the stored grid of position embeddings (37 in the public checkpoints: 518 / 14)."""
     position_resize: Literal["dinov2", "plain"] = "dinov2"
     """Resizing of that grid to an image's: as DINOv2's models do, which antialias where there are
@@ -333,7 +324,6 @@ class ViTConfig(VisionTransformer):
     def __post_init__(self) -> None:
         """Check the ranges."""
         super().__post_init__()
-        require_positive(self, "position_grid")
         fits = self.position_init != "sincos" or self.dim % 4 == 0
         require_field(self, "dim", fits, "a multiple of 4 for a sin-cos start")
 
@@ -407,15 +397,12 @@ def _joined(stacks: Sequence[Block]) -> Block:
 
 def _between(stacks: Sequence[Block], begin: int, end: int) -> Sequence[Block]:
     """Return the blocks from number `begin` to before `end`, from 0."""
-    parts, start = [], 0
+    parts = []
     for stack in stacks:
         size = len(stack.ls1)
-        first, last = max(begin - start, 0), min(max(end - start, 0), size)
-        if (first, last) == (0, size):
-            parts.append(stack)
-        elif first < last:
-            parts.append(_cut(stack, first, last))
-        start += size
+        if begin < size and end > 0:
+            parts.append(_cut(stack, max(begin, 0), min(end, size)))
+        begin, end = begin - size, end - size
     return parts
 
 
@@ -502,40 +489,32 @@ def run_blocks(
         tokens, side = carry
         tokens, statistics = block(layer, tokens, grid, config, length=length, valid=valid)
         if side is not None:
-            side = side_path(layer, tokens + side, grid, config, length)
+            adapted: Any = layer.adapter
+            side = tokens + side
+            with jax.named_scope("adapter"):
+                update, _ = adapter(adapted, side, grid, length=length, activation=gelu)
+                side = _residual(side, config.adapter.alpha, update)
         return (tokens, side), statistics
 
     # prevent_cse=False: inside a scan, CSE cannot undo the remat.
-    body = jax.checkpoint(body, prevent_cse=False, policy=choose("remat", remat, _POLICIES))
+    body = jax.checkpoint(body, prevent_cse=False, policy=_POLICIES[remat])
     carry = tokens, tokens if config.adapter.kind == "side" else None
     statistics = []
     with jax.named_scope("blocks"):
-        for stack in stacks:
-            if count is None:
-                carry, measured = jax.lax.scan(body, carry, stack)
-                statistics.append(measured)
-            else:
-                carry, _ = jax.lax.scan(
-                    lambda carry, number, stack=stack: body(carry, _layer_at(stack, number)),
-                    carry,
-                    jnp.arange(count),
-                )
+        for stack in stacks if count is None else ():
+            carry, measured = jax.lax.scan(body, carry, stack)
+            statistics.append(measured)
+        if count is not None:
+            (stack,) = stacks
+            carry, _ = jax.lax.scan(
+                lambda carry, at: body(carry, _layer_at(stack, at)), carry, jnp.arange(count)
+            )
     tokens, side = carry
     return (tokens if side is None else side)[:, :length], statistics
 
 
 def _layer_at(stack: Block, number: Int[Array, ""]) -> Block:
     return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, number, 0, False), stack)
-
-
-def side_path(
-    layer: Block, tokens: TokenBatch, grid: Grid, config: VisionTransformer, length: int | None
-) -> TokenBatch:
-    """Apply a block's side adapter, with its skip."""
-    side: Any = layer.adapter
-    with jax.named_scope("adapter"):
-        adapted, _ = adapter(side, tokens, grid, length=length, activation=gelu)
-        return _residual(tokens, config.adapter.alpha, adapted)
 
 
 def block(
@@ -580,11 +559,7 @@ def block(
     return _residual(tokens, params.ls2, update), split_statistics(params)[0]
 
 
-def _residual(
-    tokens: Float[Array, "*batch dim"],
-    gain: float | Float[Array, " dim"],
-    update: Float[Array, "*batch dim"],
-) -> Float[Array, "*batch dim"]:
+def _residual(tokens: TokenBatch, gain: float | Array, update: TokenBatch) -> TokenBatch:
     total = at_least_float32(tokens) + gain * at_least_float32(update)
     return total.astype(tokens.dtype)
 
@@ -619,8 +594,7 @@ def interpolate_positions(
     antialias = config.registers and config.position_resize == "dinov2"
     weights = _antialias_weights if antialias else _bicubic_weights
     rows, columns = (jnp.asarray(weights(side, size), positions.dtype) for size in grid)
-    precision = jax.lax.Precision.HIGHEST
-    return jnp.einsum("ri,cj,ijd->rcd", rows, columns, positions, precision=precision)
+    return jnp.einsum("ri,cj,ijd->rcd", rows, columns, positions, precision="highest")
 
 
 def _cubic(x: np.ndarray, a: float) -> np.ndarray:

@@ -5,7 +5,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 from jaxtyping import Array, Bool, Int
 
-from crisalad_jax.config.checks import require_field, require_positive
+from crisalad_jax.config.checks import NonNegativeInt, PositiveFloat, PositiveInt, require_field
 from crisalad_jax.config.part import OrName, Part
 from crisalad_jax.config.registry import Registry, part_field, resolve_names
 from crisalad_jax.config.short_repr import short_repr
@@ -58,9 +58,9 @@ class SinkhornConfig:
 
     step: OrName[Step] = part_field(STEPS, "sinkhorn")
     """One iteration; a registered step, or its name."""
-    iterations: int = 3
+    iterations: PositiveInt = 3
     """Number of iterations; with a tolerance, at most this number."""
-    tolerance: float | None = None
+    tolerance: PositiveFloat | None = None
     """Largest error of a step at which iterations stop. For plain steps it is the relative marginal
     error before the last step. float32 may never get below 1e-5."""
     throw: bool = False
@@ -68,7 +68,7 @@ class SinkhornConfig:
     domain: Literal["scaling", "log"] = "scaling"
     """Domain of the sums. Scaling computes exponentials once; problems whose scores are too far
     apart for it are solved again in the log domain."""
-    anderson_memory: int = 0
+    anderson_memory: NonNegativeInt = 0
     """Number of past iterations for Anderson acceleration; 0 for none."""
     gradient: OrName[Gradient] = part_field(GRADIENTS, "unrolled")
     """Gradient of the potentials: unrolled (through the iterations), implicit (closed form of the
@@ -78,13 +78,9 @@ class SinkhornConfig:
     def __post_init__(self) -> None:
         """Check the ranges, and that the parts go together."""
         resolve_names(self)
-        require_positive(self, "iterations")
         gradient, converges = self.gradient, self.tolerance is not None
-        if converges:
-            require_positive(self, "tolerance")
-        solves = gradient.part_name if gradient.takes_solver else None
-        memory = "0 or a whole number from 2" if solves is None else f"0 with gradient {solves!r}"
-        remembers = self.anderson_memory > 1 and solves is None
+        remembers = self.anderson_memory > 1 and not gradient.takes_solver
+        memory = "0; or a whole number from 2, with a gradient that takes no solver of its own"
         mode = "a fixed number of iterations, without a tolerance" if converges else "a tolerance"
         step = f"a step that says it solves the entropic problem, not {self.step.part_name!r}"
         for name, fits, expected in (

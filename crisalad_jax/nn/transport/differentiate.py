@@ -26,8 +26,6 @@ def solve_in_domain(
     solution = iterate(scaled, config, params, init)
     batch = solution.met.shape
     count = math.prod(batch)
-    if not count:
-        return solution
 
     def solve_in_log(problem: Problem, init: Potentials, params: Any, _: Solution) -> Solution:
         # Solve the problems one by one, so that this branch needs little memory.

@@ -86,10 +86,8 @@ class NoDustbin(Dustbin):
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Return the scores as they are."""
         rows, clusters = scores.shape[-2:]
-        each = math.log(rows / clusters)
-        return Marginals(
-            scores, jnp.zeros(rows, scores.dtype), jnp.full(clusters, each, scores.dtype)
-        )
+        log_nu = jnp.full(clusters, math.log(rows / clusters), scores.dtype)
+        return Marginals(scores, jnp.zeros(rows, scores.dtype), log_nu)
 
 
 @DUSTBINS.register("column")
@@ -179,19 +177,12 @@ def append_dustbin(
     Returns:
         The scores with one column more.
 
-    Raises:
-        InputError: the dustbin is neither a number nor as many as there are rows.
-
     Example:
         >>> import jax.numpy as jnp
         >>> append_dustbin(jnp.zeros((2, 1)), 1.0).tolist()
         [[0.0, 1.0], [0.0, 1.0]]
     """
     column = jnp.asarray(dustbin).astype(scores.dtype)
-    require(
-        column.shape in ((), scores.shape[:-1]),
-        f"dustbin: found shape {column.shape}, expected () or {scores.shape[:-1]}",
-    )
     column = jnp.broadcast_to(column[..., None] if column.ndim else column, (*scores.shape[:-1], 1))
     return jnp.concatenate([scores, column], axis=-1)
 

@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -169,13 +169,6 @@ HOTTEST = 1e12
 """Where the search for a temperature ends, for scores that are not finite."""
 
 
-class NewtonState(NamedTuple):
-    """The state of Newton's step."""
-
-    temperature: Float[Array, "*batch"]
-    """Multiple of the problem's epsilon that the next step solves for."""
-
-
 @STEPS.register("newton")
 @dataclasses.dataclass(frozen=True)
 class NewtonStep(Step):
@@ -186,18 +179,19 @@ class NewtonStep(Step):
     Sinkhorn's the one with the largest semi-dual is taken, which therefore never falls.
 
     Where scores are too sharp to begin with, epsilon is first a multiple of the problem's, the
-    temperature, which falls to 1 as the errors do. Problems must be balanced.
+    temperature, which falls to 1 as the errors do. The step's state is the next temperature.
+    Problems must be balanced.
     """
 
     entropic: ClassVar[bool] = True
 
-    def init(self, problem: Problem, params: Any) -> NewtonState:
+    def init(self, problem: Problem, params: Any) -> Float[Array, "*batch"]:
         """Return a temperature of 1; the first step finds the one for its potentials."""
-        return NewtonState(0 * problem.log_mu[..., 0] + 1)
+        return 0 * problem.log_mu[..., 0] + 1
 
     def step(
         self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, NewtonState]:
+    ) -> tuple[Potentials, Any]:
         """Take the best of four steps at the state's temperature.
 
         Raises:
@@ -208,7 +202,7 @@ class NewtonStep(Step):
             f"step newton: found row_tau {problem.row_tau} and column_tau {problem.column_tau}, "
             "expected 1: it is for balanced problems",
         )
-        temperature = jax.lax.stop_gradient(state.temperature)
+        temperature = jax.lax.stop_gradient(state)
         temperature = _temperature(problem, potentials.column, temperature, iteration == 0)
         tempered, column = _tempered(problem, potentials.column, temperature)
         row = problem.log_mu - tempered.lse_columns(column)
@@ -220,7 +214,7 @@ class NewtonStep(Step):
         column = potentials.column + temperature[..., None] * change
         row = problem.log_mu - problem.lse_columns(column)
         lower = _cooled(temperature, newton, jnp.abs(log_masses - problem.log_nu).max(axis=-1))
-        return Potentials(row, column), NewtonState(lower)
+        return Potentials(row, column), lower
 
     def error(self, problem: Problem, new: Potentials, old: Potentials) -> Float[Array, "*batch"]:
         """Return the remaining marginal error: far from the solution a step may be small."""
@@ -318,12 +312,8 @@ def _tempered(problem: Problem, column: Array, temperature: Array) -> tuple[Prob
     plan is the product of the marginals, which meets them.
     """
     by = temperature[..., None]
-    tempered = Problem(
-        problem.clusters / by[..., None],
-        problem.last / by,
-        problem.log_mu,
-        problem.log_nu,
-    )
+    clusters, last = problem.clusters / by[..., None], problem.last / by
+    tempered = Problem(clusters, last, problem.log_mu, problem.log_nu)
     if isinstance(problem, ScalingProblem):
         tempered = ScalingProblem.scaled(tempered)
     return tempered, problem.log_nu + (column - problem.log_nu) / by

@@ -6,6 +6,7 @@ parity/test_cnn.py compares outputs and gradients with torch, parity/test_zoo.py
 import dataclasses
 import itertools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +49,7 @@ def macs(backbone: StagedBackbone) -> int:
     params = jax.eval_shape(backbone.init, jax.random.key(0))
     image = jax.ShapeDtypeStruct((1, 224, 224, 3), jnp.float32)
     apply = lambda p, x: backbone.apply(p, x, FeatureSpec(), remat="none")[0].patches  # noqa: E731
-    return count_macs(apply, params, image)
+    return count_macs(apply, params, image).total()
 
 
 def count_learnt(backbone: StagedBackbone) -> int:
@@ -188,14 +189,16 @@ def test_parts_add_up() -> None:
     assert rows["backbone embedding, norm"].macs == 19 * 26 * 7 * 7 * 3 * 64
 
 
-def test_facets_are_refused() -> None:
-    config = dataclasses.replace(SMALL, aggregator=AnyLocConfig(clusters=4, layer=-1))
-    with pytest.raises(InputError, match=r"facet value of backbone resnet, expected its last"):
-        jax.eval_shape(
-            lambda p, x: describe(p, x, config),
-            parameter_shapes(config),
-            jax.ShapeDtypeStruct((1, 37, 52, 3), jnp.uint8),
-        )
+@pytest.mark.parametrize(
+    ("aggregator", "words"),
+    [
+        (AnyLocConfig(clusters=4, layer=-1), "facets of attention"),
+        (AnyLocConfig(clusters=4, layer=-2, facet="token"), "features of other blocks"),
+    ],
+)
+def test_what_a_convolutional_backbone_lacks_is_refused(aggregator: Any, words: str) -> None:
+    with pytest.raises(InputError, match=f"found resnet for aggregator anyloc, .* {words}"):
+        dataclasses.replace(SMALL, aggregator=aggregator)
 
 
 def test_a_number_of_stages() -> None:

@@ -357,7 +357,7 @@ def test_newtons_steps_by_hand() -> None:
                 taken.add(best)
             # Rounding of float64 potentials of 100, amplified tenfold by each of five systems.
             np.testing.assert_allclose(at.column, columns, rtol=1e-9, atol=1e-8)
-            np.testing.assert_allclose(state.temperature, temperatures, rtol=1e-12)
+            np.testing.assert_allclose(state, temperatures, rtol=1e-12)
             started = started or list(temperatures)
     assert started is not None
     assert started[0] == 1

@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 import pytest
 
 from crisalad_jax.nn.aggregators.salad import SaladConfig
@@ -61,7 +60,7 @@ MU, NU = jnp.zeros(6), jnp.log(jnp.array([1.0, 2.0, 3.0]))
 BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "one axis": (
         lambda: solve(jnp.zeros(3), MU, NU),
-        r"float32 and shape \(3,\), expected",
+        r"found scores of shape \(3,\), expected",
     ),
     "rows": (
         lambda: solve(jnp.zeros((5, 3)), MU, NU),
@@ -91,35 +90,21 @@ BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: assign_with_dustbin(jnp.zeros((6, 3)), 1.0, "row"),
         "^dustbin: found 'row', expected one of column, mass, none, row and column,",
     ),
-    "solver": (
-        lambda: solve(
-            jnp.zeros((6, 3)), MU, NU, solver=optimistix.FixedPointIteration(rtol=0, atol=1)
-        ),
-        "a solver with gradient 'unrolled', expected one that takes it",
-    ),
     "no columns": (
         lambda: solve(jnp.zeros((6, 0)), MU, MU[:0]),
-        r"and shape \(6, 0\), expected real numbers",
-    ),
-    "complex": (
-        lambda: solve(jnp.zeros((6, 3), complex), MU, NU),
-        "found scores of complex64 and shape .*, expected real numbers",
+        r"found scores of shape \(6, 0\), expected",
     ),
     "a step's tuple": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-tuple")),
-        r"^step test-input-tuple: found to return \(\(float32.*, expected \(Potentials\(row",
+        r"^step test-input-tuple, step: found to return \(\(float32.*, expected \(Potentials\(row",
     ),
     "a step's state": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-state")),
-        "^step test-input-state: found to return .*, float32.*, expected .*, int32",
+        "^step test-input-state, step: found to return .*, float32.*, expected .*, int32",
     ),
     "a step without a state": (
         lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-alone")),
-        "^step test-input-alone: found to return Potentials.*expected \\(Potentials.*, None\\)",
-    ),
-    "appended": (
-        lambda: append_dustbin(jnp.zeros((6, 3)), jnp.ones(5)),
-        r"dustbin: found shape \(5,\), expected \(\) or \(6,\)",
+        r"^step test-input-alone, step: found to return P.*expected \(Potentials.*, None\)",
     ),
     "assign": (
         lambda: assign_with_dustbin(jnp.zeros(6), jnp.float32(1)),
@@ -279,16 +264,10 @@ def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
         ),
         (
             SinkhornConfig,
-            {"iterations": 2.5},
-            "SinkhornConfig.iterations: found 2.5, expected a whole number",
-        ),
-        (
-            SinkhornConfig,
             {"tolerance": 0.0, "gradient": "stop"},
             "SinkhornConfig.tolerance: found 0.0",
         ),
         (SinkhornConfig, {"anderson_memory": 1}, "SinkhornConfig.anderson_memory: found 1"),
-        (SinkhornConfig, {"anderson_memory": 2.5}, "SinkhornConfig.anderson_memory: found 2.5"),
         (SinkhornConfig, {"anderson_memory": -2}, "SinkhornConfig.anderson_memory: found -2"),
         (
             SinkhornConfig,
@@ -300,7 +279,7 @@ def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
         (
             SinkhornConfig,
             {"gradient": "optimistix", "tolerance": 1e-3, "anderson_memory": 3},
-            "anderson_memory: found 3, expected 0 with gradient 'optimistix'",
+            "anderson_memory: found 3, expected 0; or a whole number from 2, with",
         ),
         (
             SinkhornConfig,
@@ -395,7 +374,7 @@ def test_a_dustbin_of_ones_own() -> None:
             Potentials(jnp.zeros(5), jnp.zeros(3)),
             r"init.row .* \(5,\), expected \(6,\)",
         ),
-        (jnp.zeros(6), r"init.column found of shape \(6,\), expected \(3,\)"),
+        ((jnp.zeros(6), jnp.zeros(6)), r"init.column found of shape \(6,\), expected \(3,\)"),
     ],
 )
 def test_potentials_to_start_from_that_do_not_fit_are_refused(init, words):
