@@ -72,11 +72,9 @@ def check_count(what: str, count: Any) -> None:
     Raises:
         InputError: it is below, or no whole number.
     """
-    whole = "" if kind_of(int).fits(count) else "a whole number of "
-    require(
-        not whole and count >= 1,
-        f"{what}: found {in_one_line(count)}, expected {whole}at least 1",
-    )
+    is_whole = kind_of(int).fits(count)
+    expected = "at least 1" if is_whole else "a whole number of at least 1"
+    require(is_whole and count >= 1, f"{what}: found {in_one_line(count)}, expected {expected}")
 
 
 PATH = (str, os.PathLike)
@@ -115,12 +113,7 @@ def takes(**kinds: type | tuple[type, ...]) -> Callable[[_F], _F]:
                 if not isinstance(value, kind):
                     plain = value is None or isinstance(value, str | int | float)
                     found = repr(value) if plain else type(value).__name__
-                    classes = kind if isinstance(kind, tuple) else (kind,)
-                    words = (
-                        "a path"
-                        if kind is PATH
-                        else ", or ".join(kind_of(each).words for each in classes)
-                    )
+                    words = "a path" if kind is PATH else kind_of(Union[kind]).words  # noqa: UP007
                     raise InputError(f"{name}: found {found}, expected {words}")
             return function(*args, **options)
 
