@@ -70,16 +70,15 @@ def _locked(folder: pathlib.Path) -> contextlib.ExitStack:
         stack.enter_context(made_folder(folder))
         is_held = False
         while not is_held:
-            try:
+            with wrap_os_errors(folder):
                 file = stack.enter_context(path.open("a", encoding="utf-8"))
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise BusyFolderError(
-                    f"{folder}: found another process that writes here{_holder(folder)}, "
-                    "expected to be the only one"
-                ) from error
-            except OSError as error:
-                raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError as error:
+                    raise BusyFolderError(
+                        f"{folder}: found another process that writes here{_holder(folder)}, "
+                        "expected to be the only one"
+                    ) from error
             # The last holder may have removed the file between the two calls.
             is_held = os.fstat(file.fileno()).st_nlink > 0
         stack.enter_context(in_use(path))
