@@ -121,7 +121,6 @@ def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str)
             type(default),
             prog=what,
             args=arguments,
-            default=default,
             add_help=False,
             config=(tyro.conf.FlagConversionOff,),
         )
@@ -204,11 +203,6 @@ def _expected(metavar: str) -> str:
     return f"a {kind}" if len(parts) == 1 else f"{len(parts)} {kind}s"
 
 
-_NO_NUMBER = (
-    r"Error parsing (\S+): (?:invalid literal for|could not convert) .*?(int|float).*?: (.*)"
-)
-
-
 def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
     """Say in our words what tyro says; what we do not know stays as it is.
 
@@ -218,9 +212,10 @@ def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
     """
     said: list[str] = []
     for text in texts:
-        if found := re.match(_NO_NUMBER, text):
-            kind = "a whole number" if found[2] == "int" else "a number"
-            said.append(f"{found[1]}: found {found[3]}, expected {kind}")
+        if found := re.match(
+            r"Error parsing (\S+): (?:invalid|could not) .*?(int|float).*?: (.*)", text
+        ):
+            said.append(f"{found[1]}: found {found[3]}, expected {_expected(found[2].upper())}")
         elif found := re.match(
             r"Error parsing (\S+): no type matching (.+) could .*? (\[.*\])", text
         ):

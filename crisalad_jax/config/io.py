@@ -18,7 +18,7 @@ from crisalad_jax.utils.errors import InputError, locate_errors
 from crisalad_jax.utils.files import read_json
 
 _T = TypeVar("_T")
-_PLUGIN = "plugin"
+PLUGIN = "plugin"
 """Key of the plug-in that registered a part, next to its name."""
 
 
@@ -35,7 +35,7 @@ def to_plain(config: Any) -> Any:
         if not isinstance(config, Part):
             return fields
         home = home_of(type(config).__module__)
-        return {NAME: config.part_name, **({_PLUGIN: home} if home else {}), **fields}
+        return {NAME: config.part_name, **({PLUGIN: home} if home else {}), **fields}
     if isinstance(config, list | tuple):
         return [to_plain(item) for item in config]
     value = config.item() if isinstance(config, np.generic) else config
@@ -83,8 +83,8 @@ def _class_and_fields(kind: Any, value: Any) -> tuple[Any, Mapping[str, Any]]:
     if not isinstance(value, Mapping):
         raise InputError(f"found {value!r}, expected an object of fields")
     if issubclass(kind, Part):
-        kind = kind.registry.find(value.get(NAME), value.get(_PLUGIN))
-        value = {key: each for key, each in value.items() if key not in (NAME, _PLUGIN)}
+        kind = kind.registry.find(value.get(NAME), value.get(PLUGIN))
+        value = {key: each for key, each in value.items() if key not in (NAME, PLUGIN)}
     fields = {field.name: default_of(field) for field in dataclasses.fields(kind)}
     unknown = ", ".join(sorted(value.keys() - fields.keys()))
     needed = {name for name, default in fields.items() if default is dataclasses.MISSING}

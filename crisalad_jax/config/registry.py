@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Generic, TypeVar, cast
 
 from crisalad_jax.config.checks import REGISTRY, check_types, require
-from crisalad_jax.config.io import from_plain, to_plain
-from crisalad_jax.config.part import P, Part
+from crisalad_jax.config.io import PLUGIN, from_plain, to_plain
+from crisalad_jax.config.part import NAME, P, Part
 from crisalad_jax.config.plugins import load_entry_points
 from crisalad_jax.config.short_repr import in_one_line, with_field_docs
 from crisalad_jax.utils.errors import InputError, locate_errors
@@ -17,8 +17,6 @@ from crisalad_jax.utils.errors import InputError, locate_errors
 _C = TypeVar("_C", bound=Callable[..., Any])
 REGISTRIES: dict[str, "Registry[Any]"] = {}
 """All registries by kind."""
-_RESERVED = ("name", "plugin")
-"""Fields in which files keep a part's own name and plug-in."""
 
 
 class Registry(Generic[P]):
@@ -88,10 +86,10 @@ class Registry(Generic[P]):
             f"found {getattr(part, '__qualname__', type(part).__name__)}, expected a subclass of "
             f"{self.base.__name__} with @dataclasses.dataclass(frozen=True) below the registration",
         )
+        methods = {each for each in dir(self.base) if callable(getattr(self.base, each))}
         for field in dataclasses.fields(cast(Any, part)):
-            is_free = field.name not in _RESERVED and not callable(
-                getattr(self.base, field.name, None)
-            )
+            # Files have a part's own name and plug-in among its fields.
+            is_free = field.name not in {NAME, PLUGIN, *methods}
             require(is_free, f"found a field {field.name!r}, which has another meaning here")
         return cast(type[P], part)
 
