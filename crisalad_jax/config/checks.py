@@ -53,17 +53,13 @@ def require(condition: bool, message: str) -> None:
         raise InputError(message)
 
 
-SEEDS = 2**32
-"""Number of seeds: JAX would drop the higher bits of a larger one without a word."""
-
-
 def check_seed(what: str, seed: int) -> None:
-    """Check that a seed draws other numbers than every other one.
+    """Check that a seed draws other numbers than every other one: JAX drops higher bits.
 
     Raises:
         InputError: it is negative, or has more than 32 bits.
     """
-    require(0 <= seed < SEEDS, f"{what}: found {seed}, expected at least 0, and less than 2**32")
+    require(0 <= seed < 2**32, f"{what}: found {seed}, expected at least 0, and less than 2**32")
 
 
 def check_count(what: str, count: Any) -> None:
