@@ -137,19 +137,19 @@ def check_types(config: Any) -> None:
         ...
         crisalad_jax.utils.errors.InputError: CrossImageConfig.layers: found 1.5, expected a ...
     """
-    for name, hint in _checked_hints(type(config)).items():
+    for name, kind in _checked_kinds(type(config)).items():
         value = getattr(config, name)
-        kind = kind_of(hint)
-        where = f"{type(config).__name__}.{name}"
-        require(kind.fits(value), f"{where}: found {in_one_line(value)}, expected {kind.words}")
+        if not kind.fits(value):
+            where = f"{type(config).__name__}.{name}"
+            raise InputError(f"{where}: found {in_one_line(value)}, expected {kind.words}")
 
 
 @functools.cache
-def _checked_hints(kind: type) -> Mapping[str, Any]:
-    """Return the types of the fields that are for no part."""
-    hints = get_type_hints(kind)
-    fields: Any = dataclasses.fields(kind)
-    return {f.name: hints[f.name] for f in fields if REGISTRY not in f.metadata}
+def _checked_kinds(config: Any) -> Mapping[str, "Kind"]:
+    """Return what the fields of a configuration's class hold that are for no part."""
+    fields = [f.name for f in dataclasses.fields(config) if REGISTRY not in f.metadata]
+    hints = get_type_hints(config)
+    return {name: kind_of(hints[name]) for name in fields}
 
 
 class Kind(NamedTuple):
