@@ -85,7 +85,7 @@ else:
 
 def parts_of(config: Any, prefix: str = "") -> dict[str, Part]:
     """Return all parts in a configuration by the dotted names of their fields."""
-    parts = {prefix: config} if isinstance(config, Part) else {}
+    parts: dict[str, Part] = {prefix: config} if isinstance(config, Part) else {}
     for field in dataclasses.fields(config) if dataclasses.is_dataclass(config) else ():
         name = f"{prefix}.{field.name}".removeprefix(".")
         parts |= parts_of(getattr(config, field.name), name)

@@ -39,7 +39,7 @@ def short_repr(*always: str, switch: tuple[Any, ...] = ()) -> Callable[[type[_T]
         switch: a field, its value with which others are not in use, and the names of these; by
             default of all others. They are left out, and not compared (`config.io.differences`).
     """
-    return functools.partial(_print_in, _Style(always, switch))
+    return lambda cls: _print_in(_Style(always, switch), cls)
 
 
 def brief(cls: type[_T]) -> type[_T]:

@@ -156,7 +156,7 @@ def lowering_platforms() -> tuple[str, ...] | None:
     None is JAX's own choice, outside of `lowering_for` and for a portable program.
     """
     name = _LOWERED_AS.get(_chosen.value.platform) if _chosen.value else None
-    return name and (name,)
+    return None if name is None else (name,)
 
 
 @contextlib.contextmanager
