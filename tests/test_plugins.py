@@ -691,7 +691,7 @@ def test_settings_that_no_file_can_keep_are_refused(kind: Any, default: Any, wor
     )
     with pytest.raises(InputError, match=words):
         cj.register_loss("odd")(made)
-    assert "odd" not in REGISTRIES["loss"].names()
+    assert "odd" not in REGISTRIES["loss"]
 
 
 def test_a_field_or_a_preset_of_another_name_is_refused() -> None:

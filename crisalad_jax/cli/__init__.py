@@ -11,8 +11,7 @@ import os
 import re
 import signal
 import sys
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from crisalad_jax.config.checks import require
@@ -24,7 +23,7 @@ from crisalad_jax.config.plugins import (
 )
 from crisalad_jax.utils.errors import InputError, Interrupted, how_ended
 from crisalad_jax.utils.extras import missing_extra
-from crisalad_jax.utils.output import Note, one_line, printable
+from crisalad_jax.utils.output import one_line, print_notes, printable
 from crisalad_jax.utils.version import VERSION
 
 _COMMANDS = {
@@ -146,17 +145,6 @@ def _numbers(flag: str, value: Any) -> Iterator[tuple[str, int]]:
             yield from _numbers(path, each)
 
 
-def _show_note(message: Any, category: type[Warning], *rest: Any, **more: Any) -> None:
-    """Print a note in one line; other warnings stay as Python shows them."""
-    if issubclass(category, Note):
-        print(f"crisalad: note: {one_line(message)}", file=sys.stderr)
-    else:
-        _show_warning(message, category, *rest, **more)
-
-
-_show_warning: Callable[..., None] = warnings.showwarning
-
-
 def main(arguments: Sequence[str] | None = None, *, keep_programs: bool = False) -> int:
     """Run one command, and return its exit code.
 
@@ -172,9 +160,7 @@ def main(arguments: Sequence[str] | None = None, *, keep_programs: bool = False)
     if given == ["--version"]:
         print(f"crisalad-jax {VERSION}")
         return 0
-    with warnings.catch_warnings():
-        warnings.showwarning = _show_note
-        warnings.simplefilter("default", Note)  # the same words once
+    with print_notes():
         return _exit_code(given, keep_programs)
 
 

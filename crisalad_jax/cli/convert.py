@@ -14,19 +14,11 @@ from crisalad_jax.cli.flags import JsonFlag, PluginFlag, Target
 from crisalad_jax.config.checks import require
 from crisalad_jax.training.summary import model_words
 
-
-def _sources() -> str:
-    files = ", ".join(each.holds for each in FORMATS.values())
-    return f"{files}, or a file of this package."
-
-
-def _formats() -> str:
-    return (
-        f"{', '.join(FORMATS)}, for a source of this package; by default the one its parts came "
-        "from (huggingface if the target is a .safetensors)."
-    )
-
-
+_SOURCES = f"{', '.join(each.holds for each in FORMATS.values())}, or a file of this package."
+_FORMATS = (
+    f"{', '.join(FORMATS)}, for a source of this package; by default the one its parts came from "
+    "(huggingface if the target is a .safetensors)."
+)
 COMMON = "source target format backbone json"
 EXAMPLE = "crisalad convert dino_salad.ckpt salad.safetensors"
 
@@ -36,11 +28,11 @@ class Convert(PluginFlag, JsonFlag):
     """Convert a public torch checkpoint to a file of this package, or such a file back."""
 
     source: Annotated[
-        tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="SRC", help=_sources())
+        tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="SRC", help=_SOURCES)
     ]
     target: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="DST"), Target()]
     """A .safetensors file; for a source of this package, the public checkpoint to write."""
-    format: Annotated[str | None, tyro.conf.arg(help=_formats())] = None
+    format: Annotated[str | None, tyro.conf.arg(help=_FORMATS)] = None
     backbone: pathlib.Path | None = None
     """The backbone's checkpoint, or a published model's name, as in dinov2-vitg14: for a vocabulary
     of AnyLoc, which is one tensor by itself."""
@@ -67,22 +59,17 @@ def run(arguments: Convert) -> dict[str, Any]:
         f"{source}: found the name of a published model, expected a file; --weights {source} "
         "converts it by itself",
     )
-    done = convert(
-        source,
-        target,
-        arguments.format,
-        backbone=find_given(backbone),
-        fields=fields,
-        half=arguments.half,
-    )
-    formats = {
-        path: "crisalad-jax" if name is None else FORMATS[name].holds
-        for path, name in ((source, done.source), (target, done.target))
+    backbone = find_given(backbone)
+    more = pick(arguments, "format", "half")
+    done = convert(source, target, backbone=backbone, fields=fields, **more)
+    files = {
+        end: {
+            "file": str(getattr(arguments, end)),
+            "format": "crisalad-jax" if name is None else FORMATS[name].holds,
+        }
+        for end, name in (("source", done.source), ("target", done.target))
     }
-    ends = " -> ".join(f"{path} ({name})" for path, name in formats.items())
-    echo(f"{ends}: {model_words(done.config)}")
-    return {
-        "source": {"file": str(source), "format": formats[source]},
-        "target": {"file": str(target), "format": formats[target]},
-        "model": model_words(done.config),
-    }
+    ends = " -> ".join(f"{each['file']} ({each['format']})" for each in files.values())
+    words = model_words(done.config)
+    echo(f"{ends}: {words}")
+    return {**files, "model": words}

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from crisalad_jax.cli.common import echo, load_model
+from crisalad_jax.cli.common import echo, load_model, pick
 from crisalad_jax.cli.flags import NEW_FOLDER, ComputeFlags, JsonFlag, PluginFlag
 from crisalad_jax.config.checks import require
 
@@ -54,17 +54,12 @@ def run(arguments: Export) -> dict[str, Any]:
         f"--platforms: found with --format {arguments.format}, expected --format stablehlo",
     )
     how = ExportConfig(
-        grouping=arguments.grouping,
         batch_size=None if arguments.batch_size == "symbolic" else arguments.batch_size,
-        weights_inside=arguments.weights_inside,
         platforms=tuple(dict.fromkeys((arguments.platforms or "cpu,cuda").split(","))),  # pyright: ignore
-        format=arguments.format,
-        pixels=arguments.pixels,
+        **pick(arguments, "grouping", "weights_inside", "format", "pixels"),
     )
     model = load_model(arguments.weights, arguments)
-    calibration = None
-    if arguments.int8 is not None:
-        calibration = read_calibration(arguments.int8, model.config)
+    calibration = arguments.int8 and read_calibration(arguments.int8, model.config)
     manifest = write_export(arguments.out, model, how, calibration=calibration)
     shapes = (
         f"{manifest[name]['dtype']} ({', '.join(map(str, manifest[name]['shape']))})"

@@ -48,13 +48,8 @@ def run(arguments: Models) -> dict[str, Any]:
 
 def _facts(model: Published) -> dict[str, Any]:
     """Return what is known of a model, by name."""
-    facts = dataclasses.asdict(model)
-    licence = facts.pop("licence")
-    return facts | {
-        "licence": licence["name"],
-        "commercial": licence["commercial"],
-        "cached": is_cached(model),
-    }
+    licence = {"licence": model.licence.name, "commercial": model.licence.commercial}
+    return dataclasses.asdict(model) | licence | {"cached": is_cached(model)}
 
 
 _NOTES = {

@@ -42,12 +42,10 @@ class Pca(JsonFlag, QuietFlag):
 
 def run(arguments: Pca) -> dict[str, Any]:
     """Fit components, write them, and print their share of the variance."""
-    model = None
-    if arguments.weights is not None:
-        weights = arguments.weights
-        model = load(weights, verify=arguments.verify, quiet=arguments.quiet)
-        dim = model.config.projection.dim
-        require(not dim, f"{weights}: found a model with a projection to {dim} numbers already")
+    weights = arguments.weights
+    model = None if weights is None else load(weights, **pick(arguments, "verify", "quiet"))
+    dim = model.config.projection.dim if model else 0
+    require(not dim, f"{weights}: found a model with a projection to {dim} numbers already")
     descriptors = open_npy(arguments.descriptors, verify=arguments.verify)
     pca = fit_pca(
         descriptors,
@@ -59,7 +57,7 @@ def run(arguments: Pca) -> dict[str, Any]:
     if model is None:
         save_pca(arguments.out, pca)
     else:
-        pca.check(model.config.descriptor_dim, str(arguments.weights))
+        pca.check(model.config.descriptor_dim, str(weights))
         layer, projection = pca.projection()
         params = dataclasses.replace(model.params, projection=layer)
         config = dataclasses.replace(model.config, projection=projection)

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 from typing import Annotated, Any
 
-from crisalad_jax.cli.common import echo
+from crisalad_jax.cli.common import echo, pick
 from crisalad_jax.cli.flags import FOLDER, JsonFlag, QuietFlag
 from crisalad_jax.synthetic import (
     SCENERIES,
@@ -51,8 +51,7 @@ class Render(JsonFlag, QuietFlag):
 
 def run(arguments: Render) -> dict[str, Any]:
     """Render the world, and print what is in it."""
-    fields = {field.name for field in dataclasses.fields(WorldConfig)}
-    given = {name: value for name, value in vars(arguments).items() if name in fields}
+    given = pick(arguments, *(field.name for field in dataclasses.fields(WorldConfig)))
     config = WorldConfig(**given)
     places = config.scenes * config.stations
     is_there = has_world(arguments.out, config)  # a wrong folder is told before there is a bar

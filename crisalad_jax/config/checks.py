@@ -54,17 +54,13 @@ def require(condition: bool, message: str) -> None:
         raise InputError(message)
 
 
-SEEDS = 2**32
-"""Number of seeds: JAX would drop the higher bits of a larger one without a word."""
-
-
 def check_seed(what: str, seed: int) -> None:
-    """Check that a seed draws other numbers than every other one.
+    """Check that a seed draws other numbers than every other one: JAX drops higher bits.
 
     Raises:
         InputError: it is negative, or has more than 32 bits.
     """
-    require(0 <= seed < SEEDS, f"{what}: found {seed}, expected at least 0, and less than 2**32")
+    require(0 <= seed < 2**32, f"{what}: found {seed}, expected at least 0, and less than 2**32")
 
 
 def check_count(what: str, count: Any) -> None:
@@ -73,11 +69,9 @@ def check_count(what: str, count: Any) -> None:
     Raises:
         InputError: it is below, or no whole number.
     """
-    whole = "" if kind_of(int).fits(count) else "a whole number of "
-    require(
-        not whole and count >= 1,
-        f"{what}: found {in_one_line(count)}, expected {whole}at least 1",
-    )
+    is_whole = kind_of(int).fits(count)
+    expected = "at least 1" if is_whole else "a whole number of at least 1"
+    require(is_whole and count >= 1, f"{what}: found {in_one_line(count)}, expected {expected}")
 
 
 PATH = (str, os.PathLike)
@@ -116,12 +110,7 @@ def takes(**kinds: type | tuple[type, ...]) -> Callable[[_F], _F]:
                 if not isinstance(value, kind):
                     plain = value is None or isinstance(value, str | int | float)
                     found = repr(value) if plain else type(value).__name__
-                    classes = kind if isinstance(kind, tuple) else (kind,)
-                    words = (
-                        "a path"
-                        if kind is PATH
-                        else ", or ".join(kind_of(each).words for each in classes)
-                    )
+                    words = "a path" if kind is PATH else kind_of(cast(Any, Union)[kind]).words
                     raise InputError(f"{name}: found {found}, expected {words}")
             return function(*args, **options)
 
@@ -149,19 +138,19 @@ def check_types(config: Any) -> None:
         ...
         crisalad_jax.utils.errors.InputError: CrossImageConfig.layers: found 1.5, expected a ...
     """
-    for name, hint in _checked_hints(type(config)).items():
+    for name, kind in _checked_kinds(type(config)).items():
         value = getattr(config, name)
-        kind = kind_of(hint)
-        where = f"{type(config).__name__}.{name}"
-        require(kind.fits(value), f"{where}: found {in_one_line(value)}, expected {kind.words}")
+        if not kind.fits(value):
+            where = f"{type(config).__name__}.{name}"
+            raise InputError(f"{where}: found {in_one_line(value)}, expected {kind.words}")
 
 
 @functools.cache
-def _checked_hints(kind: type) -> Mapping[str, Any]:
-    """Return the types of the fields that are for no part."""
-    hints = get_type_hints(kind, include_extras=True)
-    fields: Any = dataclasses.fields(kind)
-    return {f.name: hints[f.name] for f in fields if REGISTRY not in f.metadata}
+def _checked_kinds(config: Any) -> Mapping[str, "Kind"]:
+    """Return what the fields of a configuration's class hold that are for no part."""
+    fields = [f.name for f in dataclasses.fields(config) if REGISTRY not in f.metadata]
+    hints = get_type_hints(config, include_extras=True)
+    return {name: kind_of(hints[name]) for name in fields}
 
 
 class Kind(NamedTuple):

@@ -19,7 +19,7 @@ import tyro
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.registry import Registry
 from crisalad_jax.config.short_repr import field_docs
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.errors import InputError, locate_errors
 
 _KIND = "_kind"
 """Attribute of a dataclass that `flags_of` makes: the configuration's class."""
@@ -47,7 +47,7 @@ def flags_of(config: Any, arguments: Sequence[str], preset: str, path: str = "")
         if chosen is not None and registry.find(chosen) is not type(config):
             config = registry.make(chosen, preset)
         help_text = f"Which {registry.kind}; its own settings follow."
-        names = Literal[tuple(registry.names())]  # pyright: ignore
+        names = Literal[tuple(registry)]  # pyright: ignore
         hint = Annotated[names, tyro.conf.arg(name="", help=help_text)]
         fields.append(("part_name", hint, config.part_name))
     kind = type(config)
@@ -115,20 +115,16 @@ def parse_changes(config: Any, arguments: Sequence[str], preset: str, what: str)
     Raises:
         InputError: no such flag or part, or a value that does not fit; one line.
     """
-    try:
+    with locate_errors(f"{what}: "), refusals(arguments):
         default = flags_of(config, arguments, preset)
-        with refusals(arguments):
-            parsed = tyro.cli(
-                type(default),
-                prog=what,
-                args=arguments,
-                default=default,
-                add_help=False,
-                config=(tyro.conf.FlagConversionOff,),
-            )
+        parsed = tyro.cli(
+            type(default),
+            prog=what,
+            args=arguments,
+            add_help=False,
+            config=(tyro.conf.FlagConversionOff,),
+        )
         return config_of(parsed)
-    except InputError as error:
-        raise InputError(f"{what}: {error}") from error
 
 
 _WIDE = "100000"
@@ -207,11 +203,6 @@ def _expected(metavar: str) -> str:
     return f"a {kind}" if len(parts) == 1 else f"{len(parts)} {kind}s"
 
 
-_NO_NUMBER = (
-    r"Error parsing (\S+): (?:invalid literal for|could not convert) .*?(int|float).*?: (.*)"
-)
-
-
 def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
     """Say in our words what tyro says; what we do not know stays as it is.
 
@@ -221,9 +212,10 @@ def _refusal(texts: Sequence[str], arguments: Sequence[str]) -> str:
     """
     said: list[str] = []
     for text in texts:
-        if found := re.match(_NO_NUMBER, text):
-            kind = "a whole number" if found[2] == "int" else "a number"
-            said.append(f"{found[1]}: found {found[3]}, expected {kind}")
+        if found := re.match(
+            r"Error parsing (\S+): (?:invalid|could not) .*?(int|float).*?: (.*)", text
+        ):
+            said.append(f"{found[1]}: found {found[3]}, expected {_expected(found[2].upper())}")
         elif found := re.match(
             r"Error parsing (\S+): no type matching (.+) could .*? (\[.*\])", text
         ):

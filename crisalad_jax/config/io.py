@@ -14,11 +14,11 @@ from crisalad_jax.config.part import NAME, Part
 from crisalad_jax.config.plugins import home_of
 from crisalad_jax.config.short_repr import default_of, fields_in_use
 from crisalad_jax.utils.checksums import CHECKSUM, ChangedFileError
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.errors import InputError, locate_errors
 from crisalad_jax.utils.files import read_json
 
 _T = TypeVar("_T")
-_PLUGIN = "plugin"
+PLUGIN = "plugin"
 """Key of the plug-in that registered a part, next to its name."""
 
 
@@ -35,7 +35,7 @@ def to_plain(config: Any) -> Any:
         if not isinstance(config, Part):
             return fields
         home = home_of(type(config).__module__)
-        return {NAME: config.part_name, **({_PLUGIN: home} if home else {}), **fields}
+        return {NAME: config.part_name, **({PLUGIN: home} if home else {}), **fields}
     if isinstance(config, list | tuple):
         return [to_plain(item) for item in config]
     value = config.item() if isinstance(config, np.generic) else config
@@ -58,41 +58,40 @@ def from_plain(kind: type[_T], value: Any, *, source: str) -> _T:
         InputError: naming `source`, and an unknown field, part that is not registered, or value
             that does not fit.
     """
-    try:
+    with locate_errors(f"{source}: "):
         return _config(kind, value, "config")
-    except InputError as error:
-        raise InputError(f"{source}: {error}") from error
 
 
 def _config(kind: Any, value: Any, path: str) -> Any:
     """Make a dataclass; messages end with the path of the field."""
-    if isinstance(value, str) and issubclass(kind, Part):
-        value = {NAME: value}
-    if not isinstance(value, Mapping):
-        raise InputError(f"found {value!r}, expected an object of fields @ {path}")
-    if issubclass(kind, Part):
-        name, plugin = value.get(NAME), value.get(_PLUGIN)
-        value = {key: each for key, each in value.items() if key not in (NAME, _PLUGIN)}
-        try:
-            kind = kind.registry.find(name, plugin)
-        except InputError as error:
-            raise InputError(f"{error} @ {path}") from error
-    fields = {field.name: field for field in dataclasses.fields(kind)}
-    needed = {name for name, field in fields.items() if default_of(field) is dataclasses.MISSING}
-    unknown, missing = sorted(value.keys() - fields.keys()), sorted(needed - value.keys())
-    if unknown or missing:
-        found = f"found {', '.join(unknown)}" if unknown else f"found no {', '.join(missing)}"
-        raise InputError(f"{found}, expected {', '.join(fields)} @ {path}")
+    with locate_errors(after=f" @ {path}"):
+        kind, value = _class_and_fields(kind, value)
     hints = typing.get_type_hints(kind)
     given = {
         # A map's description has a field `config`, as the whole is called.
         name: _value(hints[name], each, path if path == name else f"{path}.{name}")
         for name, each in value.items()
     }
-    try:
+    with locate_errors(after=f" @ {path}"):
         return kind(**given)
-    except InputError as error:
-        raise InputError(f"{error} @ {path}") from error
+
+
+def _class_and_fields(kind: Any, value: Any) -> tuple[Any, Mapping[str, Any]]:
+    """Return the class of a JSON value, for a part the one with its name, and its fields."""
+    if isinstance(value, str) and issubclass(kind, Part):
+        value = {NAME: value}
+    if not isinstance(value, Mapping):
+        raise InputError(f"found {value!r}, expected an object of fields")
+    if issubclass(kind, Part):
+        kind = kind.registry.find(value.get(NAME), value.get(PLUGIN))
+        value = {key: each for key, each in value.items() if key not in (NAME, PLUGIN)}
+    fields = {field.name: default_of(field) for field in dataclasses.fields(kind)}
+    unknown = ", ".join(sorted(value.keys() - fields.keys()))
+    needed = {name for name, default in fields.items() if default is dataclasses.MISSING}
+    missing = ", ".join(sorted(needed - value.keys()))
+    if unknown or missing:
+        raise InputError(f"found {unknown or f'no {missing}'}, expected {', '.join(fields)}")
+    return kind, value
 
 
 def _value(hint: Any, value: Any, path: str) -> Any:

@@ -85,13 +85,10 @@ else:
 
 def parts_of(config: Any, prefix: str = "") -> dict[str, Part]:
     """Return all parts in a configuration by the dotted names of their fields."""
-    parts: dict[str, Part] = {}
-    if isinstance(config, Part):
-        parts[prefix] = config
-    if dataclasses.is_dataclass(config):
-        for field in dataclasses.fields(config):
-            name = f"{prefix}.{field.name}" if prefix else field.name
-            parts |= parts_of(getattr(config, field.name), name)
+    parts: dict[str, Part] = {prefix: config} if isinstance(config, Part) else {}
+    for field in dataclasses.fields(config) if dataclasses.is_dataclass(config) else ():
+        name = f"{prefix}.{field.name}".removeprefix(".")
+        parts |= parts_of(getattr(config, field.name), name)
     return parts
 
 

@@ -16,6 +16,7 @@ from crisalad_jax.config.checks import takes
 from crisalad_jax.config.part import Part, parts_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
+from crisalad_jax.utils.output import one_line
 
 ENTRY_POINTS = "crisalad_jax.plugins"
 """Group of entry points under which an installed package names its modules of parts."""
@@ -68,7 +69,7 @@ def load_plugin(plugin: str) -> None:
         where = f" in line {lines[-1]}" if lines else ""
         raise InputError(
             f"plugin {plugin}: cannot be loaded: it raises {type(error).__name__}{where}: "
-            f"{' '.join(str(error).split())}"
+            f"{one_line(error)}"
         ) from error
     _LOADED[spec.origin if plugin.endswith(".py") else plugin] = spec.name
 
@@ -120,7 +121,7 @@ def plugin_failure(error: BaseException) -> str | None:
     where = ", ".join(sorted(files))
     if places:
         where = f"{places[-1].filename}: line {places[-1].lineno}, in {places[-1].name}"
-    return f"plugin {where}: {type(error).__name__}: {' '.join(str(error).split())}"
+    return f"plugin {where}: {type(error).__name__}: {one_line(error)}"
 
 
 def home_of(module: str | None) -> str | None:

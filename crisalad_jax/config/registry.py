@@ -3,21 +3,20 @@
 import dataclasses
 import functools
 import inspect
+import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Generic, TypeVar, cast
 
-from crisalad_jax.config.checks import REGISTRY, check_types
-from crisalad_jax.config.io import from_plain, to_plain
-from crisalad_jax.config.part import P, Part
+from crisalad_jax.config.checks import REGISTRY, check_types, require
+from crisalad_jax.config.io import PLUGIN, from_plain, to_plain
+from crisalad_jax.config.part import NAME, P, Part
 from crisalad_jax.config.plugins import load_entry_points
 from crisalad_jax.config.short_repr import in_one_line, with_field_docs
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.errors import InputError, locate_errors
 
 _C = TypeVar("_C", bound=Callable[..., Any])
 REGISTRIES: dict[str, "Registry[Any]"] = {}
 """All registries by kind."""
-_RESERVED = ("name", "plugin")
-"""Fields in which files keep a part's own name and plug-in."""
 
 
 class Registry(Generic[P]):
@@ -57,16 +56,14 @@ class Registry(Generic[P]):
                 this kind.
         """
         where = f"register_{self.kind}"
-        if not isinstance(name, str) or not name or set(name) & set(":,") or name != name.strip():
-            raise InputError(
-                f"{where}: found {name!r}, expected a name without ':' and ',': @{where}('...')"
-            )
+        require(
+            isinstance(name, str) and re.fullmatch(r"(?!\s)[^:,]+(?<!\s)", name) is not None,
+            f"{where}: found {name!r}, expected a name without ':' and ',': @{where}('...')",
+        )
 
         def decorate(part: _C) -> _C:
-            try:
+            with locate_errors(f"{where} {name!r}: "):
                 self._add(name, self._class_of(part), presets)
-            except InputError as error:
-                raise InputError(f"{where} {name!r}: {error}") from error
             return part
 
         return decorate
@@ -84,31 +81,30 @@ class Registry(Generic[P]):
             return cast(type[P], dataclasses.dataclass(frozen=True)(made))
         is_part = isinstance(part, type) and issubclass(part, self.base)
         parameters = vars(part).get("__dataclass_params__") if is_part else None
-        if parameters is None or not parameters.frozen:
-            raise InputError(
-                f"found {getattr(part, '__qualname__', type(part).__name__)}, expected a subclass "
-                f"of {self.base.__name__} with @dataclasses.dataclass(frozen=True) below the "
-                "registration"
-            )
+        require(
+            parameters is not None and parameters.frozen,
+            f"found {getattr(part, '__qualname__', type(part).__name__)}, expected a subclass of "
+            f"{self.base.__name__} with @dataclasses.dataclass(frozen=True) below the registration",
+        )
+        methods = {each for each in dir(self.base) if callable(getattr(self.base, each))}
         for field in dataclasses.fields(cast(Any, part)):
-            if field.name in _RESERVED or callable(getattr(self.base, field.name, None)):
-                raise InputError(f"found a field {field.name!r}, which has another meaning here")
+            # Files have a part's own name and plug-in among its fields.
+            is_free = field.name not in {NAME, PLUGIN, *methods}
+            require(is_free, f"found a field {field.name!r}, which has another meaning here")
         return cast(type[P], part)
 
     def _add(self, name: str, part: type[P], presets: Mapping[str, Mapping[str, Any]]) -> None:
-        existing = self._parts.get(name)
+        taken = _home(self._parts.get(name, part))
         # A notebook's cell or a plug-in's file that runs again registers the same part.
-        if existing is not None and _home(existing) != _home(part):
-            raise InputError(
-                f"found the name taken by {existing.__module__}.{existing.__qualname__}, expected "
-                f"another name for {part.__qualname__}"
-            )
+        require(
+            taken == _home(part),
+            f"found the name taken by {taken}, expected another name for {part.__qualname__}",
+        )
         earlier = vars(part).get("part_name", name)
-        if earlier != name:
-            raise InputError(
-                f"found {part.__qualname__} registered as {earlier!r}, expected one name for a "
-                "class"
-            )
+        require(
+            earlier == name,
+            f"found {part.__qualname__} registered as {earlier!r}, expected one name for a class",
+        )
         try:
             for fields in ({}, *presets.values()):
                 hash(part(**fields))
@@ -125,17 +121,9 @@ class Registry(Generic[P]):
             del self._parts[name], self._presets[name]
             raise
 
-    def names(self) -> list[str]:
-        """Return the names of all parts, in order."""
-        return sorted(self._parts)
-
     def __iter__(self) -> Iterator[str]:
-        """Iterate over `names`."""
-        return iter(self.names())
-
-    def __contains__(self, name: object) -> bool:
-        """Return whether a part has this name."""
-        return name in self._parts
+        """Iterate over the names of all parts, in order."""
+        return iter(sorted(self._parts))
 
     def find(self, name: str, plugin: str | None = None, *, where: str | None = None) -> type[P]:
         """Return the class of the part with this name; if needed, load installed plug-ins first.
@@ -148,10 +136,9 @@ class Registry(Generic[P]):
         Raises:
             InputError: there is none; the message lists all parts.
         """
-        # A file may have any value in the place of a name, even an unhashable one.
-        if name not in self.names():
+        if name not in self:
             load_entry_points()
-        if name not in self.names():
+        if name not in self:
             hint = "is a plug-in missing? --plugin FILE.py or MODULE, or load_plugin"
             if plugin is not None:
                 hint = f"the plug-in {plugin} had it: --plugin {plugin}, or load_plugin"
@@ -188,8 +175,8 @@ class Registry(Generic[P]):
         return value
 
 
-def _home(part: type[Part]) -> tuple[str, str]:
-    return part.__module__, part.__qualname__
+def _home(part: type[Part]) -> str:
+    return f"{part.__module__}.{part.__qualname__}"
 
 
 def part_field(registry: Registry[P], default: str | type[P]) -> Any:
@@ -223,21 +210,20 @@ def count_arguments(function: Callable[..., Any], *offered: str) -> int:
     Raises:
         InputError: it requires more arguments.
     """
-    parameters = list(inspect.signature(function).parameters.values())
+    signature = inspect.signature(function)
+    parameters = signature.parameters.values()
     if any(each.kind is each.VAR_POSITIONAL for each in parameters):
         return len(offered)
     by_place = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
     taken = [
         number
-        for number, each in enumerate(by_place, 1)
-        if each.default is each.empty or each.name in offered[number - 1 : number]
+        for number, (each, name) in enumerate(zip(by_place, offered, strict=False), 1)
+        if each.default is each.empty or each.name == name
     ]
     count = max(taken, default=0)
-    more = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.default is p.empty]
-    more += [each.name for each in by_place[len(offered) : count]]
-    if more:
-        raise InputError(
-            f"{getattr(function, '__name__', function)}: found the arguments {', '.join(more)}, "
-            f"expected at most {', '.join(offered)}"
-        )
+    try:
+        signature.bind(*offered[:count])
+    except TypeError as error:
+        name = getattr(function, "__name__", function)
+        raise InputError(f"{name}: {error}, expected at most {', '.join(offered)}") from error
     return count

@@ -1,25 +1,32 @@
-"""How public classes print: their `repr`, their HTML in a notebook, and their `help`."""
+"""How public classes print: their `repr` and their `help`."""
 
 import ast
 import dataclasses
 import functools
-import html
 import inspect
 import itertools
 import math
 import pathlib
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Self, SupportsIndex, TypeVar
+from typing import Any, NamedTuple, SupportsIndex, TypeVar
 
 _T = TypeVar("_T")
 _WIDTH = 88
 """Characters of a line, at most: as a notebook shows without a scroll bar."""
 _FEW = 4
 """Number of items in a collection that is shown whole; of a larger one the first is shown."""
-_SWITCH = "__short_repr_switch__"
-_ALWAYS = "__short_repr_always__"
-_BRIEF = "__short_repr_brief__"
+
+
+class _Style(NamedTuple):
+    """How a class prints."""
+
+    always: tuple[str, ...] = ()
+    switch: tuple[Any, ...] = ()
+    is_brief: bool = False
+
+
+_STYLE = "__crisalad_style__"
 
 
 def short_repr(*always: str, switch: tuple[Any, ...] = ()) -> Callable[[type[_T]], type[_T]]:
@@ -32,21 +39,14 @@ def short_repr(*always: str, switch: tuple[Any, ...] = ()) -> Callable[[type[_T]
         switch: a field, its value with which others are not in use, and the names of these; by
             default of all others. They are left out, and not compared (`config.io.differences`).
     """
-
-    def decorate(cls: type[_T]) -> type[_T]:
-        setattr(cls, _ALWAYS, always)
-        setattr(cls, _SWITCH, switch)
-        cls.__repr__ = concise_repr  # pyright: ignore[reportAttributeAccessIssue]
-        return with_field_docs(cls)
-
-    return decorate
+    return lambda cls: _print_in(_Style(always, switch), cls)
 
 
 def brief(cls: type[_T]) -> type[_T]:
     """Give a class of results a `repr` of a line for each field, whatever its size.
 
-    Arrays print as type and shape, parameters as their number, collections as their first items. A
-    notebook shows the same as a table, and `help` the texts below the fields.
+    Arrays print as type and shape, parameters as their number, collections as their first items.
+    `help` shows the texts below the fields.
 
     Args:
         cls: a dataclass or NamedTuple.
@@ -61,10 +61,17 @@ def brief(cls: type[_T]) -> type[_T]:
         >>> Found([f"{i}.jpg" for i in range(9)], np.zeros((9, 256)))
         Found(names=['0.jpg', ... 8 more], descriptors=float64[9, 256])
     """
-    setattr(cls, _BRIEF, True)
+    return _print_in(_Style(is_brief=True), cls)
+
+
+def _print_in(style: _Style, cls: type[_T]) -> type[_T]:
+    setattr(cls, _STYLE, style)
     cls.__repr__ = concise_repr  # pyright: ignore[reportAttributeAccessIssue]
-    cls._repr_html_ = _html  # pyright: ignore[reportAttributeAccessIssue]
     return with_field_docs(cls)
+
+
+def _style_of(value: Any) -> _Style:
+    return getattr(value, _STYLE, _Style())
 
 
 def concise_repr(value: Any) -> str:
@@ -84,35 +91,37 @@ def concise_repr(value: Any) -> str:
         >>> print(ModelConfig(aggregator="gem", cross_image=CrossImageConfig(layers=0, heads=4)))
         ModelConfig(backbone='vit', aggregator='gem', cross_image=CrossImageConfig(layers=0))
     """
-    return _write(value, "", 0, _WIDTH)
+    return _write(value, _WIDTH)
 
 
 def in_one_line(value: Any) -> str:
     """Write any value for a message: a configuration in one line, of other values the first."""
-    first, *more = _write(value, "", 0, math.inf).splitlines() or [""]
+    first, *more = _write(value, math.inf).splitlines() or [""]
     return f"{first} ..." if more else first
 
 
-def _write(value: Any, before: str, indent: int, width: float) -> str:
-    """Write `before` and a value; the line has `indent` characters already."""
+def _write(value: Any, width: float) -> str:
+    """Write a value in a line of this width, or else in one for each field."""
     if type(value).__repr__ is not concise_repr:
-        return f"{before}{value!r}"
-    shown = list(_shown(value))
-    name = getattr(value, "part_name", None)
-    if before and name and not shown:
-        return f"{before}{name!r}"
-    opening, inner = f"{before}{type(value).__qualname__}(", indent + 4
-    if hasattr(value, _BRIEF):
-        texts = [f"{field}={_short(each)}" for field, each in shown]
-        lines = [_clipped(text, _WIDTH - inner) for text in texts]
-    else:
-        texts = [_write(each, f"{field}=", 0, math.inf) for field, each in shown]
-        lines = [_write(each, f"{field}=", inner, width) for field, each in shown]
-    line = f"{opening}{', '.join(texts)})"
-    if indent + len(line) <= width:
+        return repr(value)
+    name = type(value).__qualname__
+    line = f"{name}({', '.join(_fields(value, math.inf))})"
+    if len(line) <= width:
         return line
-    fields = "".join(f"{' ' * inner}{line},\n" for line in lines)
-    return f"{opening}\n{fields}{' ' * indent})"
+    lines = ",\n".join(_fields(value, width - 4))
+    return f"{name}(\n{textwrap.indent(lines, '    ')},\n)"
+
+
+def _fields(value: Any, width: float) -> Iterator[str]:
+    """Write the fields that are printed."""
+    for name, each in _shown(value):
+        if _style_of(value).is_brief:
+            text = f"{name}={_short(each)}"
+            yield text if len(text) <= width else f"{text[: int(width) - 4]} ..."
+        elif hasattr(each, "part_name") and not list(_shown(each)):
+            yield f"{name}={each.part_name!r}"
+        else:
+            yield f"{name}={_write(each, width - len(name) - 1)}"
 
 
 def _short(value: Any) -> str:
@@ -121,7 +130,7 @@ def _short(value: Any) -> str:
     if isinstance(shape, tuple) and dtype is not None:
         return f"{dtype}{list(shape)}" if shape else str(value)
     if type(value).__repr__ is concise_repr:
-        return _write(value, "", 0, math.inf)
+        return _write(value, math.inf)
     if isinstance(value, pathlib.PurePath):
         return repr(str(value))
     if isinstance(value, float):  # a fraction has four digits, and metres all of theirs
@@ -144,31 +153,17 @@ def _few(ends: str, count: int, items: Iterator[str]) -> str:
     return f"{ends[0]}{', '.join(texts)}{ends[1]}"
 
 
-def _clipped(text: str, width: int) -> str:
-    return text if len(text) <= width else f"{text[: width - 4]} ..."
-
-
-def _html(self: Any) -> str:
-    rows = (
-        f"<tr><th>{field}</th><td>{html.escape(_clipped(_short(value), _WIDTH))}</td></tr>"
-        for field, value in _shown(self)
-    )
-    return f"<table><caption>{type(self).__qualname__}</caption>{''.join(rows)}</table>"
-
-
 def _shown(value: Any) -> Iterator[tuple[str, Any]]:
     """Yield name and value of the fields that are printed."""
     if dataclasses.is_dataclass(value):
-        always = getattr(value, _ALWAYS, ())
         defaults = {field.name: default_of(field) for field in fields_in_use(value)}
     else:
-        always = ()
         defaults = dict.fromkeys(value._fields, dataclasses.MISSING) | value._field_defaults
     for name, default in defaults.items():
         each = getattr(value, name)
         # Arrays have no truth value.
         same = each is default or (not hasattr(each, "shape") and each == default)
-        if name in always or not same:
+        if name in _style_of(value).always or not same:
             yield name, each
 
 
@@ -187,7 +182,7 @@ def fields_in_use(config: Any) -> list[dataclasses.Field[Any]]:
         >>> [field.name for field in fields_in_use(CrossImageConfig(layers=0))]
         ['layers']
     """
-    fields, switch = list(dataclasses.fields(config)), getattr(config, _SWITCH, ())
+    fields, switch = list(dataclasses.fields(config)), _style_of(config).switch
     if not switch or getattr(config, switch[0]) != switch[1]:
         return fields
     name, _, *unused = switch
@@ -195,38 +190,30 @@ def fields_in_use(config: Any) -> list[dataclasses.Field[Any]]:
 
 
 def with_field_docs(cls: type[_T]) -> type[_T]:
-    """Let a class's docstring end with the texts below its fields."""
-    cls.__doc__ = _Doc(cls.__doc__ or "", cls)
+    """Let the `help` of a class end with the texts below its fields."""
+    doc = _Doc(cls.__doc__ or "")
+    doc.kind = cls
+    cls.__doc__ = doc
     return cls
 
 
 class _Doc(str):
-    """A docstring that is put together when it is read: to read sources would slow an import.
+    """A docstring that is completed when it is shown: to read sources would slow an import.
 
-    `help` takes the docstring of an abstract class out of its namespace, without `__get__`, and
-    begins with `expandtabs`.
+    `help`, and `?` in a notebook, begin with `expandtabs`.
     """
-
-    def __new__(cls, text: str, kind: type) -> Self:
-        doc = super().__new__(cls, text)
-        doc.kind = kind
-        return doc
 
     kind: type
 
     def expandtabs(self, tabsize: SupportsIndex = 8) -> str:
-        return self.__get__(None, self.kind).expandtabs(tabsize)
-
-    def __get__(self, instance: Any, owner: type) -> str:
         names = getattr(self.kind, "_fields", None)
         if names is None:
             names = [field.name for field in dataclasses.fields(self.kind)]
         texts = field_docs(self.kind)
         lines = (f"    {name}: {texts[name]}" for name in names if name in texts)
         fields = [line.replace("\n", "\n" + 8 * " ") for line in lines]
-        if not fields:
-            return str(self)
-        return "\n".join([inspect.cleandoc(str(self)), "", "Attributes:", *fields])
+        heading = ["", "Attributes:"] if fields else []
+        return "\n".join([inspect.cleandoc(str(self)), *heading, *fields]).expandtabs(tabsize)
 
 
 @functools.cache

@@ -22,7 +22,6 @@ from crisalad_jax.utils.checksums import sha256_of, tell_unchecked
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import (
     atomic_path,
-    check_one_array,
     check_source,
     npy_header,
     read_json,
@@ -194,7 +193,6 @@ def open_npy(path: str | os.PathLike[str], *, verify: bool = True) -> Descriptor
     """
     path = pathlib.Path(path)
     check_source(path, "a .npy file of descriptors")
-    check_one_array(path)
     if verify:
         _check_files(path, ["descriptors"])
     try:
@@ -230,8 +228,6 @@ def read_descriptors(
             holds something else.
     """
     path = pathlib.Path(path)
-    if path.suffix == ".npz":
-        check_one_array(path)
     readers = {".npy": _read_npy, ".h5": _read_h5}
     read = choose(f"{path}: suffix of the descriptors' file", path.suffix, readers)
     check_source(path, "a file of descriptors")

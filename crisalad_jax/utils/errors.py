@@ -1,7 +1,8 @@
 """The errors that a command ends with in one line: bad input, and a signal."""
 
+import contextlib
 import signal
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 _MOST = 3
 """Number of problems that one message lists."""
@@ -13,6 +14,15 @@ class InputError(ValueError):
     The command line ends with code 2. The message is one line that names the file or argument, what
     was found and what was expected.
     """
+
+
+@contextlib.contextmanager
+def locate_errors(before: str = "", after: str = "") -> Iterator[None]:
+    """Say in the message of an InputError that the block raises where the input is."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{before}{error}{after}") from error
 
 
 def how_ended(number: int) -> str:

@@ -21,8 +21,6 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 from jax.experimental import serialize_executable
 from jax.experimental.compilation_cache import compilation_cache
 
@@ -89,17 +87,17 @@ def cached_executable(
     names = (static_argnames,) if isinstance(static_argnames, str) else static_argnames
     static = {name: given.pop(name) for name in sorted(names) if name in given}
     leaves, tree = jax.tree.flatten(((), given))  # positional arguments, and those by name
-    arrays = [_as_array(leaf) for leaf in leaves]
+    arrays = [x if isinstance(x, jax.Array) else jax.device_put(x) for x in leaves]
     _, given = jax.tree.unflatten(tree, arrays)
-    signature = (
-        function,
-        tuple(static.items()),
-        tree,
-        tuple((leaf.aval, leaf.sharding, leaf.committed) for leaf in arrays),
-    )
+    described = tuple((leaf.aval, leaf.sharding, leaf.committed) for leaf in arrays)
+    signature = (function, tuple(static.items()), tree, described)
     program = _programs.get(signature)
     if program is None:
-        path = _Folder.path / _key(function, static, tree, arrays)
+        ids = [sorted(each.id for each in leaf.sharding.device_set) for leaf in arrays]
+        fixed = {name: _whole(value) for name, value in static.items()}
+        name = f"{function.__module__}.{function.__qualname__}"
+        words = repr((_surroundings(), name, tree, fixed, described, ids))
+        path = _Folder.path / hashlib.sha256(words.encode()).hexdigest()
         program = _read(path, tree, _devices(arrays))
         if program is None:
             with _without_jaxs_cache():
@@ -122,13 +120,6 @@ def _without_jaxs_cache() -> Iterator[None]:
         compilation_cache.reset_cache()
 
 
-def _as_array(leaf: Any) -> jax.Array:
-    """Put a numpy array on the device, for which `jnp.asarray` would compile a program."""
-    if isinstance(leaf, np.ndarray):
-        return jax.device_put(leaf)
-    return leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf)
-
-
 _signature = functools.cache(inspect.signature)
 _programs: dict[Hashable, Any] = {}
 """Programs of this process, by all that they depend on."""
@@ -139,27 +130,6 @@ def _devices(arrays: Sequence[jax.Array]) -> list[Any]:
     committed = (leaf.sharding.device_set for leaf in arrays if leaf.committed)
     chosen = next(committed, jax.local_devices()[:1])
     return sorted(chosen, key=lambda device: device.id)
-
-
-def _key(
-    function: Callable[..., Any],
-    static: Mapping[str, Any],
-    tree: Any,
-    arrays: Sequence[jax.Array],
-) -> str:
-    """Digest all that a program depends on: the same in every process."""
-    arguments = [
-        (leaf.aval.str_short(), leaf.aval.weak_type, leaf.committed, leaf.sharding, _ids(leaf))
-        for leaf in arrays
-    ]
-    fixed = {name: _whole(value) for name, value in static.items()}
-    name = f"{function.__module__}.{function.__qualname__}"
-    words = repr((_surroundings(), name, tree, fixed, arguments))
-    return hashlib.sha256(words.encode()).hexdigest()
-
-
-def _ids(array: jax.Array) -> list[int]:
-    return sorted(device.id for device in array.sharding.device_set)
 
 
 def _whole(value: Any) -> str:
@@ -181,17 +151,11 @@ def _surroundings() -> str:
     words += [VERSION, sys.version, *(importlib.metadata.version(name) for name in _TRACED_WITH)]
     words += [f"{k}={v}" for k, v in sorted(os.environ.items()) if k.startswith(_SETTINGS)]
     words += [f"{k}={v}" for k, v in sorted(jax.config.values.items(), key=lambda pair: pair[0])]
-    words += [str(jax.devices()), *_processor()]
-    return hashlib.sha256("\n".join(words).encode()).hexdigest()
-
-
-def _processor() -> list[str]:
-    """Describe the processor that machine code is for."""
-    words = [platform.system(), platform.machine(), platform.processor()]
-    with contextlib.suppress(OSError):
+    words += [str(jax.devices()), platform.system(), platform.machine(), platform.processor()]
+    with contextlib.suppress(OSError):  # the processor that machine code is for
         lines = pathlib.Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
         words += [line for line in lines if line.startswith(("model name", "flags", "Features"))]
-    return words
+    return hashlib.sha256("\n".join(words).encode()).hexdigest()
 
 
 def _is_ones_own(path: pathlib.Path) -> bool:

@@ -5,10 +5,10 @@ import io
 import json
 import os
 import pathlib
+import re
 import stat
 import tempfile
-import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -51,26 +51,27 @@ def check_source(
         InputError: there is none, one that is larger, or something that is no file: a folder, a
             pipe, a device. Opening a pipe may wait for ever, and a device may never end.
     """
-    found = _found_instead(path)
-    if found is None and largest is not None and (size := os.stat(path).st_size) > largest:
+    found = _kind_of(path)
+    if found == _FILE:
+        size = os.stat(path).st_size
+        if largest is None or size <= largest:
+            return
         found, expected = f"{size} bytes", f"{expected}, of at most {largest}"
-    if found is not None:
-        raise InputError(f"{path}: found {found}, expected {expected}")
+    raise InputError(f"{path}: found {found}, expected {expected}")
 
 
-_KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
-_NOTHING = "no such file"
+_NOTHING, _FILE, _FOLDER = "no such file", "a file", "a folder"
+_KINDS = {stat.S_IFREG: _FILE, stat.S_IFDIR: _FOLDER, stat.S_IFIFO: "a pipe"}
 
 
-def _found_instead(path: str | os.PathLike[str]) -> str | None:
-    """Describe what `path` is if it is not a regular file; otherwise return None."""
+def _kind_of(path: str | os.PathLike[str]) -> str:
+    """Describe what there is at `path`."""
     try:
-        mode = os.stat(path).st_mode
+        return _KINDS.get(stat.S_IFMT(os.stat(path).st_mode), "a device or a socket")
     except (FileNotFoundError, NotADirectoryError):
         return _NOTHING
     except (OSError, ValueError) as error:  # links in a circle, a NUL in the name
         return f"a name that cannot be made or read ({getattr(error, 'strerror', error)})"
-    return None if stat.S_ISREG(mode) else _KINDS.get(stat.S_IFMT(mode), "a device")
 
 
 CACHE = "CRISALAD_CACHE"
@@ -108,25 +109,6 @@ def read_bytes(path: str | os.PathLike[str], expected: str) -> bytes:
     """
     check_source(path, expected, largest=LARGEST)
     return pathlib.Path(path).read_bytes()
-
-
-def check_one_array(path: pathlib.Path) -> None:
-    """Check that a file is not an .npz archive, where one array is expected.
-
-    Raises:
-        InputError: it is one; the message says how to save an array of it.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            arrays = [name.removesuffix(".npy") for name in archive.namelist()]
-    except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError):
-        return  # whoever reads it says what it is
-    names = ", ".join(arrays[:8]) or "nothing"
-    first = arrays[0] if arrays else "arr_0"
-    raise InputError(
-        f"{path}: found an .npz archive of {names}, expected one array: "
-        f"numpy.save({path.stem + '.npy'!r}, numpy.load({path.name!r})[{first!r}]) writes it"
-    )
 
 
 def read_text(path: str | os.PathLike[str], expected: str) -> str:
@@ -219,9 +201,7 @@ def check_target(path: str | os.PathLike[str], suffix: str | None = None) -> Non
         raise InputError(f"{path}: found no name of a file, expected one")
     if suffix is not None and path.suffix != suffix:
         raise InputError(f"{path}: found the suffix {path.suffix!r}, expected {suffix}")
-    if (found := _found_instead(path)) not in (None, _NOTHING):
-        raise InputError(f"{path}: found {found}, expected a file or nothing yet")
-    _check_can_make(path, path.parents)
+    _check_place(path, _FILE, "a file or nothing yet")
 
 
 def check_folder(path: str | os.PathLike[str]) -> None:
@@ -230,16 +210,32 @@ def check_folder(path: str | os.PathLike[str]) -> None:
     Raises:
         InputError: as `check_target`.
     """
+    _check_place(path, _FOLDER, "a folder or nothing yet")
+
+
+def check_new_folder(path: str | os.PathLike[str]) -> None:
+    """Check that a folder can be made at `path`, where there may be an empty one.
+
+    Raises:
+        InputError: there is a file, or a folder that holds something or that this runs in; or
+            nothing can be made there.
+    """
     path = pathlib.Path(path)
-    found = _found_instead(path) or "a file"
-    if found not in ("a folder", _NOTHING):
-        raise InputError(f"{path}: found {found}, expected a folder or nothing yet")
-    _check_can_make(path, (path, *path.parents))
+    _check_place(path, _FOLDER, "a new or empty folder")
+    if path.exists() and path.samefile(os.curdir):
+        raise InputError(f"{path}: found the folder that this runs in, expected another")
+    if path.exists() and any(path.iterdir()):
+        raise InputError(f"{path}: found a folder with files in it, expected a new or empty one")
 
 
-def _check_can_make(path: pathlib.Path, folders: Iterable[pathlib.Path]) -> None:
-    """Check that the first of some folders that is there takes files."""
-    nearest = next(folder for folder in folders if folder.exists())
+def _check_place(path: str | os.PathLike[str], kind: str, expected: str) -> None:
+    """Check that there is a `kind` of thing at `path`, or can be one."""
+    path = pathlib.Path(path)
+    found = _kind_of(path)
+    if found not in (kind, _NOTHING):
+        raise InputError(f"{path}: found {found}, expected {expected}")
+    places = path.parents if kind == _FILE else (path, *path.parents)
+    nearest = next(place for place in places if place.exists())
     try:
         # A folder's permissions say nothing of /proc or of a disk that is only read.
         tempfile.TemporaryFile(dir=nearest).close()
@@ -353,12 +349,12 @@ def split_markers(page: pathlib.Path, name: str) -> tuple[str, str]:
         InputError: there is no such page, or it has no place of this name.
     """
     text = read_text(page, "a page with a place for the table").replace("\r\n", "\n")
-    start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
-    before, opened, rest = text.partition(start)
-    _, closed, after = rest.partition(end)
-    if not opened or not closed:
-        raise InputError(f"{page}: found no {start.strip()} ... {end}, expected both comments")
-    return before + start, end + after
+    start, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
+    place = rf"(.*?{re.escape(start)}\n).*?({re.escape(end)}.*)"
+    found = re.fullmatch(place, text, re.DOTALL)
+    if found is None:
+        raise InputError(f"{page}: found no {start} ... {end}, expected both comments")
+    return found[1], found[2]
 
 
 @contextlib.contextmanager
@@ -374,25 +370,6 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     with _renamed_to(path, temporary):
         temporary.mkdir()
         yield temporary
-
-
-def check_new_folder(path: str | os.PathLike[str]) -> None:
-    """Check that a folder can be made at `path`, where there may be an empty one.
-
-    Raises:
-        InputError: there is a file, or a folder that holds something or that this runs in; or
-            nothing can be made there.
-    """
-    path = pathlib.Path(path)
-    found = _found_instead(path) or "a file"
-    if found == _NOTHING:
-        _check_can_make(path, path.parents)
-    elif found != "a folder":
-        raise InputError(f"{path}: found {found}, expected a new or empty folder")
-    elif path.samefile(os.curdir):
-        raise InputError(f"{path}: found the folder that this runs in, expected another")
-    elif any(path.iterdir()):
-        raise InputError(f"{path}: found a folder with files in it, expected a new or empty one")
 
 
 def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> None:

@@ -44,17 +44,16 @@ def lock(
         InputError: the folder cannot be made or written to.
     """
     folder = pathlib.Path(folder)
-    while True:
-        try:
-            held = _locked(folder)
-            break
-        except BusyFolderError:
-            if not wait:
-                raise
-            if not quiet:
-                warn(f"{folder}: waiting for another process{_holder(folder)}")
-                quiet = True
-            time.sleep(POLL)
+    while (held := _acquire(folder)) is None:
+        if not wait:
+            raise BusyFolderError(
+                f"{folder}: found another process that writes here{_holder(folder)}, expected to "
+                "be the only one"
+            )
+        if not quiet:
+            warn(f"{folder}: waiting for another process{_holder(folder)}")
+            quiet = True
+        time.sleep(POLL)
     with held:
         yield
 
@@ -63,23 +62,19 @@ POLL = 0.2
 """Seconds between two looks at a lock that another process holds."""
 
 
-def _locked(folder: pathlib.Path) -> contextlib.ExitStack:
-    """Lock a folder until the returned stack is closed."""
+def _acquire(folder: pathlib.Path) -> contextlib.ExitStack | None:
+    """Lock a folder until the returned stack is closed; None where another process holds it."""
     path = folder / LOCK
     with block_signals(), contextlib.ExitStack() as stack:
         stack.enter_context(made_folder(folder))
         is_held = False
         while not is_held:
-            try:
+            with wrap_os_errors(folder):
                 file = stack.enter_context(path.open("a", encoding="utf-8"))
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise BusyFolderError(
-                    f"{folder}: found another process that writes here{_holder(folder)}, "
-                    "expected to be the only one"
-                ) from error
-            except OSError as error:
-                raise InputError(f"{folder}: cannot be written to: {error.strerror}") from error
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    return None
             # The last holder may have removed the file between the two calls.
             is_held = os.fstat(file.fileno()).st_nlink > 0
         stack.enter_context(in_use(path))

@@ -1,7 +1,10 @@
 """What a program says: notes to its user, and text without control characters."""
 
+import contextlib
 import sys
 import warnings
+from collections.abc import Iterator
+from typing import Any
 
 _PACKAGE = __name__.partition(".")[0]
 
@@ -19,6 +22,23 @@ def warn(message: str) -> None:
     while frame is not None and frame.f_globals.get("__name__", "").startswith(_PACKAGE):
         level, frame = level + 1, frame.f_back
     warnings.warn(message, Note, stacklevel=level)
+
+
+@contextlib.contextmanager
+def print_notes() -> Iterator[None]:
+    """Print notes in one line on standard error; other warnings stay as Python shows them."""
+    show_warning = warnings.showwarning
+
+    def show(message: Any, category: type[Warning], *rest: Any, **more: Any) -> None:
+        if issubclass(category, Note):
+            print(f"crisalad: note: {one_line(message)}", file=sys.stderr)
+        else:
+            show_warning(message, category, *rest, **more)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        warnings.simplefilter("default", Note)  # the same words once
+        yield
 
 
 def printable(text: str) -> str:

@@ -1,6 +1,7 @@
 """Progress on the terminal: a bar with rate and time left, on stderr, silent when asked."""
 
 import contextlib
+import functools
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -62,16 +63,14 @@ def progress_bar(
         def render(self, task: parts.Task) -> rich.text.Text:
             return rich.text.Text(task.fields["note"], no_wrap=True, overflow="ellipsis")
 
-    def whole() -> rich.table.Column:
-        return rich.table.Column(no_wrap=True)
-
     console = rich.console.Console(stderr=True)
-    # The note alone gives way where the terminal is narrow.
+    # The note alone gives way where the terminal is narrow: no other column wraps.
+    whole = functools.partial(rich.table.Column, no_wrap=True)
     progress = parts.Progress(
-        parts.TextColumn("{task.description}", table_column=whole()),
+        parts.TextColumn("{task.description}"),
         parts.BarColumn(bar_width=28 if console.width >= 120 else 8),
-        parts.TaskProgressColumn(table_column=whole()),
-        parts.TextColumn("{task.completed:.0f}/{task.total:.0f}", table_column=whole()),
+        parts.TaskProgressColumn(),
+        parts.TextColumn("{task.completed:.0f}/{task.total:.0f}"),
         Rate(table_column=whole()),
         parts.TimeRemainingColumn(elapsed_when_finished=True, table_column=whole()),
         Note(),

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -62,8 +62,7 @@ def pytree_dataclass(cls: type[_T]) -> type[_T]:
 
     def unflatten(values: tuple[Any, ...], children: Any) -> _T:
         tree = object.__new__(cls)
-        for name, value in (*zip(names, children, strict=True), *zip(statics, values, strict=True)):
-            object.__setattr__(tree, name, value)
+        vars(tree).update(zip((*names, *statics), (*children, *values), strict=True))
         return tree
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
@@ -116,9 +115,9 @@ class _Word:
     """A leaf, which prints as its type and shape, or its class."""
 
     def __init__(self, leaf: Any) -> None:
-        shape, dtype = getattr(leaf, "shape", None), getattr(leaf, "dtype", None)
-        sizes = f"[{','.join(map(str, shape or ()))}]"
-        self._words = type(leaf).__name__ if dtype is None else f"{dtype}{sizes}"
+        self._words = type(leaf).__name__
+        if hasattr(leaf, "dtype"):
+            self._words = f"{leaf.dtype}[{','.join(map(str, leaf.shape))}]"
 
     def __repr__(self) -> str:
         return self._words
@@ -131,7 +130,7 @@ def named_leaves(tree: Any) -> dict[str, Any]:
 
 
 _MOST = 24
-"""Number of lines of a printed tree, at most."""
+"""Number of lines of a printed tree, where its first names are no more."""
 
 
 def summary(tree: Any) -> str:
@@ -155,43 +154,39 @@ def summary(tree: Any) -> str:
           bias  (3,)  float32
         1 leaf, 3 parameters, 12 bytes
     """
-    leaves = {name: _sizes(leaf) for name, leaf in named_leaves(tree).items()}
-    depths = range(max((name.count(".") for name in leaves), default=0), -1, -1)
-    groupings = (_by_prefix(leaves, depth + 1) for depth in depths)
-    groups = next((each for each in groupings if len(each) <= _MOST), {"...": list(leaves)})
-    lines: list[tuple[str, str, str]] = []
-    for prefix, names in groups.items():
-        shape, dtype, count, _ = leaves[names[0]]
-        if len(names) > 1:
-            shape, dtype = f"{len(names)} leaves", f"{sum(leaves[n][2] for n in names):,}"
-        lines.append((names[0] if len(names) == 1 else prefix, shape, dtype))
-    name_width, shape_width = (max((len(row[i]) for row in lines), default=0) for i in (0, 1))
-    count, size = sum(leaf[2] for leaf in leaves.values()), sum(leaf[3] for leaf in leaves.values())
-    return "\n".join(
-        [
-            type(tree).__name__,
-            *(f"  {n:{name_width}}  {s:{shape_width}}  {d}".rstrip() for n, s, d in lines),
-            f"{len(leaves)} lea{'f' if len(leaves) == 1 else 'ves'}, {count:,} parameters, "
-            f"{_in_bytes(size)}",
-        ]
-    )
+    leaves = named_leaves(tree)
+    depth = max((name.count(".") for name in leaves), default=0) + 1
+    while len(groups := _by_prefix(leaves, depth)) > _MOST and depth > 1:
+        depth -= 1
+    rows = [_row(prefix, group) for prefix, group in groups.items()]
+    widths = [max((len(row[i]) for row in rows), default=0) for i in (0, 1)]
+    lines = [f"  {n:{widths[0]}}  {s:{widths[1]}}  {d}".rstrip() for n, s, d in rows]
+    arrays = [leaf for leaf in leaves.values() if hasattr(leaf, "dtype")]
+    size = sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in arrays)
+    plural = "leaf" if len(leaves) == 1 else "leaves"
+    totals = f"{len(leaves)} {plural}, {_count(arrays):,} parameters, {_in_bytes(size)}"
+    return "\n".join([type(tree).__name__, *lines, totals])
 
 
-def _sizes(leaf: Any) -> tuple[str, str, int, int]:
-    """Return a leaf's shape and type as text, its numbers and its bytes."""
-    shape, dtype = getattr(leaf, "shape", None), getattr(leaf, "dtype", None)
-    if not isinstance(shape, tuple) or dtype is None:
-        return type(leaf).__name__, "", 0, 0
-    # An export's sides may be symbols.
-    count = math.prod(shape) if all(isinstance(side, int) for side in shape) else 0
-    return str(shape), str(dtype), count, count * getattr(dtype, "itemsize", 0)
-
-
-def _by_prefix(names: Iterable[str], depth: int) -> dict[str, list[str]]:
-    groups: dict[str, list[str]] = {}
-    for name in names:
-        groups.setdefault(".".join(name.split(".")[:depth]), []).append(name)
+def _by_prefix(leaves: Mapping[str, Any], depth: int) -> dict[str, dict[str, Any]]:
+    groups: dict[str, dict[str, Any]] = {}
+    for name, leaf in leaves.items():
+        groups.setdefault(".".join(name.split(".")[:depth]), {})[name] = leaf
     return groups
+
+
+def _row(prefix: str, group: Mapping[str, Any]) -> tuple[str, str, str]:
+    """Return name, shape and type of a single leaf; of several how many, and their parameters."""
+    (name, leaf), *more = group.items()
+    if more:
+        return prefix, f"{len(group)} leaves", f"{_count(group.values()):,}"
+    if not hasattr(leaf, "dtype"):
+        return name, type(leaf).__name__, ""
+    return name, str(leaf.shape), str(leaf.dtype)
+
+
+def _count(leaves: Iterable[Any]) -> int:
+    return sum(math.prod(leaf.shape) for leaf in leaves if hasattr(leaf, "dtype"))
 
 
 def _in_bytes(size: int) -> str:

@@ -178,8 +178,7 @@ def defer_signals() -> Iterator[SignalState]:
         yield SignalState()
         return
     # Ignored signals, as under nohup, stay ignored.
-    handlers = {number: signal.getsignal(number) for number in _SIGNALS}
-    before = {n: handler for n, handler in handlers.items() if handler is not signal.SIG_IGN}
+    before = {n: h for n in _SIGNALS if (h := signal.getsignal(n)) is not signal.SIG_IGN}
     state = SignalState.current = SignalState(before)
     _watch()
     for number in before:

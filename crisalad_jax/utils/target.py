@@ -49,7 +49,6 @@ PORTABLE = Target("portable")
 """No choice by platform: a program runs on all of them."""
 STRAIGHT = Target("portable", branches=False)
 """No choice by platform, and no branches: a program of another format, for any engine."""
-TARGETS = {"cpu": CPU, "gpu": GPU, "tpu": TPU, "portable": PORTABLE}
 # JAX keeps traces apart by it: a function traced for one target is traced again for another.
 _chosen = jax.make_user_context(None)
 _mesh = jax.make_user_context(None)
@@ -67,7 +66,7 @@ def machine() -> Target:
     platform = jax.default_backend()
     if platform == "gpu":
         return Target("gpu", cudnn=_compiles_cudnn())
-    return TARGETS.get(platform, PORTABLE)
+    return {"cpu": CPU, "tpu": TPU}.get(platform, PORTABLE)
 
 
 def absent_platforms(error: Exception | None = None) -> str | None:
@@ -156,10 +155,8 @@ def lowering_platforms() -> tuple[str, ...] | None:
 
     None is JAX's own choice, outside of `lowering_for` and for a portable program.
     """
-    chosen = _chosen.value
-    return (
-        None if chosen is None or chosen.platform == "portable" else (_LOWERED_AS[chosen.platform],)
-    )
+    name = _LOWERED_AS.get(_chosen.value.platform) if _chosen.value else None
+    return None if name is None else (name,)
 
 
 @contextlib.contextmanager

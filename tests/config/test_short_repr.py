@@ -136,11 +136,6 @@ def test_a_result_takes_a_line_for_each_field_whatever_its_size():
     ]
     lines = repr(benchmark).splitlines()
     assert lines[-3:] == ["    database_positions=float64[10000, 2],", "    radius=54321.5,", ")"]
-    page = benchmark._repr_html_()
-    assert "n" * 80 in page
-    assert "n" * 90 not in page
-    assert "<th>rule</th><td>&#x27;25 m &lt;&gt; 0&#x27;</td>" in page
-    assert len(page) < 1000
 
 
 def test_a_runs_result_prints_the_number_of_parameters():
@@ -212,6 +207,6 @@ def test_an_import_reads_no_sources():
         "import crisalad_jax as cj; cj.TrainConfig; cj.evaluate; cj.Map\n"
         "from crisalad_jax.config.short_repr import field_docs\n"
         "assert field_docs.cache_info().currsize == 0\n"
-        "assert 'patience: ' in cj.TrainConfig.__doc__"
+        "import inspect; assert 'patience: ' in inspect.getdoc(cj.TrainConfig)"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -142,7 +142,7 @@ def test_a_npy_file_is_mapped_with_its_type(tmp_path, kind):
 def test_files_that_are_no_descriptors_are_named(tmp_path):
     path = tmp_path / "map.npy"
     for save, array, words in (
-        (np.savez, DESCRIPTORS, r"found an \.npz archive of arr_0, expected one"),
+        (np.savez, DESCRIPTORS, r"not a whole \.npy file: the magic string is not correct"),
         (np.save, DESCRIPTORS[0], r"found shape \(6,\), expected \(images, descriptor\)"),
         (np.save, DESCRIPTORS[:0], r"found shape \(0, 6\), expected"),
         (np.save, np.array(["a"]), "found <U1, expected an array of floating-point numbers"),

@@ -213,7 +213,7 @@ def test_a_folder_that_cannot_be_locked_is_one_line(tmp_path):
     for name, words in (
         ("file", "cannot make this folder: File exists"),
         ("file/deep", "cannot make this folder: Not a directory"),
-        ("out", "cannot be written to: Is a directory"),
+        ("out", "cannot be written: Is a directory"),
     ):
         with pytest.raises(InputError) as error, lock(tmp_path / name):
             pass

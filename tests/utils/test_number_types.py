@@ -49,7 +49,7 @@ def in_both_modes(make: Callable[[], Any]) -> Any:
     return found
 
 
-@pytest.mark.parametrize("name", AGGREGATORS.names())
+@pytest.mark.parametrize("name", list(AGGREGATORS))
 def test_parameters_are_float32_and_the_same(name: str) -> None:
     alone = CrossImageConfig(layers=0)
     config = with_aggregator(PRESETS["tiny"], name, "tiny", cross_image=alone)
@@ -138,7 +138,7 @@ def test_a_training_step_is_the_same() -> None:
     in_both_modes(train)
 
 
-@pytest.mark.parametrize("name", LOSSES.names())
+@pytest.mark.parametrize("name", list(LOSSES))
 def test_losses_of_float32_are_float32(name: str) -> None:
     rows = np.random.default_rng(0).normal(size=(4, 6)).astype(np.float32)
     config = LossConfig(kind=LOSSES.make(name), miner="none")

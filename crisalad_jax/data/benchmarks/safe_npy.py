@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_one_array, read_bytes
+from crisalad_jax.utils.files import read_bytes
 
 _NAMES = frozenset(
     (
@@ -34,8 +34,6 @@ def read_npy(path: pathlib.Path) -> np.ndarray:
     Raises:
         InputError: the file is missing, damaged, or holds anything else.
     """
-    archive = path.with_suffix(".npz")
-    check_one_array(archive if archive.exists() and not path.exists() else path)
     file = io.BytesIO(read_bytes(path, "a .npy file"))
     try:
         return _read(file)

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from crisalad_jax.data.benchmarks.safe_npy import read_npy
-from crisalad_jax.retrieval.descriptor_files import open_npy, read_descriptors
 from tests.data.benchmarks.trees import ragged, refused
 
 
@@ -203,26 +202,3 @@ def test_damaged_files(tmp_path, damage):
     words = "found no such file" if damage == "missing" else "cannot be read"
     with refused(rf"a\.npy: {words}"):
         read_npy(path)
-
-
-def test_an_archive_of_arrays_is_told(tmp_path):
-    """Under its own suffix, another one, or in place of the file that is read."""
-    array = np.arange(3)
-    np.savez(tmp_path / "gt.npz", matches=array, other=array)
-    words = (
-        r"gt\.npz: found an \.npz archive of matches, other, expected one array: "
-        r"numpy\.save\('gt\.npy', numpy\.load\('gt\.npz'\)\['matches'\]\) writes it"
-    )
-    for read, name in (
-        *((read_npy, "gt.npz"), (read_npy, "gt.npy")),
-        *((read_descriptors, "gt.npz"), (open_npy, "gt.npz")),
-    ):
-        with refused(words):
-            read(tmp_path / name)
-    (tmp_path / "gt.npz").rename(tmp_path / "gt.npy")
-    with refused(r"gt\.npy: found an \.npz archive of matches, other"):
-        read_npy(tmp_path / "gt.npy")
-    # What the message says works, also next to the archive.
-    np.save(tmp_path / "one.npy", np.load(tmp_path / "gt.npy")["matches"])
-    np.savez(tmp_path / "one.npz", array)
-    assert read_npy(tmp_path / "one.npy").tolist() == [0, 1, 2]
