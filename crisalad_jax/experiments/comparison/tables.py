@@ -1,10 +1,8 @@
 """A comparison as tables: for the terminal, as Markdown, CSV and JSON, and as one HTML page."""
 
-import csv
-import io
 import json
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from crisalad_jax.evaluation.results import percent
@@ -20,7 +18,7 @@ from crisalad_jax.experiments.report.style import (
     label_axes,
     new_figure,
 )
-from crisalad_jax.experiments.report.tables import NOTHING, Cell, Table, no_formula, write_text
+from crisalad_jax.experiments.report.tables import NOTHING, Cell, Table, write_csv, write_text
 from crisalad_jax.utils.files import split_markers, write_json
 
 _PAGE_TITLES = {"compare": "Methods compared", "ablate": "What each part brings"}
@@ -29,7 +27,7 @@ _PAGE_TITLES = {"compare": "Methods compared", "ablate": "What each part brings"
 def write_tables(summary: Summary, out: pathlib.Path) -> None:
     """Write table.md, table.csv, results.json, and index.html with its charts, recall_N.png."""
     write_text(out / "table.md", markdown(summary))
-    write_text(out / "table.csv", comma_separated(summary))
+    write_csv(out / "table.csv", list(csv_rows(summary)))
     write_json(out / "results.json", as_json(summary))
     charts = [_chart(summary, name, out, number) for number, name in enumerate(summary.sets)]
     context = {
@@ -189,23 +187,19 @@ _COLUMNS = (
 )
 
 
-def comma_separated(summary: Summary) -> str:
-    """Write a CSV line for each row, set and K: recalls as fractions, missing values empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*summary.headers, *_COLUMNS])
-    nothing = (None,) * 3
+def csv_rows(summary: Summary) -> Iterator[dict[str, Any]]:
+    """Yield a line of table.csv for each row, set and K: recalls as fractions."""
+    columns, nothing = [*summary.headers, *_COLUMNS], (None,) * 3
     for row in summary.rows:
         costs = (row.dimension, row.speed, row.images_per_second, row.parameters, row.trained)
         times = (*(row.training or nothing), *(row.training_seconds or nothing))
         for name, by_k in row.recalls.items():
             for k, recall in by_k.items():
-                texts = map(no_formula, (*row.labels, row.name, row.grouping, name))
+                names = (*row.labels, row.name, row.grouping, name, k)
                 values = (recall.mean, recall.spread, *recall.interval, len(recall.by_seed))
                 mean, interval, verdict = recall.difference or (None, (None, None), None)
-                differs = (mean, *interval, verdict)
-                writer.writerow([*texts, k, *values, *differs, *costs, *times])
-    return text.getvalue()
+                line = (*names, *values, mean, *interval, verdict, *costs, *times)
+                yield dict(zip(columns, line, strict=True))
 
 
 def _chart(summary: Summary, name: str, out: pathlib.Path, number: int) -> Drawing:

@@ -95,21 +95,18 @@ def show_retrievals(
             "results alone"
         )
     count = len(found.neighbours.indices)
-    if queries is not None:
-        chosen = list(queries)
-    elif benchmark is None:
-        chosen = evenly(np.arange(count), rows)
-    else:
+    right = np.ones(count, bool)
+    if benchmark is not None:
         right = first_right_ranks(found.neighbours, benchmark.ground_truth()) == 1
-        chosen = _half_right(right, rows)
+    chosen = _half_right(right, rows) if queries is None else list(queries)
     if not chosen or not all(0 <= query < count for query in chosen):
         raise InputError(f"queries: found {chosen}, expected numbers from 0 to {count - 1}")
     if isinstance(found, Answers):
-        tiles = [_answers(found, query, columns, root) for query in chosen]
+        tiles = [list(_answers(found, query, columns, root)) for query in chosen]
     else:
         assert benchmark is not None
-        tiles = [_results(found, benchmark, query, columns) for query in chosen]
-    return _draw([list(row) for row in tiles], title, strict=is_result)
+        tiles = [list(_results(found, benchmark, query, columns)) for query in chosen]
+    return _draw(tiles, title, strict=is_result)
 
 
 def write_galleries(
@@ -257,18 +254,10 @@ def _draw_tile(axes: Axes, tile: _Tile, image: UInt8[np.ndarray, "h w 3"]) -> No
     plain = tile.colour == INK
     axes.spines[:].set(color=GREY if plain else tile.colour, linewidth=0.5 if plain else 3)
     if tile.name:
-        axes.annotate(
-            shortened(tile.name, _NAME),
-            (0, 0),
-            xycoords="axes fraction",
-            xytext=(0, -18),
-            textcoords="offset points",
-            va="top",
-            fontsize=7,
-            family="monospace",
-            color=GREY,
-            parse_math=False,  # a dollar sign in a name starts no formula
-        )
+        below = {"xycoords": "axes fraction", "xytext": (0, -18), "textcoords": "offset points"}
+        # A dollar sign in a name starts no formula.
+        how = {"va": "top", "fontsize": 7, "family": "monospace", "parse_math": False}
+        axes.annotate(shortened(tile.name, _NAME), (0, 0), color=GREY, **below, **how)
 
 
 def _read(file: Path) -> UInt8[np.ndarray, "h w 3"]:
