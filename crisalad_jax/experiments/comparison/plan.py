@@ -75,6 +75,9 @@ class ComparisonConfig:
     """Words that change how images are resized, as `ModelConfig.resized` takes them."""
     batch_size: int = 16
     """Number of images described together."""
+    on_bad_image: OnBadImage = "stop"
+    """What to do at an unreadable image. "skip": training masks it out, and the evaluation sets are
+    compared on without it; each call reads all of their images to find it."""
     grouping: str = "single"
     """Groupings between commas; a method without a cross-image encoder needs only one."""
     rerank: int = 20
@@ -215,22 +218,16 @@ class Prepared(NamedTuple):
     config: ComparisonConfig
     variants: list[Variant]
     benchmarks: list[Benchmark]
-    on_bad_image: OnBadImage
-    """What training does at an unreadable image."""
     left_out: list[str]
     """A line for each set that lost unreadable images."""
 
 
-def prepare(
-    config: ComparisonConfig, on_bad_image: OnBadImage = "stop", *, quiet: bool = True
-) -> Prepared:
+def prepare(config: ComparisonConfig, *, quiet: bool = True) -> Prepared:
     """Read the sets and make and check all configurations, weights from files included.
 
     Args:
         config: what to compare.
-        on_bad_image: "stop" at an unreadable image, or "skip" it: all images of the evaluation sets
-            are then read once, and unreadable ones left out.
-        quiet: no progress bar of that.
+        quiet: no progress bar where all images are read.
 
     Returns:
         The comparison.
@@ -241,7 +238,7 @@ def prepare(
             parts each other; more images would be re-ranked than a set has.
     """
     files = _weights(config)
-    benchmarks, left_out = _open_sets(config, on_bad_image, quiet=quiet)
+    benchmarks, left_out = _open_sets(config, quiet=quiet)
     variants = [_draft(config, name, files) for name in config.lines]
     smallest = min(len(benchmark.database) for benchmark in benchmarks)
     for variant in variants:
@@ -252,10 +249,10 @@ def prepare(
     if config.backbone is not None:
         for backbone in {v.model.backbone: None for v in variants if v.weights is None}:
             read_backbone(config.backbone, backbone, backbone.init(jax.random.key(0)))
-    variants = _fitted(config, variants, on_bad_image)
+    variants = _fitted(config, variants)
     digest = functools.cache(sha256_of)
     variants = [dataclasses.replace(v, settings=_settings(config, v, digest)) for v in variants]
-    return Prepared(config, variants, benchmarks, on_bad_image, left_out)
+    return Prepared(config, variants, benchmarks, left_out)
 
 
 def _weights(config: ComparisonConfig) -> dict[str, pathlib.Path]:
@@ -272,15 +269,13 @@ def _weights(config: ComparisonConfig) -> dict[str, pathlib.Path]:
     return files
 
 
-def _open_sets(
-    config: ComparisonConfig, on_bad_image: OnBadImage, *, quiet: bool
-) -> tuple[list[Benchmark], list[str]]:
+def _open_sets(config: ComparisonConfig, *, quiet: bool) -> tuple[list[Benchmark], list[str]]:
     """Open the evaluation sets; return them, and a line for each that lost unreadable images."""
     benchmarks, left_out = [], []
     for path in config.test:
-        benchmark = readable = open_benchmark(path, on_bad_image=on_bad_image)
+        benchmark = readable = open_benchmark(path, on_bad_image=config.on_bad_image)
         benchmark.ground_truth()  # raises where there is none
-        if on_bad_image == "skip":
+        if config.on_bad_image == "skip":
             readable = leave_out_unreadable(benchmark, quiet=quiet)
         queries = len(benchmark.queries) - len(readable.queries)
         database = len(benchmark.database) - len(readable.database)
@@ -347,36 +342,31 @@ def _check_method(name: str, wanted: ModelConfig, found: ModelConfig, path: path
         )
 
 
-def _fitted(
-    config: ComparisonConfig, variants: list[Variant], on_bad_image: OnBadImage
-) -> list[Variant]:
+def _fitted(config: ComparisonConfig, variants: list[Variant]) -> list[Variant]:
     """Fit the recipes of what is made here to the training set; what a row sets stays as it is."""
     # A vocabulary needs training images too, although nothing trains.
     need = dict.fromkeys(variant.run for variant in variants if variant.weights is None)
     if not need:
         return variants
-    train = config.train
-    if train is None:
+    if config.train is None:
         raise InputError(
             f"--train: found none, expected a training set for {', '.join(need)}, or --weights of "
             "each"
         )
-
-    @functools.cache
-    def read(min_images: int, cities: tuple[str, ...] | None) -> Places:
-        return read_places(train, cities=cities, min_images=min_images, on_bad_image=on_bad_image)
-
-    typical = int(np.clip(np.median(read(2, None).image_counts), 2, _VIEWS))
+    read = functools.cache(
+        functools.partial(read_places, config.train, on_bad_image=config.on_bad_image)
+    )
+    typical = int(np.clip(np.median(read(cities=None, min_images=2).image_counts), 2, _VIEWS))
 
     def fit(variant: Variant) -> Variant:
         training, row = variant.training, variant.row
         sets = row.sets if row is not None else lambda flag: False
         views = training.images_per_place if sets("images-per-place") else typical
-        places = len(read(views, training.cities).place_id)
+        places = len(read(cities=training.cities, min_images=views).place_id)
         training = _of_size(config, training, places, views)
         if row is not None:
             training = row.changed(training, config.preset)
-        places = read(training.min_images_of_place, training.cities)
+        places = read(cities=training.cities, min_images=training.min_images_of_place)
         if not sets("optimiser.warmup-"):
             per_epoch = PlaceBatches(training, places).steps_per_epoch
             steps = per_epoch * training.epochs

@@ -21,7 +21,7 @@ from crisalad_jax.checkpoints.public import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.config.checks import PATH, check_count, takes
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.data.images import OnBadImage, read_pixels
+from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.comparison.costs import (
@@ -50,7 +50,7 @@ from crisalad_jax.training.loop import fit
 from crisalad_jax.training.start import with_vocabulary_of
 from crisalad_jax.training.trainer import run_keys
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target, real_path, split_markers, write_json
+from crisalad_jax.utils.files import real_path, split_markers, write_json
 from crisalad_jax.utils.locks import POLL, BusyFolderError, lock
 from crisalad_jax.utils.output import Note
 from crisalad_jax.utils.target import target
@@ -65,7 +65,6 @@ def compare(
     out: str | os.PathLike[str],
     *,
     page: str | os.PathLike[str] | None = None,
-    on_bad_image: OnBadImage = "stop",
     jobs: int = 1,
     say: Say = lambda line: None,
     quiet: bool = False,
@@ -83,8 +82,6 @@ def compare(
             index.html.
         page: a Markdown page that gets the tables too, between its comments <!-- NAME --> and
             <!-- end of NAME -->, where NAME is the name of the folder.
-        on_bad_image: "stop" at an unreadable image, or "skip" it: training masks it out, and the
-            sets are compared on without it. Each call reads all images of the sets to find them.
         jobs: number of runs at once, each in a process with its share of this host's devices. A
             program needs `if __name__ == "__main__"` for more than one.
         say: is given a line at the start and before each run.
@@ -100,13 +97,12 @@ def compare(
         Interrupted: a signal asked for the end; the same call resumes.
     """
     out = pathlib.Path(out)
-    check_target(out / "config.json")
     name = real_path(out).name
     if page is not None:
         split_markers(pathlib.Path(page), name)
     check_count("--jobs", jobs)
     jobs = min(jobs, len(config.lines) * config.seeds)
-    work = functools.partial(carry_out, config, out, on_bad_image)
+    work = functools.partial(carry_out, config, out)
     with warnings.catch_warnings():
         if jobs > 1:
             run_jobs(functools.partial(work, quiet=True), jobs, say)
@@ -122,20 +118,13 @@ def compare(
 
 
 def carry_out(
-    config: ComparisonConfig,
-    out: pathlib.Path,
-    on_bad_image: OnBadImage,
-    *,
-    say: Say,
-    quiet: bool,
-    beside: bool = False,
+    config: ComparisonConfig, out: pathlib.Path, *, say: Say, quiet: bool, beside: bool = False
 ) -> tuple[Prepared, list[Run]]:
     """Prepare a comparison, make `out` its folder, and take all runs that nobody is at.
 
     Args:
         config: what to compare.
         out: the folder.
-        on_bad_image: as `compare`.
         say: is given a line at the start and before each run.
         quiet: no progress bars.
         beside: whether they share this process's device.
@@ -144,7 +133,7 @@ def carry_out(
         InputError: what `compare` raises.
         Interrupted: a signal asked for the end.
     """
-    prepared = prepare(config, on_bad_image, quiet=quiet)
+    prepared = prepare(config, quiet=quiet)
     path = out / "config.json"
     if not path.exists() and out.exists() and holds_other_files(out):
         raise InputError(
@@ -213,7 +202,7 @@ def _model(prepared: Prepared, run: Run, quiet: bool, beside: bool = False) -> C
         save_weights(weights, Model(start, variant.model))
         return start
     assert variant.places is not None
-    how = {"on_bad_image": prepared.on_bad_image, "quiet": quiet}
+    how = {"on_bad_image": prepared.config.on_bad_image, "quiet": quiet}
     fitted = fit(training, variant.places, folder, initial=start, **how)
     # Repeated steps of a resumed run count once.
     images = training.places_per_batch * training.images_per_place
@@ -235,7 +224,7 @@ def _start(prepared: Prepared, run: Run, training: TrainConfig, quiet: bool) -> 
     if prepared.config.backbone is not None:
         params = with_backbone_of(params, training.model, prepared.config.backbone)
     assert run.variant.places is not None
-    how = {"on_bad_image": prepared.on_bad_image, "quiet": quiet}
+    how = {"on_bad_image": prepared.config.on_bad_image, "quiet": quiet}
     start = with_vocabulary_of(params, training, run.variant.places, **how)
     assert start is not None
     return start

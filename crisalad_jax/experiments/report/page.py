@@ -35,8 +35,7 @@ from crisalad_jax.experiments.report.tables import (
     write_text,
 )
 from crisalad_jax.experiments.report.transport import Transported, draw_transport, transport_of
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.locks import staged_folder
 from crisalad_jax.utils.output import printable
@@ -55,8 +54,7 @@ def write_report(
     benchmark: Benchmark,
     groupings: Sequence[GroupingResult],
     *,
-    params: Crisalad,
-    config: ModelConfig,
+    model: Model,
     model_name: str,
     settings: dict[str, Any],
     similarities: Float[np.ndarray, "rows columns"] | None = None,
@@ -70,8 +68,7 @@ def write_report(
         out: the folder, made where it is missing. Files of the same names are replaced.
         benchmark: what was evaluated on.
         groupings: the results, at least one.
-        params: the model's, for the section on its transport; a model without one has none.
-        config: the model's.
+        model: for the section on its transport; a model without one has none.
         model_name: which weights.
         settings: what `evaluation_settings` returns, shown folded.
         similarities: what `similarity.similarity_map` gives of the first grouping.
@@ -90,7 +87,7 @@ def write_report(
             "title": benchmark.name,
             "model_name": model_name,
             "subject": subject,
-            "config": config,
+            "config": model.config,
             "groupings": groupings,
             "main": main,
             "table": _table(groupings),
@@ -104,7 +101,7 @@ def write_report(
             "results": page_rows(subject, main),
             "outcomes": OUTCOMES,
             "map": _map(folder, subject),
-            "transport": list(_transport(subject, shown, params, config)),
+            "transport": list(_transport(subject, shown, model)),
             "matrix": _matrix(folder, subject, similarities),
             "settings": json.dumps(settings, indent=2),
         }
@@ -338,26 +335,22 @@ def _matrix(
 
 
 def _transport(
-    subject: Subject,
-    shown: Mapping[str, list[int]],
-    params: Crisalad,
-    config: ModelConfig,
-    each: int = 2,
+    subject: Subject, shown: Mapping[str, list[int]], model: Model
 ) -> Iterator[tuple[str, Drawing]]:
-    """Yield name and drawing of `each` wrong and right queries, with their first retrievals.
+    """Yield name and drawing of two wrong and two right queries, with their first retrievals.
 
     A model without a transport has none.
     """
-    if not config.aggregator.transports:
+    if not model.config.aggregator.transports:
         return
     benchmark, first = subject.benchmark, subject.neighbours.indices[:, 0]
 
     def transport(path: pathlib.Path) -> Transported:
-        image = read_image(path, bit_depth=config.preprocessing.bit_depth)
-        return transport_of(image, params, config)
+        bit_depth = model.config.preprocessing.bit_depth
+        return transport_of(read_image(path, bit_depth=bit_depth), model)
 
     pairs = []
-    for query in shown["wrong"][:each] + shown["right"][:each] or shown["no positive"][:each]:
+    for query in shown["wrong"][:2] + shown["right"][:2] or shown["no positive"][:2]:
         word = "right" if subject.outcomes[query] == "right" else "wrong"
         retrieved = transport(benchmark.database[first[query]])
         pair = {"query": transport(benchmark.queries[query]), f"retrieved, {word}": retrieved}

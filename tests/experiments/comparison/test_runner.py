@@ -405,7 +405,7 @@ def test_runs_are_shared_with_another_process(finished, config, monkeypatch):
             other.close()
 
         monkeypatch.setattr(runner.time, "sleep", ended)
-        runner.carry_out(config, finished, "stop", say=lines.append, quiet=True)
+        runner.carry_out(config, finished, say=lines.append, quiet=True)
     assert one == [1]
     assert lines[1:] == [
         "crisalad, seed 1: 0 of 2 runs done",
@@ -419,7 +419,7 @@ def test_the_run_of_a_killed_process_is_free(finished, config, monkeypatch):
     (folder / temporaries.LOCK).write_text(f"process 1 on {socket.gethostname()}\n")
     change(folder, ranks={})
     monkeypatch.delattr(runner, "fit")
-    runner.carry_out(config, finished, "stop", say=print, quiet=True)
+    runner.carry_out(config, finished, say=print, quiet=True)
     assert not (folder / temporaries.LOCK).exists()
 
 

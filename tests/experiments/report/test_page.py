@@ -22,7 +22,7 @@ from crisalad_jax.experiments.report.charts import outcomes_of
 from crisalad_jax.experiments.report.page import Subject, page_rows, query_results
 from crisalad_jax.experiments.report.tables import write_csv
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Crisalad, Model
 from crisalad_jax.retrieval.neighbours import Neighbours
 from tests.conftest import MODEL
 
@@ -100,7 +100,7 @@ GROUPINGS = [
 def write(out, benchmark, groupings, params, config=MODEL, **options):
     settings = {"batch_size": 8, "seeds": 2, "same_place": "</pre><script>"}
     given = {"model_name": "a <b>model</b>", "settings": settings}
-    return write_report(out, benchmark, groupings, params=params, config=config, **given, **options)
+    return write_report(out, benchmark, groupings, model=Model(params, config), **given, **options)
 
 
 @pytest.fixture(scope="module")

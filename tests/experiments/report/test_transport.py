@@ -46,7 +46,7 @@ def test_shares_by_hand():
 
 def test_shares_are_those_of_the_model(benchmark, params):
     for path in benchmark.queries[:2]:
-        picture = transport_of(read_image(path), params, MODEL)
+        picture = transport_of(read_image(path), cj.Model(params, MODEL))
         assert picture.masses.shape == (3, 4, MODEL.aggregator.clusters + 1)
         # Rows are updated last: each patch has sent all it has, to rounding of float32.
         np.testing.assert_allclose(picture.masses.sum(axis=-1), 1, rtol=1e-5)
