@@ -71,9 +71,6 @@ class WorldConfig:
     def __post_init__(self) -> None:
         """Check the types and ranges."""
         check_types(self)
-        # The order of variations makes no other world.
-        varied = tuple(name for name in VARIATIONS if name in self.varied)
-        object.__setattr__(self, "varied", varied)
         require_range(self, 1, math.inf, "scenes", "stations", "images_per_place", "test_scenes")
         require_range(self, 0, 3, "repaint")
         require(bool(self.sceneries), "WorldConfig.sceneries: found none, expected at least one")

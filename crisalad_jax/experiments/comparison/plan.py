@@ -126,11 +126,9 @@ class ComparisonConfig:
 
 def _check_distinct(flag: str, values: Sequence[str], key: Callable[[str], str]) -> None:
     """Check that there are values, and that no two are for the same folder."""
-    keys = list(map(key, values))
-    twice = [value for value in values if keys.count(key(value)) > 1]
-    if twice or not values:
+    if not values or len(set(map(key, values))) < len(values):
         raise InputError(
-            f"{flag}: found {' and '.join(twice) or 'none'}, expected at least one, and each once, "
+            f"{flag}: found {', '.join(values) or 'none'}, expected at least one, and each once, "
             "under names that differ in letters or digits"
         )
 

@@ -1,6 +1,5 @@
 """Charts: recall, precision and training curves, a map of positions, a matrix of similarities."""
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -34,7 +33,6 @@ OUTCOMES = ("wrong", "no positive", "right")
 """What may become of a query: its first retrieval is wrong although another image is right, no
 database image is right, or it is right."""
 _DASHES = ("-", "--", ":")
-_RECALL = re.compile(r"R@(\d+)")
 # Key, title of the panel, and whether to smooth it because batches make it noisy.
 _LOSSES = (
     ("loss", "loss", True),
@@ -103,8 +101,7 @@ def training_curves(records: Sequence[Mapping[str, int | float]], title: str = "
         for key in dict.fromkeys(key for record in records for key in record)
     }
     losses = [panel for panel in _LOSSES if panel[0] in series]
-    ks = sorted(int(match[1]) for match in map(_RECALL.fullmatch, series) if match)
-    recalls = {f"R@{k}": series[f"R@{k}"] for k in ks}
+    recalls = {key: series[key] for key in series if key.startswith("R@")}
     heights = [1.5] * len(losses) + [2.4] * bool(recalls)
     figure = new_figure(sum(heights) + 0.45 * len(heights) + 0.6, title, **WIDE)
     panels = figure.subplots(len(heights), sharex=True, squeeze=False, height_ratios=heights)[:, 0]

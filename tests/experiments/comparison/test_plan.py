@@ -78,7 +78,7 @@ def test_a_method_is_a_line():
 
 REFUSED = [
     (("--methods", "crisalad,vlad"), ("--methods: found 'vlad', expected one of", "cricavpr")),
-    (("--methods", "salad,salad"), ("--methods: found salad and salad", "each once")),
+    (("--methods", "salad,salad"), ("--methods: found salad, salad", "each once")),
     (("--seeds", 0), ("seeds: found 0, expected at least 1",)),
     (("--epochs", 0), ("epochs: found 0, expected at least 1",)),
     (("--methods", "crisalad+transvpr"), ("found transvpr:20 over a database of 7 images",)),
