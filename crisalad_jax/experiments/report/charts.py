@@ -81,7 +81,7 @@ def precision_curves(curves: Mapping[str, PrecisionRecall]) -> Picture:
     return figure
 
 
-def training_curves(records: Sequence[Mapping[str, int | float]], title: str = "") -> Picture:
+def training_curves(records: Sequence[Mapping[str, int | float]]) -> Picture:
     """Draw a run: its losses, learning rate and validation recalls against the step.
 
     A panel is drawn for each that the records hold. Long noisy series are pale under their running
@@ -91,7 +91,6 @@ def training_curves(records: Sequence[Mapping[str, int | float]], title: str = "
         records: the lines of metrics.jsonl, each with "step" and any of "loss",
             "easy_anchor_fraction", "accuracy", "learning_rate", and "R@K" as a fraction of the
             queries, 0 to 1.
-        title: stands above the picture.
 
     Returns:
         The figure.
@@ -103,7 +102,7 @@ def training_curves(records: Sequence[Mapping[str, int | float]], title: str = "
     losses = [panel for panel in _LOSSES if panel[0] in series]
     recalls = {key: series[key] for key in series if key.startswith("R@")}
     heights = [1.5] * len(losses) + [2.4] * bool(recalls)
-    figure = new_figure(sum(heights) + 0.45 * len(heights) + 0.6, title, **WIDE)
+    figure = new_figure(sum(heights) + 0.45 * len(heights) + 0.6, **WIDE)
     panels = figure.subplots(len(heights), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (key, label, noisy) in zip(panels, losses, strict=False):
         label_axes(axes, "", "", title=label)

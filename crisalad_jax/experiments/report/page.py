@@ -88,7 +88,6 @@ def write_report(
             "model_name": model_name,
             "subject": subject,
             "config": model.config,
-            "groupings": groupings,
             "main": main,
             "table": _table(groupings),
             "notes": table_notes(groupings, settings),

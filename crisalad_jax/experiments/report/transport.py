@@ -97,9 +97,7 @@ def transport_of(image: Pixels, model: Model) -> Transported:
     return Transported(image, mass.reshape(*grid, -1), config.token_shape.tokens)
 
 
-def strongest_clusters(
-    pictures: Sequence[Transported], most: int = len(CLUSTER_COLOURS)
-) -> dict[int, float]:
+def strongest_clusters(pictures: Sequence[Transported]) -> dict[int, float]:
     """Find the clusters that take most mass from the patches that they win.
 
     A cluster wins a patch if it takes more of it than any other does. Each cluster comes with that
@@ -110,7 +108,7 @@ def strongest_clusters(
     for picture in pictures:
         np.add.at(mass, picture.top, picture.taken.max(axis=-1))
     total = sum(picture.taken.sum() for picture in pictures)
-    order = np.argsort(-mass, kind="stable")[:most]
+    order = np.argsort(-mass, kind="stable")[: len(CLUSTER_COLOURS)]
     return {int(cluster): float(mass[cluster] / total) for cluster in order if mass[cluster] > 0}
 
 

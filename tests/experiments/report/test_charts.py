@@ -198,7 +198,7 @@ def test_training_curves_draw_what_the_records_hold(tmp_path):
         ("validation", validation),
         ("once", training[:1]),
     ):
-        picture = drawn(report.training_curves(records, title="tiny"), tmp_path)
+        picture = drawn(report.training_curves(records), tmp_path)
         assert picture.shape[1] == 840
         assert near_colour(picture, BLUE).any()
         # R@5 is the second line of the recalls.

@@ -41,7 +41,6 @@ def test_shares_by_hand():
     strongest = strongest_clusters([PICTURE])
     assert list(strongest) == [0, 1]
     assert list(strongest.values()) == pytest.approx([1.6 / 2.8, 0.3 / 2.8])
-    assert list(strongest_clusters([PICTURE], most=1)) == [0]
 
 
 def test_shares_are_those_of_the_model(benchmark, params):
