@@ -266,6 +266,6 @@ def parse_row(text: str) -> AblationRow:
             "all rows of a comparison"
         )
     base = flags.pop("recipe", "crisalad")
-    if "image-size" in flags:  # as `train` has it, for the size is wanted often
-        flags["model.image-size"] = flags.pop("image-size")
-    return AblationRow(name, base, tuple(flags.items()))
+    # As `train` has it, for the size is wanted often.
+    short = {"image-size": "model.image-size"}
+    return AblationRow(name, base, tuple((short.get(flag, flag), flags[flag]) for flag in flags))
