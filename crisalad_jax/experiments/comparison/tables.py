@@ -62,8 +62,8 @@ def tables_of(summary: Summary) -> dict[str, Table]:
     for row in summary.rows:
         title = _title(row, summary.rows)
         labels = (title, *(label or NOTHING for label in row.labels[1:]))
-        line = dict(zip(summary.headers, labels, strict=True))
-        difference = {f"{first}, less {summary.reference}": title}
+        line: dict[str, str | Cell] = dict(zip(summary.headers, labels, strict=True))
+        difference: dict[str, str | Cell] = {f"{first}, less {summary.reference}": title}
         for name, k in itertools.product(summary.sets, KS):
             line[f"{name} R@{k}"] = _recall(row, name, k, summary.rows)
             difference[f"{name} Δ R@{k}"] = _difference(row.recalls[name][k].difference)

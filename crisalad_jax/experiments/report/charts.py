@@ -131,7 +131,7 @@ def _draw_recalls(axes: Axes, curves: Mapping[str, Mapping[int, float]]) -> None
 
 def _draw_line(axes: Axes, number: int, name: str, x: Any, y: Any, marker: str = "") -> None:
     dashes, colour = divmod(number, len(COLOURS))
-    style = {"color": COLOURS[colour], "linestyle": _DASHES[dashes % len(_DASHES)]}
+    style: Any = {"color": COLOURS[colour], "linestyle": _DASHES[dashes % len(_DASHES)]}
     style |= {"linewidth": 1.8, "marker": marker, "markersize": 4.5}
     axes.plot(x, y, label=name, clip_on=False, **style)  # markers at 100 % are not cut in half
 
