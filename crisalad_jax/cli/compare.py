@@ -82,15 +82,15 @@ def run_comparison(
         test=tuple(map(str, flags.test)),
         train=None if flags.train is None else str(flags.train),
         backbone=None if backbone is None else str(backbone),
-        **pick(flags, "preset", "epochs", "image_size", "resize", "batch_size", "grouping"),
-        **pick(flags, "seeds", "reference"),
+        **pick(flags, "preset", "epochs", "image_size", "resize", "batch_size", "on_bad_image"),
+        **pick(flags, "grouping", "seeds", "reference"),
         **more,
     )
     notes = rich.console.Console(stderr=True, markup=False, emoji=False, quiet=flags.quiet)
     summary = compare(
         config,
         flags.out,
-        **pick(flags, "page", "on_bad_image", "jobs", "quiet"),
+        **pick(flags, "page", "jobs", "quiet"),
         say=lambda line: notes.print(line, soft_wrap=True, highlight=False),
     )
     for table in tables_of(summary).values():

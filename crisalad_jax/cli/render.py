@@ -12,11 +12,9 @@ from crisalad_jax.synthetic import (
     Scenery,
     Variation,
     WorldConfig,
-    has_world,
     write_world,
 )
 from crisalad_jax.utils.output import counted
-from crisalad_jax.utils.progress import progress_bar
 
 EXAMPLE = "crisalad render --out world --scenes 2400"
 
@@ -54,15 +52,10 @@ def run(arguments: Render) -> dict[str, Any]:
     given = pick(arguments, *(field.name for field in dataclasses.fields(WorldConfig)))
     config = WorldConfig(**given)
     places = config.scenes * config.stations
-    is_there = has_world(arguments.out, config)  # a wrong folder is told before there is a bar
-    if not is_there:
-        with progress_bar(
-            "rendering the world", config.images, "images", quiet=arguments.quiet
-        ) as bar:
-            write_world(arguments.out, config, progress=bar.advance)
+    is_new = write_world(arguments.out, config, quiet=arguments.quiet)
     tests = config.test_scenes * config.stations
     echo(
-        f"{arguments.out}: {'there already, ' * is_there}{counted(places, 'place')} with "
+        f"{arguments.out}: {'' if is_new else 'there already, '}{counted(places, 'place')} with "
         f"{counted(config.images_per_place, 'image')} each in {arguments.out / 'train'}; "
         f"{counted(tests, 'other place')} in {arguments.out / 'test'}"
     )

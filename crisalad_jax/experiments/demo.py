@@ -32,9 +32,7 @@ from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.locks import lock
-from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries
 
 GROUPINGS = ("single", "shuffled", "sequential")
@@ -73,12 +71,11 @@ def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> D
         InputError: `out` holds other files, or a demo of another configuration; or another process
             writes there.
     """
-    new = not (out / "city").exists()
-    if out.exists() and new and (not out.is_dir() or holds_other_files(out)):
-        raise InputError(
-            f"{out}: found files but no demo, expected a demo or a new or empty folder"
-        )
     with lock(out):
+        if not (out / "city").exists() and holds_other_files(out):
+            raise InputError(
+                f"{out}: found files but no demo, expected a demo or a new or empty folder"
+            )
         remove_temporaries(out)
         return _run(config, out, quiet)
 
@@ -88,8 +85,7 @@ def _run(config: DemoConfig, out: pathlib.Path, quiet: bool) -> DemoSummary:
     city = SyntheticCityConfig(
         train_places=config.train_places, test_places=config.test_places, seed=config.seed
     )
-    with progress_bar("rendering the city", city.images, "images", quiet=quiet) as bar:
-        write_synthetic_city(out / "city", city, progress=bar.advance)
+    write_synthetic_city(out / "city", city, quiet=quiet)
     benchmark = open_benchmark(out / "city" / "test")
     measure = functools.partial(
         evaluate,
@@ -126,19 +122,9 @@ def _run(config: DemoConfig, out: pathlib.Path, quiet: bool) -> DemoSummary:
     }
     for name, figure in figures.items():
         save(figure, out / name)
-    pictures = [out / name for name in figures]
     write_text(out / "recalls.md", recall_table(rows).markdown())
-    summary = DemoSummary(rows, pictures, time.monotonic() - started, training_seconds)
-    write_json(
-        out / "summary.json",
-        {
-            "config": dataclasses.asdict(config),
-            "seconds": round(summary.seconds, 1),
-            "training_seconds": round(training_seconds, 1),
-            "results": [row._asdict() for row in rows],
-        },
-    )
-    return summary
+    pictures = [out / name for name in figures]
+    return DemoSummary(rows, pictures, time.monotonic() - started, training_seconds)
 
 
 def demo_recipe(config: DemoConfig) -> TrainConfig:

@@ -7,22 +7,14 @@ contents of a place); `street`, `corridor` and `country` (its kinds); `light` an
 (drawing); `layouts`, `city` and `world` (the files).
 """
 
-from crisalad_jax.synthetic.city import SyntheticCityConfig, write_synthetic_city
-from crisalad_jax.synthetic.picture import render
-from crisalad_jax.synthetic.view import SCENERIES, SEASONS, Scenery, View
-from crisalad_jax.synthetic.world import VARIATIONS, Variation, WorldConfig, has_world, write_world
-
-__all__ = [
-    "SCENERIES",
-    "SEASONS",
-    "VARIATIONS",
-    "Scenery",
-    "SyntheticCityConfig",
-    "Variation",
-    "View",
-    "WorldConfig",
-    "has_world",
-    "render",
-    "write_synthetic_city",
-    "write_world",
-]
+from crisalad_jax.synthetic.city import SyntheticCityConfig as SyntheticCityConfig
+from crisalad_jax.synthetic.city import write_synthetic_city as write_synthetic_city
+from crisalad_jax.synthetic.picture import render as render
+from crisalad_jax.synthetic.view import SCENERIES as SCENERIES
+from crisalad_jax.synthetic.view import SEASONS as SEASONS
+from crisalad_jax.synthetic.view import Scenery as Scenery
+from crisalad_jax.synthetic.view import View as View
+from crisalad_jax.synthetic.world import VARIATIONS as VARIATIONS
+from crisalad_jax.synthetic.world import Variation as Variation
+from crisalad_jax.synthetic.world import WorldConfig as WorldConfig
+from crisalad_jax.synthetic.world import write_world as write_world

@@ -10,7 +10,6 @@ import numpy as np
 from crisalad_jax.config.checks import check_seed, check_types, require_range
 from crisalad_jax.synthetic.layouts import (
     Files,
-    Progress,
     Shot,
     derive_seed,
     gsv_city,
@@ -65,24 +64,27 @@ class SyntheticCityConfig:
 
 
 def write_synthetic_city(
-    root: str | os.PathLike[str], config: SyntheticCityConfig, *, progress: Progress = None
-) -> None:
+    root: str | os.PathLike[str], config: SyntheticCityConfig, *, quiet: bool = False
+) -> bool:
     """Render the city into `root`, whole or not at all.
 
     `root/train` has the GSV-Cities layout with two cities. `root/test` has that of
     VPR-datasets-downloader (`images/test/{database,queries}`). Places are 80 m apart and the images
-    of one within 10 m, so that 25 m separate positives; no place is in both. `root/city.json` holds
+    of one within 10 m, so that 25 m separate positives; no place is in both. `root/set.json` holds
     the configuration; a root that holds the same city already is not changed.
 
     Args:
         root: a folder that does not exist, or is empty, or holds this city.
         config: how many places, the size of their images, the seed.
-        progress: called with 1 after every image.
+        quiet: no progress bar.
+
+    Returns:
+        Whether it was written: False where it was there.
 
     Raises:
         InputError: `root` is a file, holds something else, or cannot be written to.
     """
-    write_set(root, "city.json", config, _files(config), progress)
+    return write_set(root, config, _files(config), quiet=quiet)
 
 
 def _files(config: SyntheticCityConfig) -> Files:

@@ -8,7 +8,7 @@ import itertools
 import json
 import os
 import pathlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import cv2
@@ -18,13 +18,14 @@ from jaxtyping import UInt8
 from crisalad_jax.synthetic.mesh import Rng
 from crisalad_jax.synthetic.view import EYE, PITCH, Season, View
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_folder, check_new_folder, read_json, write_json
+from crisalad_jax.utils.files import atomic_folder, read_json, write_json
+from crisalad_jax.utils.progress import progress_bar
 
 Files = Iterator[tuple[str, bytes]]
-Progress = Callable[[int], object] | None
 
 RENDERER = 1
 """Version of the renderer: increase it if pictures change, and sets on disk no longer match."""
+_FILE = "set.json"
 _METRES_PER_DEGREE = 111_195.0
 """Metres in a degree of latitude, on a sphere of radius 6371 km."""
 _LONGITUDE = -40.0
@@ -34,61 +35,43 @@ _UTM_ORIGIN = (500_000.0, 5_000_000.0)
 _MONTHS: dict[Season, int] = {"spring": 4, "summer": 7, "autumn": 10, "winter": 1}
 
 
-def holds(root: str | os.PathLike[str], file: str, config: Any) -> bool:
-    """Return whether a folder holds this set already; False where it can be written there.
-
-    Args:
-        root: the folder.
-        file: name of the file that says what the folder holds.
-        config: the set's configuration, a dataclass.
-
-    Raises:
-        InputError: `root` is a file, or holds anything else.
-    """
-    root = pathlib.Path(root)
-    if not (root / file).is_file():
-        check_new_folder(root)
-        return False
-    existing = read_json(root / file, "a rendered set")
-    for name, value in _identity(config).items():
-        if existing.get(name) != value:
-            raise InputError(
-                f"{root}: found a rendered set of another configuration ({name}: "
-                f"{existing.get(name, 'default')}, not {value}), expected a new or empty folder"
-            )
-    return True
-
-
-def _identity(config: Any) -> dict[str, Any]:
-    """Return what tells a set from others, as JSON has it."""
-    return json.loads(json.dumps({"renderer": RENDERER, **dataclasses.asdict(config)}))
-
-
-def write_set(
-    root: str | os.PathLike[str], file: str, config: Any, files: Files, progress: Progress
-) -> None:
+def write_set(root: str | os.PathLike[str], config: Any, files: Files, *, quiet: bool) -> bool:
     """Write a set into `root`, whole or not at all, unless it is there.
 
     Args:
         root: a folder that does not exist, or is empty, or holds this set.
-        file: name of the file that says what the folder holds.
-        config: the set's configuration, a dataclass.
+        config: the set's configuration, a dataclass, which the file set.json in the folder holds.
         files: the set.
-        progress: called with 1 after every picture.
+        quiet: no progress bar.
+
+    Returns:
+        Whether it was written: False where it was there.
 
     Raises:
         InputError: `root` is a file, holds something else, or cannot be written to.
     """
-    if holds(root, file, config):
-        return
-    with atomic_folder(root) as folder:
+    root = pathlib.Path(root)
+    identity = json.loads(json.dumps({"renderer": RENDERER, **dataclasses.asdict(config)}))
+    if (root / _FILE).is_file():
+        existing = read_json(root / _FILE, "a rendered set")
+        for name, value in identity.items():
+            if existing.get(name) != value:
+                raise InputError(
+                    f"{root}: found a rendered set of another configuration ({name}: "
+                    f"{existing.get(name, 'default')}, not {value}), expected a new or empty folder"
+                )
+        return False
+    with (
+        atomic_folder(root) as folder,
+        progress_bar("rendering", config.images, "images", quiet=quiet) as bar,
+    ):
         for name, data in files:
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
-            if progress is not None and path.suffix == ".jpg":
-                progress(1)
-        write_json(folder / file, _identity(config))
+            bar.advance(path.suffix == ".jpg")
+        write_json(folder / _FILE, identity)
+    return True
 
 
 class Shot(NamedTuple):

@@ -11,11 +11,9 @@ import numpy as np
 from crisalad_jax.config.checks import check_seed, check_types, require, require_range
 from crisalad_jax.synthetic.layouts import (
     Files,
-    Progress,
     Shot,
     derive_seed,
     gsv_city,
-    holds,
     jpeg,
     utm_images,
     write_set,
@@ -44,7 +42,6 @@ _FIELDS: dict[Variation, tuple[str, ...]] = {
     "exposure": ("exposure", "noise"),
 }
 """Fields of `View` that are one variation, where that is not the field of its name."""
-_FILE = "world.json"
 _SCENES_PER_CITY = 12
 _SPACING = 100.0
 """Metres between places in the files, where stations of a scene lie nearer in truth."""
@@ -74,9 +71,6 @@ class WorldConfig:
     def __post_init__(self) -> None:
         """Check the types and ranges."""
         check_types(self)
-        # The order of variations makes no other world.
-        varied = tuple(name for name in VARIATIONS if name in self.varied)
-        object.__setattr__(self, "varied", varied)
         require_range(self, 1, math.inf, "scenes", "stations", "images_per_place", "test_scenes")
         require_range(self, 0, 3, "repaint")
         require(bool(self.sceneries), "WorldConfig.sceneries: found none, expected at least one")
@@ -89,9 +83,7 @@ class WorldConfig:
         return (self.scenes * self.images_per_place + self.test_scenes * 2) * self.stations
 
 
-def write_world(
-    root: str | os.PathLike[str], config: WorldConfig, *, progress: Progress = None
-) -> None:
+def write_world(root: str | os.PathLike[str], config: WorldConfig, *, quiet: bool = False) -> bool:
     """Render a world into `root`, whole or not at all.
 
     `root/train` has the layout of GSV-Cities; a city is some scenes of one kind. `root/test` has
@@ -100,25 +92,15 @@ def write_world(
     Args:
         root: a folder that does not exist, or is empty, or holds this world.
         config: how many scenes and images, their size, the seed.
-        progress: called with 1 after every image.
+        quiet: no progress bar.
+
+    Returns:
+        Whether it was written: False where it was there.
 
     Raises:
         InputError: `root` is a file, holds something else, or cannot be written to.
     """
-    write_set(root, _FILE, config, _files(config), progress)
-
-
-def has_world(root: str | os.PathLike[str], config: WorldConfig) -> bool:
-    """Return whether `root` holds this world already; False where it can be written there.
-
-    Args:
-        root: a folder.
-        config: the world.
-
-    Raises:
-        InputError: `root` is a file, or holds something else.
-    """
-    return holds(root, _FILE, config)
+    return write_set(root, config, _files(config), quiet=quiet)
 
 
 def _files(config: WorldConfig) -> Files:

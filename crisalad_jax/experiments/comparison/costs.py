@@ -9,25 +9,18 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from crisalad_jax.experiments.comparison.methods import AdapterKind
 from crisalad_jax.nn.adapter import AdapterConfig, adapter, init_adapter
 from crisalad_jax.nn.backbones.vit import ViTConfig
-from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.costs import adapter_macs, paper_adapter_macs
-from crisalad_jax.nn.model import (
-    Crisalad,
-    attend_across_images,
-    cast_params,
-    extract_tokens,
-    self_mask,
-)
 from crisalad_jax.utils.compiler import jit
-from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.progress import progress_bar
 
+_ROUNDS = 5
+"""Number of turns of each."""
 _CALLS = 3
 """Number of calls of each in a round; their median counts."""
 _LONG = 3.0
@@ -49,7 +42,7 @@ class Spread(NamedTuple):
 
 def race(
     contenders: Mapping[str, Callable[[], Callable[[], Any]]],
-    rounds: int,
+    rounds: int = _ROUNDS,
     *,
     quiet: bool = True,
 ) -> dict[str, list[float]]:
@@ -90,32 +83,6 @@ def _seconds(call: Callable[[], Any]) -> float:
     return time.perf_counter() - started
 
 
-def describing(
-    params: Crisalad, config: ModelConfig, image: np.ndarray, batch_size: int
-) -> Callable[[], Any]:
-    """Make a call that describes a batch, each image alone, with the programs of `evaluate`.
-
-    Args:
-        params: the model's parameters.
-        config: the model.
-        image: a prepared image, which is repeated.
-        batch_size: number of images.
-
-    Returns:
-        The call, which takes no argument and waits for its result.
-    """
-    devices = devices_for(batch_size)
-    shared = devices.replicate(cast_params(params, config))
-    images = devices.shard_batch(np.repeat(image[None], batch_size, axis=0))
-    mask = self_mask(batch_size)
-
-    def call() -> None:
-        tokens = extract_tokens(shared, images, config)
-        jax.block_until_ready(attend_across_images(shared, tokens, config, mask=mask))
-
-    return call
-
-
 def machine() -> str:
     """Name the device that is measured on, in a few words."""
     device = jax.devices()[0]
@@ -145,46 +112,48 @@ NOTES = (
 )
 
 
-def adapter_costs(*, measure: bool = True, rounds: int = 5, images: int = 4) -> list[AdapterCost]:
-    """Compute Table 3, of one adapter at the paper's size.
-
-    Args:
-        measure: whether to time the adapters, in turns.
-        rounds: number of turns of each.
-        images: number of images in a batch.
-    """
-    kinds: tuple[AdapterKind, ...] = ("mlp", "multi-resolution", "depthwise")
-    calls = {kind: functools.partial(_adapter_call, kind, images) for kind in kinds}
-    seconds = race(calls, rounds) if measure else {}
-    return [_adapter_cost(kind, seconds) for kind in kinds]
-
-
-_PAPER_PARAMETERS = {"mlp": 590_976, "multi-resolution": 761_472, "depthwise": 741_504}
+_PAPER_PARAMETERS: Mapping[AdapterKind, int] = {
+    "mlp": 590_976,
+    "multi-resolution": 761_472,
+    "depthwise": 741_504,
+}
 """By the count that docs/comparison.md explains."""
 
 
-def _adapter_cost(kind: AdapterKind, seconds: Mapping[str, Sequence[float]]) -> AdapterCost:
-    config = AdapterConfig(kind=kind)
-    backbone = ViTConfig(adapter=config)
-    model = dataclasses.replace(PRESETS["b14"], backbone=backbone)
-    make = functools.partial(init_adapter, dim=backbone.dim, config=config)
-    leaves = jax.tree.leaves(jax.eval_shape(make, jax.random.key(0)))
-    true_macs = adapter_macs(model)
-    macs = paper_adapter_macs(model, true_macs)
-    if kind == "mlp":  # the paper counts each weight twice here, and the biases
-        macs = 2 * macs + backbone.dim // 2 + backbone.dim
-    time = Spread.of(ratios(seconds, kind, "depthwise")) if seconds else None
-    parameters = sum(leaf.size for leaf in leaves)
-    return AdapterCost(kind, _PAPER_PARAMETERS[kind], parameters, macs, true_macs, time)
+def adapter_calls() -> dict[str, Callable[[], Callable[[], Any]]]:
+    """Make what `race` takes, to time an adapter of each kind on four images."""
+    key, tokens = jax.random.key(0), jnp.ones((4, 1 + 16 * 16, ViTConfig().dim), jnp.float32)
+
+    def ready(kind: AdapterKind) -> Callable[[], Any]:
+        params = init_adapter(key, tokens.shape[-1], AdapterConfig(kind=kind))
+        return lambda: jax.block_until_ready(_apply_adapter(params, tokens))
+
+    return {kind: functools.partial(ready, kind) for kind in _PAPER_PARAMETERS}
 
 
-def _adapter_call(kind: AdapterKind, images: int) -> Callable[[], Any]:
-    dim, grid = ViTConfig().dim, (16, 16)
-    tokens = jnp.ones((images, 1 + grid[0] * grid[1], dim), jnp.float32)
-    params = init_adapter(jax.random.key(0), dim, AdapterConfig(kind=kind))
-    return lambda: jax.block_until_ready(_apply_adapter(params, tokens, grid))
+def adapter_costs(seconds: Mapping[str, Sequence[float]]) -> list[AdapterCost]:
+    """Compute Table 3, of one adapter at the paper's size.
+
+    Args:
+        seconds: what `race` returns of `adapter_calls`; empty where they were not timed.
+    """
+    costs = []
+    for kind, paper_parameters in _PAPER_PARAMETERS.items():
+        config = AdapterConfig(kind=kind)
+        backbone = ViTConfig(adapter=config)
+        model = dataclasses.replace(PRESETS["b14"], backbone=backbone)
+        true_macs = adapter_macs(model)
+        macs = paper_adapter_macs(model, true_macs)
+        if kind == "mlp":  # the paper counts each weight twice here, and the biases
+            macs = 2 * macs + backbone.dim // 2 + backbone.dim
+        time = Spread.of(ratios(seconds, kind, "depthwise")) if seconds else None
+        make = functools.partial(init_adapter, dim=backbone.dim, config=config)
+        leaves = jax.tree.leaves(jax.eval_shape(make, jax.random.key(0)))
+        parameters = sum(leaf.size for leaf in leaves)
+        costs.append(AdapterCost(kind, paper_parameters, parameters, macs, true_macs, time))
+    return costs
 
 
-@functools.partial(jit, static_argnames="grid")
-def _apply_adapter(params: Any, tokens: jax.Array, grid: tuple[int, int]) -> jax.Array:
-    return adapter(params, tokens, grid)[0]
+@jit
+def _apply_adapter(params: Any, tokens: jax.Array) -> jax.Array:
+    return adapter(params, tokens, (16, 16))[0]

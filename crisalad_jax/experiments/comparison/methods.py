@@ -10,7 +10,6 @@ from typing import Literal, NamedTuple
 from crisalad_jax.config.flags import parse_changes
 from crisalad_jax.data.augmentations import Augmentation
 from crisalad_jax.nn.adapter import AdapterConfig
-from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.recipes import (
     RECIPES,
@@ -80,20 +79,16 @@ def method_of(name: str, preset: str, what: str = "--methods") -> ComparedMethod
         >>> method_of("crisalad+gem", "b14").title, method_of("step:newton", "b14").title
         ('CriSALAD + GeM', 'crisalad+step:newton')
     """
-    if name in METHODS:
-        return METHODS[name]
+    whole = name
     if mines_tuples(name):
         warn(
             f"{what}: found {name}, whose own recipe mines tuples of queries: it is crisalad+"
             f"{name} here, trained on places as all others are (`crisalad train` has the recipe)"
         )
         whole = f"crisalad+{name}"
-    elif name in RECIPES:
-        whole = name
-    else:
+    elif name not in METHODS and name not in RECIPES:
         base, part = split_name(name)
-        others = {*METHODS, *ABLATIONS, *RECIPES}
-        find_part(part, preset, what=what, others=others)
+        find_part(part, preset, what=what, others={*METHODS, *ABLATIONS, *RECIPES})
         whole = f"{base or 'crisalad'}+{part}"
     return METHODS.get(whole, ComparedMethod(whole, whole))
 
@@ -133,10 +128,10 @@ def method_training(name: str, preset: str, *, from_nothing: bool) -> TrainConfi
     if not from_nothing:
         return config
     scratch = from_scratch(config)
-    if name in RECIPES or not isinstance(find_part(split_name(name)[1], preset), Augmentation):
-        return scratch
-    # `from_scratch` sets its own augmentation, which would replace the one that is compared.
-    return dataclasses.replace(scratch, augmentation=config.augmentation)
+    if name not in RECIPES and isinstance(find_part(split_name(name)[1], preset), Augmentation):
+        # It is what is compared, and `from_scratch` has set its own.
+        scratch = dataclasses.replace(scratch, augmentation=config.augmentation)
+    return scratch
 
 
 class Ablation(NamedTuple):
@@ -149,35 +144,30 @@ class Ablation(NamedTuple):
 
     def training(self, preset: str, *, from_nothing: bool) -> TrainConfig:
         """Make the paper's recipe with these settings, or from nothing that of `scratch`."""
-        config = recipe(preset, "crisalad")
-        model = config.model
-        backbone = dataclasses.replace(model.backbone, adapter=AdapterConfig(kind=self.adapter))
-        layers = model.cross_image.layers if self.encoder else 0
-        cross_image = dataclasses.replace(model.cross_image, layers=layers)
-        config = dataclasses.replace(
-            config,
-            model=dataclasses.replace(model, backbone=backbone, cross_image=cross_image),
-            # The backbone stays frozen: without adapters the head alone trains.
-            trainable="head" if self.adapter == "none" else config.trainable,
-        )
-        rate = self.learning_rate
+        config, rate = recipe(preset, "crisalad"), self.learning_rate
+        backbone, cross_image = config.model.backbone, config.model.cross_image
+        backbone = dataclasses.replace(backbone, adapter=AdapterConfig(kind=self.adapter))
+        if not self.encoder:
+            cross_image = dataclasses.replace(cross_image, layers=0)
+        model = dataclasses.replace(config.model, backbone=backbone, cross_image=cross_image)
+        # The backbone stays frozen: without adapters the head alone trains.
+        trainable = "head" if self.adapter == "none" else config.trainable
+        config = dataclasses.replace(config, model=model, trainable=trainable)
         if from_nothing:
             config = from_scratch(config)
             rate *= config.optimiser.learning_rate / OptimiserConfig.learning_rate
-        optimiser = dataclasses.replace(
-            config.optimiser, learning_rate=rate, schedule=self.schedule
-        )
+        changes = {"learning_rate": rate, "schedule": self.schedule}
+        optimiser = dataclasses.replace(config.optimiser, **changes)
         return dataclasses.replace(config, optimiser=optimiser)
 
     def words(self, training: TrainConfig) -> str:
         """Say what the row changes, of CriSALAD itself its settings; `training` is its recipe."""
-        settings = {
-            "adapter": self.adapter,
-            "cross-image encoder": "yes" if self.encoder else "no",
-            "learning rate": f"{training.optimiser.learning_rate:.2g}",
-            "scheduler": self.schedule,
-        }
-        words = [f"{name} {setting}" for name, setting in settings.items()]
+        words = (
+            f"adapter {self.adapter}",
+            f"cross-image encoder {'yes' if self.encoder else 'no'}",
+            f"learning rate {training.optimiser.learning_rate:.2g}",
+            f"scheduler {self.schedule}",
+        )
         changed = [own != usual for own, usual in zip(self, Ablation(), strict=True)]
         return ", ".join(itertools.compress(words, changed) if any(changed) else words)
 
@@ -194,11 +184,6 @@ ABLATIONS: Mapping[str, Ablation] = {
 }
 """The paper's rows, and one without any adapter, which the paper lacks. Its last row, printed with
 the step schedule, is also here with the linear one, which changes a single part."""
-
-
-def adapter_kind(model: ModelConfig) -> str:
-    """Return the kind of a model's adapters; "none" where its backbone has no such setting."""
-    return getattr(model.backbone, "adapter", AdapterConfig(kind="none")).kind
 
 
 _FLAG = re.compile(

@@ -2,10 +2,10 @@
 
 import dataclasses
 import functools
+import math
 import pathlib
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -14,7 +14,7 @@ import numpy as np
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.public import read_backbone
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.config.checks import check_count, check_types
+from crisalad_jax.config.checks import check_types, require_range
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.part import parts_of
 from crisalad_jax.config.plugins import source_digest
@@ -27,23 +27,22 @@ from crisalad_jax.experiments.comparison.methods import (
     ABLATIONS,
     METHODS,
     AblationRow,
-    adapter_kind,
     is_method,
     method_of,
     method_training,
     parse_row,
 )
+from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import parse_groupings
 from crisalad_jax.retrieval.reranking import parse_reranking
 from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
-from crisalad_jax.training.optimiser import count_steps, warmup_length, with_short_warmup
+from crisalad_jax.training.optimiser import with_short_warmup
 from crisalad_jax.training.run_files import checksum_of_places
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.output import warn
 
 EPOCHS = 6
 """Number of epochs from random weights: all methods on two small sets, three seeds each, take less
@@ -58,8 +57,7 @@ class ComparisonConfig:
 
     kind: Literal["compare", "ablate"]
     names: tuple[str, ...]
-    """Names of `METHODS`, `ABLATIONS`, recipes, parts and `rows`, and any others that `weights`
-    has."""
+    """Names of `METHODS`, `ABLATIONS`, recipes and parts, and any others that `weights` has."""
     test: tuple[str, ...]
     """Evaluation sets, of any layout that `open_benchmark` knows."""
     train: str | None = None
@@ -77,6 +75,9 @@ class ComparisonConfig:
     """Words that change how images are resized, as `ModelConfig.resized` takes them."""
     batch_size: int = 16
     """Number of images described together."""
+    on_bad_image: OnBadImage = "stop"
+    """What to do at an unreadable image. "skip": training masks it out, and the evaluation sets are
+    compared on without it; each call reads all of their images to find it."""
     grouping: str = "single"
     """Groupings between commas; a method without a cross-image encoder needs only one."""
     rerank: int = 20
@@ -84,34 +85,28 @@ class ComparisonConfig:
     seeds: int = 3
     """Number of runs of each method, with seeds from 0."""
     rows: tuple[str, ...] = ()
-    """Custom rows of an ablation, as `parse_row` reads them. Those that `names` lacks follow after
-    it."""
+    """Custom rows of an ablation, as `parse_row` reads them."""
     reference: str | None = None
     """Name that differences, speeds and training times are relative to; None is crisalad, or the
     first where that is not compared."""
 
     def __post_init__(self) -> None:
-        """Check the types, the ranges and the names."""
+        """Check the types, the ranges, and that nothing comes twice; `prepare` looks names up."""
         check_types(self)
-        own = [row.name for row in map(parse_row, self.rows)]
-        names = (*self.names, *(name for name in own if name not in self.names))
-        object.__setattr__(self, "names", names)
-        check_count("batch size", self.batch_size)
-        check_count("seeds", self.seeds)
-        if self.epochs is not None:
-            check_count("--epochs", self.epochs)
+        require_range(self, 1, math.inf, "batch_size", "seeds", "epochs")
         parse_groupings(self.grouping.split(","))
-        _check_distinct("--row", (*ABLATIONS, *own), str)
-        _check_distinct(self.flag, names, file_name)
+        _check_distinct(self.flag, self.lines, file_name)
         _check_distinct("--test", self.test, str)
-        for name in names:
-            if name not in self.models:
-                _draft(self, name)  # which raises for an unknown name
-        if self.reference not in (None, *names):
+        if self.reference not in (None, *self.lines):
             raise InputError(
                 f"--reference: found {self.reference}, expected one of those compared, "
-                f"{', '.join(names)}"
+                f"{', '.join(self.lines)}"
             )
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Names of all that is compared: `names`, then the custom rows."""
+        return (*self.names, *(parse_row(text).name for text in self.rows))
 
     @property
     def flag(self) -> str:
@@ -119,23 +114,21 @@ class ComparisonConfig:
         return "--methods" if self.kind == "compare" else "--rows"
 
     @property
+    def is_papers(self) -> bool:
+        """Whether the rows are those of the paper's Table 2, which Table 3 belongs to."""
+        return self.kind == "ablate" and not self.rows
+
+    @property
     def from_nothing(self) -> bool:
         """Whether training starts from random weights."""
         return self.backbone is None
 
-    @property
-    def models(self) -> tuple[str, ...]:
-        """Names of the lines that are whatever model a file holds, and no method's."""
-        return models_of(self.weights)
-
 
 def _check_distinct(flag: str, values: Sequence[str], key: Callable[[str], str]) -> None:
     """Check that there are values, and that no two are for the same folder."""
-    keys = list(map(key, values))
-    twice = [value for value in values if keys.count(key(value)) > 1]
-    if twice or not values:
+    if not values or len(set(map(key, values))) < len(values):
         raise InputError(
-            f"{flag}: found {' and '.join(twice) or 'none'}, expected at least one, and each once, "
+            f"{flag}: found {', '.join(values) or 'none'}, expected at least one, and each once, "
             "under names that differ in letters or digits"
         )
 
@@ -223,24 +216,16 @@ class Prepared(NamedTuple):
     config: ComparisonConfig
     variants: list[Variant]
     benchmarks: list[Benchmark]
-    on_bad_image: OnBadImage
-    """What training does at an unreadable image."""
     left_out: list[str]
     """A line for each set that lost unreadable images."""
 
 
-def prepare(
-    config: ComparisonConfig, on_bad_image: OnBadImage = "stop", *, quiet: bool = True
-) -> Prepared:
+def prepare(config: ComparisonConfig, *, quiet: bool = True) -> Prepared:
     """Read the sets and make and check all configurations, weights from files included.
-
-    Notes say which runs warm up for fewer steps than their recipes, because they are short.
 
     Args:
         config: what to compare.
-        on_bad_image: "stop" at an unreadable image, or "skip" it: all images of the evaluation sets
-            are then read once, and unreadable ones left out.
-        quiet: no progress bar of that.
+        quiet: no progress bar where all images are read.
 
     Returns:
         The comparison.
@@ -251,22 +236,8 @@ def prepare(
             parts each other; more images would be re-ranked than a set has.
     """
     files = _weights(config)
-    benchmarks = [open_benchmark(path, on_bad_image=on_bad_image) for path in config.test]
-    for benchmark in benchmarks:
-        benchmark.ground_truth()
-    left_out = []
-    if on_bad_image == "skip":
-        readable = [leave_out_unreadable(each, quiet=quiet) for each in benchmarks]
-        for was, now in zip(benchmarks, readable, strict=True):
-            queries = len(was.queries) - len(now.queries)
-            database = len(was.database) - len(now.database)
-            if queries or database:
-                left_out.append(
-                    f"{was.name}: unreadable and left out: {queries} queries and {database} "
-                    "database images."
-                )
-        benchmarks = readable
-    variants = [_draft(config, name, files) for name in config.names]
+    benchmarks, left_out = _open_sets(config, quiet=quiet)
+    variants = [_draft(config, name, files) for name in config.lines]
     smallest = min(len(benchmark.database) for benchmark in benchmarks)
     for variant in variants:
         if variant.trains:
@@ -276,10 +247,10 @@ def prepare(
     if config.backbone is not None:
         for backbone in {v.model.backbone: None for v in variants if v.weights is None}:
             read_backbone(config.backbone, backbone, backbone.init(jax.random.key(0)))
-    variants = _fitted(config, variants, on_bad_image)
+    variants = _fitted(config, variants)
     digest = functools.cache(sha256_of)
     variants = [dataclasses.replace(v, settings=_settings(config, v, digest)) for v in variants]
-    return Prepared(config, variants, benchmarks, on_bad_image, left_out)
+    return Prepared(config, variants, benchmarks, left_out)
 
 
 def _weights(config: ComparisonConfig) -> dict[str, pathlib.Path]:
@@ -287,23 +258,41 @@ def _weights(config: ComparisonConfig) -> dict[str, pathlib.Path]:
     files: dict[str, pathlib.Path] = {}
     for text in config.weights:
         name, separator, file = text.partition("=")
-        if name not in config.names or name in files or (separator and not file):
+        if name not in config.lines or name in files or (separator and not file):
             raise InputError(
                 f"--weights: found {text!r}, expected NAME=FILE or the NAME of a published model, "
-                f"each once, of one of those compared, {', '.join(config.names)}"
+                f"each once, of one of those compared, {', '.join(config.lines)}"
             )
         files[name] = find_weights(file or name)
     return files
 
 
-def _draft(
-    config: ComparisonConfig, name: str, files: Mapping[str, pathlib.Path] = MappingProxyType({})
-) -> Variant:
+def _open_sets(config: ComparisonConfig, *, quiet: bool) -> tuple[list[Benchmark], list[str]]:
+    """Open the evaluation sets; return them, and a line for each that lost unreadable images."""
+    benchmarks, left_out = [], []
+    for path in config.test:
+        benchmark = readable = open_benchmark(path, on_bad_image=config.on_bad_image)
+        benchmark.ground_truth()  # raises where there is none
+        if config.on_bad_image == "skip":
+            readable = leave_out_unreadable(benchmark, quiet=quiet)
+        queries = len(benchmark.queries) - len(readable.queries)
+        database = len(benchmark.database) - len(readable.database)
+        if queries or database:
+            left_out.append(
+                f"{benchmark.name}: unreadable and left out: {queries} queries and {database} "
+                "database images."
+            )
+        benchmarks.append(readable)
+    return benchmarks, left_out
+
+
+def _draft(config: ComparisonConfig, name: str, files: Mapping[str, pathlib.Path]) -> Variant:
     """Make a variant as its recipe defines it, or as its file holds it."""
     size = {"preset": config.preset, "from_nothing": config.from_nothing}
     row = next((row for row in map(parse_row, config.rows) if row.name == name), None)
     rerank, title, changed, run = None, name, "", name
-    if name in config.models:
+    is_any = name in models_of(config.weights)
+    if is_any:
         training = TrainConfig(trainable="head")
     elif row is not None:
         changed, training = row.words, row.training(**size)
@@ -314,20 +303,19 @@ def _draft(
     else:
         title, run, rerank = method_of(name, config.preset, config.flag)
         changed, training = title, method_training(run, **size)
-    model = training.model
     # Methods of one recipe share its model, and its file unless they have their own.
     file, run = (files[name], name) if name in files else (files.get(run), run)
-    if file is not None:
-        _, found = load_weights(file)
-        if name not in config.models:
-            _check_method(name, model, found, file)
-        model = found.resized(config.image_size, config.resize)
-    else:
+    if file is None:
         model = dataclasses.replace(
-            model,
-            image_size=config.image_size or model.image_size,
-            preprocessing=model.preprocessing.changed_by(config.resize),
+            training.model,
+            image_size=config.image_size or training.model.image_size,
+            preprocessing=training.model.preprocessing.changed_by(config.resize),
         )
+    else:
+        _, found = load_weights(file)
+        if not is_any:
+            _check_method(name, training.model, found, file)
+        model = found.resized(config.image_size, config.resize)
     training = dataclasses.replace(training, model=model)
     labels = (title,) if config.kind == "compare" else (name, changed)
     rerank = None if rerank is None else f"{rerank}:{config.rerank}"
@@ -338,10 +326,11 @@ def _check_method(name: str, wanted: ModelConfig, found: ModelConfig, path: path
     """Check that a file's model is one of a method."""
 
     def words(model: ModelConfig) -> str:
+        adapter = getattr(model.backbone, "adapter", AdapterConfig(kind="none"))
         encoder = "with" if model.cross_image.layers else "without"
         return (
             f"backbone {model.backbone.part_name}, aggregator {model.aggregator.part_name}, "
-            f"adapter {adapter_kind(model)}, {encoder} a cross-image encoder"
+            f"adapter {adapter.kind}, {encoder} a cross-image encoder"
         )
 
     if words(found) != words(wanted):
@@ -351,38 +340,36 @@ def _check_method(name: str, wanted: ModelConfig, found: ModelConfig, path: path
         )
 
 
-def _fitted(
-    config: ComparisonConfig, variants: list[Variant], on_bad_image: OnBadImage
-) -> list[Variant]:
+def _fitted(config: ComparisonConfig, variants: list[Variant]) -> list[Variant]:
     """Fit the recipes of what is made here to the training set; what a row sets stays as it is."""
     # A vocabulary needs training images too, although nothing trains.
     need = dict.fromkeys(variant.run for variant in variants if variant.weights is None)
     if not need:
         return variants
-    train = config.train
-    if train is None:
+    if config.train is None:
         raise InputError(
             f"--train: found none, expected a training set for {', '.join(need)}, or --weights of "
             "each"
         )
-
-    @functools.cache
-    def read(min_images: int, cities: tuple[str, ...] | None) -> Places:
-        return read_places(train, cities=cities, min_images=min_images, on_bad_image=on_bad_image)
-
-    typical = int(np.clip(np.median(read(2, None).image_counts), 2, _VIEWS))
+    read = functools.cache(
+        functools.partial(read_places, config.train, on_bad_image=config.on_bad_image)
+    )
+    typical = int(np.clip(np.median(read(cities=None, min_images=2).image_counts), 2, _VIEWS))
 
     def fit(variant: Variant) -> Variant:
         training, row = variant.training, variant.row
         sets = row.sets if row is not None else lambda flag: False
         views = training.images_per_place if sets("images-per-place") else typical
-        places = len(read(views, training.cities).place_id)
+        places = len(read(cities=training.cities, min_images=views).place_id)
         training = _of_size(config, training, places, views)
         if row is not None:
             training = row.changed(training, config.preset)
-        places = read(training.min_images_of_place, training.cities)
+        places = read(cities=training.cities, min_images=training.min_images_of_place)
         if not sets("optimiser.warmup-"):
-            training = _with_short_warmup(variant, training, places)
+            per_epoch = PlaceBatches(training, places).steps_per_epoch
+            steps = per_epoch * training.epochs
+            optimiser = with_short_warmup(training.optimiser, steps, per_epoch)
+            training = dataclasses.replace(training, optimiser=optimiser)
         return dataclasses.replace(variant, training=training, places=places)
 
     return [each if each.weights is not None else fit(each) for each in variants]
@@ -397,42 +384,27 @@ def _of_size(
     classification loss takes a small set's places as classes, all in one group.
     """
     loss, grouping = training.loss, training.loss.kind.grouping
-    changes: dict[str, Any] = {"patience": None}
+    size, images = training.places_per_batch, training.images_per_place
+    least, epochs = training.min_images, training.epochs
     if config.from_nothing:
         if grouping is not None:
             classes = dataclasses.replace(grouping, kind="places", groups=1, steps=None)
             loss = dataclasses.replace(loss, kind=loss.kind.with_grouping(classes))
-        size = training.places_per_batch * training.images_per_place // views
-        changes |= {
-            "epochs": config.epochs or EPOCHS,
-            "loss": loss,
-            "places_per_batch": min(size, places),
-            "images_per_place": views,
-            "min_images": views,
-        }
-    else:
-        changes["epochs"] = config.epochs or training.epochs
-        changes["places_per_batch"] = min(training.places_per_batch, places)
-        changes["micro_batch"] = None
-        if grouping is None:
-            changes["images_per_place"] = min(training.images_per_place, views)
-        if grouping is None or grouping.kind == "places":
-            changes["min_images"] = min(training.min_images, views)
-    return dataclasses.replace(training, **changes)
-
-
-def _with_short_warmup(variant: Variant, training: TrainConfig, places: Places) -> TrainConfig:
-    """Shorten the warm-up of a short run, and say so."""
-    per_epoch = PlaceBatches(training, places).steps_per_epoch
-    steps = per_epoch * training.epochs
-    optimiser = with_short_warmup(training.optimiser, steps, per_epoch)
-    if optimiser != training.optimiser and variant.trains:
-        warn(  # once of all runs that it is the same for
-            f"warm-up: found {warmup_length(training.optimiser, per_epoch)} steps, shortened to "
-            f"{warmup_length(optimiser, per_epoch)} of the run's "
-            f"{count_steps(optimiser, steps, per_epoch)}"
-        )
-    return dataclasses.replace(training, optimiser=optimiser)
+        size, images, least, epochs = size * images // views, views, views, EPOCHS
+    elif grouping is None:
+        images, least = min(images, views), min(least, views)
+    elif grouping.kind == "places":
+        least = min(least, views)
+    return dataclasses.replace(
+        training,
+        loss=loss,
+        epochs=config.epochs or epochs,
+        places_per_batch=min(size, places),
+        images_per_place=images,
+        min_images=least,
+        micro_batch=None,
+        patience=None,
+    )
 
 
 def _settings(

@@ -1,6 +1,7 @@
 """The results of a comparison: a file for each run, and their summary, a row for each method."""
 
 import dataclasses
+import itertools
 import pathlib
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,7 +15,13 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
-from crisalad_jax.experiments.comparison.costs import NOTES, AdapterCost, Spread, ratios
+from crisalad_jax.experiments.comparison.costs import (
+    NOTES,
+    AdapterCost,
+    Spread,
+    adapter_costs,
+    ratios,
+)
 from crisalad_jax.experiments.comparison.plan import (
     Prepared,
     Variant,
@@ -56,8 +63,6 @@ class RunResult:
     """Steps and times of its training, once that is finished."""
     ranks: dict[str, dict[str, list[int]]] = dataclasses.field(default_factory=dict)
     """Evaluation -> grouping -> rank of each query's first right retrieval, from 1; 0 for none."""
-    seconds: float = 0.0
-    """How long training, without compiling, and all evaluations took."""
 
     def write(self, folder: pathlib.Path) -> None:
         """Write it into the run's folder, whole or not at all."""
@@ -76,7 +81,6 @@ class Evaluation(NamedTuple):
 class Run(NamedTuple):
     """A model that is made once, by one process at a time, and evaluated for its variants."""
 
-    variants: list[Variant]
     seed: int
     folder: pathlib.Path
     evaluations: list[Evaluation]
@@ -84,7 +88,7 @@ class Run(NamedTuple):
     @property
     def variant(self) -> Variant:
         """The first of the variants that share its model."""
-        return self.variants[0]
+        return self.evaluations[0].variant
 
     def read(self) -> RunResult:
         """Read its result, or begin one.
@@ -115,24 +119,19 @@ class Run(NamedTuple):
 def runs_of(prepared: Prepared, out: pathlib.Path) -> list[Run]:
     """List the runs of a comparison: a seed each, and one of a model from a file."""
     config = prepared.config
-    sharing: dict[str, list[Variant]] = {}
-    for variant in prepared.variants:
-        sharing.setdefault(variant.run, []).append(variant)
-    sets = [
-        (f"{each.name} {checksum_of_benchmark(each):08x}", each) for each in prepared.benchmarks
-    ]
     how = f"{config.grouping}, batches of {config.batch_size}"
-    runs = []
-    for name, variants in sharing.items():
-        evaluations = [
-            Evaluation(f"{variant.rerank or 'one stage'}, {words}, {how}", variant, benchmark)
-            for variant in variants
-            for words, benchmark in sets
-        ]
-        for seed in range(1 if variants[0].weights is not None else config.seeds):
-            folder = out / file_name(name) / f"seed-{seed}"
-            runs.append(Run(variants, seed, folder, evaluations))
-    return runs
+    evaluations: dict[str, list[Evaluation]] = {}
+    for benchmark in prepared.benchmarks:
+        what = f"{benchmark.name} {checksum_of_benchmark(benchmark):08x}, {how}"
+        for variant in prepared.variants:
+            key = f"{variant.rerank or 'one stage'}, {what}"
+            each = Evaluation(key, variant, benchmark)
+            evaluations.setdefault(variant.run, []).append(each)
+    return [
+        Run(seed, out / file_name(name) / f"seed-{seed}", of_run)
+        for name, of_run in evaluations.items()
+        for seed in range(1 if of_run[0].variant.weights is not None else config.seeds)
+    ]
 
 
 def _changes(was: Any, now: Any, name: str = "") -> Iterator[str]:
@@ -273,20 +272,14 @@ class Summary(NamedTuple):
     settings: Mapping[str, Any]
 
 
-def summarise(
-    prepared: Prepared,
-    runs: Sequence[Run],
-    speed: Mapping[str, Any],
-    adapters: Sequence[AdapterCost] = (),
-) -> Summary:
+def summarise(prepared: Prepared, runs: Sequence[Run], speed: Mapping[str, Any]) -> Summary:
     """Read the results of all runs, and summarise them by row.
 
     Args:
         prepared: the comparison.
         runs: its runs, which are done.
-        speed: the times of all models: "rounds", "batch_size", "device", and whether seconds are
-            "absolute".
-        adapters: Table 3, for an ablation.
+        speed: the times of all models: "rounds", "batch_size", "device", whether seconds are
+            "absolute", and the times of "adapters".
 
     Returns:
         The summary.
@@ -301,21 +294,17 @@ def summarise(
     results: dict[str, list[tuple[Run, RunResult]]] = {}
     for run in runs:
         results.setdefault(run.variant.run, []).append((run, run.read()))
-    rows = [
-        row
-        for variant in prepared.variants
-        for row in _rows(variant, reference, sets, results, speed)
-    ]
-    notes = [*_notes(prepared, reference, speed), *(NOTES if adapters else ())]
+    rows = [_rows(variant, reference, sets, results, speed) for variant in prepared.variants]
+    adapters = adapter_costs(speed["adapters"]) if config.is_papers else []
     return Summary(
-        config.kind,
-        ("method",) if config.kind == "compare" else ("row", "changed"),
-        reference.labels[0],
-        sets,
-        rows,
-        notes,
-        list(adapters),
-        to_plain(config),
+        kind=config.kind,
+        headers=("method",) if config.kind == "compare" else ("row", "changed"),
+        reference=reference.labels[0],
+        sets=sets,
+        rows=list(itertools.chain(*rows)),
+        notes=[*_notes(prepared, reference, speed), *(NOTES if adapters else ())],
+        adapters=adapters,
+        settings=to_plain(config),
     )
 
 
@@ -332,28 +321,30 @@ def _rows(
     relative = statistics.median(ratios(rounds, variant.run, reference.run))
     ours, others = (_training_seconds(results[each.run]) for each in (variant, reference))
     theirs = _ranks(reference, sets, results[reference.run])
+    parameters = sum(leaf.size for leaf in jax.tree.leaves(parameter_shapes(variant.model)))
+    trained = None if variant.weights is not None else 0
+    if variant.trains:
+        trained = count_trainable(variant.model, variant.training.trainable)
     for grouping, ranks in _ranks(variant, sets, results[variant.run]).items():
         # A grouping that the reference lacks is compared with its first.
         other = theirs.get(grouping, next(iter(theirs.values())))
-        recalls = {
-            name: {
-                k: recall_of(ranks[name], k, None if variant is reference else other[name])
-                for k in KS
-            }
-            for name in sets
-        }
+        recalls = {}
+        for name in sets:
+            than = None if variant is reference else other[name]
+            recalls[name] = {k: recall_of(ranks[name], k, than) for k in KS}
         yield Row(
-            variant.name,
-            variant.labels,
-            grouping,
-            variant.model.descriptor_dim,
-            recalls,
-            1 / relative,
-            speed["batch_size"] / batch if speed["absolute"] else None,
-            *_parameters(variant),
+            name=variant.name,
+            labels=variant.labels,
+            grouping=grouping,
+            dimension=variant.model.descriptor_dim,
+            recalls=recalls,
+            speed=1 / relative,
+            images_per_second=speed["batch_size"] / batch if speed["absolute"] else None,
+            parameters=parameters,
+            trained=trained,
             # Runs are not interleaved: one of the same seed met no more of the same load.
-            Spread.of([each / other for each in ours for other in others]),
-            Spread.of(ours),
+            training=Spread.of([each / other for each in ours for other in others]),
+            training_seconds=Spread.of(ours),
         )
 
 
@@ -398,15 +389,6 @@ def _training_seconds(results: Sequence[tuple[Run, RunResult]]) -> list[float]:
     records = [result.training for _, result in results if result.training is not None]
     alone = [each["steps"] * each["step_seconds"] for each in records if not each["beside"]]
     return alone if len(alone) > 1 else []
-
-
-def _parameters(variant: Variant) -> tuple[int, int | None]:
-    """Count all parameters, and those that were trained; None for a model from a file."""
-    total = sum(leaf.size for leaf in jax.tree.leaves(parameter_shapes(variant.model)))
-    if variant.weights is not None:
-        return total, None
-    trains = variant.trains
-    return total, count_trainable(variant.model, variant.training.trainable) if trains else 0
 
 
 def _notes(prepared: Prepared, reference: Variant, speed: Mapping[str, Any]) -> list[str]:

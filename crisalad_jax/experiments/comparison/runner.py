@@ -2,9 +2,8 @@
 
 OUT/config.json                       what the last command here compared
 OUT/NAME/seed-S/result.json           a run's settings, the time of its training, its evaluations
-OUT/NAME/seed-S/run/                  its training, which can be resumed
-OUT/NAME/seed-S/start.safetensors     what it starts from, where a vocabulary was built
-OUT/speed.json, adapters.json         the timing of all models, and of the paper's adapters
+OUT/NAME/seed-S/run/                  its training, which can be resumed, or its vocabulary
+OUT/speed.json                        the timing of all models, and of the paper's adapters
 """
 
 import contextlib
@@ -18,20 +17,15 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
-
 from crisalad_jax.checkpoints.public import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.config.checks import PATH, check_count, takes
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.data.images import OnBadImage, read_pixels
+from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.comparison.costs import (
-    AdapterCost,
-    Spread,
-    adapter_costs,
-    describing,
+    adapter_calls,
     machine,
     race,
 )
@@ -47,20 +41,20 @@ from crisalad_jax.experiments.comparison.results import (
 from crisalad_jax.experiments.comparison.tables import markdown, put_in_page, write_tables
 from crisalad_jax.experiments.report.gallery import first_right_ranks
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
-from crisalad_jax.retrieval.describe import prepare_image
+from crisalad_jax.retrieval.describe import describe_prepared, prepare_image
+from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.reranking import parse_reranking
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.start import with_vocabulary_of
+from crisalad_jax.training.trainer import run_keys
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_target, real_path, split_markers, write_json
+from crisalad_jax.utils.files import real_path, split_markers, write_json
 from crisalad_jax.utils.locks import POLL, BusyFolderError, lock
 from crisalad_jax.utils.output import Note
 from crisalad_jax.utils.target import target
 from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries
-
-_ROUNDS = 5
 
 Say = Callable[[str], None]
 
@@ -71,7 +65,6 @@ def compare(
     out: str | os.PathLike[str],
     *,
     page: str | os.PathLike[str] | None = None,
-    on_bad_image: OnBadImage = "stop",
     jobs: int = 1,
     say: Say = lambda line: None,
     quiet: bool = False,
@@ -89,8 +82,6 @@ def compare(
             index.html.
         page: a Markdown page that gets the tables too, between its comments <!-- NAME --> and
             <!-- end of NAME -->, where NAME is the name of the folder.
-        on_bad_image: "stop" at an unreadable image, or "skip" it: training masks it out, and the
-            sets are compared on without it. Each call reads all images of the sets to find them.
         jobs: number of runs at once, each in a process with its share of this host's devices. A
             program needs `if __name__ == "__main__"` for more than one.
         say: is given a line at the start and before each run.
@@ -106,13 +97,12 @@ def compare(
         Interrupted: a signal asked for the end; the same call resumes.
     """
     out = pathlib.Path(out)
-    check_target(out / "config.json")
     name = real_path(out).name
     if page is not None:
         split_markers(pathlib.Path(page), name)
     check_count("--jobs", jobs)
-    jobs = min(jobs, len(config.names) * config.seeds)
-    work = functools.partial(carry_out, config, out, on_bad_image, jobs=jobs)
+    jobs = min(jobs, len(config.lines) * config.seeds)
+    work = functools.partial(carry_out, config, out)
     with warnings.catch_warnings():
         if jobs > 1:
             run_jobs(functools.partial(work, quiet=True), jobs, say)
@@ -120,9 +110,7 @@ def compare(
         prepared, runs = work(say=say, quiet=quiet)
     with lock(out, wait=True):
         speed = _speed(prepared, runs, out, say, quiet)
-        # Table 3 belongs to the paper's rows.
-        papers = config.kind == "ablate" and not config.rows
-        summary = summarise(prepared, runs, speed, _adapter_costs(out) if papers else [])
+        summary = summarise(prepared, runs, speed)
         write_tables(summary, out)
     if page is not None:
         put_in_page(pathlib.Path(page), name, markdown(summary))
@@ -130,31 +118,22 @@ def compare(
 
 
 def carry_out(
-    config: ComparisonConfig,
-    out: pathlib.Path,
-    on_bad_image: OnBadImage,
-    *,
-    say: Say,
-    quiet: bool,
-    jobs: int = 1,
-    beside: bool = False,
+    config: ComparisonConfig, out: pathlib.Path, *, say: Say, quiet: bool, beside: bool = False
 ) -> tuple[Prepared, list[Run]]:
     """Prepare a comparison, make `out` its folder, and take all runs that nobody is at.
 
     Args:
         config: what to compare.
         out: the folder.
-        on_bad_image: as `compare`.
         say: is given a line at the start and before each run.
         quiet: no progress bars.
-        jobs: number of processes that do the same, for the time that is left.
         beside: whether they share this process's device.
 
     Raises:
         InputError: what `compare` raises.
         Interrupted: a signal asked for the end.
     """
-    prepared = prepare(config, on_bad_image, quiet=quiet)
+    prepared = prepare(config, quiet=quiet)
     path = out / "config.json"
     if not path.exists() and out.exists() and holds_other_files(out):
         raise InputError(
@@ -171,7 +150,8 @@ def carry_out(
         for run in left:
             with contextlib.suppress(BusyFolderError), lock(run.folder):
                 if not run.is_done:  # by another, a moment ago
-                    say(progress_words(run, runs, jobs))
+                    done = sum(each.is_done for each in runs)
+                    say(f"{run.variant.run}, seed {run.seed}: {done} of {len(runs)} runs done")
                     _complete(prepared, run, quiet, beside)
                     began = True
         if not began:
@@ -182,29 +162,6 @@ def carry_out(
     return prepared, runs
 
 
-def progress_words(run: Run, runs: Sequence[Run], jobs: int) -> str:
-    """Say which run begins, of how many, and how long the rest takes.
-
-    That is told by finished runs of the same method, of other processes and earlier calls too:
-    methods take times that differ tenfold, so that a mean of all says nothing.
-    """
-    taken: dict[str, list[float]] = {}
-    left = []
-    for each in runs:
-        if each.is_done:
-            taken.setdefault(each.variant.run, []).append(each.read().seconds)
-        else:
-            left.append(each.variant.run)
-    line = f"{run.variant.run}, seed {run.seed}: {len(runs) - len(left)} of {len(runs)} runs done"
-    known = [statistics.fmean(taken[name]) for name in left if name in taken]
-    if not known:
-        return line
-    minutes = sum(known) / jobs / 60
-    words = f"{minutes:.0f} min" if minutes < 90 else f"{minutes / 60:.1f} h"
-    of = "" if len(known) == len(left) else f" for {len(known)} of the {len(left)}"
-    return f"{line}, about {words} left{of}"
-
-
 def _complete(prepared: Prepared, run: Run, quiet: bool, beside: bool) -> None:
     """Train a run's model and evaluate its variants, as far as results are missing."""
     remove_temporaries(run.folder)
@@ -213,7 +170,6 @@ def _complete(prepared: Prepared, run: Run, quiet: bool, beside: bool) -> None:
     for key, variant, benchmark in run.evaluations:
         if key in result.ranks:
             continue
-        started = time.monotonic()
         results = evaluate(
             Model(params, variant.model),
             benchmark,
@@ -228,7 +184,6 @@ def _complete(prepared: Prepared, run: Run, quiet: bool, beside: bool) -> None:
             each.grouping: first_right_ranks(each.neighbours, benchmark.ground_truth()).tolist()
             for each in results
         }
-        result.seconds += time.monotonic() - started
         result.write(run.folder)
 
 
@@ -237,22 +192,18 @@ def _model(prepared: Prepared, run: Run, quiet: bool, beside: bool = False) -> C
     variant, result, folder = run.variant, run.read(), run.folder / "run"
     if variant.weights is not None:
         return load_weights(variant.weights)[0]
-    if result.training is not None:
-        return load_weights(folder / "last.safetensors", expected=variant.model)[0]
+    weights = folder / "last.safetensors"
+    if weights.exists() and not (variant.trains and result.training is None):
+        return load_weights(weights, expected=variant.model)[0]
     training = dataclasses.replace(variant.training, seed=run.seed)
     start = _start(prepared, run, training, quiet)
     result.write(run.folder)  # the settings, which a resumed training is checked by
     if not variant.trains:
+        save_weights(weights, Model(start, variant.model))
         return start
     assert variant.places is not None
-    fitted = fit(
-        training,
-        variant.places,
-        folder,
-        initial=start,
-        on_bad_image=prepared.on_bad_image,
-        quiet=quiet,
-    )
+    how = {"on_bad_image": prepared.config.on_bad_image, "quiet": quiet}
+    fitted = fit(training, variant.places, folder, initial=start, **how)
     # Repeated steps of a resumed run count once.
     images = training.places_per_batch * training.images_per_place
     records = read_metrics(folder / "metrics.jsonl")
@@ -263,30 +214,20 @@ def _model(prepared: Prepared, run: Run, quiet: bool, beside: bool = False) -> C
         "device": machine(),
         "beside": beside,
     }
-    result.seconds += sum(seconds)
     result.write(run.folder)
     return fitted.params
 
 
 def _start(prepared: Prepared, run: Run, training: TrainConfig, quiet: bool) -> Crisalad:
     """Make the parameters that a run starts from, always the same for its seed."""
-    path, model = run.folder / "start.safetensors", training.model
-    if path.exists():
-        return load_weights(path, expected=model)[0]
-    # The same split of the seed's key as in `fit`, so that both draw the same parameters.
-    key, _ = jax.random.split(jax.random.key(run.seed))
-    params = init_crisalad(key, model)
+    params = init_crisalad(run_keys(run.seed)[0], training.model)
     if prepared.config.backbone is not None:
-        params = with_backbone_of(params, model, prepared.config.backbone)
-    if not model.aggregator.starts_from_centroids:
-        return params
-    places = run.variant.places
-    assert places is not None
-    how = {"on_bad_image": prepared.on_bad_image, "quiet": quiet}
-    built = with_vocabulary_of(params, training, places, **how)
-    assert built is not None
-    save_weights(path, Model(built, model))
-    return built
+        params = with_backbone_of(params, training.model, prepared.config.backbone)
+    assert run.variant.places is not None
+    how = {"on_bad_image": prepared.config.on_bad_image, "quiet": quiet}
+    start = with_vocabulary_of(params, training, run.variant.places, **how)
+    assert start is not None
+    return start
 
 
 def _speed(
@@ -295,9 +236,11 @@ def _speed(
     """Time a batch of every model in turns, unless that was done; variants of a run count once."""
     path, size = out / "speed.json", prepared.config.batch_size
     models = {run.variant.run: run for run in runs if run.seed == 0}
+    adapters = adapter_calls() if prepared.config.is_papers else {}
     if path.exists():
         record = read_result(path)
-        if models.keys() <= record["rounds"].keys() and record["batch_size"] == size:
+        is_timed = models.keys() <= record["rounds"].keys() and record["batch_size"] == size
+        if is_timed and adapters.keys() <= record["adapters"].keys():
             return record
     say("images described a second, all models in turns")
 
@@ -305,7 +248,8 @@ def _speed(
         params, model = _model(prepared, run, quiet=True), run.variant.model
         # Of the first set's size, which models that take images at their own size go by.
         image = prepare_image(read_pixels(prepared.benchmarks[0].queries[0]), model)
-        return describing(params, model, image, size)
+        describer = describer_of(Model(params, model))
+        return functools.partial(describe_prepared, describer, [image] * size, size)
 
     calls = {name: functools.partial(ready, run) for name, run in models.items()}
     record = {
@@ -313,17 +257,8 @@ def _speed(
         # A CPU's times depend on other load.
         "absolute": target().platform != "cpu",
         "batch_size": size,
-        "rounds": race(calls, _ROUNDS, quiet=quiet),
+        "rounds": race(calls, quiet=quiet),
+        "adapters": race(adapters),
     }
     write_json(path, record)
     return record
-
-
-def _adapter_costs(out: pathlib.Path) -> list[AdapterCost]:
-    """Measure Table 3, which takes a minute, in the first call for a folder."""
-    path = out / "adapters.json"
-    if not path.exists():
-        write_json(path, {"costs": [cost._asdict() for cost in adapter_costs()]})
-    return [
-        AdapterCost(**cost | {"time": Spread(*cost["time"])}) for cost in read_result(path)["costs"]
-    ]

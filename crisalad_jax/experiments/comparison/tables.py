@@ -1,15 +1,14 @@
 """A comparison as tables: for the terminal, as Markdown, CSV and JSON, and as one HTML page."""
 
-import csv
-import io
+import itertools
 import json
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from crisalad_jax.evaluation.results import percent
 from crisalad_jax.experiments.comparison.costs import AdapterCost
-from crisalad_jax.experiments.comparison.results import KS, Difference, Recall, Row, Summary
+from crisalad_jax.experiments.comparison.results import KS, Difference, Row, Summary
 from crisalad_jax.experiments.report.page import PAGE, render
 from crisalad_jax.experiments.report.style import (
     COLOURS,
@@ -20,7 +19,7 @@ from crisalad_jax.experiments.report.style import (
     label_axes,
     new_figure,
 )
-from crisalad_jax.experiments.report.tables import NOTHING, Cell, Table, no_formula, write_text
+from crisalad_jax.experiments.report.tables import NOTHING, Cell, Table, write_csv, write_text
 from crisalad_jax.utils.files import split_markers, write_json
 
 _PAGE_TITLES = {"compare": "Methods compared", "ablate": "What each part brings"}
@@ -29,7 +28,7 @@ _PAGE_TITLES = {"compare": "Methods compared", "ablate": "What each part brings"
 def write_tables(summary: Summary, out: pathlib.Path) -> None:
     """Write table.md, table.csv, results.json, and index.html with its charts, recall_N.png."""
     write_text(out / "table.md", markdown(summary))
-    write_text(out / "table.csv", comma_separated(summary))
+    write_csv(out / "table.csv", list(csv_rows(summary)))
     write_json(out / "results.json", as_json(summary))
     charts = [_chart(summary, name, out, number) for number, name in enumerate(summary.sets)]
     context = {
@@ -58,43 +57,36 @@ def put_in_page(page: pathlib.Path, name: str, text: str) -> None:
 
 def tables_of(summary: Summary) -> dict[str, Table]:
     """Make the tables of a comparison by name; those without a row are left out."""
-    first, *described = summary.headers
-    columns = [(name, k) for name in summary.sets for k in KS]
-    recalls = [
-        [
-            Cell(_title(row, summary.rows)),
-            *(Cell(label or NOTHING) for label in row.labels[1:]),
-            *(_recall(row.recalls[name][k], name, k, summary.rows) for name, k in columns),
-        ]
-        for row in summary.rows
-    ]
-    differences = [
-        [Cell(_title(row, summary.rows))]
-        + [_difference(row.recalls[name][k].difference) for name, k in columns]
-        for row in summary.rows
-        if any(row.recalls[name][k].difference for name, k in columns)
-    ]
-    # A model's costs do not depend on the grouping.
-    of_each = {row.name: row for row in reversed(summary.rows)}.values()
+    first = summary.headers[0]
+    recalls, differences, costs = [], [], {}
+    for row in summary.rows:
+        title = _title(row, summary.rows)
+        labels = (title, *(label or NOTHING for label in row.labels[1:]))
+        line: dict[str, str | Cell] = dict(zip(summary.headers, labels, strict=True))
+        difference: dict[str, str | Cell] = {f"{first}, less {summary.reference}": title}
+        for name, k in itertools.product(summary.sets, KS):
+            line[f"{name} R@{k}"] = _recall(row, name, k, summary.rows)
+            difference[f"{name} Δ R@{k}"] = _difference(row.recalls[name][k].difference)
+        recalls.append(line)
+        if any(each.difference for by_k in row.recalls.values() for each in by_k.values()):
+            differences.append(difference)
+        # A model's costs do not depend on the grouping.
+        costs.setdefault(row.name, {first: row.labels[0]} | costs_of(row))
     tables = {
-        "recall": Table(
-            [first, *described, *(f"{name} R@{k}" for name, k in columns)],
-            recalls,
-            labels=len(summary.headers),
-        ),
-        "differences": Table(
-            [f"{first}, less {summary.reference}", *(f"{name} Δ R@{k}" for name, k in columns)],
-            differences,
-        ),
-        "costs": _table_of([{first: row.labels[0]} | costs_of(row) for row in reversed(of_each)]),
+        "recall": _table_of(recalls, labels=len(summary.headers)),
+        "differences": _table_of(differences),
+        "costs": _table_of(list(costs.values())),
         "adapters": _table_of(list(map(adapter_cells, summary.adapters))),
     }
     return {name: table for name, table in tables.items() if table.rows}
 
 
-def _table_of(rows: Sequence[Mapping[str, str]]) -> Table:
-    """Make a table whose headers are the names of the rows' texts."""
-    return Table(list(rows[0]) if rows else [], [list(map(Cell, row.values())) for row in rows])
+def _table_of(rows: Sequence[Mapping[str, str | Cell]], labels: int = 1) -> Table:
+    """Make a table whose headers are the names of the rows' cells."""
+    cells = [
+        [Cell(each) if isinstance(each, str) else each for each in row.values()] for row in rows
+    ]
+    return Table(list(rows[0]) if rows else [], cells, labels)
 
 
 def _title(row: Row, rows: Sequence[Row]) -> str:
@@ -103,11 +95,12 @@ def _title(row: Row, rows: Sequence[Row]) -> str:
     return f"{row.labels[0]}, {row.grouping}" if several else row.labels[0]
 
 
-def _recall(recall: Recall, name: str, k: int, rows: Sequence[Row]) -> Cell:
+def _recall(row: Row, name: str, k: int, rows: Sequence[Row]) -> Cell:
     """Format a recall with its deviation and interval; the best of its column is marked."""
+    recall = row.recalls[name][k]
     spread = "" if recall.spread is None else f"± {percent(recall.spread)}\n"
     note = f"{spread}({percent(recall.interval.low)}-{percent(recall.interval.high)})"
-    best = max(row.recalls[name][k].mean for row in rows)
+    best = max(each.recalls[name][k].mean for each in rows)
     return Cell(percent(recall.mean), note, "best" if recall.mean == best else "")
 
 
@@ -189,23 +182,19 @@ _COLUMNS = (
 )
 
 
-def comma_separated(summary: Summary) -> str:
-    """Write a CSV line for each row, set and K: recalls as fractions, missing values empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*summary.headers, *_COLUMNS])
-    nothing = (None,) * 3
+def csv_rows(summary: Summary) -> Iterator[dict[str, Any]]:
+    """Yield a line of table.csv for each row, set and K: recalls as fractions."""
+    columns, nothing = [*summary.headers, *_COLUMNS], (None,) * 3
     for row in summary.rows:
         costs = (row.dimension, row.speed, row.images_per_second, row.parameters, row.trained)
         times = (*(row.training or nothing), *(row.training_seconds or nothing))
         for name, by_k in row.recalls.items():
             for k, recall in by_k.items():
-                texts = map(no_formula, (*row.labels, row.name, row.grouping, name))
+                names = (*row.labels, row.name, row.grouping, name, k)
                 values = (recall.mean, recall.spread, *recall.interval, len(recall.by_seed))
                 mean, interval, verdict = recall.difference or (None, (None, None), None)
-                differs = (mean, *interval, verdict)
-                writer.writerow([*texts, k, *values, *differs, *costs, *times])
-    return text.getvalue()
+                line = (*names, *values, mean, *interval, verdict, *costs, *times)
+                yield dict(zip(columns, line, strict=True))
 
 
 def _chart(summary: Summary, name: str, out: pathlib.Path, number: int) -> Drawing:

@@ -1,6 +1,5 @@
 """Charts: recall, precision and training curves, a map of positions, a matrix of similarities."""
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
 from matplotlib.ticker import MaxNLocator
 
+from crisalad_jax.data.metres import flattened
 from crisalad_jax.evaluation.metrics import PrecisionRecall, right_retrievals
 from crisalad_jax.evaluation.similarity import cells_of
 from crisalad_jax.experiments.report.style import (
@@ -27,15 +27,12 @@ from crisalad_jax.experiments.report.style import (
     legend_below,
     new_figure,
 )
-from crisalad_jax.experiments.report.tables import check_recalls
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.utils.errors import InputError
 
 OUTCOMES = ("wrong", "no positive", "right")
 """What may become of a query: its first retrieval is wrong although another image is right, no
 database image is right, or it is right."""
 _DASHES = ("-", "--", ":")
-_RECALL = re.compile(r"R@(\d+)")
 # Key, title of the panel, and whether to smooth it because batches make it noisy.
 _LOSSES = (
     ("loss", "loss", True),
@@ -60,11 +57,7 @@ def recall_curves(
 
     Returns:
         The figure.
-
-    Raises:
-        InputError: no curves, a curve without values, or a recall outside 0 to 1.
     """
-    check_recalls("curves", curves)
     figure = new_figure(4.5, title, **WIDE) if wide else new_figure(3.4, title)
     axes = figure.add_subplot()
     label_axes(axes, "K, database images retrieved", "Recall@K")
@@ -88,7 +81,7 @@ def precision_curves(curves: Mapping[str, PrecisionRecall]) -> Picture:
     return figure
 
 
-def training_curves(records: Sequence[Mapping[str, int | float]], title: str = "") -> Picture:
+def training_curves(records: Sequence[Mapping[str, int | float]]) -> Picture:
     """Draw a run: its losses, learning rate and validation recalls against the step.
 
     A panel is drawn for each that the records hold. Long noisy series are pale under their running
@@ -98,28 +91,18 @@ def training_curves(records: Sequence[Mapping[str, int | float]], title: str = "
         records: the lines of metrics.jsonl, each with "step" and any of "loss",
             "easy_anchor_fraction", "accuracy", "learning_rate", and "R@K" as a fraction of the
             queries, 0 to 1.
-        title: stands above the picture.
 
     Returns:
         The figure.
-
-    Raises:
-        InputError: no record with a known value.
     """
     series = {
         key: {int(record["step"]): record[key] for record in records if key in record}
         for key in dict.fromkeys(key for record in records for key in record)
     }
     losses = [panel for panel in _LOSSES if panel[0] in series]
-    ks = sorted(int(match[1]) for match in map(_RECALL.fullmatch, series) if match)
-    recalls = {f"R@{k}": series[f"R@{k}"] for k in ks}
-    if not losses and not recalls:
-        raise InputError(
-            f"records: found {len(records)} without any of "
-            f"{', '.join(key for key, *_ in _LOSSES)} or R@K, expected at least one"
-        )
+    recalls = {key: series[key] for key in series if key.startswith("R@")}
     heights = [1.5] * len(losses) + [2.4] * bool(recalls)
-    figure = new_figure(sum(heights) + 0.45 * len(heights) + 0.6, title, **WIDE)
+    figure = new_figure(sum(heights) + 0.45 * len(heights) + 0.6, **WIDE)
     panels = figure.subplots(len(heights), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (key, label, noisy) in zip(panels, losses, strict=False):
         label_axes(axes, "", "", title=label)
@@ -147,17 +130,10 @@ def _draw_recalls(axes: Axes, curves: Mapping[str, Mapping[int, float]]) -> None
 
 
 def _draw_line(axes: Axes, number: int, name: str, x: Any, y: Any, marker: str = "") -> None:
-    axes.plot(
-        x,
-        y,
-        color=COLOURS[number % len(COLOURS)],
-        linestyle=_DASHES[number // len(COLOURS) % len(_DASHES)],
-        linewidth=1.8,
-        marker=marker,
-        markersize=4.5,
-        label=name,
-        clip_on=False,  # markers at 100 % are not cut in half
-    )
+    dashes, colour = divmod(number, len(COLOURS))
+    style: Any = {"color": COLOURS[colour], "linestyle": _DASHES[dashes % len(_DASHES)]}
+    style |= {"linewidth": 1.8, "marker": marker, "markersize": 4.5}
+    axes.plot(x, y, label=name, clip_on=False, **style)  # markers at 100 % are not cut in half
 
 
 def _draw_series(axes: Axes, series: Mapping[int, float], noisy: bool) -> None:
@@ -223,11 +199,13 @@ def position_map(
     right.
 
     Args:
-        positions: in metres, east and north or any two axes.
+        positions: of all images, in metres.
         first: the first retrieval of each query, an index of the database.
         outcomes: what `outcomes_of` returns.
     """
-    database, queries, database_placed, queries_placed, _ = positions
+    points = flattened(np.concatenate([positions.database, positions.queries]))
+    database, queries = np.split(points, [len(positions.database)])
+    database_placed, queries_placed = positions.database_placed, positions.queries_placed
     points = np.concatenate([database[database_placed], queries[queries_placed]])
     low, span = points.min(axis=0), np.ptp(points, axis=0)
     # A narrow place gets room around it, so that nothing is squeezed into a line.

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 from matplotlib.axes import Axes
 
-from crisalad_jax.config.checks import check_count, takes
+from crisalad_jax.config.checks import takes
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.resize import resize_image
@@ -28,7 +28,6 @@ from crisalad_jax.experiments.report.style import (
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.locks import staged_folder
 from crisalad_jax.utils.output import counted, warn
 
 _DPI = 120
@@ -72,8 +71,8 @@ def show_retrievals(
         A figure that a notebook shows; `figure.savefig(path)` writes it.
 
     Raises:
-        InputError: neither of these; a result without its benchmark, or answers with one; a query
-            that there is not; rows or columns below 1; or an image that cannot be read.
+        InputError: neither of these; a result without its benchmark, or answers with one; no query,
+            or one that there is not; or an image that cannot be read.
 
     Example:
         >>> import numpy as np, pathlib
@@ -85,8 +84,6 @@ def show_retrievals(
         >>> [axes.get_xlabel() for axes in figure.axes]
         ['query 0', '1   1.000', '2   0.500']
     """
-    check_count("rows", rows)
-    check_count("columns", columns)
     is_result = isinstance(found, GroupingResult)
     if is_result != (benchmark is not None):
         raise InputError(
@@ -95,31 +92,24 @@ def show_retrievals(
             "results alone"
         )
     count = len(found.neighbours.indices)
-    if queries is not None:
-        chosen = list(queries)
-    elif benchmark is None:
-        chosen = evenly(np.arange(count), rows)
-    else:
+    right = np.ones(count, bool)
+    if benchmark is not None:
         right = first_right_ranks(found.neighbours, benchmark.ground_truth()) == 1
-        chosen = _half_right(right, rows)
+    chosen = _half_right(right, rows) if queries is None else list(queries)
     if not chosen or not all(0 <= query < count for query in chosen):
         raise InputError(f"queries: found {chosen}, expected numbers from 0 to {count - 1}")
     if isinstance(found, Answers):
-        tiles = [_answers(found, query, columns, root) for query in chosen]
+        tiles = [list(_answers(found, query, columns, root)) for query in chosen]
     else:
         assert benchmark is not None
-        tiles = [_results(found, benchmark, query, columns) for query in chosen]
-    return _draw([list(row) for row in tiles], title, strict=is_result)
+        tiles = [list(_results(found, benchmark, query, columns)) for query in chosen]
+    return _draw(tiles, title, strict=is_result)
 
 
 def write_galleries(
-    out: str | os.PathLike[str],
-    benchmark: Benchmark,
-    results: Sequence[GroupingResult],
-    *,
-    model_name: str,
-) -> list[Path]:
-    """Write a gallery of retrievals for each result of an evaluation.
+    out: Path, benchmark: Benchmark, results: Sequence[GroupingResult], *, model_name: str
+) -> None:
+    """Write a gallery of retrievals for each result of an evaluation, gallery_GROUPING.png.
 
     Args:
         out: the folder, made where it is missing.
@@ -127,20 +117,14 @@ def write_galleries(
         results: what `evaluate` returned.
         model_name: which weights, for the titles.
 
-    Returns:
-        The pictures, gallery_GROUPING.png.
-
     Raises:
         InputError: an image cannot be read, or a picture not be written.
     """
-    names = []
-    with staged_folder(out) as folder:
-        for result in results:
-            label = re.sub(r"[/:]", "-", result.label).replace(" + ", "_")
-            names.append(f"gallery_{label}.png")
-            title = f"{benchmark.name}, {model_name}, {result.label}"
-            save(show_retrievals(result, benchmark, rows=6, title=title), folder / names[-1])
-    return [Path(out) / name for name in names]
+    for result in results:
+        label = re.sub(r"[/:]", "-", result.label).replace(" + ", "_")
+        title = f"{benchmark.name}, {model_name}, {result.label}"
+        figure = show_retrievals(result, benchmark, rows=6, title=title)
+        save(figure, out / f"gallery_{label}.png")
 
 
 def first_right_ranks(
@@ -257,18 +241,10 @@ def _draw_tile(axes: Axes, tile: _Tile, image: UInt8[np.ndarray, "h w 3"]) -> No
     plain = tile.colour == INK
     axes.spines[:].set(color=GREY if plain else tile.colour, linewidth=0.5 if plain else 3)
     if tile.name:
-        axes.annotate(
-            shortened(tile.name, _NAME),
-            (0, 0),
-            xycoords="axes fraction",
-            xytext=(0, -18),
-            textcoords="offset points",
-            va="top",
-            fontsize=7,
-            family="monospace",
-            color=GREY,
-            parse_math=False,  # a dollar sign in a name starts no formula
-        )
+        below = {"xycoords": "axes fraction", "xytext": (0, -18), "textcoords": "offset points"}
+        # A dollar sign in a name starts no formula.
+        how = {"va": "top", "fontsize": 7, "family": "monospace", "parse_math": False}
+        axes.annotate(shortened(tile.name, _NAME), (0, 0), color=GREY, **below, **how)
 
 
 def _read(file: Path) -> UInt8[np.ndarray, "h w 3"]:

@@ -1,7 +1,5 @@
 """One HTML page of an evaluation, which embeds its pictures and loads nothing from the network."""
 
-import csv
-import io
 import json
 import math
 import os
@@ -15,7 +13,6 @@ from jaxtyping import Float
 
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import read_image
-from crisalad_jax.data.metres import flattened
 from crisalad_jax.evaluation.operating_point import OperatingPoint
 from crisalad_jax.evaluation.record import table_notes
 from crisalad_jax.evaluation.results import GroupingResult, percent
@@ -34,13 +31,11 @@ from crisalad_jax.experiments.report.style import Drawing, chart, illustration, 
 from crisalad_jax.experiments.report.tables import (
     Cell,
     Table,
-    check_recalls,
-    no_formula,
+    write_csv,
     write_text,
 )
-from crisalad_jax.experiments.report.transport import draw_transport, transport_of
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.experiments.report.transport import Transported, draw_transport, transport_of
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.locks import staged_folder
 from crisalad_jax.utils.output import printable
@@ -59,8 +54,7 @@ def write_report(
     benchmark: Benchmark,
     groupings: Sequence[GroupingResult],
     *,
-    params: Crisalad,
-    config: ModelConfig,
+    model: Model,
     model_name: str,
     settings: dict[str, Any],
     similarities: Float[np.ndarray, "rows columns"] | None = None,
@@ -74,28 +68,26 @@ def write_report(
         out: the folder, made where it is missing. Files of the same names are replaced.
         benchmark: what was evaluated on.
         groupings: the results, at least one.
-        params: the model's, for the section on its transport; a model without one has none.
-        config: the model's.
+        model: for the section on its transport; a model without one has none.
         model_name: which weights.
         settings: what `evaluation_settings` returns, shown folded.
         similarities: what `similarity.similarity_map` gives of the first grouping.
 
     Raises:
-        InputError: no groupings or ground truth, a recall outside 0 to 1, an image that cannot be
-            read, or files that cannot be written: then none of them is.
+        InputError: no ground truth, an image that cannot be read, or files that cannot be written:
+            then none of them is.
     """
-    check_recalls("groupings", {grouping.label: grouping.recalls for grouping in groupings})
     main = groupings[0]
     subject = Subject.of(benchmark, main.neighbours)
     shown = subject.choose()
     with staged_folder(out) as folder:
-        write_results(folder / "results.csv", subject, groupings)
+        rows = [row for grouping in groupings for row in query_results(subject, grouping)]
+        write_csv(folder / "results.csv", rows)
         context = {
             "title": benchmark.name,
             "model_name": model_name,
             "subject": subject,
-            "config": config,
-            "groupings": groupings,
+            "config": model.config,
             "main": main,
             "table": _table(groupings),
             "notes": table_notes(groupings, settings),
@@ -108,7 +100,7 @@ def write_report(
             "results": page_rows(subject, main),
             "outcomes": OUTCOMES,
             "map": _map(folder, subject),
-            "transport": list(_transport(subject, shown, params, config)),
+            "transport": list(_transport(subject, shown, model)),
             "matrix": _matrix(folder, subject, similarities),
             "settings": json.dumps(settings, indent=2),
         }
@@ -170,9 +162,7 @@ class Subject(NamedTuple):
         most harm. Right queries are spread evenly from the most to the least confident.
         """
         order = np.argsort(-self.neighbours.similarities[:, 0], kind="stable")
-        right, wrong, unmatched = (
-            order[self.outcomes[order] == outcome] for outcome in ("right", "wrong", "no positive")
-        )
+        wrong, unmatched, right = (order[self.outcomes[order] == each] for each in OUTCOMES)
         return {
             "right": evenly(right, most),
             "wrong": wrong[:most].tolist(),
@@ -238,7 +228,7 @@ def _curves(folder: pathlib.Path, groupings: Sequence[GroupingResult]) -> list[D
 
 
 def query_results(subject: Subject, grouping: GroupingResult) -> Iterator[dict[str, Any]]:
-    """Yield what each query found under a grouping, in their order, as rows of results.csv.
+    """Yield what each query found under a grouping (of the first seed), as rows of results.csv.
 
     Files are named by their path in the set's folder, with control characters escaped.
     """
@@ -258,21 +248,6 @@ def query_results(subject: Subject, grouping: GroupingResult) -> Iterator[dict[s
             "similarity": round(float(neighbours.similarities[query, 0]), 6),
             "distance_m": None if metres is None else round(metres, 2),
         }
-
-
-def write_results(
-    path: pathlib.Path, subject: Subject, groupings: Sequence[GroupingResult]
-) -> None:
-    """Write results.csv: a row for every query under every grouping, of the first seed."""
-    rows = [row for grouping in groupings for row in query_results(subject, grouping)]
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, list(rows[0]))
-    writer.writeheader()
-    for row in rows:
-        # No cell is a spreadsheet's formula.
-        names = {name: no_formula(row[name]) for name in ("query", "first_retrieval")}
-        writer.writerow(row | names)
-    write_text(path, text.getvalue())
 
 
 def page_rows(subject: Subject, grouping: GroupingResult) -> list[list[Any]]:
@@ -334,14 +309,11 @@ def _map(folder: pathlib.Path, subject: Subject) -> Drawing | None:
     positions, outcomes = subject.positions, subject.outcomes
     if positions is None:
         return None
-    count = len(positions.database)
-    points = flattened(np.concatenate([positions.database, positions.queries]))
-    positions = positions._replace(database=points[:count], queries=points[count:])
     figure = position_map(positions, subject.neighbours.indices[:, 0], outcomes)
     right, wrong = ((outcomes == outcome).sum() for outcome in ("right", "wrong"))
     words = (
-        f"Map of {count} database images and {len(points) - count} queries, of which {right} are "
-        f"right and {wrong} wrong"
+        f"Map of {len(positions.database)} database images and {len(outcomes)} queries, of which "
+        f"{right} are right and {wrong} wrong"
     )
     return chart(figure, folder / "positions.png", words)
 
@@ -362,30 +334,27 @@ def _matrix(
 
 
 def _transport(
-    subject: Subject,
-    shown: Mapping[str, list[int]],
-    params: Crisalad,
-    config: ModelConfig,
-    each: int = 2,
+    subject: Subject, shown: Mapping[str, list[int]], model: Model
 ) -> Iterator[tuple[str, Drawing]]:
-    """Yield name and drawing of `each` wrong and right queries, with their first retrievals.
+    """Yield name and drawing of two wrong and two right queries, with their first retrievals.
 
     A model without a transport has none.
     """
-    if not config.aggregator.transports:
+    if not model.config.aggregator.transports:
         return
     benchmark, first = subject.benchmark, subject.neighbours.indices[:, 0]
-    pairs = {}
-    for query in shown["wrong"][:each] + shown["right"][:each] or shown["no positive"][:each]:
+
+    def transport(path: pathlib.Path) -> Transported:
+        bit_depth = model.config.preprocessing.bit_depth
+        return transport_of(read_image(path, bit_depth=bit_depth), model)
+
+    pairs = []
+    for query in shown["wrong"][:2] + shown["right"][:2] or shown["no positive"][:2]:
         word = "right" if subject.outcomes[query] == "right" else "wrong"
-        files = benchmark.queries[query], benchmark.database[first[query]]
-        # One by one, for their sizes may differ.
-        bit_depth = config.preprocessing.bit_depth
-        images = (read_image(path, bit_depth=bit_depth) for path in files)
-        transported = (transport_of(image, params, config) for image in images)
-        pairs[query] = dict(zip(("query", f"retrieved, {word}"), transported, strict=True))
-    among = [picture for pair in pairs.values() for picture in pair.values()]
-    for query, pair in pairs.items():
-        name = subject.name(benchmark.queries[query])
+        retrieved = transport(benchmark.database[first[query]])
+        pair = {"query": transport(benchmark.queries[query]), f"retrieved, {word}": retrieved}
+        pairs.append((subject.name(benchmark.queries[query]), pair))
+    among = [picture for _, pair in pairs for picture in pair.values()]
+    for name, pair in pairs:
         words = f"Dustbin and top clusters of each patch of {name} and of its first retrieval"
         yield name, illustration(draw_transport(pair, among, photographs=False), words)

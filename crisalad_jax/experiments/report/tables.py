@@ -1,13 +1,14 @@
 """Tables for the terminal, for Markdown and for a page, and files of text."""
 
-import os
+import csv
+import io
+import pathlib
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import rich.table
 from rich.text import Text
 
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path
 
 NOTHING = "-"
@@ -71,12 +72,7 @@ class RecallRow(NamedTuple):
 
 
 def recall_table(rows: Sequence[RecallRow], title: str = "") -> Table:
-    """Make a table of recalls in percent with one decimal, a line for each row.
-
-    Raises:
-        InputError: no rows, or a recall outside 0 to 1.
-    """
-    check_recalls("rows", {", ".join(row[:3]): row.recalls for row in rows})
+    """Make a table of recalls in percent with one decimal, a line for each row."""
     ks = sorted({k for row in rows for k in row.recalls})
     body = [
         [row.benchmark, row.model, row.grouping]
@@ -87,29 +83,23 @@ def recall_table(rows: Sequence[RecallRow], title: str = "") -> Table:
     return Table(headers, [list(map(Cell, cells)) for cells in body], labels=3, title=title)
 
 
-def check_recalls(what: str, curves: Mapping[str, Mapping[int, float]]) -> None:
-    """Check that there are curves of recalls, and that all are within 0 to 1.
-
-    Raises:
-        InputError: there are none, or one is outside 0 to 1.
-    """
-    wrong = [
-        f"{name}: {dict(recalls)}"
-        for name, recalls in curves.items()
-        if not recalls or not all(0 <= value <= 1 for value in recalls.values())
-    ]
-    if wrong or not curves:
-        raise InputError(
-            f"{what}: found {', '.join(wrong) or 'none'}, expected recalls as fractions, 0 to 1"
-        )
+def write_csv(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write a CSV file of rows with the same columns; None is an empty cell."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({name: _no_formula(value) for name, value in row.items()})
+    write_text(path, text.getvalue())
 
 
-def no_formula(text: str) -> str:
+def _no_formula(value: Any) -> Any:
     """Put a quote before a text that a spreadsheet would take for a formula."""
-    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
+    is_formula = isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r"))
+    return f"'{value}" if is_formula else value
 
 
-def write_text(path: str | os.PathLike[str], text: str) -> None:
+def write_text(path: pathlib.Path, text: str) -> None:
     """Write a file of UTF-8, whole or not at all; other bytes, as of names, become escapes."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")

@@ -18,8 +18,7 @@ from crisalad_jax.data.prepare import as_rgb
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.experiments.report.gallery import thumbnail
 from crisalad_jax.experiments.report.style import GREY, INK, Picture, new_figure
-from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, Model, check_params, transport_masses
+from crisalad_jax.nn.model import Model, check_params, transport_masses
 from crisalad_jax.retrieval.describe import prepare_image
 
 CLUSTER_COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
@@ -57,10 +56,9 @@ def show_transport(image: str | os.PathLike[str] | Pixels, model: Model) -> Pict
         >>> [axes.get_title(loc="left").split(",")[0] for axes in figure.axes[:3]]
         ['80 x 60 pixels', 'dustbin: 67 %', 'top clusters']
     """
-    params, config = model
-    check_params(params, config)
+    check_params(*model)
     pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
-    picture = transport_of(as_rgb(pixels, config.preprocessing.bit_depth), params, config)
+    picture = transport_of(as_rgb(pixels, model.config.preprocessing.bit_depth), model)
     return draw_transport({"": picture}, [picture], photographs=True)
 
 
@@ -90,17 +88,16 @@ class Transported(NamedTuple):
         return self.taken.argmax(axis=-1)
 
 
-def transport_of(image: Pixels, params: Crisalad, config: ModelConfig) -> Transported:
+def transport_of(image: Pixels, model: Model) -> Transported:
     """Compute the transport of a photograph, resized as the configuration says."""
+    params, config = model
     prepared = prepare_image(image, config)
     grid = config.backbone.grid((prepared.shape[0], prepared.shape[1]))
     (mass,) = np.asarray(transport_masses(params, prepared[None], config), np.float32)
     return Transported(image, mass.reshape(*grid, -1), config.token_shape.tokens)
 
 
-def strongest_clusters(
-    pictures: Sequence[Transported], most: int = len(CLUSTER_COLOURS)
-) -> dict[int, float]:
+def strongest_clusters(pictures: Sequence[Transported]) -> dict[int, float]:
     """Find the clusters that take most mass from the patches that they win.
 
     A cluster wins a patch if it takes more of it than any other does. Each cluster comes with that
@@ -111,7 +108,7 @@ def strongest_clusters(
     for picture in pictures:
         np.add.at(mass, picture.top, picture.taken.max(axis=-1))
     total = sum(picture.taken.sum() for picture in pictures)
-    order = np.argsort(-mass, kind="stable")[:most]
+    order = np.argsort(-mass, kind="stable")[: len(CLUSTER_COLOURS)]
     return {int(cluster): float(mass[cluster] / total) for cluster in order if mass[cluster] > 0}
 
 

@@ -289,7 +289,7 @@ def test_a_vocabulary_is_built_once_and_kept(shared, settings, tmp_path, monkeyp
     summary = run(config, out)
     assert built == [(24, 500, 0), (24, 500, 1)]
     assert summary.rows[0].trained == 0
-    params, model = load_weights(out / "anyloc" / "seed-1" / "start.safetensors")
+    params, model = load_weights(out / "anyloc" / "seed-1" / "run" / "last.safetensors")
     key, _ = jax.random.split(jax.random.key(1))
     fresh = init_crisalad(key, model)
     moved = jax.tree.map(lambda x: x + 1, fresh.aggregator)
@@ -405,7 +405,7 @@ def test_runs_are_shared_with_another_process(finished, config, monkeypatch):
             other.close()
 
         monkeypatch.setattr(runner.time, "sleep", ended)
-        runner.carry_out(config, finished, "stop", say=lines.append, quiet=True)
+        runner.carry_out(config, finished, say=lines.append, quiet=True)
     assert one == [1]
     assert lines[1:] == [
         "crisalad, seed 1: 0 of 2 runs done",
@@ -419,7 +419,7 @@ def test_the_run_of_a_killed_process_is_free(finished, config, monkeypatch):
     (folder / temporaries.LOCK).write_text(f"process 1 on {socket.gethostname()}\n")
     change(folder, ranks={})
     monkeypatch.delattr(runner, "fit")
-    runner.carry_out(config, finished, "stop", say=print, quiet=True)
+    runner.carry_out(config, finished, say=print, quiet=True)
     assert not (folder / temporaries.LOCK).exists()
 
 
@@ -432,25 +432,3 @@ def test_a_training_time_is_of_runs_with_a_device_of_their_own(finished, flags, 
     assert "of runs that had their device to themselves, at least two" in told
     row = row_of(finished)
     assert (row["training"], row["training_seconds"]) == (None, None)
-
-
-def test_the_time_left_is_told_by_runs_of_the_same_method():
-    """A slow method's seconds say nothing of a fast one."""
-
-    def fake(name, seed, seconds=None):
-        return types.SimpleNamespace(
-            variant=types.SimpleNamespace(run=name),
-            seed=seed,
-            is_done=seconds is not None,
-            read=lambda: types.SimpleNamespace(seconds=seconds),
-        )
-
-    slow, fast = [fake("slow", 0, 1200.0), fake("slow", 1, 2400.0)], [fake("fast", 0)]
-    left = [fake("slow", 2), fake("slow", 3)]
-    for runs, words in (
-        (fast, "0 of 1 runs done"),
-        ([*slow, *left], "2 of 4 runs done, about 60 min left"),
-        ([*slow, *left, *fast], "2 of 5 runs done, about 60 min left for 2 of the 3"),
-    ):
-        assert runner.progress_words(runs[-1], runs, 1).partition(": ")[2] == words
-    assert "about 30 min left" in runner.progress_words(left[0], [*slow, *left], 2)

@@ -1,7 +1,6 @@
 """Tables of hand-made results, to the letter."""
 
 import csv
-import io
 import json
 import types
 
@@ -76,8 +75,15 @@ def test_on_a_gpu_times_are_absolute_and_need_a_spread(images, speed):
     assert list(tables.costs_of(once).values()) == [*costs, "-"]
 
 
-def test_csv_has_a_line_for_each_number():
-    lines = list(csv.DictReader(io.StringIO(tables.comma_separated(SUMMARY))))
+def written(summary, folder):
+    """The lines of table.csv."""
+    tables.write_tables(summary, folder)
+    with (folder / "table.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_csv_has_a_line_for_each_number(tmp_path):
+    lines = written(SUMMARY, tmp_path)
     assert len(lines) == 3 * 3
     assert lines[0] == {
         **{"method": "First", "name": "first", "grouping": "single", "set": "town", "k": "1"},
@@ -92,10 +98,10 @@ def test_csv_has_a_line_for_each_number():
     assert lines[-1]["standard_deviation"] == lines[-1]["training"] == ""
 
 
-def test_a_row_that_changes_nothing_has_an_empty_cell_in_csv_and_a_hyphen_for_readers():
+def test_a_row_that_changes_nothing_has_an_empty_cell_in_csv_and_a_hyphen_for_readers(tmp_path):
     plain = row("first", "single", LONE, labels=("base", ""))
     summary = SUMMARY._replace(headers=("row", "changed"), rows=[plain])
-    lines = list(csv.DictReader(io.StringIO(tables.comma_separated(summary))))
+    lines = written(summary, tmp_path)
     assert [line["changed"] for line in lines] == ["", "", ""]
     assert not {"-", "'-", "\N{EM DASH}"} & {cell for line in lines for cell in line.values()}
     assert tables.markdown(summary).splitlines()[2].startswith("| base | - | 25.0")
@@ -186,8 +192,8 @@ def test_differences_in_markdown():
     ]
 
 
-def test_differences_in_csv_and_json():
-    lines = list(csv.DictReader(io.StringIO(tables.comma_separated(COMPARED))))
+def test_differences_in_csv_and_json(tmp_path):
+    lines = written(COMPARED, tmp_path)
     assert [line["verdict"] for line in lines] == [
         *("", "", ""),
         *("better", "not told apart", "worse"),

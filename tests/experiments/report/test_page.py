@@ -19,11 +19,11 @@ from crisalad_jax.evaluation.metrics import Interval, precision_recall
 from crisalad_jax.evaluation.results import GroupingResult, Scores
 from crisalad_jax.experiments.report import write_report
 from crisalad_jax.experiments.report.charts import outcomes_of
-from crisalad_jax.experiments.report.page import Subject, page_rows, write_results
+from crisalad_jax.experiments.report.page import Subject, page_rows, query_results
+from crisalad_jax.experiments.report.tables import write_csv
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import Crisalad
+from crisalad_jax.nn.model import Crisalad, Model
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL
 
 DASH = "\N{EN DASH}"
@@ -100,7 +100,7 @@ GROUPINGS = [
 def write(out, benchmark, groupings, params, config=MODEL, **options):
     settings = {"batch_size": 8, "seeds": 2, "same_place": "</pre><script>"}
     given = {"model_name": "a <b>model</b>", "settings": settings}
-    return write_report(out, benchmark, groupings, params=params, config=config, **given, **options)
+    return write_report(out, benchmark, groupings, model=Model(params, config), **given, **options)
 
 
 @pytest.fixture(scope="module")
@@ -234,14 +234,6 @@ def test_names_of_files_are_no_markup(
     assert [e["text"] for e in page.all("figcaption")][1].split() == ["✓", "1", "0.910"]
 
 
-def test_a_page_without_results(benchmark: Benchmark, params: Crisalad, tmp_path: pathlib.Path):
-    percent = [GroupingResult("single", {1: 33}, NEIGHBOURS)]
-    for groupings, found in (([], "none"), (percent, "single: .1: 33., expected")):
-        with pytest.raises(InputError, match=f"^groupings: found {found}"):
-            write(tmp_path / "out", small(benchmark), groupings, params)
-    assert not (tmp_path / "out").exists()
-
-
 def subject_of(benchmark, root, **changes):
     return Subject.of(dataclasses.replace(small(benchmark), root=root, **changes), NEIGHBOURS)
 
@@ -251,7 +243,8 @@ def test_a_row_for_every_query_and_grouping(benchmark, tmp_path: pathlib.Path):
     queries = tuple(tmp_path / name for name in ("=1+1.jpg", "a/b,\x1b.jpg", "@c.jpg"))
     database = tuple(tmp_path / "d" / f"{number}.jpg" for number in range(3))
     subject = subject_of(benchmark, tmp_path, queries=queries, database=database)
-    write_results(tmp_path / "results.csv", subject, GROUPINGS)
+    found = [row for grouping in GROUPINGS for row in query_results(subject, grouping)]
+    write_csv(tmp_path / "results.csv", found)
     with (tmp_path / "results.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [(row["grouping"], row["query"]) for row in rows] == [

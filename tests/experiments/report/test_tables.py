@@ -1,10 +1,8 @@
 """Tables by their numbers."""
 
-import pytest
 from rich.console import Console
 
 from crisalad_jax.experiments import report
-from crisalad_jax.utils.errors import InputError
 
 ROWS = [
     report.RecallRow("streets", "HOG", "single", {1: 0.405, 5: 0.6126}),
@@ -42,11 +40,3 @@ def test_terminal_table_has_the_same_numbers():
     ]
     rules = [number for number, line in enumerate(lines) if line.startswith("├")]
     assert rules == [6]  # between the two data sets, and nowhere else
-
-
-@pytest.mark.parametrize("value", [40.5, float("nan")])
-def test_tables_reject_what_is_no_recall(value):
-    with pytest.raises(InputError, match=r"^rows: found none"):
-        report.recall_table([])
-    with pytest.raises(InputError, match=rf"^rows: found a, HOG, single: .1: {value}., expected"):
-        report.recall_table([report.RecallRow("a", "HOG", "single", {1: value})])
