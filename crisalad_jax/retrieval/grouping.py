@@ -102,14 +102,12 @@ class Batches(NamedTuple):
     """Whether a place holds an image, and not padding."""
     kept: Bool[np.ndarray, "batch place"]
     """Whether a place's descriptor is kept; every image is kept in exactly one batch."""
-    mutual: bool
-    """Whether the images of a batch attend to each other, or each at itself alone."""
+    grouping: str
+    """Which of `GROUPINGS` this is: under "single" each image attends to itself alone."""
 
     def part(self, start: int, stop: int) -> "Batches":
         """Return batches `start` to `stop`."""
-        return Batches(
-            self.images[start:stop], self.filled[start:stop], self.kept[start:stop], self.mutual
-        )
+        return Batches(*(each[start:stop] for each in self[:3]), self.grouping)
 
     @property
     def attention_mask(self) -> Bool[np.ndarray, "batch place place"]:
@@ -117,7 +115,7 @@ class Batches(NamedTuple):
 
         Each attends to itself. None attends to padding.
         """
-        seen = self.filled & self.mutual
+        seen = self.filled & (self.grouping != "single")
         return seen[:, :, None] & seen[:, None, :] | np.eye(self.images.shape[1], dtype=bool)
 
 
@@ -141,7 +139,7 @@ def batches_of(count: int, grouping: str, batch_size: int, seed: int = 0) -> Bat
         filled = images >= 0
         keep = np.zeros_like(filled)
         keep[:, -1] = True
-        return Batches(np.where(filled, images, order[:, None]), filled, keep, mutual=True)
+        return Batches(np.where(filled, images, order[:, None]), filled, keep, grouping)
     if grouping == "shuffled":
         order = np.random.default_rng(seed).permutation(count)
     starts = np.arange(0, count, batch_size)
@@ -151,4 +149,4 @@ def batches_of(count: int, grouping: str, batch_size: int, seed: int = 0) -> Bat
     wrapped = (
         starts[:, None] + np.arange(batch_size) % np.minimum(count - starts, batch_size)[:, None]
     )
-    return Batches(order[wrapped], filled, filled, mutual=grouping != "single")
+    return Batches(order[wrapped], filled, filled, grouping)

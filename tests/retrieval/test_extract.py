@@ -70,7 +70,7 @@ def test_components_in_memory(params, town, expected, tmp_path):
     np.testing.assert_array_equal(found.descriptors, fitted.apply(expected))
     assert json.loads((tmp_path / "d.npy.json").read_text())["pca"] == "3 components"
     loose = fit_pca(expected, 3, PcaConfig(renormalise=False))
-    with pytest.raises(InputError, match="--pairs: found components that leave lengths"):
+    with pytest.raises(InputError, match="--pairs: found descriptors whose lengths are left"):
         run(params, town, pca=loose, pairs=tmp_path / "pairs.txt")
 
 

@@ -77,7 +77,7 @@ def write_report(
         params: the model's, for the section on its transport; a model without one has none.
         config: the model's.
         model_name: which weights.
-        settings: what `evaluation_settings` returns, shown folded.
+        settings: those of an `evaluation_record`, shown folded.
         similarities: what `similarity.similarity_map` gives of the first grouping.
 
     Raises:

@@ -11,7 +11,7 @@ from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.data.sources import ImageSource, check_rate_used, open_source
+from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
 from crisalad_jax.retrieval.describer import Describer, describer_of
@@ -213,8 +213,7 @@ def index(
     part = None if share is None else Share.parse(share)
     out = pathlib.Path(out)
     metadata = read_metadata(out)
-    source = open_source(images, fps=fps, on_bad_image=reading.on_bad_image)
-    check_rate_used(fps, source.paths)
+    (source,) = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
     table = source.positions if positions is None else positions
     if table is None:
         known = utm_positions(source.names)
