@@ -13,7 +13,7 @@ import numpy as np
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.checks import check_count, check_seed, choose
+from crisalad_jax.config.checks import check_count, check_seed, choose, require
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import check_lines, read_pixels
@@ -261,11 +261,11 @@ def check_extraction(
         raise InputError("--database: found without --pairs, expected both")
     if share is not None:
         Share.parse(share)
-        if grouping != "single" or out is None:
-            found = f"grouping {grouping}" if out is not None else "no file to write"
-            raise InputError(
-                f"share: found {found}, expected images of grouping single, into a file"
-            )
+        found = f"grouping {grouping}" if out is not None else "no file to write"
+        require(
+            grouping == "single" and out is not None,
+            f"share: found {found}, expected images of grouping single, into a file",
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -303,7 +303,7 @@ def test_recalls_are_those_of_a_flat_faiss_index_on_the_same_descriptors(params,
     benchmark = open_benchmark(town)
     assert len(benchmark.database) == 15
     database, queries = (
-        grouped(params, tokens_of(params, paths).descriptors, "single")
+        grouped(params, tokens_of(params, paths).rows, "single")
         for paths in (benchmark.database, benchmark.queries)
     )
     index = faiss.IndexFlatL2(database.shape[1])

@@ -14,7 +14,7 @@ from crisalad_jax.checkpoints.runtime import read_header
 from crisalad_jax.checkpoints.starter import FILES, recorded, resolved
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.maps.store import check_store, store_name
-from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened_length
+from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.output import warn
@@ -90,7 +90,7 @@ def new_metadata(
     """
     check_store(store, dtype)
     config = describer.config
-    length = shortened_length(pca, config, str(weights), unit=True)
+    length, _ = shortened(pca, config, str(weights), unit=True)
     return MapMetadata(
         model=describer.digest,
         weights=recorded(weights),
