@@ -192,12 +192,14 @@ def answer_lines(answers: Answers) -> Iterator[str]:
     Numbers stand in columns, and names at the ends of lines: a name that a terminal has no room for
     runs on in its next line, and is copied whole.
     """
+    found = list(json_rows(answers))
     position = ", ".join(answers.axes or ("position",))
-    columns = ["rank", "similarity", "probability", position, "name"]
+    if "zone" in found[0]:
+        position += f" (zone {found[0]['zone']})"
+    numbers = ["similarity"] if answers.probabilities is None else ["similarity", "probability"]
     queries: list[str | None] = [None]
-    rows = [columns]
-    for row in json_rows(answers):
-        columns[3] = f"{position} (zone {row['zone']})" if "zone" in row else position
+    rows = [["rank", *numbers, position, "name"]]
+    for row in found:
         known = row.get("known", True)
         for answer in row["neighbours"] if known else row["neighbours"][:1]:
             at = answer["position"] if known else None
@@ -205,15 +207,11 @@ def answer_lines(answers: Answers) -> Iterator[str]:
             rows.append(
                 [
                     str(answer["rank"]) if known else "-",
-                    f"{answer['similarity']:.3f}",
-                    f"{answer.get('probability', 0):.3f}",
+                    *(f"{answer[name]:.3f}" for name in numbers),
                     "-" if at is None else ", ".join(f"{value:.9g}" for value in at.values()),
                     answer["name"] if known else "unknown",
                 ]
             )
-    if answers.probabilities is None:
-        for cells in rows:
-            del cells[2]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:-1]
     for name, cells in zip(queries, rows, strict=True):
         if name is not None:

@@ -357,10 +357,10 @@ class _Work:
     def _digest(self) -> str:
         """Compute a digest of the settings, and of the names, sizes and times of the files."""
         files = []
-        for path in self.paths:
+        for path, name in zip(self.paths, self.names, strict=True):
             with contextlib.suppress(OSError):  # reported when it is read
                 there = file_of(path).stat()
-                files.append(f"{os.fspath(path)} {there.st_size} {there.st_mtime_ns}")
+                files.append(f"{name} {path} {there.st_size} {there.st_mtime_ns}")
         return digest_of(files, self.settings())
 
     def _check(self, rows: np.ndarray, numbers: np.ndarray) -> None:
