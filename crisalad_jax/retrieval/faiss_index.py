@@ -202,11 +202,11 @@ def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
     """
     path = pathlib.Path(path)
     check_source(path, "a faiss index")
+    if verify and path.stat().st_size:  # no file is mapped without bytes
+        _check_appended(path)
     try:
-        if verify:
-            _check_appended(path)
         index = faiss.read_index(str(path))
-    except (RuntimeError, MemoryError, ValueError) as error:
+    except (RuntimeError, MemoryError) as error:
         raise InputError(f"{path}: not a whole faiss index: {one_line(error)}") from error
     kinds: dict[type, Kind] = {faiss.IndexHNSWFlat: "hnsw", faiss.IndexIVFPQ: "ivf-pq"}
     if type(index) not in kinds or index.metric_type != faiss.METRIC_INNER_PRODUCT:
@@ -240,7 +240,6 @@ def _check_appended(path: pathlib.Path) -> None:
     """Check the digest that `save_index` appended; a note tells of a file without one.
 
     Raises:
-        ValueError: the file is empty.
         InputError: the file has other bytes than the line says.
     """
     data = np.memmap(path, np.uint8, "r")
