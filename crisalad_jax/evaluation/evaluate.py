@@ -131,7 +131,8 @@ def evaluate(
             drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
             name = str(grouping) if config.cross_image.layers else ANY
             observer = observe and functools.partial(observe, name)
-            rankings, shares = _rank(sides, grouping, drawn, k, observer, is_unit=is_unit)
+            ranked = _rank(sides, grouping, drawn, k, observer, is_unit=is_unit)
+            rankings, (database_share, query_share) = ranked
             for label, stage in stages.items():
                 result = summarise(
                     name,
@@ -140,8 +141,8 @@ def evaluate(
                     KS,
                     is_random=is_random,
                     precision=precision,
-                    query_share=shares[1],
-                    database_share=shares[0],
+                    query_share=query_share,
+                    database_share=database_share,
                     rerank=label,
                     skipped=skipped,
                 )
