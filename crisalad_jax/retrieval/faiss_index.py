@@ -246,5 +246,8 @@ def _check_appended(path: pathlib.Path) -> None:
     line = data[-_APPENDED_SIZE:].tobytes()
     if not line.startswith(_APPENDED):
         tell_unchecked(path)
-    elif line[len(_APPENDED) : -1].decode() != hashlib.sha256(data[:-_APPENDED_SIZE]).hexdigest():
+    elif (
+        line[len(_APPENDED) : -1].decode()
+        != hashlib.sha256(data[:-_APPENDED_SIZE].data).hexdigest()
+    ):
         raise ChangedFileError(path)

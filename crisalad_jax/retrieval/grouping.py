@@ -107,7 +107,8 @@ class Batches(NamedTuple):
 
     def part(self, start: int, stop: int) -> "Batches":
         """Return batches `start` to `stop`."""
-        return Batches(*(each[start:stop] for each in self[:3]), self.grouping)
+        images, filled, kept = (each[start:stop] for each in self[:3])
+        return Batches(images, filled, kept, self.grouping)
 
     @property
     def attention_mask(self) -> Bool[np.ndarray, "batch place place"]:
