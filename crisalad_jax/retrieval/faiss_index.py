@@ -246,8 +246,7 @@ def _check_appended(path: pathlib.Path) -> None:
     line = data[-_APPENDED_SIZE:].tobytes()
     if not line.startswith(_APPENDED):
         tell_unchecked(path)
-    elif (
-        line[len(_APPENDED) : -1].decode()
-        != hashlib.sha256(data[:-_APPENDED_SIZE].data).hexdigest()
-    ):
+        return
+    digest = hashlib.sha256(data[:-_APPENDED_SIZE].data).hexdigest()
+    if line != _APPENDED + digest.encode() + b"\n":
         raise ChangedFileError(path)
