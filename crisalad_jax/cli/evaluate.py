@@ -5,6 +5,7 @@ import dataclasses
 import pathlib
 from typing import Annotated
 
+from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
     echo,
@@ -157,6 +158,6 @@ def _reranking(arguments: Evaluate) -> Reranking | None:
         return None
     rerank = parse_reranking(arguments.rerank)
     if arguments.rerank_weights is not None:
-        model = load_weights(arguments.rerank_weights, **pick(arguments, "verify", "quiet"))
-        rerank = dataclasses.replace(rerank, model=model)
+        file = find_weights(arguments.rerank_weights, quiet=arguments.quiet)
+        rerank = dataclasses.replace(rerank, model=load_weights(file, verify=arguments.verify))
     return rerank
