@@ -28,10 +28,9 @@ from crisalad_jax.utils.shapes import Float, Int
 
 faiss: Any = _faiss  # its classes are made when it is loaded
 Kind = Literal["hnsw", "ivf-pq"]
-KINDS = {
-    "hnsw": "a graph over the descriptors as they are: nearly exact, and as large as they are",
-    "ivf-pq": "lists of codes of at most 128 bytes each: small, and less exact",
-}
+KINDS: dict[Kind, type] = {"hnsw": faiss.IndexHNSWFlat, "ivf-pq": faiss.IndexIVFPQ}
+"""A graph over the descriptors as they are, nearly exact and as large as they are; or lists of
+codes of at most 128 bytes each, small and less exact."""
 _LINKS = 32
 """Number of links of a vector in each layer of the graph; twice as many in the lowest. Faiss
 recommends 4 to 64 and the paper 5 to 48, with more for longer vectors."""
@@ -208,13 +207,13 @@ def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
         index = faiss.read_index(str(path))
     except (RuntimeError, MemoryError) as error:
         raise InputError(f"{path}: not a whole faiss index: {one_line(error)}") from error
-    kinds: dict[type, Kind] = {faiss.IndexHNSWFlat: "hnsw", faiss.IndexIVFPQ: "ivf-pq"}
-    if type(index) not in kinds or index.metric_type != faiss.METRIC_INNER_PRODUCT:
+    kind = next((name for name, each in KINDS.items() if type(index) is each), None)
+    if kind is None or index.metric_type != faiss.METRIC_INNER_PRODUCT:
         raise InputError(
             f"{path}: found a {type(index).__name__}, expected one of inner products, as `build` "
             "makes it"
         )
-    return Index(kinds[type(index)], index)
+    return Index(kind, index)
 
 
 def recall_against_exact(found: Int[np.ndarray, "q k"], exact: Int[np.ndarray, "q k"]) -> float:

@@ -38,15 +38,6 @@ class Grouping:
     queries: str
     database: str
 
-    def __post_init__(self) -> None:
-        """Check both sides' groupings.
-
-        Raises:
-            InputError: a grouping is unknown.
-        """
-        for kind in (self.queries, self.database):
-            choose("grouping", kind, GROUPINGS)
-
     @classmethod
     def parse(cls, text: str) -> "Grouping":
         """Read "window/single", queries and database apart, or "single" for both alike.
@@ -59,6 +50,8 @@ class Grouping:
             raise InputError(
                 f"grouping: found {text!r}, expected one for both sides, or QUERIES/DATABASE"
             )
+        for kind in kinds:
+            choose("grouping", kind, GROUPINGS)
         return cls(kinds[0], kinds[-1])
 
     def __str__(self) -> str:
