@@ -2,15 +2,35 @@
 
 import collections
 import datetime
-import itertools
 import pathlib
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from crisalad_jax.data.video import Moment, moment_of
 
 if TYPE_CHECKING:
     from crisalad_jax.retrieval.maps.map import Map, MapImage
+
+
+class MapAddition(NamedTuple):
+    """Images that were appended to a map from one folder on one day."""
+
+    day: str | None
+    """The day, as YYYY-MM-DD in UTC; None where its record says none."""
+    root: str
+    """The folder that their names are relative to."""
+    images: int
+
+
+def with_addition(
+    additions: list[MapAddition], added: str | None, root: str, images: int
+) -> list[MapAddition]:
+    """Return additions with one more, which counts to the last if that is of its day and root."""
+    day = added and added[:10]
+    if additions and additions[-1][:2] == (day, root):
+        *additions, last = additions
+        images += last.images
+    return [*additions, MapAddition(day, root, images)]
 
 
 def contents(places: "Map") -> dict[str, Any]:
@@ -19,8 +39,7 @@ def contents(places: "Map") -> dict[str, Any]:
     Returns:
         `folders`: each folder below a root, or video, with its number of images and, where all of
         their names say times, the first and the last (in seconds of a video, else in UTC);
-        `additions`: the numbers of images that were appended one after the other on a day, in UTC,
-        from one root; `extent`: the smallest and largest of each axis of the positions, or None.
+        `additions`; `extent`: the smallest and the largest of each axis of the positions, or None.
     """
     folders: dict[str, list[Moment | None]] = collections.defaultdict(list)
     for image in places.images:
@@ -32,16 +51,9 @@ def contents(places: "Map") -> dict[str, Any]:
             {"folder": name, "images": len(moments), **_times(moments)}
             for name, moments in folders.items()
         ],
-        "additions": [
-            {"day": day, "root": root, "images": sum(len(each["names"]) for each in records)}
-            for (day, root), records in itertools.groupby(places.records, _day_and_root)
-        ],
+        "additions": [each._asdict() for each in places.additions],
         "extent": _extent(places.images, places.axes),
     }
-
-
-def _day_and_root(record: Mapping[str, Any]) -> tuple[str | None, str]:
-    return record["added"] and record["added"][:10], record["root"]
 
 
 def _times(moments: Sequence[Moment | None]) -> dict[str, float | str]:

@@ -36,7 +36,7 @@ from crisalad_jax.retrieval.maps.approximate import (
     stale_kind,
 )
 from crisalad_jax.retrieval.maps.calibration import Calibration, read_calibration
-from crisalad_jax.retrieval.maps.contents import contents
+from crisalad_jax.retrieval.maps.contents import MapAddition, contents, with_addition
 from crisalad_jax.retrieval.maps.metadata import (
     COMPONENTS,
     METADATA,
@@ -125,6 +125,8 @@ class Map:
         """The contents of map.json."""
         self.images: list[MapImage] = []
         """The images by number."""
+        self.additions: list[MapAddition] = []
+        """What was appended, in order: from which folder, on which day, and how many images."""
         self.axes: tuple[str, str] | None = None
         """Axes of the positions, see `positions.AXES`; None where no image has a position."""
         self.zone: Zone | None = None
@@ -233,11 +235,6 @@ class Map:
         """
         return model_config(self.metadata, self.folder)
 
-    @property
-    def records(self) -> Sequence[Mapping[str, Any]]:
-        """What was appended, in order: `root`, `added` (the time), `names` and more, see docs."""
-        return self._segments.records
-
     def image(self, name: str) -> MapImage | None:
         """Return what the map knows of the image of this name; None if it has none."""
         number = self._numbers.get(name)
@@ -265,6 +262,7 @@ class Map:
         self._numbers |= {image.name: i for i, image in enumerate(images, len(self))}
         self.images += images
         self.axes, self.zone = self.axes or axes, self.zone or zone
+        self.additions = with_addition(self.additions, added, root, len(images))
 
     def search(self, queries: Queries, k: int, *, exact: bool = False) -> Neighbours:
         """Find the k most similar images of each query, best first; all where there are fewer.

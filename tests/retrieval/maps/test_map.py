@@ -20,7 +20,6 @@ from crisalad_jax.data.positions import Positions, utm_positions
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.maps.build import _append_share
-from crisalad_jax.retrieval.maps.contents import contents
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import check_model, new_metadata, read_metadata
 from crisalad_jax.retrieval.segments import write_record
@@ -96,16 +95,16 @@ def test_a_map_lists_its_folders_additions_and_extent(tmp_path, monkeypatch):
             first = len(target)
             where = utm_positions(new)
             target.append(new, [1] * len(new), rows(first, len(new)), root=root, positions=where)
-        grown = contents(target)
+        grown = target.additions
     with Map.open(tmp_path / "map") as found:
+        assert found.additions == grown
+        assert grown == [
+            ("2025-06-11", "/days", 2),
+            ("2025-06-12", "/days", 3),
+            ("2025-06-12", "/videos", 2),
+            ("2025-06-13", "/videos", 2),
+        ]
         summary = found.summary()
-    assert grown["additions"] == summary["additions"]
-    assert [tuple(each.values()) for each in grown["additions"]] == [
-        ("2025-06-11", "/days", 2),
-        ("2025-06-12", "/days", 3),
-        ("2025-06-12", "/videos", 2),
-        ("2025-06-13", "/videos", 2),
-    ]
     utc = ("2014-12-12T10:56:38Z", "2014-12-12T10:57:41Z")
     assert summary["folders"] == [
         {"folder": "monday", "images": 2, "first": utc[0], "last": utc[1]},
