@@ -69,17 +69,16 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, JsonFlag):
 
 def run(arguments: Evaluate) -> None:
     """Evaluate the model, print the table, and write the files that are asked for."""
-    groupings, weights = arguments.grouping.split(","), None
+    groupings = arguments.grouping.split(",")
     drawn = pick(arguments, "seed", "seeds", "precision")
     check_evaluation(groupings, **drawn)
     _check_flags(arguments)
     rerank = _reranking(arguments)
     benchmark = open_set(arguments)
     if arguments.preset is not None:
-        model, name = _untrained(arguments.preset, arguments)
+        model, name, file = _untrained(arguments.preset, arguments)
     else:
         model, name, file = open_flagged(arguments, groupings=groupings)
-        weights = arguments.weights or file
     config = model.config
     pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
     echo(name)
@@ -95,10 +94,10 @@ def run(arguments: Evaluate) -> None:
         reading=arguments.reading,
         **drawn,
     )
-    asked = pick(arguments, "batch_size", "seed", "seeds", "pca", "rerank", "rerank_weights")
-    record = evaluation_record(
-        results, benchmark, config, model_name=name, weights=weights, **asked
+    asked = {"weights": arguments.weights or file} | pick(
+        arguments, "batch_size", "seed", "seeds", "pca", "rerank", "rerank_weights"
     )
+    record = evaluation_record(results, benchmark, config, model_name=name, **asked)
     show(grouping_table(results))
     if points := {each.label: each.operating_point for each in results if each.operating_point}:
         show(points_table(points))
@@ -139,7 +138,7 @@ def _check_flags(arguments: Evaluate) -> None:
     refuse_without("--rerank", arguments.rerank, rerank_weights=arguments.rerank_weights)
 
 
-def _untrained(preset: str, arguments: Evaluate) -> tuple[Model, str]:
+def _untrained(preset: str, arguments: Evaluate) -> tuple[Model, str, None]:
     """Make an untrained model of a preset."""
     import jax
 
@@ -149,7 +148,7 @@ def _untrained(preset: str, arguments: Evaluate) -> tuple[Model, str]:
     config = recipe(preset).model
     params = init_crisalad(jax.random.key(arguments.seed), config)
     model = Model(params, arguments.applied_to(config))
-    return model, f"untrained {preset}, seed {arguments.seed}"
+    return model, f"untrained {preset}, seed {arguments.seed}", None
 
 
 def _reranking(arguments: Evaluate) -> Reranking | None:
