@@ -28,7 +28,7 @@ from crisalad_jax.utils.shapes import Float, Int
 
 faiss: Any = _faiss  # its classes are made when it is loaded
 Kind = Literal["hnsw", "ivf-pq"]
-KINDS: dict[Kind, type] = {"hnsw": faiss.IndexHNSWFlat, "ivf-pq": faiss.IndexIVFPQ}
+KINDS: dict[str, type] = {"hnsw": faiss.IndexHNSWFlat, "ivf-pq": faiss.IndexIVFPQ}
 """A graph over the descriptors as they are, nearly exact and as large as they are; or lists of
 codes of at most 128 bytes each, small and less exact."""
 _LINKS = 32
@@ -207,7 +207,7 @@ def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
         index = faiss.read_index(str(path))
     except (RuntimeError, MemoryError) as error:
         raise InputError(f"{path}: not a whole faiss index: {one_line(error)}") from error
-    kind = next((name for name, each in KINDS.items() if type(index) is each), None)
+    kind: Any = next((name for name, each in KINDS.items() if type(index) is each), None)
     if kind is None or index.metric_type != faiss.METRIC_INNER_PRODUCT:
         raise InputError(
             f"{path}: found a {type(index).__name__}, expected one of inner products, as `build` "
