@@ -34,7 +34,7 @@ from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, Model, parameter_shapes
-from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.retrieval.describe import TokenSet
 from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.loop import fit
@@ -274,5 +274,5 @@ def read_options(options: dict[str, Any]) -> dict[str, Any]:
 def describe_single(model: Model, paths: Sequence[pathlib.Path]) -> np.ndarray:
     """Describe images independently, by tokens and their grouping, in batches of `BATCH`."""
     describer = describer_of(model)
-    rows = read_tokens(describer, paths, Reading(batch_size=BATCH, quiet=True)).descriptors
-    return group(describer, rows, len(paths), "single", batch_size=BATCH)
+    tokens = TokenSet(describer, paths, Reading(batch_size=BATCH, quiet=True))
+    return tokens.describe("single")[0]

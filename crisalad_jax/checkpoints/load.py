@@ -2,14 +2,19 @@
 
 import os
 import pathlib
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.config.checks import PATH, takes
+from crisalad_jax.config.io import to_plain
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 
 if TYPE_CHECKING:
+    from crisalad_jax.checkpoints.engines import EngineName
+    from crisalad_jax.checkpoints.runtime import Runtime
+    from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.model import Model
 
 
@@ -46,7 +51,9 @@ def load(path: str | os.PathLike[str], *, verify: bool = True, quiet: bool = Fal
     return read_checkpoint(find_weights(path, quiet=quiet), verify=verify).model
 
 
-def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False) -> pathlib.Path:
+def find_weights(
+    weights: str | os.PathLike[str] | None, *, engine: str = "jax", quiet: bool = False
+) -> pathlib.Path:
     """Return the file that is meant by a path, or by the name of a published model.
 
     None is the small model in this package, with a note; it has a name, too, "starter". Another
@@ -56,6 +63,7 @@ def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False)
 
     Args:
         weights: a path, or a name of `crisalad models`, or None.
+        engine: any but "jax" takes a folder too, of an exported model.
         quiet: no progress bar.
 
     Returns:
@@ -80,7 +88,7 @@ def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False)
         return starter.FILE
     path = pathlib.Path(weights)
     name = os.fspath(weights)
-    if path.suffix and os.path.isfile(path):
+    if (path.suffix and os.path.isfile(path)) or (engine != "jax" and path.is_dir()):
         return path
     # Imported here: a file needs no table of published models.
     from crisalad_jax.checkpoints.published import PUBLISHED, nearest_names
@@ -107,3 +115,62 @@ def find_weights(weights: str | os.PathLike[str] | None, *, quiet: bool = False)
             f"two (`crisalad models` lists them{near})"
         )
     return path
+
+
+class OpenedModel(NamedTuple):
+    """A model by its file or name, in JAX or another engine."""
+
+    model: "Model | Runtime"
+    name: str
+    """Its name for tables and titles."""
+    file: pathlib.Path
+    """The file, or for other engines the exported folder."""
+
+
+def open_model(
+    weights: str | os.PathLike[str] | None,
+    engine: "EngineName | Literal['jax']",
+    changed: "Callable[[ModelConfig], ModelConfig]",
+    *,
+    groupings: Sequence[str] = ("single",),
+    verify: bool = True,
+    quiet: bool = False,
+) -> OpenedModel:
+    """Load a model of this package's for JAX, or open it in another engine.
+
+    Args:
+        weights: a path or a name, as `find_weights` takes it; or for another engine an exported
+            folder.
+        engine: "jax", "onnxruntime" or "openvino".
+        changed: returns the configuration to describe images with, given the model's.
+        groupings: the groupings that images will be described in.
+        verify: whether to compare files with their checksums.
+        quiet: no progress of a download.
+
+    Raises:
+        InputError: what `find_weights`, `load_weights` and `open_runtime` raise, or `changed`; or
+            a model of float64 for another engine.
+    """
+    file = find_weights(weights, engine=engine, quiet=quiet)
+    short = f"{file.parent.name}/{file.name}" if file.parent.name else file.name
+    name = starter.named(file) if file in starter.FILES.values() else short
+    # Imported here: an engine's model is opened without JAX, and JAX's without an engine.
+    if engine == "jax":
+        from crisalad_jax.checkpoints.weights import read_weights
+
+        model = read_weights(file, verify=verify).model
+        return OpenedModel(model._replace(config=changed(model.config)), name, file)
+    from crisalad_jax.checkpoints.runtime import open_runtime, read_model
+
+    config = changed(read_model(file))
+    if config.compute_dtype == "float64":
+        raise InputError(f"--runtime: found {engine} with a model of float64, expected jax")
+    attends = bool(config.cross_image.layers)
+    model = open_runtime(
+        file,
+        engine,
+        to_plain(config),
+        any_grouping=attends and set("/".join(groupings).split("/")) != {"single"},
+        verify=verify,
+    )
+    return OpenedModel(model, f"{name}, {engine}", file)

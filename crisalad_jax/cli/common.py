@@ -5,22 +5,19 @@ import json
 import pathlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 import rich.console
 import rich.table
 
-from crisalad_jax.checkpoints import starter
-from crisalad_jax.checkpoints.load import find_weights
+from crisalad_jax.checkpoints.load import OpenedModel, find_weights, open_model
 from crisalad_jax.cli.flags import ModelFlags, RuntimeName, SetFlags, SizeFlags, Target
-from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_format, write_json
 from crisalad_jax.utils.output import printable
 
 if TYPE_CHECKING:  # commands that load no model of a file start without these
-    from crisalad_jax.checkpoints.runtime import Runtime
     from crisalad_jax.data.benchmarks import Benchmark
     from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.model import Model
@@ -154,11 +151,9 @@ def find_given(
 ) -> pathlib.Path | None:
     """Return the file that an optional flag means, as `find_weights` does; None where not given.
 
-    For another runtime a folder is an exported model: no name to look up, which would import JAX.
+    For another runtime a folder is an exported model.
     """
-    if weights is None or (runtime != "jax" and weights.is_dir()):
-        return weights
-    return find_weights(weights, quiet=quiet)
+    return None if weights is None else find_weights(weights, engine=runtime, quiet=quiet)
 
 
 def open_set(flags: Any) -> "Benchmark":
@@ -190,24 +185,14 @@ def load_model(weights: pathlib.Path, flags: SizeFlags, *, quiet: bool = False) 
     return model._replace(config=flags.applied_to(model.config))
 
 
-class OpenedModel(NamedTuple):
-    """A model as the flags of a command name it."""
-
-    model: "Model | Runtime"
-    name: str
-    """Its name for tables and titles."""
-    file: pathlib.Path
-    """The file, or for other engines the exported folder."""
-
-
-def open_model(
+def open_flagged(
     flags: ModelFlags,
     weights: pathlib.Path | None = None,
     *,
     groupings: Sequence[str] = ("single",),
     like: "ModelConfig | None" = None,
 ) -> OpenedModel:
-    """Load the model of --weights for JAX, or open it in the engine of --runtime.
+    """Open the model of --weights in the engine of --runtime.
 
     Args:
         flags: which model, and how it describes images.
@@ -216,35 +201,14 @@ def open_model(
         like: configuration of a map, whose image size and types the flags then change.
 
     Raises:
-        InputError: what `find_weights`, `load_weights`, `ModelConfig.resized` and `open_runtime`
-            raise.
+        InputError: what `open_model` and `ModelConfig.resized` raise.
     """
-
-    def changed(config: "ModelConfig") -> "ModelConfig":
-        return flags.applied_to(
-            config if like is None else with_non_semantic_fields_of(like, config)
-        )
-
-    given = weights or flags.weights
-    file = find_given(given, runtime=flags.runtime, quiet=flags.quiet) or find_weights(None)
-    short = f"{file.parent.name}/{file.name}" if file.parent.name else file.name
-    name = starter.named(file) if file in starter.FILES.values() else short
-    if flags.runtime == "jax":
-        from crisalad_jax.checkpoints.weights import load_weights
-
-        model = load_weights(file, verify=flags.verify)
-        return OpenedModel(model._replace(config=changed(model.config)), name, file)
-    from crisalad_jax.checkpoints.runtime import open_runtime, read_model
-
-    config = changed(read_model(file))
-    if config.compute_dtype == "float64":
-        raise InputError(f"--runtime: found {flags.runtime} with a model of float64, expected jax")
-    attends = bool(config.cross_image.layers)
-    model = open_runtime(
-        file,
+    return open_model(
+        weights or flags.weights,
         flags.runtime,
-        to_plain(config),
-        any_grouping=attends and set("/".join(groupings).split("/")) != {"single"},
-        verify=flags.verify,
+        lambda config: flags.applied_to(
+            config if like is None else with_non_semantic_fields_of(like, config)
+        ),
+        groupings=groupings,
+        **pick(flags, "verify", "quiet"),
     )
-    return OpenedModel(model, f"{name}, {flags.runtime}", file)

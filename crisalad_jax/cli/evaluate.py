@@ -10,7 +10,7 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
     echo,
     emit_json,
-    open_model,
+    open_flagged,
     open_set,
     pick,
     refuse_with,
@@ -20,7 +20,7 @@ from crisalad_jax.cli.common import (
 from crisalad_jax.cli.flags import FOLDER, JsonFlag, ModelFlags, ReadFlags, SetFlags
 from crisalad_jax.cli.tables import grouping_table, points_table
 from crisalad_jax.evaluation.evaluate import check_evaluation, evaluate
-from crisalad_jax.evaluation.record import evaluation_settings, results_json, table_notes
+from crisalad_jax.evaluation.record import evaluation_record
 from crisalad_jax.evaluation.similarity import FirstSimilarities
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.grouping import DEFAULT_GROUPINGS
@@ -69,16 +69,16 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, JsonFlag):
 
 def run(arguments: Evaluate) -> None:
     """Evaluate the model, print the table, and write the files that are asked for."""
-    groupings, weights, reading = arguments.grouping.split(","), None, arguments.reading
-    check_evaluation(groupings, **pick(arguments, "seed", "seeds", "precision"))
+    groupings = arguments.grouping.split(",")
+    drawn = pick(arguments, "seed", "seeds", "precision")
+    check_evaluation(groupings, **drawn)
     _check_flags(arguments)
     rerank = _reranking(arguments)
     benchmark = open_set(arguments)
     if arguments.preset is not None:
-        model, name = _untrained(arguments.preset, arguments)
+        model, name, file = _untrained(arguments.preset, arguments)
     else:
-        model, name, file = open_model(arguments, groupings=groupings)
-        weights = arguments.weights or file
+        model, name, file = open_flagged(arguments, groupings=groupings)
     config = model.config
     pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
     echo(name)
@@ -91,19 +91,17 @@ def run(arguments: Evaluate) -> None:
         pca=pca,
         observe=None if arguments.report is None else similarities,
         rerank=rerank,
-        reading=reading,
-        **pick(arguments, "seed", "seeds", "precision"),
+        reading=arguments.reading,
+        **drawn,
     )
-    settings = evaluation_settings(
-        benchmark,
-        config,
-        weights=weights,
-        **pick(arguments, "batch_size", "seed", "seeds", "pca", "rerank", "rerank_weights"),
+    asked = {"weights": arguments.weights or file} | pick(
+        arguments, "batch_size", "seed", "seeds", "pca", "rerank", "rerank_weights"
     )
+    record = evaluation_record(results, benchmark, config, model_name=name, **asked)
     show(grouping_table(results))
     if points := {each.label: each.operating_point for each in results if each.operating_point}:
         show(points_table(points))
-    for note in table_notes(results, settings):
+    for note in record.notes:
         echo(note)
     readable = results[0].skipped.rest_of(benchmark)
     with contextlib.ExitStack() as staged:  # so that all files appear, or none
@@ -112,7 +110,7 @@ def run(arguments: Evaluate) -> None:
 
             folder = staged.enter_context(staged_folder(arguments.out))
             write_galleries(folder, readable, results, model_name=name)
-            write_json(folder / "config.json", settings)
+            write_json(folder / "config.json", record.settings)
         if arguments.report is not None and isinstance(model, Model):
             from crisalad_jax.experiments.report import write_report
 
@@ -122,11 +120,10 @@ def run(arguments: Evaluate) -> None:
                 results,
                 model=model,
                 model_name=name,
-                settings=settings,
+                settings=record.settings,
                 similarities=similarities.map,
             )
-        values = results_json(results, settings, model_name=name, benchmark=benchmark)
-        emit_json(arguments.json, values)
+        emit_json(arguments.json, record.values)
     if arguments.report is not None:
         echo(f"report: {arguments.report / 'index.html'}")
 
@@ -140,7 +137,7 @@ def _check_flags(arguments: Evaluate) -> None:
     refuse_without("--rerank", arguments.rerank, rerank_weights=arguments.rerank_weights)
 
 
-def _untrained(preset: str, arguments: Evaluate) -> tuple[Model, str]:
+def _untrained(preset: str, arguments: Evaluate) -> tuple[Model, str, None]:
     """Make an untrained model of a preset."""
     import jax
 
@@ -150,7 +147,7 @@ def _untrained(preset: str, arguments: Evaluate) -> tuple[Model, str]:
     config = recipe(preset).model
     params = init_crisalad(jax.random.key(arguments.seed), config)
     model = Model(params, arguments.applied_to(config))
-    return model, f"untrained {preset}, seed {arguments.seed}"
+    return model, f"untrained {preset}, seed {arguments.seed}", None
 
 
 def _reranking(arguments: Evaluate) -> Reranking | None:
@@ -160,6 +157,5 @@ def _reranking(arguments: Evaluate) -> Reranking | None:
     rerank = parse_reranking(arguments.rerank)
     if arguments.rerank_weights is not None:
         file = find_weights(arguments.rerank_weights, quiet=arguments.quiet)
-        params, config = load_weights(file, verify=arguments.verify)
-        rerank = dataclasses.replace(rerank, params=params, config=config)
+        rerank = dataclasses.replace(rerank, model=load_weights(file, verify=arguments.verify))
     return rerank

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 from typing import Annotated, Any
 
-from crisalad_jax.cli.common import echo, open_model, pick, waiting_words
+from crisalad_jax.cli.common import echo, open_flagged, pick, waiting_words
 from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags, Target
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
@@ -53,19 +53,10 @@ class Extract(ReadFlags, ModelFlags, JsonFlag):
 def run(arguments: Extract) -> dict[str, Any] | None:
     """Describe the images, and print what was written."""
     out, how = arguments.out, pick(arguments, "grouping", "seed", "pairs", "database", "k", "share")
-    reading = arguments.reading
     check_extraction(out, **how)
-    opened = open_model(arguments, groupings=[arguments.grouping])
-    model = opened.model
-    result = extract(
-        model,
-        arguments.images,
-        out,
-        weights=opened.file,
-        **how,
-        **pick(arguments, "fps", "root", "pca", "verify"),
-        reading=reading,
-    )
+    model, _, file = open_flagged(arguments, groupings=[arguments.grouping])
+    more = pick(arguments, "fps", "root", "pca", "verify", "reading")
+    result = extract(model, arguments.images, out, weights=file, **how, **more)
     described = counted(len(result.names), "descriptor")
     if waiting := waiting_words(result):
         echo(f"{out}: share {arguments.share}: {described}; {waiting}")

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 from typing import Annotated, Any, Literal
 
-from crisalad_jax.cli.common import echo, open_model, pick, waiting_words
+from crisalad_jax.cli.common import echo, open_flagged, pick, waiting_words
 from crisalad_jax.cli.flags import FOLDER, JsonFlag, ModelFlags, ReadFlags
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
@@ -55,21 +55,15 @@ class Index(ReadFlags, ModelFlags, JsonFlag):
 
 def run(arguments: Index) -> dict[str, Any]:
     """Index the images, and print what became of them."""
-    out, weights, like, reading = arguments.out, None, None, arguments.reading
+    out, weights, like = arguments.out, None, None
     metadata = read_metadata(out)
     if metadata is not None:
         like = model_config(metadata, out)
         weights = None if arguments.weights else weights_of(metadata, out)
-    opened = open_model(arguments, weights, like=like)
-    config = opened.model.config
-    result = index(
-        opened.model,
-        arguments.images,
-        out,
-        weights=opened.file,
-        **pick(arguments, "fps", "positions", "store", "dtype", "pca", "search", "share"),
-        reading=reading,
-    )
+    model, _, file = open_flagged(arguments, weights, like=like)
+    config = model.config
+    more = pick(arguments, "fps", "positions", "store", "dtype", "pca", "search", "share")
+    result = index(model, arguments.images, out, weights=file, reading=arguments.reading, **more)
     if waiting := waiting_words(result):
         described = f"{counted(result.added, 'image')} described"
         echo(f"{out}: share {arguments.share}: {described}; {waiting}")

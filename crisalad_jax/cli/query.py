@@ -6,7 +6,7 @@ import importlib
 import pathlib
 import sys
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -16,15 +16,11 @@ from crisalad_jax.config.checks import require
 from crisalad_jax.data.live import Camera, FolderWatch
 from crisalad_jax.retrieval.maps.live import latency_words, query_live
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
+from crisalad_jax.retrieval.maps.query import Answers, json_lines, json_rows, query, write_answers
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.files import atomic_path, real_path
 from crisalad_jax.utils.output import counted, printable
 from crisalad_jax.utils.signals import defer_signals
-
-if TYPE_CHECKING:
-    from crisalad_jax.checkpoints.runtime import Runtime
-    from crisalad_jax.nn.model import Model
 
 _ROWS = 24
 """Largest number of queries in a gallery."""
@@ -104,7 +100,6 @@ def run(arguments: Query) -> None:
         answers = query(
             places,
             arguments.images,
-            model=_model_of(places, arguments),
             sequence=sequence,
             **pick(arguments, "k", "fps", "window", "exact", "min_similarity", "reading"),
         )
@@ -163,20 +158,19 @@ def _sequence_of(arguments: Query) -> BayesFilter | None:
     return BayesFilter() if reach is None else BayesFilter(reach=reach)
 
 
-def _opened(arguments: Query) -> Map:
+@contextlib.contextmanager
+def _opened(arguments: Query) -> Iterator[Map]:
+    """Open the map, and its model in the engine that the flags ask for."""
+    verify, runtime = arguments.verify, arguments.runtime
     calibrated = arguments.min_similarity is None
-    return Map.open(arguments.map, verify=arguments.verify, calibrated=calibrated)
-
-
-def _model_of(places: Map, arguments: Query) -> "Model | Runtime":
-    """Load the map's model, or open it in the engine that the flags ask for."""
-    runtime = arguments.runtime
-    return places.load_model(
-        find_given(arguments.weights, runtime=runtime, quiet=arguments.quiet),
-        engine=runtime,
-        groupings=["single" if arguments.window == 1 else "window"],
-        verify=arguments.verify,
-    )
+    with Map.open(arguments.map, verify=verify, calibrated=calibrated) as places:
+        places.load_model(
+            find_given(arguments.weights, runtime=runtime, quiet=arguments.quiet),
+            engine=runtime,
+            groupings=["single" if arguments.window == 1 else "window"],
+            verify=verify,
+        )
+        yield places
 
 
 def _unknown_words(answers: Answers, places: Map) -> str:
@@ -198,37 +192,32 @@ def answer_lines(answers: Answers) -> Iterator[str]:
     Numbers stand in columns, and names at the ends of lines: a name that a terminal has no room for
     runs on in its next line, and is copied whole.
     """
-    followed = answers.probabilities is not None
-    probability = ["probability"] if followed else []
+    found = list(json_rows(answers))
     position = ", ".join(answers.axes or ("position",))
-    if answers.zone is not None:
-        position += f" (zone {answers.zone})"
-    head = ["rank", "similarity", *probability, position, "name"]
-    asked: list[str | None] = []
-    rows = [head]
-    for name, known, (_, ranked) in zip(answers.names, answers.known, answers.rows(), strict=True):
-        for answer in ranked if known else ranked[:1]:
-            at = answers.position(answer.image) if known else None
-            asked.append(name if answer.rank == 1 else None)
+    if "zone" in found[0]:
+        position += f" (zone {found[0]['zone']})"
+    numbers = ["similarity"] if answers.probabilities is None else ["similarity", "probability"]
+    queries: list[str | None] = [None]
+    rows = [["rank", *numbers, position, "name"]]
+    for row in found:
+        known = row.get("known", True)
+        for answer in row["neighbours"] if known else row["neighbours"][:1]:
+            at = answer["position"] if known else None
+            queries.append(row["query"] if answer["rank"] == 1 else None)
             rows.append(
                 [
-                    str(answer.rank) if known else "-",
-                    f"{answer.similarity:.3f}",
-                    *([f"{answer.probability:.3f}"] if followed else []),
+                    str(answer["rank"]) if known else "-",
+                    *(f"{answer[name]:.3f}" for name in numbers),
                     "-" if at is None else ", ".join(f"{value:.9g}" for value in at.values()),
-                    answer.image.name if known else "unknown",
+                    answer["name"] if known else "unknown",
                 ]
             )
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:-1]
-    lines = (
-        "  ".join((*(cell.rjust(width) for cell, width in zip(row, widths, strict=False)), row[-1]))
-        for row in rows
-    )
-    yield next(lines)
-    for name, line in zip(asked, lines, strict=True):
+    for name, cells in zip(queries, rows, strict=True):
         if name is not None:
             yield name
-        yield line
+        padded = (cell.rjust(width) for cell, width in zip(cells, widths, strict=False))
+        yield "  ".join((*padded, cells[-1]))
 
 
 def _run_live(arguments: Query) -> None:
@@ -256,7 +245,6 @@ def _run_live(arguments: Query) -> None:
             source = stack.enter_context(Camera(arguments.camera, fps=arguments.fps))
             words = f"taking frames from {source.name}"
         places = stack.enter_context(_opened(arguments))
-        model = _model_of(places, arguments)
         latencies: list[float] = []
         state = stack.enter_context(defer_signals())
 
@@ -267,7 +255,6 @@ def _run_live(arguments: Query) -> None:
         answers = query_live(
             places,
             source,
-            model=model,
             sequence=sequence,
             ready=ready,
             check=state.check,

@@ -91,6 +91,26 @@ def open_source(
     return _source(root, _frames(found, path, _FORMS, fps, skips), path)
 
 
+def open_sources(
+    images: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    *,
+    fps: float | None = None,
+    on_bad_image: OnBadImage = "stop",
+) -> list[ImageSource]:
+    """List the images of one source or of several, as `open_source` does each.
+
+    Raises:
+        InputError: no source; a rate without a video among the images; or what `open_source`
+            raises.
+    """
+    given = [images] if isinstance(images, str | os.PathLike) else list(images)
+    if not given:
+        raise InputError("images: found none, expected at least one image")
+    sources = [open_source(each, fps=fps, on_bad_image=on_bad_image) for each in given]
+    check_rate_used(fps, [path for source in sources for path in source.paths])
+    return sources
+
+
 def _frames(
     found: Sequence[pathlib.Path],
     given: pathlib.Path,

@@ -1,13 +1,14 @@
 """Evaluation of a model on a benchmark, under each protocol of grouping images."""
 
 import contextlib
+import dataclasses
 import functools
 import statistics
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Int64
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count, check_seed, takes
@@ -17,25 +18,19 @@ from crisalad_jax.evaluation.leakage import SamePlace, by_truth, near, same_plac
 from crisalad_jax.evaluation.operating_point import check_precision
 from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, summarise
 from crisalad_jax.nn.model import Model
-from crisalad_jax.retrieval.describe import group, read_tokens
-from crisalad_jax.retrieval.describer import Describer, Rows, describer_of
-from crisalad_jax.retrieval.grouping import (
-    DEFAULT_GROUPINGS,
-    Grouping,
-    batches_of,
-    parse_groupings,
-)
+from crisalad_jax.retrieval.chunks import Descriptors
+from crisalad_jax.retrieval.describe import TokenSet
+from crisalad_jax.retrieval.describer import Describer, describer_of
+from crisalad_jax.retrieval.grouping import DEFAULT_GROUPINGS, Grouping, parse_groupings
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.retrieval.pca import Pca
+from crisalad_jax.retrieval.pca import Pca, shortened
 from crisalad_jax.retrieval.reranking import Reranker, Reranking
 from crisalad_jax.retrieval.search import search, to_unit_vectors
 from crisalad_jax.utils.errors import InputError
 
 KS = (1, 5, 10, 20)
 
-Observe = Callable[
-    [str, Float[np.ndarray, "image descriptor"], Float[np.ndarray, "image descriptor"]], None
-]
+Observe = Callable[[str, Descriptors, Descriptors], None]
 """Takes the name of a grouping, the database's descriptors, and the queries' descriptors."""
 
 
@@ -102,43 +97,27 @@ def evaluate(
     parsed = check_evaluation(groupings, seed=seed, seeds=seeds, precision=precision)
     describer = describer_of(model, groupings)
     config = describer.config
-    if pca is not None:
-        pca.check(config.descriptor_dim, "model")
+    _, is_unit = shortened(pca, config, "model")
     if rerank is not None:
         rerank.check(config, len(benchmark.database))
-        if rerank.params is None:
+        if rerank.model is None:
             if not isinstance(model, tuple):
                 raise InputError(
                     "rerank: found with a model in another engine, expected weights of its own "
                     "(--rerank-weights)"
                 )
-            rerank = rerank.over(*model)
-    unit = config.unit_length if pca is None else pca.config.renormalise
-    benchmark.ground_truth()
+            rerank = dataclasses.replace(rerank, model=model)
+    benchmark.ground_truth()  # or there is none, which is known before any work
     reading = reading.fitted(max(len(benchmark.database), len(benchmark.queries)))
-    tokens_there = read_tokens(describer, benchmark.database, reading, "database")
-    tokens_asked = read_tokens(describer, benchmark.queries, reading, "queries")
-    skipped = Skipped(*(tuple(t.unreadable.tolist()) for t in (tokens_asked, tokens_there)))
+    database, queries = (
+        TokenSet(describer, paths, reading, label)
+        for paths, label in ((benchmark.database, "database"), (benchmark.queries, "queries"))
+    )
+    skipped = Skipped(*(tuple(side.unreadable.tolist()) for side in (queries, database)))
     benchmark = skipped.rest_of(benchmark)
     positives = benchmark.ground_truth()
     same_queries, same_database = _same_place(benchmark, positives)
-    database = _Side("database", tokens_there.descriptors, same_database, 0)
-    queries = _Side("queries", tokens_asked.descriptors, same_queries, 1)
-    batch_size = reading.batch_size
-
-    def describe(side: _Side, kind: str, seed: int) -> Float[np.ndarray, "image descriptor"]:
-        full = group(
-            describer,
-            side.tokens,
-            len(side.tokens),
-            kind,
-            batch_size=batch_size,
-            seed=seed + side.offset,
-            label=side.name,
-            quiet=reading.quiet,
-        )
-        return full if pca is None else pca.apply(full)
-
+    sides = _Side(database, same_database, 0, pca), _Side(queries, same_queries, 1, pca)
     stages: dict[str | None, Callable[[Neighbours], Neighbours]] = {None: lambda ranked: ranked}
     with contextlib.ExitStack() as stack:
         if rerank is not None:
@@ -151,12 +130,9 @@ def evaluate(
             is_random = "shuffled" in (grouping.queries, grouping.database)
             drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
             name = str(grouping) if config.cross_image.layers else ANY
-            sides = (database, grouping.database), (queries, grouping.queries)
-            database_share, query_share = (
-                _mean_share(side, kind, drawn, batch_size) for side, kind in sides
-            )
             observer = observe and functools.partial(observe, name)
-            rankings = _rank(describe, sides, drawn, k, observer, unit=unit)
+            ranked = _rank(sides, grouping, drawn, k, observer, is_unit=is_unit)
+            rankings, (database_share, query_share) = ranked
             for label, stage in stages.items():
                 result = summarise(
                     name,
@@ -197,11 +173,17 @@ def _first(neighbours: Neighbours, count: int) -> Neighbours:
 class _Side(NamedTuple):
     """One side, database or queries: its tokens and its test of same-place images."""
 
-    name: str
-    tokens: Rows
+    tokens: TokenSet
     same: SamePlace
     offset: int
     """Added to the seed of a shuffle, so that the two sides are never shuffled alike."""
+    pca: Pca | None
+
+    def describe(self, kind: str, seed: int) -> tuple[Descriptors, float | None]:
+        """Return descriptors under a grouping, and the share of same-place images in sight."""
+        descriptors, batches = self.tokens.describe(kind, seed + self.offset)
+        short = descriptors if self.pca is None else self.pca.apply(descriptors)
+        return short, same_place_share(batches, self.same)
 
 
 def same_place_rule(benchmark: Benchmark) -> str:
@@ -221,45 +203,40 @@ def _same_place(
     return near(benchmark.query_positions, radius), near(benchmark.database_positions, radius)
 
 
-def _mean_share(side: _Side, kind: str, seeds: Sequence[int], batch_size: int) -> float | None:
-    """Average the share of same-place images over seeds; see `GroupingResult`."""
-    count = len(side.tokens)
-    shares = [
-        same_place_share(batches_of(count, kind, batch_size, seed + side.offset), side.same)
-        for seed in (seeds if kind == "shuffled" else seeds[:1])
-    ]
-    known = [share for share in shares if share is not None]
-    return statistics.fmean(known) if known else None
-
-
 def _rank(
-    describe: Callable[..., Float[np.ndarray, "image descriptor"]],
-    sides: Sequence[tuple[_Side, str]],
+    sides: tuple[_Side, _Side],
+    grouping: Grouping,
     seeds: Sequence[int],
     k: int,
-    observe: Callable[..., None] | None,
+    observe: Callable[[Descriptors, Descriptors], None] | None,
     *,
-    unit: bool,
-) -> dict[int, Neighbours]:
+    is_unit: bool,
+) -> tuple[dict[int, Neighbours], list[float | None]]:
     """Rank the k nearest neighbours for each seed; only shuffled sides are described anew.
 
-    `observe` is given the descriptors of the first seed. Those that are not `unit` vectors are
-    ranked by Euclidean distance.
+    `observe` is given the descriptors of the first seed. Those that are not unit vectors are ranked
+    by Euclidean distance.
+
+    Returns:
+        The rankings by seed, and both sides' share of same-place images: the mean over the seeds.
     """
 
-    fixed = {
-        side.name: describe(side, kind, seeds[0]) for side, kind in sides if kind != "shuffled"
-    }
-
-    def ranking(seed: int) -> Neighbours:
-        database, queries = (
-            fixed[side.name] if side.name in fixed else describe(side, kind, seed)
-            for side, kind in sides
-        )
-        if observe is not None and seed == seeds[0]:
-            observe(database, queries)
-        if not unit:
+    def compare(database: Descriptors, queries: Descriptors) -> Neighbours:
+        if not is_unit:
             database, queries = to_unit_vectors(database, queries)
         return search(database, queries, k=k)
 
-    return {seed: ranking(seed) for seed in seeds}
+    kinds = grouping.database, grouping.queries
+    descriptors: dict[int, Descriptors] = {}
+    shares: tuple[list[float], list[float]] = [], []
+    rankings = {}
+    for seed in seeds:
+        for number, (side, kind) in enumerate(zip(sides, kinds, strict=True)):
+            if kind == "shuffled" or seed == seeds[0]:
+                descriptors.pop(number, None)  # makes room
+                descriptors[number], share = side.describe(kind, seed)
+                shares[number].extend([] if share is None else [share])
+        if observe is not None and seed == seeds[0]:
+            observe(descriptors[0], descriptors[1])
+        rankings[seed] = compare(descriptors[0], descriptors[1])
+    return rankings, [statistics.fmean(each) if each else None for each in shares]

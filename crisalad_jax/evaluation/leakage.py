@@ -59,7 +59,7 @@ def same_place_share(batches: Batches, same: SamePlace) -> float | None:
 
     The share is averaged over all images that looked at another one; None where none did.
     """
-    if not batches.mutual:
+    if batches.grouping == "single":
         return None
     share, looking = 0.0, 0
     step = max(1, _CHUNK // batches.images.shape[1] ** 2)

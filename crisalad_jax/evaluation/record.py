@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.config.io import to_plain
@@ -20,21 +20,38 @@ _RECALLS = (
 )
 
 
-def evaluation_settings(benchmark: Benchmark, config: ModelConfig, **asked: Any) -> dict[str, Any]:
-    """Put all settings that decide an evaluation's result into JSON values.
+class Record(NamedTuple):
+    """What is written and printed of an evaluation, besides its tables."""
+
+    settings: dict[str, Any]
+    """All settings that decide the results, as JSON values by name."""
+    notes: list[str]
+    """What `table_notes` returns."""
+    values: dict[str, Any]
+    """The settings and the results, as JSON values by name."""
+
+
+def evaluation_record(
+    results: Sequence[GroupingResult],
+    benchmark: Benchmark,
+    config: ModelConfig,
+    *,
+    model_name: str,
+    **asked: Any,
+) -> Record:
+    """Record what an evaluation found, with its settings.
 
     Args:
-        benchmark: what is evaluated on.
+        results: what `evaluate` returned.
+        benchmark: what was evaluated on.
         config: the model.
+        model_name: which weights, for each row.
         **asked: what `crisalad evaluate` was asked for: the files `weights` (None is an untrained
             model), `pca` and `rerank_weights` (None is the first stage's), `batch_size`, `seed`,
             `seeds` and `rerank`.
-
-    Returns:
-        The values by name.
     """
     files = {name: each for name, each in asked.items() if isinstance(each, os.PathLike)}
-    return {
+    settings = {
         **asked,
         **{name: starter.named(file) for name, file in files.items()},
         "benchmark": benchmark.name,
@@ -42,35 +59,14 @@ def evaluation_settings(benchmark: Benchmark, config: ModelConfig, **asked: Any)
         "same_place": same_place_rule(benchmark),
         "model": to_plain(config),
     }
-
-
-def results_json(
-    results: Sequence[GroupingResult],
-    settings: dict[str, Any],
-    *,
-    model_name: str,
-    benchmark: Benchmark,
-) -> dict[str, Any]:
-    """Put what an evaluation found into JSON values, with its settings.
-
-    Args:
-        results: what `evaluate` returned.
-        settings: what `evaluation_settings` returned.
-        model_name: which weights, for each row.
-        benchmark: what was evaluated on, for the names of unreadable images that were left out.
-
-    Returns:
-        The values by name.
-    """
-    names = {"benchmark": settings["benchmark"], "model": model_name}
-    skipped = results[0].skipped._asdict()
-    return settings | {
-        "results": [names | to_json(result) for result in results],
-        "skipped": {
-            side: [str(getattr(benchmark, side)[number]) for number in numbers]
-            for side, numbers in skipped.items()
-        },
+    names = {"benchmark": benchmark.name, "model": model_name}
+    skipped = {
+        side: [str(getattr(benchmark, side)[number]) for number in numbers]
+        for side, numbers in results[0].skipped._asdict().items()
     }
+    rows = [names | to_json(result) for result in results]
+    values = settings | {"results": rows, "skipped": skipped}
+    return Record(settings, table_notes(results, settings), values)
 
 
 def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> list[str]:
@@ -78,7 +74,7 @@ def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> 
 
     Args:
         results: what `evaluate` returned.
-        settings: what `evaluation_settings` returned.
+        settings: those of a `Record`.
 
     Returns:
         The paragraphs.

@@ -53,9 +53,6 @@ class Skipped(NamedTuple):
         return benchmark.of_readable(queries, database)
 
 
-_NONE = Skipped()
-
-
 @brief
 class GroupingResult(NamedTuple):
     """The result of a benchmark under one grouping."""
@@ -87,7 +84,7 @@ class GroupingResult(NamedTuple):
     rerank: str | None = None
     """The second stage, as `reranking.parse_reranking` reads it; its scores replace the
     similarities of the retrievals that it re-ranked. None is the first stage alone."""
-    skipped: Skipped = _NONE
+    skipped: Skipped = Skipped()
     """The unreadable images that were left out, the same under every grouping."""
     operating_point: OperatingPoint | None = None
     """The similarity that leaves the asked precision, of the first seed; None if none was asked."""

@@ -6,7 +6,7 @@ Nothing here imports JAX: what computes is a `Describer`.
 import itertools
 import os
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,11 +18,11 @@ from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.retrieval.describer import Describer, Rows, describer_of
-from crisalad_jax.retrieval.grouping import batches_of
+from crisalad_jax.retrieval.grouping import Batches, batches_of
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import progress_bar
-from crisalad_jax.utils.shapes import Float, Float32, Int64
+from crisalad_jax.utils.shapes import Bool, Float, Float32, Int64
 
 if TYPE_CHECKING:  # an engine describes images without JAX
     from crisalad_jax.nn.config import ModelConfig
@@ -72,7 +72,7 @@ def prepare_image(image: np.ndarray, config: "ModelConfig", name: str = "image")
     return Preparation.of(config).prepare(image, name)
 
 
-def as_list(name: str, given: Any) -> list[Any]:
+def _as_list(name: str, given: Any) -> list[Any]:
     """Return what was given, a file or a list, as a list.
 
     Raises:
@@ -121,9 +121,10 @@ def describe_files(
         (1, 576)
     """
     describer = describer_of(model)
-    paths = [pathlib.Path(file) for file in as_list("files", files)]
+    paths = [pathlib.Path(file) for file in _as_list("files", files)]
     stream = described(describer, paths, reading.fitted(len(paths)))
-    return _in_memory(stream, "images", len(paths), quiet=reading.quiet).descriptors
+    stream = shown(stream, "images", len(paths), quiet=reading.quiet)
+    return _concatenated(list(stream)).descriptors
 
 
 def describe_images(
@@ -156,7 +157,7 @@ def describe_images(
         (1, 576)
     """
     describer, reading = describer_of(model), Reading(batch_size=batch_size)
-    how, given = describer.preparation, as_list("images", images)
+    how, given = describer.preparation, _as_list("images", images)
     prepared = [how.prepare(image) for image in given]
     return describe_prepared(describer, prepared, reading.batch_size)
 
@@ -211,12 +212,13 @@ def described(
     """
     shorten = (lambda rows: rows) if components is None else components.apply
     frames = FrameDescriber(describer, window)
-    for rows, batch, unreadable in _tokens(describer, paths, reading):
+
+    def describe(rows: Rows, valid: Bool[np.ndarray, " image"]) -> Rows:
         if window == 1:
-            descriptors = shorten(_alone(describer, rows))[batch.valid]
-        else:
-            descriptors = shorten(frames.of_tokens(rows[batch.valid]))
-        yield Described(batch.indices[batch.valid], descriptors, unreadable)
+            return shorten(_alone(describer, rows))[valid]
+        return shorten(frames.of_tokens(rows[valid]))
+
+    return _each_batch(describer, paths, reading, describe)
 
 
 def token_rows(
@@ -227,17 +229,20 @@ def token_rows(
     Raises:
         InputError: an image cannot be read and `reading` says "stop".
     """
-    for rows, batch, unreadable in _tokens(describer, paths, reading):
-        yield Described(batch.indices[batch.valid], rows[batch.valid], unreadable)
+    return _each_batch(describer, paths, reading, lambda rows, valid: rows[valid])
 
 
-def _tokens(
-    describer: Describer, paths: Sequence[pathlib.Path], reading: Reading
-) -> Iterator[tuple[Rows, ImageBatch, Int64[np.ndarray, " _"]]]:
-    """Yield the tokens of each batch, padding included, and which images could not be read."""
+def _each_batch(
+    describer: Describer,
+    paths: Sequence[pathlib.Path],
+    reading: Reading,
+    describe: Callable[[Rows, Bool[np.ndarray, " image"]], Rows],
+) -> Iterator[Described]:
+    """Yield what is made of each batch's tokens, padding included, and of which are valid."""
     batches = reading.batches(paths, describer.preparation)
     for rows, batch in describer.tokens(batches):
-        yield rows, batch, batch.indices[(batch.indices >= 0) & ~batch.valid]
+        unreadable = batch.indices[(batch.indices >= 0) & ~batch.valid]
+        yield Described(batch.indices[batch.valid], describe(rows, batch.valid), unreadable)
 
 
 def described_sources(
@@ -290,24 +295,37 @@ def _concatenated(parts: Sequence[Described]) -> Described:
     return Described(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def read_tokens(
-    describer: Describer, paths: Sequence[pathlib.Path], reading: Reading, label: str = "images"
-) -> Described:
-    """Read the tokens of all images into memory, as `token_rows` yields them."""
-    stream = token_rows(describer, paths, reading)
-    return _in_memory(stream, label, len(paths), quiet=reading.quiet)
+class TokenSet:
+    """The tokens of images in memory, from which they are described under any grouping."""
 
+    def __init__(
+        self,
+        describer: Describer,
+        paths: Sequence[pathlib.Path],
+        reading: Reading,
+        label: str = "images",
+    ) -> None:
+        """Read the images, as `token_rows`."""
+        stream = token_rows(describer, paths, reading)
+        stream = shown(stream, label, len(paths), quiet=reading.quiet)
+        _, self.rows, self.unreadable = _concatenated(list(stream))
+        self._describer, self._reading, self._label = describer, reading, label
 
-def _in_memory(stream: Iterator[Described], label: str, total: int, *, quiet: bool) -> Described:
-    return _concatenated(list(shown(stream, label, total, quiet=quiet)))
+    def describe(
+        self, grouping: str, seed: int = 0
+    ) -> tuple[Float[np.ndarray, "image descriptor"], Batches]:
+        """Return the descriptors of the readable images under a grouping, and its batches."""
+        batches = batches_of(len(self.rows), grouping, self._reading.batch_size, seed)
+        options = {"label": self._label, "quiet": self._reading.quiet}
+        return group(self._describer, self.rows, batches, **options), batches
 
 
 def group(
-    describer: Describer, rows: "Rows | Segments", count: int, grouping: str, **options: Any
+    describer: Describer, rows: Rows, batches: Batches, **options: Any
 ) -> Float[np.ndarray, "image descriptor"]:
-    """Describe images, in their order, under one of `GROUPINGS`; options are those of `grouped`."""
-    descriptors = np.empty((count, describer.config.descriptor_dim), np.float32)
-    for images, found in grouped(describer, rows, count, grouping, **options):
+    """Describe images, in their order, in batches; options are those of `grouped`."""
+    descriptors = np.empty((len(rows), describer.config.descriptor_dim), np.float32)
+    for images, found in grouped(describer, rows, batches, **options):
         descriptors[images] = found
     return descriptors
 
@@ -315,35 +333,30 @@ def group(
 def grouped(
     describer: Describer,
     rows: "Rows | Segments",
-    count: int,
-    grouping: str,
+    batches: Batches,
     *,
-    batch_size: int,
-    seed: int = 0,
     first: int = 0,
     label: str = "images",
     quiet: bool = True,
 ) -> Iterator[tuple[Int64[np.ndarray, " n"], Float[np.ndarray, "n descriptor"]]]:
-    """Yield the descriptors of images under a grouping, some at a time, with the images' numbers.
+    """Yield the descriptors of images in batches, some at a time, with the images' numbers.
 
     Args:
         describer: the model.
         rows: the images' tokens, by number.
-        count: number of images.
-        grouping: one of `GROUPINGS`.
-        batch_size: number of images that attend to each other.
-        seed: draws the order of `shuffled`.
-        first: number of the first image of a `window` that is described.
+        batches: which images attend to each other.
+        first: the first batch that is described.
         label: label of the progress bar.
         quiet: whether to show no progress bar.
     """
-    batches = batches_of(count, grouping, batch_size, seed)
-    # A window gives one descriptor, so `batch_size` windows are computed at a time.
-    step = max(1, min(batch_size, count - first)) if grouping == "window" else 1
+    count, size = batches.images.shape
+    # A window gives one descriptor, so as many are computed at a time as it has images.
+    is_window = batches.grouping == "window"
+    step = max(1, min(size, count - first)) if is_window else 1
     # The other groupings take little time compared with the backbone: they need no bar.
-    silent = quiet or grouping != "window"
-    with progress_bar(f"{label}, {grouping}", count, "images", quiet=silent) as bar:
-        for start in range(first, len(batches.images), step):
+    silent = quiet or not is_window
+    with progress_bar(f"{label}, {batches.grouping}", count, "images", quiet=silent) as bar:
+        for start in range(first, count, step):
             part = batches.part(start, start + step)
             # The last groups are repeated, so that all steps run one program.
             groups = np.resize(np.arange(len(part.images)), step)
@@ -397,8 +410,8 @@ class FrameDescriber:
         held = np.concatenate([*self._before, rows])
         first = len(held) - len(rows)
         self._before = [held[max(0, len(held) - self._window + 1) :]]
-        options = {"batch_size": self._window, "first": first}
-        return group(self._describer, held, len(held), "window", **options)[first:]
+        batches = batches_of(len(held), "window", self._window)
+        return group(self._describer, held, batches, first=first)[first:]
 
     def forget(self) -> None:
         """Start again without an image."""

@@ -30,6 +30,7 @@ from crisalad_jax.utils.files import (
     write_json,
     write_npy,
 )
+from crisalad_jax.utils.output import one_line
 from crisalad_jax.utils.shapes import Float, Int
 
 _DIGESTS = "files"
@@ -37,16 +38,6 @@ _DIGESTS = "files"
 _SUFFIXES = (".npy", ".h5")
 _INFLATION = 1100
 """Largest ratio of numbers to bytes that deflate, HDF5's compression, reaches."""
-
-
-def check_suffix(path: str | os.PathLike[str]) -> None:
-    """Check that descriptors can be written to a file of this suffix, before any work is done.
-
-    Raises:
-        InputError: the suffix is neither .npy nor .h5.
-    """
-    suffix = pathlib.Path(path).suffix
-    choose(f"{path}: suffix of the descriptors' file", suffix, dict.fromkeys(_SUFFIXES))
 
 
 def record_of(path: pathlib.Path) -> pathlib.Path:
@@ -58,9 +49,9 @@ def targets(path: pathlib.Path) -> list[pathlib.Path]:
     """List all files that a set of descriptors in `path` consists of.
 
     Raises:
-        InputError: what `check_suffix` raises.
+        InputError: the suffix is neither .npy nor .h5.
     """
-    check_suffix(path)
+    choose(f"{path}: suffix of the descriptors' file", path.suffix, dict.fromkeys(_SUFFIXES))
     return [*_files_of(path).values(), record_of(path)]
 
 
@@ -96,8 +87,8 @@ def write_descriptors(
     Raises:
         InputError: another suffix, a name twice in a .h5, or a file that cannot be written.
     """
-    check_suffix(path)
     path = pathlib.Path(path)
+    targets(path)
     with contextlib.ExitStack() as stack:
         # The files that are entered last are renamed first.
         files = {
@@ -198,17 +189,12 @@ def open_npy(path: str | os.PathLike[str], *, verify: bool = True) -> Descriptor
     try:
         array = np.lib.format.open_memmap(path, mode="r")
     except Exception as error:  # numpy's parser of headers raises errors of many kinds
-        raise InputError(f"{path}: not a whole .npy file: {_words(error)}") from error
+        raise InputError(f"{path}: not a whole .npy file: {one_line(error)}") from error
     if array.dtype.kind != "f" and array.dtype != np.dtype("V2"):
         raise InputError(
             f"{path}: found {array.dtype}, expected an array of floating-point numbers"
         )
     return as_rows(array, str(path))
-
-
-def _words(error: BaseException) -> str:
-    lines = str(error).splitlines()
-    return lines[0] if lines else type(error).__name__
 
 
 def read_descriptors(
@@ -296,7 +282,7 @@ def _read_h5(path: pathlib.Path) -> tuple[list[str], Descriptors]:
     except InputError:
         raise
     except Exception as error:  # damaged files end in errors of many kinds
-        raise InputError(f"{path}: not a whole HDF5 file: {_words(error)}") from error
+        raise InputError(f"{path}: not a whole HDF5 file: {one_line(error)}") from error
     if not rows:
         raise InputError(f"{path}: found no dataset global_descriptor, expected one for each image")
     return names, np.stack(rows)

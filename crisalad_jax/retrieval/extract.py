@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import hashlib
 import itertools
 import os
 import pathlib
@@ -14,16 +13,15 @@ import numpy as np
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.checks import check_count, check_seed, choose
+from crisalad_jax.config.checks import check_count, check_seed, choose, require
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import check_lines, read_pixels
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.data.sources import check_rate_used, open_source
-from crisalad_jax.data.video import file_of, frame_time, name_frame
+from crisalad_jax.data.sources import open_sources
+from crisalad_jax.data.video import file_of
 from crisalad_jax.retrieval.chunks import Descriptors, as_rows, check_all_rows, check_rows
 from crisalad_jax.retrieval.describe import (
-    as_list,
     check_readable,
     described,
     grouped,
@@ -40,10 +38,10 @@ from crisalad_jax.retrieval.descriptor_files import (
     write_descriptors,
     write_rows,
 )
-from crisalad_jax.retrieval.grouping import GROUPINGS
+from crisalad_jax.retrieval.grouping import GROUPINGS, batches_of
 from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_pairs
 from crisalad_jax.retrieval.maps.file_store import FileStore
-from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened_length
+from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened
 from crisalad_jax.retrieval.segments import SEGMENT, Segments, Share, Shares, digest_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import (
@@ -151,24 +149,24 @@ def extract(
     )
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca, verify=verify)
     made_by = "--pairs" if pairs is not None else "model" if weights is None else str(weights)
-    length = shortened_length(components, describer.config, made_by, unit=pairs is not None)
+    length, is_unit = shortened(components, describer.config, made_by, unit=pairs is not None)
     paths, names = _listed(images, root, fps, reading)
-    check_rate_used(fps, paths)
     others = None if pairs is None else _others(pairs, names, database, length, verify=verify)
     reading = reading.fitted(len(paths))
     source = str(images) if isinstance(images, str | os.PathLike) else "images"
+    work = _Work(
+        describer, components, length, is_unit, grouping, seed, reading, source, paths, names
+    )
     record = {
         "weights": None if weights is None else starter.named(weights),
         "images": source,
+        "fps": fps,
         "grouping": grouping,
         "batch_size": reading.batch_size,
         "seed": seed,
         "pca": f"{length} components" if isinstance(pca, Pca) else pca and str(pca),
         "model": to_plain(describer.config),
     }
-    if any(frame_time(path) is not None for path in paths):
-        record["fps"] = 1.0 if fps is None else fps
-    work = _Work(describer, components, length, grouping, seed, reading, source)
 
     def finish(
         parts: Sequence[Segments], skipped: list[str], folder: pathlib.Path, **more: Any
@@ -195,12 +193,12 @@ def extract(
         with _work_folder(out) as folder:
             # A single batch is nothing to resume: it needs no digest of the model.
             resumes = out is not None and len(paths) > reading.batch_size
-            rows, skipped = work.resume(folder, paths, names, resumes=resumes)
+            rows, skipped = work.resume(folder, resumes=resumes)
             return finish([rows], skipped, folder)
     out = pathlib.Path(out)
     common = {name: value for name, value in record.items() if name not in ("weights", "images")}
     folder = out.with_name(f"{out.name}.shares")
-    shares = Shares(folder, Share.parse(share), digest_of(names, common | work.plan()))
+    shares = Shares(folder, Share.parse(share), digest_of(names, common | work.settings()))
     is_there = all(file.exists() for file in targets(out))
     known = read_json(record_of(out), "a record of descriptors") if is_there else {}
     if known.get(_SHARES) == shares.digest:  # joined from shares of these images and settings
@@ -208,7 +206,8 @@ def extract(
         return Extracted(listed, descriptors, known["skipped"])
     mine = shares.share.of(len(paths), reading.batch_size)
     with lock(shares.own):
-        rows, skipped = work.resume(shares.own, paths[mine], names[mine])
+        own = dataclasses.replace(work, paths=paths[mine], names=names[mine])
+        rows, skipped = own.resume(shares.own)
         found = Extracted(_names_in(rows), np.empty((0, length), np.float32), skipped)
         shares.finish({"skipped": skipped})
     with shares.joining() as (results, waiting):
@@ -262,11 +261,11 @@ def check_extraction(
         raise InputError("--database: found without --pairs, expected both")
     if share is not None:
         Share.parse(share)
-        if grouping != "single" or out is None:
-            found = f"grouping {grouping}" if out is not None else "no file to write"
-            raise InputError(
-                f"share: found {found}, expected images of grouping single, into a file"
-            )
+        found = f"grouping {grouping}" if out is not None else "no file to write"
+        require(
+            grouping == "single" and out is not None,
+            f"share: found {found}, expected images of grouping single, into a file",
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -280,13 +279,17 @@ class _Work:
     components: Pca | None
     length: int
     """Number of dimensions of the descriptors that are written."""
+    is_unit: bool
+    """Whether these are unit vectors."""
     grouping: str
     seed: int
     reading: Reading
     source: str
+    paths: Sequence[pathlib.Path]
+    names: Sequence[str]
 
-    def plan(self) -> dict[str, Any]:
-        """Return what all rows depend on."""
+    def settings(self) -> dict[str, Any]:
+        """Return what all rows depend on, except the images."""
         return {
             "digest": self.describer.digest,
             "config": to_plain(self.describer.config),
@@ -303,58 +306,65 @@ class _Work:
             length, dtype = self.describer.row_length, self.describer.row_dtype
         return Segments(folder, FileStore(folder, length, dtype), dtype)
 
-    def resume(
-        self,
-        folder: pathlib.Path,
-        paths: Sequence[pathlib.Path],
-        names: Sequence[str],
-        *,
-        resumes: bool = True,
-    ) -> tuple[Segments, list[str]]:
+    def resume(self, folder: pathlib.Path, *, resumes: bool = True) -> tuple[Segments, list[str]]:
         """Describe the images whose rows are not in the folder yet, and store them there.
 
         Returns:
             All rows, and the names of the images that could not be read.
+
+        Raises:
+            InputError: an image cannot be read and `reading` says "stop"; or a descriptor is not
+                finite.
         """
-        plan = digest_of((), self.plan()) if resumes else ""
-        if not resumes:
-            _remove_work(folder)
-        first = _reusable(folder, plan, paths, complete=self.reading.on_bad_image == "stop")
-        try:
-            segments = self.opened(folder)
-            segments.verify()
-        except InputError as error:
-            warn(f"{error}; the work in this folder starts again")
-            _remove_work(folder)
-            first, segments = 0, self.opened(folder)
+        digest = self._digest() if resumes else "none"
+        segments = self._reusable(folder, digest)
         skipped = [name for record in segments.records for name in record["skipped"]]
-        done = first
-        if self.grouping == "single":
-            new = described(self.describer, paths[first:], self.reading, components=self.components)
+        if skipped and self.reading.on_bad_image == "stop":
+            read_pixels(self.paths[self.names.index(skipped[0])])  # raises what it was skipped for
+        first = len(segments) + len(skipped)
+        is_single, rest = self.grouping == "single", self.paths[first:]
+        if is_single:
+            new = described(self.describer, rest, self.reading, components=self.components)
         else:
-            new = token_rows(self.describer, paths[first:], self.reading)
-        new = shown(new, "images", len(paths), quiet=self.reading.quiet, done=first)
+            new = token_rows(self.describer, rest, self.reading)
+        new = shown(new, "images", len(self.paths), quiet=self.reading.quiet, done=first)
         for part in joined(new, SEGMENT):
-            images = paths[done : done + part.tried]
-            done += part.tried
-            unreadable = [names[first + int(number)] for number in part.unreadable]
+            unreadable = [self.names[first + int(number)] for number in part.unreadable]
             skipped += unreadable
             if not len(part.indices):
                 continue
-            if self.grouping == "single":
+            if is_single:
                 self._check(part.descriptors, part.indices)
-            record = {
-                "names": [names[first + int(number)] for number in part.indices],
-                "skipped": unreadable,
-                "work": _digest(plan, images),
-            }
+            names = [self.names[first + int(number)] for number in part.indices]
+            record = {"names": names, "skipped": unreadable, "work": digest}
             segments.append(record, part.descriptors)
         return segments, skipped
 
+    def _reusable(self, folder: pathlib.Path, digest: str) -> Segments:
+        """Open the stored rows if they are whole and of this work; else remove them."""
+        try:
+            segments = self.opened(folder)
+            segments.verify()
+            if all(record.get("work") == digest for record in segments.records):
+                return segments
+            reason = f"{folder}: found work of another model, batch size or images"
+        except InputError as error:
+            reason = str(error)
+        warn(f"{reason}; the work in this folder starts again")
+        _remove_work(folder)
+        return self.opened(folder)
+
+    def _digest(self) -> str:
+        """Compute a digest of the settings, and of the names, sizes and times of the files."""
+        files = []
+        for path, name in zip(self.paths, self.names, strict=True):
+            with contextlib.suppress(OSError):  # reported when it is read
+                there = file_of(path).stat()
+                files.append(f"{name} {path} {there.st_size} {there.st_mtime_ns}")
+        return digest_of(files, self.settings())
+
     def _check(self, rows: np.ndarray, numbers: np.ndarray) -> None:
-        model, components = self.describer.config, self.components
-        unit = model.unit_length if components is None else components.config.renormalise
-        check_rows(rows, f"{self.source}: descriptors", numbers, unit=unit)
+        check_rows(rows, f"{self.source}: descriptors", numbers, unit=self.is_unit)
 
     def descriptors(
         self, parts: Sequence[Segments], count: int
@@ -367,9 +377,8 @@ class _Work:
                 start += len(block)
             return
         (tokens,) = parts
-        options: dict[str, Any] = {"seed": self.seed, "quiet": self.reading.quiet}
-        options["batch_size"] = self.reading.batch_size
-        for numbers, rows in grouped(self.describer, tokens, count, self.grouping, **options):
+        batches = batches_of(count, self.grouping, self.reading.batch_size, self.seed)
+        for numbers, rows in grouped(self.describer, tokens, batches, quiet=self.reading.quiet):
             short = rows if self.components is None else self.components.apply(rows)
             self._check(short, numbers)
             yield numbers, short
@@ -422,64 +431,16 @@ def _remove_work(folder: pathlib.Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _reusable(
-    folder: pathlib.Path, plan: str, paths: Sequence[pathlib.Path], *, complete: bool
-) -> int:
-    """Count the images whose stored rows can be used again; remove the rows of all others.
-
-    Args:
-        folder: the folder of work.
-        plan: digest of what all rows depend on.
-        paths: the images.
-        complete: whether an image that was skipped is an error now.
-
-    Raises:
-        InputError: an image was skipped and is an error now.
-    """
-    done, records = 0, _records(folder)
-    for number, path in enumerate(records):
-        try:
-            record = read_json(path, "a record of images")
-            images = paths[done : done + len(record["names"]) + len(record["skipped"])]
-            is_usable = record["work"] == _digest(plan, images)
-        except (InputError, LookupError, TypeError):
-            is_usable = False
-        if not is_usable:
-            warn(
-                f"{path}: found work of another model, batch size or images, or damaged; from "
-                "there on it starts again"
-            )
-            for old in records[number:]:
-                old.unlink()
-                old.with_suffix(".npy").unlink(missing_ok=True)
-            break
-        if complete and record["skipped"]:
-            for image in images:
-                read_pixels(image)  # raises for the image that was skipped
-        done += len(images)
-    return done
-
-
-def _digest(plan: str, paths: Sequence[pathlib.Path]) -> str:
-    """Compute a digest of a plan, and of the names, sizes and times of image files."""
-    files = hashlib.sha256(plan.encode())
-    for path in paths:
-        with contextlib.suppress(OSError):  # reported when it is read
-            there = file_of(path).stat()
-            line = f"{os.fspath(path)} {there.st_size} {there.st_mtime_ns}\n"
-            files.update(line.encode(errors="surrogateescape"))
-    return files.hexdigest()
-
-
 def _listed(
     images: StrPath | Sequence[StrPath], root: StrPath | None, fps: float | None, reading: Reading
 ) -> tuple[list[pathlib.Path], list[str]]:
     """List the images, and their names relative to the root."""
+    sources = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
+    paths = [path for source in sources for path in source.paths]
     if isinstance(images, str | os.PathLike):
-        source = open_source(images, fps=fps, on_bad_image=reading.on_bad_image)
+        (source,) = sources
         inside = _inside(source.root, root) if root is not None else pathlib.PurePath()
-        return source.paths, [(inside / name).as_posix() for name in source.names]
-    paths = [name_frame(pathlib.Path(path)) for path in as_list("images", images)]
+        return paths, [(inside / name).as_posix() for name in source.names]
     names = [(path if root is None else _inside(path, root)).as_posix() for path in paths]
     check_lines(names, "images")
     return paths, names

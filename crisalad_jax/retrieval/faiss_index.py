@@ -22,15 +22,15 @@ from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.checksums import ChangedFileError, sha256_of, tell_unchecked
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source
+from crisalad_jax.utils.output import one_line
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Float, Int
 
 faiss: Any = _faiss  # its classes are made when it is loaded
 Kind = Literal["hnsw", "ivf-pq"]
-KINDS = {
-    "hnsw": "a graph over the descriptors as they are: nearly exact, and as large as they are",
-    "ivf-pq": "lists of codes of at most 128 bytes each: small, and less exact",
-}
+KINDS: dict[str, type] = {"hnsw": faiss.IndexHNSWFlat, "ivf-pq": faiss.IndexIVFPQ}
+"""A graph over the descriptors as they are, nearly exact and as large as they are; or lists of
+codes of at most 128 bytes each, small and less exact."""
 _LINKS = 32
 """Number of links of a vector in each layer of the graph; twice as many in the lowest. Faiss
 recommends 4 to 64 and the paper 5 to 48, with more for longer vectors."""
@@ -183,8 +183,10 @@ def save_index(path: str | os.PathLike[str], index: Index) -> None:
         try:
             faiss.write_index(index.faiss_index, str(temporary))
         except RuntimeError as error:
-            raise InputError(f"{path}: cannot be written: {_first_line(error)}") from error
-        _append_checksum(temporary)
+            raise InputError(f"{path}: cannot be written: {one_line(error)}") from error
+        line = _APPENDED + sha256_of(temporary).encode() + b"\n"
+        with temporary.open("ab") as file:
+            file.write(line)
 
 
 def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
@@ -199,23 +201,19 @@ def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
     """
     path = pathlib.Path(path)
     check_source(path, "a faiss index")
-    if verify:
+    if verify and path.stat().st_size:  # no file is mapped without bytes
         _check_appended(path)
     try:
         index = faiss.read_index(str(path))
     except (RuntimeError, MemoryError) as error:
-        raise InputError(f"{path}: not a whole faiss index: {_first_line(error)}") from error
-    kinds: dict[type, Kind] = {faiss.IndexHNSWFlat: "hnsw", faiss.IndexIVFPQ: "ivf-pq"}
-    if type(index) not in kinds or index.metric_type != faiss.METRIC_INNER_PRODUCT:
+        raise InputError(f"{path}: not a whole faiss index: {one_line(error)}") from error
+    kind: Any = next((name for name, each in KINDS.items() if type(index) is each), None)
+    if kind is None or index.metric_type != faiss.METRIC_INNER_PRODUCT:
         raise InputError(
             f"{path}: found a {type(index).__name__}, expected one of inner products, as `build` "
             "makes it"
         )
-    return Index(kinds[type(index)], index)
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
+    return Index(kind, index)
 
 
 def recall_against_exact(found: Int[np.ndarray, "q k"], exact: Int[np.ndarray, "q k"]) -> float:
@@ -233,33 +231,21 @@ def recall_against_exact(found: Int[np.ndarray, "q k"], exact: Int[np.ndarray, "
 
 
 _APPENDED = b"\nsha256 "
+"""Begins a line with the digest of the bytes before it, where readers of the format stop."""
 _APPENDED_SIZE = len(_APPENDED) + 64 + 1
 
 
-def _append_checksum(path: pathlib.Path) -> None:
-    """Append a line with the digest of the bytes before it, where readers of the format stop."""
-    line = _APPENDED + sha256_of(path).encode() + b"\n"
-    with path.open("ab") as file:
-        file.write(line)
-
-
 def _check_appended(path: pathlib.Path) -> None:
-    """Check the line that `_append_checksum` wrote; a note tells of a file without one.
+    """Check the digest that `save_index` appended; a note tells of a file without one.
 
     Raises:
         InputError: the file has other bytes than the line says.
     """
-    with path.open("rb") as file:
-        size = max(0, os.fstat(file.fileno()).st_size - _APPENDED_SIZE)
-        file.seek(size)
-        line = file.read()
-        if not line.startswith(_APPENDED):
-            tell_unchecked(path)
-            return
-        file.seek(0)
-        digester = hashlib.sha256()
-        while size and (data := file.read(min(size, 2**20))):
-            digester.update(data)
-            size -= len(data)
-    if line != _APPENDED + digester.hexdigest().encode() + b"\n":
+    data = np.memmap(path, np.uint8, "r")
+    line = data[-_APPENDED_SIZE:].tobytes()
+    if not line.startswith(_APPENDED):
+        tell_unchecked(path)
+        return
+    digest = hashlib.sha256(data[:-_APPENDED_SIZE].data).hexdigest()
+    if line != _APPENDED + digest.encode() + b"\n":
         raise ChangedFileError(path)

@@ -38,15 +38,6 @@ class Grouping:
     queries: str
     database: str
 
-    def __post_init__(self) -> None:
-        """Check both sides' groupings.
-
-        Raises:
-            InputError: a grouping is unknown.
-        """
-        for kind in (self.queries, self.database):
-            choose("grouping", kind, GROUPINGS)
-
     @classmethod
     def parse(cls, text: str) -> "Grouping":
         """Read "window/single", queries and database apart, or "single" for both alike.
@@ -59,6 +50,8 @@ class Grouping:
             raise InputError(
                 f"grouping: found {text!r}, expected one for both sides, or QUERIES/DATABASE"
             )
+        for kind in kinds:
+            choose("grouping", kind, GROUPINGS)
         return cls(kinds[0], kinds[-1])
 
     def __str__(self) -> str:
@@ -102,14 +95,13 @@ class Batches(NamedTuple):
     """Whether a place holds an image, and not padding."""
     kept: Bool[np.ndarray, "batch place"]
     """Whether a place's descriptor is kept; every image is kept in exactly one batch."""
-    mutual: bool
-    """Whether the images of a batch attend to each other, or each at itself alone."""
+    grouping: str
+    """Which of `GROUPINGS` this is: under "single" each image attends to itself alone."""
 
     def part(self, start: int, stop: int) -> "Batches":
         """Return batches `start` to `stop`."""
-        return Batches(
-            self.images[start:stop], self.filled[start:stop], self.kept[start:stop], self.mutual
-        )
+        images, filled, kept = (each[start:stop] for each in self[:3])
+        return Batches(images, filled, kept, self.grouping)
 
     @property
     def attention_mask(self) -> Bool[np.ndarray, "batch place place"]:
@@ -117,7 +109,7 @@ class Batches(NamedTuple):
 
         Each attends to itself. None attends to padding.
         """
-        seen = self.filled & self.mutual
+        seen = self.filled & (self.grouping != "single")
         return seen[:, :, None] & seen[:, None, :] | np.eye(self.images.shape[1], dtype=bool)
 
 
@@ -141,7 +133,7 @@ def batches_of(count: int, grouping: str, batch_size: int, seed: int = 0) -> Bat
         filled = images >= 0
         keep = np.zeros_like(filled)
         keep[:, -1] = True
-        return Batches(np.where(filled, images, order[:, None]), filled, keep, mutual=True)
+        return Batches(np.where(filled, images, order[:, None]), filled, keep, grouping)
     if grouping == "shuffled":
         order = np.random.default_rng(seed).permutation(count)
     starts = np.arange(0, count, batch_size)
@@ -151,4 +143,4 @@ def batches_of(count: int, grouping: str, batch_size: int, seed: int = 0) -> Bat
     wrapped = (
         starts[:, None] + np.arange(batch_size) % np.minimum(count - starts, batch_size)[:, None]
     )
-    return Batches(order[wrapped], filled, filled, mutual=grouping != "single")
+    return Batches(order[wrapped], filled, filled, grouping)

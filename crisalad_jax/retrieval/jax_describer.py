@@ -36,11 +36,15 @@ class JaxDescriber:
         check_params(params, config)
         self.config = config
         self.preparation = Preparation.of(config)
-        self.row_length = config.unprojected_dim
         self.row_dtype = "float64" if config.compute_dtype == "float64" else "float32"
         self._given, self._params = params, cast_params(params, config)
         self._placed: tuple[int, Devices, Crisalad] | None = None
         """A batch size, the devices that share such a batch, and the parameters on them."""
+
+    @property
+    def row_length(self) -> int:
+        """Number of values in the row of an image's tokens."""
+        return self.config.unprojected_dim
 
     @functools.cached_property
     def digest(self) -> str:

@@ -3,12 +3,13 @@
 import itertools
 import math
 from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.loader import one_ahead, read_ahead
+from crisalad_jax.data.loader import one_ahead
 from crisalad_jax.retrieval.chunks import UNIT_TOLERANCE, Block, Descriptors, Queries
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.shapes import Float, Float32, Int, Int64
@@ -110,10 +111,8 @@ def similarities_of(
         row = np.cumsum(is_new) - 1
         similarities[piece] = exact_similarities(queries, rows, query[piece], row)
 
-    starts = range(0, len(order), size)
-    cores = usable_cores() if len(starts) > 1 else 0
-    for _ in read_ahead(fill, starts, ahead=2 * cores, threads=cores):
-        pass
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        list(threads.map(fill, range(0, len(order), size)))
     return similarities
 
 

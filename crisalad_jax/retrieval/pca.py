@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
-from crisalad_jax.config.checks import PATH, check_seed, check_types, takes
+from crisalad_jax.config.checks import PATH, check_seed, check_types, require, takes
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.retrieval.chunks import WIDE, Descriptors, as_rows, blocks, sample
@@ -120,10 +120,10 @@ class Pca(NamedTuple):
             )
 
 
-def shortened_length(
+def shortened(
     pca: Pca | None, config: "ModelConfig", name: str, *, unit: bool = False
-) -> int:
-    """Check that components fit a model; return the length of the descriptors that they leave.
+) -> tuple[int, bool]:
+    """Check that components fit a model; return the descriptors' length, and if they are unit.
 
     Args:
         pca: the components; None leaves descriptors as they are.
@@ -134,19 +134,16 @@ def shortened_length(
     Raises:
         InputError: the components were fitted to other descriptors, or no unit vectors are left.
     """
-    if pca is None:
-        if unit:
-            from crisalad_jax.nn.config import check_unit_length
-
-            check_unit_length(config, name)
-        return config.descriptor_dim
-    pca.check(config.descriptor_dim, name)
-    if unit and not pca.config.renormalise:
-        raise InputError(
-            f"{name}: found components that leave lengths as they are, expected some that make "
-            "unit vectors, which are compared by cosine"
-        )
-    return len(pca.components)
+    length, is_unit = config.descriptor_dim, config.unit_length
+    if pca is not None:
+        pca.check(length, name)
+        length, is_unit = len(pca.components), pca.config.renormalise
+    require(
+        is_unit or not unit,
+        f"{name}: found descriptors whose lengths are left as they are, expected unit vectors, "
+        "which are compared by cosine",
+    )
+    return length, is_unit
 
 
 def fit_pca(

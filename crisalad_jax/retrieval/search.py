@@ -38,7 +38,6 @@ def search(
     k: int,
     *,
     chunk: int = 4096,
-    label: str = "search",
     quiet: bool = True,
 ) -> Neighbours:
     """Find the most similar database descriptors of each query, exactly.
@@ -60,7 +59,6 @@ def search(
         queries: unit descriptors of the q queries, alike.
         k: neighbours per query; a database of fewer images gives all of them, min(k, n).
         chunk: database rows compared at a time, rounded up so that devices share alike.
-        label: of the progress bar.
         quiet: no progress bar.
 
     Returns:
@@ -84,7 +82,7 @@ def search(
     size = -(-min(chunk, count) // devices) * devices
     stream = functools.partial(blocks, database, "database", size)
 
-    with progress_bar(label, count, "rows", quiet=quiet) as bar:
+    with progress_bar("search", count, "rows", quiet=quiet) as bar:
 
         def shown() -> Generator[Block, None, None]:
             for block in blocks(database, "database", size, narrow=not on_host):

@@ -57,7 +57,7 @@ from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import Model
 from crisalad_jax.nn.pixels import LOCAL_NOISE, LOCAL_WINDOW
 from crisalad_jax.retrieval import jax_describer
-from crisalad_jax.retrieval.describe import group, read_tokens
+from crisalad_jax.retrieval.describe import TokenSet
 from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.descriptor_files import write_descriptors
 from crisalad_jax.utils import compiler
@@ -256,8 +256,8 @@ def by_us(both: Sides, batch: int) -> list[Contender]:
                 jax_describer, "_token_rows", watch.program(jax_describer._token_rows)
             ),
         ):
-            rows = read_tokens(describer, paths, reading).descriptors
-        found = group(describer, rows, len(paths), "single", batch_size=batch)
+            tokens = TokenSet(describer, paths, reading)
+        found, _ = tokens.describe("single")
         write_descriptors(out, found, names(folder, paths))
 
     def load(folder: pathlib.Path, out: pathlib.Path, watch: Watch) -> None:

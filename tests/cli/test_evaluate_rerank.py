@@ -58,7 +58,7 @@ def test_rows_come_in_pairs(capfd, tmp_path, shared, weights):
 
 
 def test_bad_input_is_named_before_any_work(capfd, shared, weights, monkeypatch):
-    monkeypatch.setattr("crisalad_jax.evaluation.evaluate.read_tokens", None)
+    monkeypatch.setattr("crisalad_jax.evaluation.evaluate.TokenSet", None)
     own = shared / "weights.safetensors"
     start = ("evaluate", "--data", shared / "town", "--weights", own, "--quiet")
     nowhere = ("evaluate", "--data", shared / "none", "--weights", own, "--quiet")

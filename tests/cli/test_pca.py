@@ -109,7 +109,7 @@ def test_components_become_the_last_layer_of_a_model(capfd, tmp_path, shared, wh
     plain = tmp_path / "plain.safetensors"
     succeeds(capfd, *fit, "--no-renormalise", "--dim", 4, "--out", plain, "--quiet")
     index = ("index", "--images", town, "--weights", plain, "--out", tmp_path / "map", "--quiet")
-    fails(capfd, *index, words=(f"{plain}: found a model whose projection leaves lengths",))
+    fails(capfd, *index, words=(f"{plain}: found descriptors whose lengths are left",))
     assert not (tmp_path / "map").exists()
 
 

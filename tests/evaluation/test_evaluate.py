@@ -15,7 +15,7 @@ from crisalad_jax.evaluation.evaluate import evaluate, same_place_rule
 from crisalad_jax.evaluation.leakage import near, same_place_share
 from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.nn.model import Model, describe
-from crisalad_jax.retrieval.describe import Described, group, read_tokens
+from crisalad_jax.retrieval.describe import TokenSet, group
 from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.grouping import GROUPINGS, batches_of
 from crisalad_jax.utils.errors import InputError
@@ -42,19 +42,19 @@ def images(benchmark: Benchmark) -> np.ndarray:
     return pictures(benchmark.database)
 
 
-def tokens_of(params, paths, config=MODEL, **options) -> Described:
+def tokens_of(params, paths, config=MODEL, **options) -> TokenSet:
     reading = Reading(batch_size=BATCH, quiet=True, **options)
-    return read_tokens(describer_of(Model(params, config)), paths, reading)
+    return TokenSet(describer_of(Model(params, config)), paths, reading)
 
 
 @pytest.fixture(scope="module")
 def folder(benchmark: Benchmark, params) -> np.ndarray:
-    return tokens_of(params, benchmark.database).descriptors
+    return tokens_of(params, benchmark.database).rows
 
 
 def grouped(params, rows: np.ndarray, grouping: str, config=MODEL, **changes) -> np.ndarray:
-    describer = describer_of(Model(params, config))
-    return group(describer, rows, len(rows), grouping, **({"batch_size": BATCH} | changes))
+    batches = batches_of(len(rows), grouping, **({"batch_size": BATCH} | changes))
+    return group(describer_of(Model(params, config)), rows, batches)
 
 
 def alike(found: np.ndarray, expected: np.ndarray) -> None:
@@ -124,9 +124,8 @@ def test_an_unreadable_image_is_seen_by_none(params, benchmark, images, folder, 
     bad.write_bytes(b"")
     paths = [*benchmark.database[:2], bad, *benchmark.database[2:4]]
     found = tokens_of(params, paths, on_bad_image="skip")
-    assert (found.indices.tolist(), found.unreadable.tolist()) == ([0, 1, 3, 4], [2])
-    descriptors = grouped(params, found.descriptors, "sequential")
-    alike(descriptors, np.asarray(describe(params, images[:4], MODEL)))
+    assert (len(found.rows), found.unreadable.tolist()) == (4, [2])
+    alike(found.describe("sequential")[0], np.asarray(describe(params, images[:4], MODEL)))
     with pytest.raises(InputError, match=f"^{bad}: "):
         tokens_of(params, paths)
 
@@ -189,7 +188,7 @@ def test_only_the_groupings_asked_for_in_their_order(params, benchmark):
 
 def test_without_an_encoder_no_descriptor_depends_on_its_batch(benchmark):
     params = random_params(WITHOUT_ENCODER)
-    rows = tokens_of(params, benchmark.database, WITHOUT_ENCODER).descriptors
+    rows = tokens_of(params, benchmark.database, WITHOUT_ENCODER).rows
     single, *others = (grouped(params, rows, name, WITHOUT_ENCODER) for name in GROUPINGS)
     assert len(others) == 3
     for found in others:
@@ -304,7 +303,7 @@ def test_recalls_are_those_of_a_flat_faiss_index_on_the_same_descriptors(params,
     benchmark = open_benchmark(town)
     assert len(benchmark.database) == 15
     database, queries = (
-        grouped(params, tokens_of(params, paths).descriptors, "single")
+        grouped(params, tokens_of(params, paths).rows, "single")
         for paths in (benchmark.database, benchmark.queries)
     )
     index = faiss.IndexFlatL2(database.shape[1])

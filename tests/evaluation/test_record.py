@@ -8,7 +8,7 @@ import pytest
 
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.evaluation.record import evaluation_settings, results_json, table_notes
+from crisalad_jax.evaluation.record import Record, evaluation_record, table_notes
 from crisalad_jax.evaluation.results import ANY, GroupingResult, to_json
 from crisalad_jax.evaluation.similarity import FirstSimilarities, similarity_map
 from crisalad_jax.retrieval.neighbours import Neighbours
@@ -24,12 +24,16 @@ def result(grouping: str, rerank: str | None = None) -> GroupingResult:
     return GroupingResult(grouping, {1: 0.5}, NEIGHBOURS, rerank=rerank)
 
 
+RESULTS = [result("single"), result("single", "transvpr:3")]
+
+
 @pytest.fixture
-def settings(benchmark: Benchmark) -> dict:
-    return evaluation_settings(benchmark, MODEL, **ASKED)
+def record(benchmark: Benchmark) -> Record:
+    return evaluation_record(RESULTS, benchmark, MODEL, model_name="mine", **ASKED)
 
 
-def test_settings_are_what_was_asked(settings, benchmark):
+def test_settings_are_what_was_asked(record, benchmark):
+    settings = record.settings
     assert settings == json.loads(json.dumps(settings))
     assert settings == ASKED | {
         "weights": "w.safetensors",
@@ -40,18 +44,18 @@ def test_settings_are_what_was_asked(settings, benchmark):
     }
 
 
-def test_results_are_written_with_them(settings, benchmark, tmp_path):
-    results = [result("single"), result("single", "transvpr:3")]
-    found = results_json(results, settings, model_name="mine", benchmark=benchmark)
-    found = json.loads(json.dumps(found))
+def test_results_are_written_with_them(record, benchmark):
+    found = json.loads(json.dumps(record.values))
     rows = found.pop("results")
     assert found.pop("skipped") == {"queries": [], "database": []}
-    assert found == settings
+    assert found == record.settings
     names = {"benchmark": benchmark.name, "model": "mine"}
-    assert rows == [names | json.loads(json.dumps(to_json(each))) for each in results]
+    assert rows == [names | json.loads(json.dumps(to_json(each))) for each in RESULTS]
 
 
-def test_notes_are_of_what_the_table_shows(settings):
+def test_notes_are_of_what_the_table_shows(record):
+    settings = record.settings
+    assert record.notes == table_notes(RESULTS, settings)
     alone = table_notes([result(ANY)], settings)
     assert alone[1:] == ["No cross-image encoder: no descriptor depends on its batch."]
     _, grouped = table_notes([result("single"), result("window/single")], settings)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from crisalad_jax.retrieval.descriptor_files import (
-    check_suffix,
     open_npy,
     read_descriptors,
+    targets,
     write_descriptors,
 )
 from crisalad_jax.utils.errors import InputError
@@ -62,7 +62,10 @@ def test_h5_with_a_name_twice_is_not_written(tmp_path):
 def test_another_suffix_is_refused_before_any_work(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = rf"{name}: suffix.*expected one of \.h5, \.npy"
-    for refuse in (check_suffix, lambda name: write_descriptors(name, DESCRIPTORS, NAMES)):
+    for refuse in (
+        lambda name: targets(pathlib.Path(name)),
+        lambda name: write_descriptors(name, DESCRIPTORS, NAMES),
+    ):
         with pytest.raises(InputError, match=words):
             refuse(name)
     assert names_in(tmp_path) == set()

@@ -70,7 +70,7 @@ def test_components_in_memory(params, town, expected, tmp_path):
     np.testing.assert_array_equal(found.descriptors, fitted.apply(expected))
     assert json.loads((tmp_path / "d.npy.json").read_text())["pca"] == "3 components"
     loose = fit_pca(expected, 3, PcaConfig(renormalise=False))
-    with pytest.raises(InputError, match="--pairs: found components that leave lengths"):
+    with pytest.raises(InputError, match="--pairs: found descriptors whose lengths are left"):
         run(params, town, pca=loose, pairs=tmp_path / "pairs.txt")
 
 
@@ -89,12 +89,16 @@ def test_unreadable_images_of_a_list(params, town, tmp_path):
     ("images", "options", "words"),
     [
         ([], {}, "images: found none, expected at least one"),
-        (["a\nb.jpg"], {}, "images: found a line break in the name"),
+        (["none.jpg"], {}, "none.jpg: found no such file, expected a folder of images, an image"),
+        (["a\nb.jpg"], {}, "found a line break in the name"),
         (["a.jpg"], {"root": "/elsewhere"}, "--root: found /elsewhere, expected a folder that"),
         (["a.jpg"], {"grouping": "all"}, "grouping: found 'all'"),
     ],
 )
-def test_what_is_refused(params, images, options, words):
+def test_what_is_refused(params, images, options, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.jpg", "a\nb.jpg"):
+        (tmp_path / name).write_bytes(b"no image")
     with pytest.raises(InputError, match=words):
         run(params, images, **options)
 

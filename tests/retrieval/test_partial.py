@@ -230,7 +230,7 @@ def test_other_work_is_begun_anew_with_a_note(params, town, described, tmp_path,
     cut_short(monkeypatch, params, listed, out, after=2)
     params = jax.tree.map(lambda leaf: leaf * 0.9, params)
     described.clear()
-    words = r"0000000000\.json: found work of another model, batch size or images, or damaged"
+    words = r"d\.npy\.partial: found work of another model, batch size or images; the work"
     with pytest.warns(Note, match=words) as told:
         found = run(params, listed, out)
     assert len(told) == 1
@@ -245,7 +245,7 @@ def test_other_work_is_begun_anew_with_a_note(params, town, described, tmp_path,
 def test_what_is_damaged_is_described_again(
     params, town, whole, described, tmp_path, monkeypatch, how, part
 ):
-    """A record as from there on; rows as from the beginning. A note says so."""
+    """From the beginning. A note says so."""
     out = tmp_path / "d.npy"
     cut_short(monkeypatch, params, town, out, after=PARTS)
     folder = tmp_path / "d.npy.partial"
@@ -262,10 +262,9 @@ def test_what_is_damaged_is_described_again(
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", Note)
         run(params, town, out)
-    assert described == names_from(town, BATCH if part == ".json" else 0)
-    notes = [str(one.message) for one in told if issubclass(one.category, Note)]
-    assert notes
-    assert all("starts again" in note for note in notes)
+    assert described == names_from(town, 0)
+    (note,) = (str(one.message) for one in told if issubclass(one.category, Note))
+    assert "starts again" in note
     assert contents(tmp_path) == whole
 
 
@@ -289,35 +288,20 @@ def test_a_failure_before_anything_is_done_leaves_nothing(params, town, tmp_path
         assert "d.npy.partial" not in os.listdir(out.parent)
 
 
-@pytest.mark.parametrize(
-    ("other", "kept"),
-    [
-        ("first picture", 0),
-        ("second batch", BATCH),
-        ("order", 0),
-        ("last picture", 2 * BATCH),
-        ("fewer", 2 * BATCH),
-    ],
-)
-def test_batches_of_the_same_images_are_kept(
-    params, town, described, tmp_path, monkeypatch, other, kept
-):
-    """Two batches are done; those before the first that has changed are not described again."""
+@pytest.mark.parametrize("other", ["first picture", "last picture", "fewer", "order"])
+def test_work_of_other_images_starts_again(params, town, described, tmp_path, monkeypatch, other):
     images, out = tmp_path / "town", tmp_path / "d.npy"
     shutil.copytree(town, images)
     listed = list_images(images)
     cut_short(monkeypatch, params, listed, out, after=2)
-    place = {"first picture": 0, "second batch": BATCH, "last picture": -1}.get(other)
+    place = {"first picture": 0, "last picture": -1}.get(other)
     if place is not None:
         write_picture(listed[place], seed=99)
     listed = {"fewer": listed[:-1], "order": listed[::-1]}.get(other, listed)
     described.clear()
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always", Note)
+    with pytest.warns(Note, match="found work of another model, batch size or images"):
         found = run(params, listed, out)
-    assert described == [path.name for path in listed[kept:]]
-    assert bool(told) == (kept < 2 * BATCH)
-    assert all("found work of another model, batch" in str(note.message) for note in told)
+    assert described == [path.name for path in listed]
     alone = run(params, listed, tmp_path / "alone.npy")
     np.testing.assert_array_equal(found.descriptors, alone.descriptors)
 

@@ -12,12 +12,13 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.describe import (
     FrameDescriber,
+    TokenSet,
     check_window,
     described,
     group,
-    read_tokens,
 )
 from crisalad_jax.retrieval.describer import describer_of
+from crisalad_jax.retrieval.grouping import batches_of
 from crisalad_jax.retrieval.pca import fit_pca
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL
@@ -32,9 +33,9 @@ def town(shared, params):
     """Seven images, and their descriptors by the grouping `window`."""
     paths = list_images(shared / "town" / "images" / "test" / "database")
     describer = describer_of(Model(params, MODEL))
-    rows = read_tokens(describer, paths, READING).descriptors
-    expected = group(describer, rows, len(paths), "window", batch_size=WINDOW)
-    alone = group(describer, rows, len(paths), "single", batch_size=BATCH)
+    rows = TokenSet(describer, paths, READING).rows
+    expected = group(describer, rows, batches_of(len(rows), "window", WINDOW))
+    alone = group(describer, rows, batches_of(len(rows), "single", BATCH))
     # The test can fail: the frames before it change a descriptor.
     assert np.abs(expected - alone)[1:].max() > 1000 * ROUNDING
     return types.SimpleNamespace(paths=paths, expected=expected, describer=describer, rows=rows)
@@ -59,7 +60,7 @@ def test_an_unreadable_frame_is_left_out_and_not_looked_at(town, tmp_path):
     assert [index for part in parts for index in part.unreadable] == [2]
     found = np.concatenate([part.descriptors for part in parts])
     rows = np.delete(town.rows, 2, axis=0)
-    expected = group(town.describer, rows, len(rows), "window", batch_size=WINDOW)
+    expected = group(town.describer, rows, batches_of(len(rows), "window", WINDOW))
     np.testing.assert_allclose(found, expected, atol=ROUNDING)  # as above
 
 

@@ -70,7 +70,7 @@ def write_report(
         groupings: the results, at least one.
         model: for the section on its transport; a model without one has none.
         model_name: which weights.
-        settings: what `evaluation_settings` returns, shown folded.
+        settings: those of an `evaluation_record`, shown folded.
         similarities: what `similarity.similarity_map` gives of the first grouping.
 
     Raises:

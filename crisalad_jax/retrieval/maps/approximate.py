@@ -24,12 +24,9 @@ from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 if TYPE_CHECKING:
     from crisalad_jax.retrieval.faiss_index import Index
 
-SEARCHES = {
-    "exact": "every descriptor is compared",
-    "hnsw": "a graph over the descriptors, which are all in memory",
-    "ivf-pq": "codes of at most 128 bytes in memory; the files rank the answers",
-}
-"""How a map is searched."""
+SEARCHES = dict.fromkeys(("exact", "hnsw", "ivf-pq"))
+"""How a map is searched: every descriptor is compared; by a graph over the descriptors, which are
+all in memory; or by codes of at most 128 bytes in memory, and the files rank the answers."""
 FOLDER = "approximate"
 NEIGHBOURS, SAMPLE = 10, 100
 """Recall is measured over the 10 nearest others of so many of the map's images."""

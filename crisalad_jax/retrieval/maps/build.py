@@ -5,18 +5,19 @@ import dataclasses
 import os
 import pathlib
 import shutil
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.data.sources import ImageSource, check_rate_used, open_source
+from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import check_search
-from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.map import Map, MapImage, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import (
     SHARES,
     MapMetadata,
@@ -66,78 +67,20 @@ class Indexed(NamedTuple):
     """Whether another process joins the shares, so that these are counts of one share."""
 
 
-def index_images(
-    target: Map,
-    describer: Describer,
-    source: ImageSource,
-    positions: Positions,
-    reading: Reading = Reading(),
-) -> Indexed:
-    """Describe images as the map's are, and append them, `SEGMENT` at a time.
-
-    Images whose names the map has are left out, so that the same call resumes after a kill.
-
-    Args:
-        target: the map, open for appending.
-        describer: the map's model.
-        source: the images.
-        positions: positions by name, as far as known.
-        reading: how images are read.
-
-    Raises:
-        InputError: an image cannot be read; a name in the map is of another image here; or what
-            `Map.append` raises.
-    """
-    names, sizes, new = _new_images(target, source)
-    target.fitted(names, positions)  # checks them before any work
-    result = _so_far(target, target.metadata, source, positions)
-    root, total, quiet = real_path(source.root).as_posix(), len(source.paths), reading.quiet
-    stream = described(describer, new, reading, components=target.components)
-    for part in joined(shown(stream, "images", total, quiet=quiet, done=result.there), SEGMENT):
-        result.unreadable.extend(names[i] for i in part.unreadable)
-        if len(part.indices):
-            some, bytes_ = ([column[i] for i in part.indices] for column in (names, sizes))
-            target.append(some, bytes_, part.descriptors, root=root, positions=positions)
-    return _with_added(result, target, result.images)
-
-
-def _so_far(
-    target: Map | None, metadata: MapMetadata, source: ImageSource, positions: Positions
-) -> Indexed:
-    """Count what a map has of a source before any image is added; None has nothing."""
-    there = set[str]() if target is None else {image.name for image in target.images}
-    listed = set(source.names)
-    return Indexed(
-        added=0,
-        there=len(listed & there),
-        positions=0,
-        stay=len(positions.of.keys() & there),
-        unreadable=[],
-        unmatched=[name for name in positions.of if name not in listed],
-        images=len(there),
-        metadata=metadata,
-    )
-
-
-def _with_added(result: Indexed, target: Map, known: int) -> Indexed:
-    """Count the images that a map has beyond the first `known`."""
-    located = sum(image.position is not None for image in target.images[known:])
-    return result._replace(added=len(target) - known, positions=located, images=len(target))
-
-
 def _new_images(
-    target: Map, source: ImageSource
+    maps: Sequence[Map], source: ImageSource
 ) -> tuple[list[str], list[int], list[pathlib.Path]]:
-    """List names, sizes and paths of the images that a map does not have.
+    """List names, sizes and paths of the images that no map has.
 
     Raises:
-        InputError: a name in the map is of another image here.
+        InputError: a name in a map is of another image here.
     """
     names, sizes, new = [], [], []
     for name, path in zip(source.names, source.paths, strict=True):
         file = file_of(path)
         size = file.stat().st_size if file.is_file() else None  # missing: to be skipped
-        if (known := target.image(name)) is None:
+        known = next(filter(None, (each.image(name) for each in maps)), None)
+        if known is None:
             names.append(name)
             sizes.append(size or 0)
             new.append(path)
@@ -196,7 +139,7 @@ def index(
     Raises:
         InputError: parameters of another configuration; no image, or none that can be read;
             positions of none of them; a map of another model or of other
-            settings; what `index_images`, `new_metadata` and `open_for_appending` raise.
+            settings; what `Map.append`, `new_metadata` and `open_for_appending` raise.
 
     Example:
         >>> import jax
@@ -213,8 +156,7 @@ def index(
     part = None if share is None else Share.parse(share)
     out = pathlib.Path(out)
     metadata = read_metadata(out)
-    source = open_source(images, fps=fps, on_bad_image=reading.on_bad_image)
-    check_rate_used(fps, source.paths)
+    (source,) = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
     table = source.positions if positions is None else positions
     if table is None:
         known = utm_positions(source.names)
@@ -236,7 +178,11 @@ def index(
         known = None
     fitted = reading.fitted(len(source.paths))
     work = _Indexing(describer, source, known, metadata, components, search, fitted)
-    result = work.alone(out) if part is None else work.share(out, part)
+    if part is not None:
+        result = work.share(out, part)
+    else:
+        with open_for_appending(out, metadata, components) as target:
+            result = work.into(target)
     return result if table is not None else result._replace(stay=0)
 
 
@@ -253,20 +199,67 @@ class _Indexing:
     search: str | None
     reading: Reading
 
-    def alone(self, out: pathlib.Path) -> Indexed:
-        """Index all images in this process.
+    def into(self, target: Map) -> Indexed:
+        """Append all images to a map that is open for appending.
 
         Raises:
-            InputError: what `index_images` and `_finish` raise.
+            InputError: what `_append` and `_finish` raise.
         """
-        with open_for_appending(out, self.metadata, self.components) as target:
-            result = self._describe(target, self.source, target)
-            return result._replace(recall=self._finish(target))
+        known = len(target)
+        unreadable = self._append(target, self.source, target)
+        result = self._counts(target.images[:known], target.images[known:], unreadable)
+        return result._replace(recall=self._finish(target))
 
-    def _describe(self, target: Map, source: ImageSource, whole: Map) -> Indexed:
-        """Append images to `target`; those that `whole` has are not read."""
-        positions = _by_exif(whole, source) if self.positions is None else self.positions
-        return index_images(target, self.describer, source, positions, self.reading)
+    def _append(self, target: Map, source: ImageSource, whole: Map) -> list[str]:
+        """Describe images as the map's are, and append them to `target`, `SEGMENT` at a time.
+
+        Images whose names `target` or the `whole` map has are left out, so that the same call
+        resumes after a kill.
+
+        Returns:
+            The names of the images that cannot be read.
+
+        Raises:
+            InputError: an image cannot be read; a name in a map is of another image here; or what
+                `Map.append` raises.
+        """
+        names, sizes, new = _new_images((target, whole), source)
+        positions = self.positions
+        if positions is None:
+            positions = _by_exif(whole, zip(names, new, strict=True))
+        target.fitted(names, positions)  # checks them before any work
+        unreadable: list[str] = []
+        root, total, quiet = (
+            real_path(source.root).as_posix(),
+            len(source.paths),
+            self.reading.quiet,
+        )
+        stream = described(self.describer, new, self.reading, components=target.components)
+        done, quiet = total - len(new), self.reading.quiet
+        stream = shown(stream, "images", total, quiet=quiet, done=done)
+        for part in joined(stream, SEGMENT):
+            unreadable.extend(names[i] for i in part.unreadable)
+            if len(part.indices):
+                some, bytes_ = ([column[i] for i in part.indices] for column in (names, sizes))
+                target.append(some, bytes_, part.descriptors, root=root, positions=positions)
+        return unreadable
+
+    def _counts(
+        self, there: Sequence[MapImage], added: Sequence[MapImage], unreadable: list[str]
+    ) -> Indexed:
+        """Count what became of the images, of a map that had some before."""
+        known, listed = {image.name for image in there}, set(self.source.names)
+        given = () if self.positions is None else self.positions.of.keys()
+        return Indexed(
+            added=len(added),
+            there=len(listed & known),
+            positions=sum(image.position is not None for image in added),
+            stay=len(known.intersection(given)),
+            unreadable=unreadable,
+            unmatched=[name for name in given if name not in listed],
+            images=len(there) + len(added),
+            metadata=self.metadata,
+        )
 
     def _finish(self, target: Map) -> float | None:
         """Build the search that was asked for, and return its recall."""
@@ -279,42 +272,42 @@ class _Indexing:
         """Index the images of one share in a map of its own; if it is the last one, join all.
 
         Raises:
-            InputError: a share of other settings is there; what `index_images` and `_finish` raise.
+            InputError: a share of other settings is there; what `_append` and `_finish` raise.
         """
-        metadata, source, known = self.metadata, self.source, self.positions or utm_positions(())
+        metadata, source = self.metadata, self.source
         settings = {name: getattr(metadata, name) for name in ("dtype", "pca", "config")}
         settings |= {"batch_size": self.reading.batch_size, "digest": self.describer.digest}
         shares = Shares(out / SHARES, part, digest_of(source.names, settings))
         mine = part.of(len(source.paths), self.reading.batch_size)
         own = source._replace(names=source.names[mine], paths=source.paths[mine])
         with contextlib.ExitStack() as stack:
-            whole = None
+            whole, there = None, []
             if has_images(out):
                 whole = stack.enter_context(Map.open(out, verify=False, calibrated=False))
-                whole.fitted(source.names, known)
-                names, _, paths = _new_images(whole, own)
-                own = own._replace(names=names, paths=paths)
-            result = _so_far(whole, metadata, source, known)
+                whole.fitted(source.names, self.positions)
+                there = whole.images
+            result = self._counts(there, [], [])
             if result.there == len(source.names) and not shares.folder.exists():
                 return result
             if shares.result(part.index) is None:
                 own_metadata = dataclasses.replace(metadata, store="files")
                 with open_for_appending(shares.own, own_metadata, self.components) as target:
-                    unreadable = self._describe(target, own, whole or target).unreadable
-                    result = _with_added(result, target, 0)
+                    unreadable = self._append(target, own, whole or target)
+                    result = self._counts(there, target.images, unreadable)
                 shares.finish({"unreadable": unreadable})
         with shares.joining() as (results, waiting):
             if results is None:
                 return result._replace(**waiting)
             bar = progress_bar("joining", part.count, "shares", quiet=self.reading.quiet)
             with open_for_appending(out, metadata, self.components) as target, bar as joining:
-                before = len(target)
+                known = len(target)
                 for index in range(part.count):
                     _append_share(target, shares.path(index))
                     joining.advance(1)
                 recall = self._finish(target)
         unreadable = [name for each in results for name in each["unreadable"]]
-        return _with_added(result, target, before)._replace(unreadable=unreadable, recall=recall)
+        result = self._counts(target.images[:known], target.images[known:], unreadable)
+        return result._replace(recall=recall)
 
 
 def _append_share(target: Map, folder: pathlib.Path) -> None:
@@ -339,14 +332,9 @@ def _append_share(target: Map, folder: pathlib.Path) -> None:
     shutil.rmtree(folder)
 
 
-def _by_exif(target: Map, source: ImageSource) -> Positions:
-    """Read where JPEGs that the map lacks were taken, if its own positions are in degrees too."""
-    new = (
-        (name, path)
-        for name, path in zip(source.names, source.paths, strict=True)
-        if target.image(name) is None and frame_time(path) is None
-    )
-    found = exif_positions(new)
+def _by_exif(target: Map, images: Iterable[tuple[str, pathlib.Path]]) -> Positions:
+    """Read where JPEGs were taken, if the map's own positions are in degrees too."""
+    found = exif_positions(each for each in images if frame_time(each[1]) is None)
     if found.of and target.axes not in (None, found.axes):
         warn(
             f"{target.folder}: left out the EXIF positions of {len(found.of)} images, expected "

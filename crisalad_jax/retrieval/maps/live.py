@@ -3,15 +3,14 @@
 import pathlib
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count, takes
-from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.live import Frame
+from crisalad_jax.data.live import Camera, FolderWatch
 from crisalad_jax.retrieval.describe import FrameDescriber
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import (
@@ -27,17 +26,6 @@ from crisalad_jax.utils.output import counted
 
 if TYPE_CHECKING:  # answers are searched without JAX
     from crisalad_jax.nn.model import Model
-
-
-class FrameSource(Protocol):
-    """What gives frames as they come: a `Camera` or a `FolderWatch`."""
-
-    size: Size | None
-    """Height and width of the frames; None where they are unknown or differ."""
-
-    def frames(self, check: Callable[[], None] = ...) -> Iterator[Frame]:
-        """Yield the frames; `check` is called several times a second, and may raise."""
-        ...
 
 
 @brief
@@ -61,7 +49,7 @@ class LiveAnswer(NamedTuple):
 @takes(places=Map)
 def query_live(
     places: Map,
-    source: FrameSource,
+    source: Camera | FolderWatch,
     *,
     model: "Model | Runtime | None" = None,
     k: int = 5,

@@ -138,8 +138,6 @@ class Map:
         self._segments, self._numbers = segments, dict[str, int]()
         self._close = weakref.finalize(self, segments.store.close)
         self._approximate: Approximate | None = None
-        self._tells_stale = True
-        """Whether the next search that is not asked to be exact tells why it is."""
         self._describer: tuple[object, Describer] | None = None
         """A model that is known to be the one that made the map, and what describes with it."""
         for span, record in zip(segments.spans, segments.records, strict=True):
@@ -151,6 +149,8 @@ class Map:
         cls, folder: str | os.PathLike[str], *, verify: bool = True, calibrated: bool = True
     ) -> Self:
         """Open a map to search it as it is now; images appended meanwhile are not seen.
+
+        A note says so of an approximate search that is not of all images, and is not used.
 
         Args:
             folder: what `index` made.
@@ -186,6 +186,11 @@ class Map:
         if verify and metadata.store == "files":
             opened.verify()
         opened._approximate = open_approximate(folder, opened._segments, verify=verify)
+        if (kind := opened.stale_search) is not None:
+            warn(
+                f"{folder}: found an approximate search of fewer or other images; the map is "
+                f"searched exactly; `crisalad index --search {kind}` builds it again"
+            )
         return opened
 
     @classmethod
@@ -264,7 +269,6 @@ class Map:
 
         Search is exact, by inner product; of equal similarities the earlier image stands first.
         A map with an approximate search finds nearly all of them. Their similarities are exact.
-        A note tells, once, of an approximate search that is not of all images, and is not used.
 
         Args:
             queries: unit descriptors, of the map's model, shortened by its `components`.
@@ -280,13 +284,6 @@ class Map:
         k = min(k, len(self))
         if self._approximate is not None and not exact:
             return self._approximate.search(queries, k, len(self))
-        if self._tells_stale and not exact:
-            self._tells_stale = False
-            if (kind := self.stale_search) is not None:
-                warn(
-                    f"{self.folder}: found an approximate search of fewer or other images; the map "
-                    f"is searched exactly; `crisalad index --search {kind}` builds it anew"
-                )
         return self._segments.store.search(queries, k, len(self))
 
     @property

@@ -14,7 +14,7 @@ from crisalad_jax.checkpoints.runtime import read_header
 from crisalad_jax.checkpoints.starter import FILES, recorded, resolved
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.maps.store import check_store, store_name
-from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened_length
+from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.output import warn
@@ -90,7 +90,7 @@ def new_metadata(
     """
     check_store(store, dtype)
     config = describer.config
-    length = shortened_length(pca, config, str(weights), unit=True)
+    length, _ = shortened(pca, config, str(weights), unit=True)
     return MapMetadata(
         model=describer.digest,
         weights=recorded(weights),
@@ -117,12 +117,13 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
     path = folder / METADATA
     if not path.exists():
         # A process killed before it has made the map leaves its lock and temporary files behind.
-        others = sorted(_other_files(folder, LOCK, SEGMENTS, COMPONENTS, SHARES))
-        if _other_files(folder / SEGMENTS):
-            others.append(SEGMENTS)
+        own = (LOCK, SEGMENTS, COMPONENTS, SHARES)
+        there = [*folder.glob("*"), *(folder / SEGMENTS).glob("*")]
+        others = [p for p in there if p.name not in own and not is_temporary(p)]
         if others:
+            first = min(path.relative_to(folder).parts[0] for path in others)
             raise InputError(
-                f"{folder}: found {others[0]} and no {METADATA}, expected a map or an empty folder"
+                f"{folder}: found {first} and no {METADATA}, expected a map or an empty folder"
             )
         return None
     # Who edits the metadata removes its checksum. A changed key would be an unknown field.
@@ -144,13 +145,6 @@ def read_components(folder: pathlib.Path, metadata: MapMetadata) -> Pca | None:
             f"{folder / COMPONENTS}: found other components, expected those that {METADATA} says"
         )
     return pca
-
-
-def _other_files(folder: pathlib.Path, *names: str) -> list[str]:
-    """Return the names in `folder` that are neither temporary nor in `names`."""
-    if not folder.is_dir():
-        return []
-    return [p.name for p in folder.iterdir() if p.name not in names and not is_temporary(p)]
 
 
 def has_images(folder: pathlib.Path) -> bool:

@@ -49,24 +49,17 @@ def check_address(address: str) -> bool:
 
 @contextlib.contextmanager
 def _one_line(address: str) -> Iterator[None]:
-    """Turn Milvus' errors into one line, and silence its own logs of them."""
+    """Turn Milvus' errors into one line."""
     import grpc
     import pymilvus
 
-    loggers = [logging.getLogger(name) for name in _LOGS]
-    levels = [logger.level for logger in loggers]
     try:
-        for logger in loggers:
-            logger.setLevel(logging.CRITICAL + 1)
         yield
     except (pymilvus.MilvusException, grpc.RpcError) as error:
         words = getattr(error, "message", None) or str(error)
         if "Open local milvus failed" in words:
             words += " (damaged, or another process has it open)"
         raise InputError(f"{address}: Milvus says: {' '.join(words.split())}") from error
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
 
 
 class MilvusStore:
@@ -82,6 +75,8 @@ class MilvusStore:
                 import milvus_lite as _milvus_lite  # noqa: F401
         except ModuleNotFoundError as error:
             raise InputError(missing_extra(error, "store milvus")) from error
+        for name in _LOGS:
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # its errors are raised
         self._address, self._collection = address, collection
         self._rows = max(1, min(_MOST, _MESSAGE_BYTES // (4 * length)))
         path = pathlib.Path(address)

@@ -12,13 +12,11 @@ import numpy as np
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count, takes
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.data.sources import check_rate_used, open_source
+from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.data.video import frame_time
 from crisalad_jax.retrieval.describe import (
-    as_list,
     check_readable,
     described_sources,
     joined,
@@ -151,9 +149,10 @@ def query(
     """
     check_count("k", k)
     least = asked_similarity(places, min_similarity)
-    root, sources = _listed(images, fps, reading.on_bad_image)
+    root, sources = _below_one_root(
+        open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
+    )
     paths = list(itertools.chain(*sources))
-    check_rate_used(fps, paths)
     describer = places.describer(model, groupings=["single" if window == 1 else "window"])
     ask = asking(places, k, sequence, exact=exact)
     reading, components = reading.fitted(len(paths)), places.components
@@ -215,12 +214,10 @@ def asked_similarity(places: Map, min_similarity: float | None) -> float | None:
     return min_similarity if min_similarity > -1 else None
 
 
-def _listed(
-    images: Any, fps: float | None, on_bad_image: OnBadImage
+def _below_one_root(
+    sources: Sequence[ImageSource],
 ) -> tuple[pathlib.Path, list[list[pathlib.Path]]]:
     """List the images of each source, below a folder that holds all."""
-    given = as_list("images", images)
-    sources = [open_source(each, fps=fps, on_bad_image=on_bad_image) for each in given]
     roots = {source.root for source in sources}
     if len(roots) == 1:
         return roots.pop(), _runs([source.paths for source in sources])

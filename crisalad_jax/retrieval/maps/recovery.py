@@ -24,21 +24,15 @@ def remove_unrecorded(folder: pathlib.Path, images: int) -> None:
     """
     files = sorted((folder / SEGMENTS).glob("[0-9]*.npy"))
     unrecorded = [path for path in files if not path.with_suffix(".json").exists()]
-    signs = [
-        f"{path}: found a search of {count} images in a map of {images}"
-        for path, count in indexed_images(folder)
-        if count > images
-    ]
+    lost = [path for path, count in indexed_images(folder) if count > images]
     if not images and (folder / CALIBRATION).exists():
-        signs.append(f"{folder / CALIBRATION}: found it in a map without a record of images")
+        lost.append(folder / CALIBRATION)
     if len(unrecorded) > 1:
-        signs.append(
-            f"{unrecorded[0]}: found {len(unrecorded)} such files of descriptors without a record"
-        )
-    if signs:
+        lost += unrecorded
+    if lost:
         raise InputError(
-            f"{signs[0]}, expected the records of images that were there: put them back, or make a "
-            "new map in another folder"
+            f"{lost[0]}: found it in a map with records of {images} images alone, expected the "
+            "records of all images that were there: put them back, or make a new map"
         )
     for path in unrecorded:
         path.unlink()

@@ -15,7 +15,7 @@ from crisalad_jax.config.checks import choose
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Crisalad, cast_params
+from crisalad_jax.nn.model import Crisalad, Model, cast_params
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.reranking import matching, patch_netvlad
 from crisalad_jax.utils.devices import devices_for
@@ -75,10 +75,8 @@ class Reranking:
     transvpr, by one with that aggregator."""
     top: int
     """Number of a query's first retrievals that are re-ranked; the later ones keep their places."""
-    params: Crisalad | None = None
-    """Parameters of the model that makes local features; None uses the first stage's model."""
-    config: ModelConfig | None = None
-    """Configuration of that model."""
+    model: Model | None = None
+    """The model that makes local features; None uses the first stage's."""
 
     def __post_init__(self) -> None:
         """Check the name and the number."""
@@ -93,12 +91,6 @@ class Reranking:
         """Name and number in the form that `parse_reranking` reads."""
         return f"{self.name}:{self.top}"
 
-    def over(self, params: Crisalad, config: ModelConfig) -> "Reranking":
-        """Return this re-ranking, with the first stage's model if it has none of its own."""
-        if self.params is not None:
-            return self
-        return dataclasses.replace(self, params=params, config=config)
-
     def check(self, config: ModelConfig, database: int | None = None) -> None:
         """Check that this re-ranking fits a first stage of `config`.
 
@@ -106,7 +98,7 @@ class Reranking:
             InputError: the model that makes local features has another aggregator, or its images
                 too few patches; more retrievals than the database has images, if that is given.
         """
-        method, own = _METHODS[self.name], self.config or config
+        method, own = _METHODS[self.name], config if self.model is None else self.model.config
         found = own.aggregator.part_name, own.preprocessing.size_rule
         if found != (method.aggregator, "fixed"):
             raise InputError(
@@ -167,13 +159,13 @@ class Reranker:
         Raises:
             InputError: what `Reranking.check` raises.
         """
-        assert reranking.params is not None  # `over` gives it the first stage's
-        assert reranking.config is not None
-        reranking.check(reranking.config, len(database))
-        self._top, self._config, self._label = reranking.top, reranking.config, reranking.name
+        assert reranking.model is not None
+        params, self._config = reranking.model
+        reranking.check(self._config, len(database))
+        self._top, self._label = reranking.top, reranking.name
         self._method, self._reading = _METHODS[reranking.name], reading
         self._devices = devices_for(reading.batch_size)
-        self._params = self._devices.replicate(cast_params(reranking.params, reranking.config))
+        self._params = self._devices.replicate(cast_params(params, self._config))
         self._scores: dict[tuple[int, int], float | list[float]] = {}
         self._folder = tempfile.TemporaryDirectory(prefix="rerank-", ignore_cleanup_errors=True)
         self._database, self._queries = self._side(database, "db"), self._side(queries, "queries")

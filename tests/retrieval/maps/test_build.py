@@ -14,7 +14,7 @@ from crisalad_jax.data.positions import Positions, utm_positions
 from crisalad_jax.data.sources import ImageSource
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.describer import describer_of
-from crisalad_jax.retrieval.maps.build import Indexed, index_images
+from crisalad_jax.retrieval.maps.build import Indexed, _Indexing
 from crisalad_jax.retrieval.maps.build import index as index_source
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import new_metadata
@@ -35,7 +35,8 @@ def index(folder: pathlib.Path, params, images: pathlib.Path, paths=None, **more
         names = [path.relative_to(images).as_posix() for path in paths]
         where = more.pop("positions", utm_positions([path.name for path in paths]))
         source = ImageSource(images, paths, names)
-        return index_images(target, describer, source, where, **read_options(more))
+        reading = read_options(more)["reading"]
+        return _Indexing(describer, source, where, metadata, None, None, reading).into(target)
 
 
 def open_or_new(folder: pathlib.Path, metadata):

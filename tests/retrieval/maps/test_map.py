@@ -166,9 +166,9 @@ GRAPH = "approximate/hnsw-0123456789abcdef.index"
 @pytest.mark.parametrize(
     ("told", "value", "images", "words"),
     [
-        ("calibration.json", {}, 1, "found it in a map without a record of images"),
-        (GRAPH, {"images": 1}, 1, "found a search of 1 images in a map of 0"),
-        (GRAPH, {"images": 7}, 7, "found a search of 7 images in a map of 3, expected the"),
+        ("calibration.json", {}, 1, "found it in a map with records of 0 images alone"),
+        (GRAPH, {"images": 1}, 1, "found it in a map with records of 0 images alone"),
+        (GRAPH, {"images": 7}, 7, "found it in a map with records of 3 images alone, expected the"),
     ],
 )
 def test_a_map_that_lost_its_last_record_is_refused_where_more_tells_of_it(

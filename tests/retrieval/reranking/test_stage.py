@@ -64,8 +64,7 @@ def rerank(
 
 
 def reranking(name: str, top: int) -> Reranking:
-    own, config = model_of(name)
-    return Reranking(name, top, own, config)
+    return Reranking(name, top, Model(*model_of(name)))
 
 
 @pytest.mark.parametrize("name", [name for name in stage._METHODS if "netvlad" in name])
@@ -183,7 +182,7 @@ def test_the_first_stages_model_serves_where_it_can(name: str, benchmark) -> Non
     own, config = model_of(name)
     results = [
         evaluate(Model(own, config), benchmark, rerank=given, reading=QUIET)[1]
-        for given in (Reranking(name, 7), Reranking(name, 7, own, config))
+        for given in (Reranking(name, 7), Reranking(name, 7, Model(own, config)))
     ]
     assert results[0].rerank == f"{name}:7"
     for a, b in zip(*(result.neighbours for result in results), strict=True):
@@ -223,7 +222,7 @@ def test_what_cannot_be_read_is_named(text: str, words: str) -> None:
 def test_what_does_not_fit_is_found_before_any_work(
     given: str, config: ModelConfig, words: str, benchmark, monkeypatch
 ) -> None:
-    monkeypatch.setattr("crisalad_jax.retrieval.describe.read_tokens", None)
+    monkeypatch.setattr("crisalad_jax.retrieval.describe.token_rows", None)
     rerank = parse_reranking(given)
     with pytest.raises(InputError, match=words):
         evaluate(

@@ -326,11 +326,10 @@ def test_a_stale_search_is_told_at_the_start_and_by_health(own_map, params, pict
         first = target.descriptors
         row = next(iter(first))[:1]
         target.append(["new.jpg"], [7], row, root="/images")
-    with serving(own_map, params, appends=appends) as own:
+    said = pytest.warns(Note, match=r"own\.map: found an approximate search of fewer .* hnsw")
+    with said, serving(own_map, params, appends=appends) as own:
         health = own.ask("GET", "/health").json
         assert (health["search"], health["stale_search"]) == ("exact", "hnsw")
-        with pytest.warns(Note, match=r"own\.map: found an approximate search of fewer .* hnsw"):
-            own.worker.compile(quiet=True)  # what `serve_map` does at its start
 
 
 def test_the_page_holds_all_it_shows(service):
