@@ -287,19 +287,10 @@ def is_image(path: str | os.PathLike[str]) -> bool:
     return os.fspath(path).lower().endswith(IMAGE_SUFFIXES)
 
 
-_UNCOUNTED = (".csv", ".db", ".ini")
-"""Suffixes that no note counts: tables of positions, and what Windows leaves in folders."""
-_KINDS = 4
-"""Number of suffixes that a note names."""
-
-
 def only_images(
     files: Sequence[pathlib.Path], source: object, *, videos: bool = False
 ) -> list[pathlib.Path]:
-    """Return the images among files, and count the others in a note.
-
-    A file that is named as an image, such as its sidecar 1.json or 1.jpg.xmp of 1.jpg, is not
-    counted.
+    """Return the images among files, and count the others by suffix in a note.
 
     Args:
         files: what was found.
@@ -309,27 +300,24 @@ def only_images(
     Raises:
         InputError: no image is among them.
     """
-    images, others = [], []
-    for file in files:
-        (images if is_image(file) or (videos and is_video(file)) else others).append(file)
-    # The names of the images, with and without their suffixes.
+    images = [file for file in files if is_image(file) or (videos and is_video(file))]
+    # Sidecars of images, such as 1.json or 1.jpg.xmp of 1.jpg, and tables need no note.
     known = {name for image in images for name in (image, image.with_suffix(""))}
-    kinds = collections.Counter(
+    others = collections.Counter(
         sorted(
             file.suffix.lower() or "without a suffix"
-            for file in others
-            if file.suffix.lower() not in _UNCOUNTED and not known & {file, file.with_suffix("")}
+            for file in files
+            if not known & {file, file.with_suffix("")} and file.suffix != ".csv"
         )
     )
-    words = ", ".join(f"{count:,} {kind}" for kind, count in kinds.most_common(_KINDS))
+    kinds = ", ".join(f"{count:,} {kind}" for kind, count in others.most_common())
     if not images:
-        among = f" among {counted(kinds.total(), 'file')} ({words})" if kinds else ""
         raise InputError(
-            f"{source}: found no image{among}, expected files that end in "
-            f"{' '.join(IMAGE_SUFFIXES)}"
+            f"{source}: found no image{f' among {kinds}' if kinds else ''}, expected files that "
+            f"end in {' '.join(IMAGE_SUFFIXES)}"
         )
-    if kinds:
-        warn(f"{source}: skipped {counted(kinds.total(), 'other file')}: {words}")
+    if others:
+        warn(f"{source}: skipped {counted(others.total(), 'other file')}: {kinds}")
     return images
 
 

@@ -155,61 +155,51 @@ class Reading:
             InputError: while iterating under "stop" for an image that cannot be read.
         """
         cache = self.cache or ImageCache(0)
-        indices = np.arange(len(paths))
-        return self.read(
-            lambda position: cache.read(paths[position], preparation),
-            labels=indices,
-            indices=indices,
-            positions=indices,
-            preparation=preparation,
-            one_thread=_has_frames(paths),
-        )
+        slots = np.arange(len(paths))
+
+        def load(slot: int) -> Pixels:
+            return cache.read(paths[slot], preparation)
+
+        return self.read(load, slots, slots, slots, preparation, has_frames=_has_frames(paths))
 
     def read(
         self,
         load: Callable[[int], Pixels],
-        *,
-        labels: np.ndarray,
+        slots: np.ndarray,
         indices: np.ndarray,
-        positions: np.ndarray,
+        labels: np.ndarray,
         preparation: Preparation,
-        one_thread: bool = False,
+        *,
+        has_frames: bool,
     ) -> Iterator[ImageBatch]:
-        """Yield batches of what `load` returns for each of `positions`.
+        """Yield batches of what `load` returns for each of `slots`, with its index and label.
 
-        A batch holds the next `batch_size` of them, or fewer where the size changes.
-
-        Args:
-            load: reads the image at a position.
-            labels: label at each position.
-            indices: image index at each position.
-            positions: which to read, in order.
-            preparation: how the images are prepared.
-            one_thread: whether one thread at most reads: more would read a video each, from its
-                beginning.
+        A batch holds the next `batch_size` of them, or fewer where the size changes. Of images with
+        frames of videos one thread at most reads: more would read a video each, from its beginning.
         """
-        threads = min(self.threads, 1) if one_thread else self.threads
+        threads = min(self.threads, 1) if has_frames else self.threads
 
-        def load_or_skip(position: int) -> Pixels | None:
+        def load_or_skip(slot: int) -> Pixels | None:
             try:
-                return load(position)
+                return load(slot)
             except InputError as error:
                 if self.on_bad_image == "stop":
                     raise InputError(f"{error} (--on-bad-image skip leaves it out)") from error
                 return None
 
         ahead = max(BATCHES_AHEAD * self.batch_size, threads)
-        read = read_ahead(load_or_skip, positions.tolist(), ahead=ahead, threads=threads)
+        read = read_ahead(load_or_skip, slots.tolist(), ahead=ahead, threads=threads)
         with ONE_THREAD, contextlib.closing(read):
             start = 0
             for run in _same_size_runs(read, self.batch_size):
-                part = positions[start : start + len(run)]
+                batch = _padded_batch(run, self.batch_size, preparation)
+                batch.indices[: len(run)] = indices[start : start + len(run)]
+                batch.labels[: len(run)] = labels[start : start + len(run)]
                 start += len(run)
-                yield _batch_of(run, labels[part], indices[part], preparation, self.batch_size)
+                yield batch
 
 
 def _has_frames(files: Iterable[str | os.PathLike[str]]) -> bool:
-    """Return whether any name may be that of a frame of a video."""
     return any("#t=" in os.fspath(file) for file in files)
 
 
@@ -343,8 +333,8 @@ def batches_of_groups(
     """
     _, groups, images_per_group = chosen.shape
     batch_size = groups * images_per_group
-    number, parts = part
-    if not (0 <= start_step <= len(chosen) and 0 <= number < parts and batch_size % parts == 0):
+    mine, parts = part
+    if not (0 <= start_step <= len(chosen) and 0 <= mine < parts and batch_size % parts == 0):
         raise InputError(
             f"start_step, part: found {start_step} and {part}, expected 0 to {len(chosen)}, and "
             f"the i-th of n equal parts of {batch_size} images"
@@ -363,9 +353,9 @@ def batches_of_groups(
     slots = np.arange(indices.size).reshape(len(chosen), parts, batch_size // parts)
     augment = AUGMENTATIONS.resolve(augmentation, "augmentation")
 
-    def load(position: int) -> Pixels:
-        image = cache.read(files.path(indices[position]), how, quickly=True)
-        step, slot = divmod(position, batch_size)
+    def load(number: int) -> Pixels:
+        image = cache.read(files.path(indices[number]), how, quickly=True)
+        step, slot = divmod(number, batch_size)
         # The spawn key makes this stream, one for each place, independent of each image's.
         place = (*seed, step, slot // images_per_group)
         of_place = np.random.default_rng(np.random.SeedSequence(place, spawn_key=(1,)))
@@ -379,13 +369,10 @@ def batches_of_groups(
             )
         return augmented
 
+    chosen_slots = slots[start_step:, mine].reshape(-1)
+    own_labels = labels.reshape(-1)[chosen_slots]
     return reading.read(
-        load,
-        labels=labels.reshape(-1),
-        indices=indices,
-        positions=slots[start_step:, number].reshape(-1),
-        preparation=how,
-        one_thread=has_frames,
+        load, chosen_slots, indices[chosen_slots], own_labels, how, has_frames=has_frames
     )
 
 
@@ -432,29 +419,20 @@ def _same_size_runs(
 ) -> Iterator[list[Pixels | None]]:
     """Yield runs of at most `batch_size` consecutive images of one size; None is of any size."""
     run: list[Pixels | None] = []
-    shape: tuple[int, ...] | None = None
     for image in images:
-        own = None if image is None else image.shape
-        if None not in (own, shape) and own != shape:
+        if len({each.shape for each in (*run, image) if each is not None}) > 1:
             yield run
-            run, shape = [], None
+            run = []
         run.append(image)
-        shape = own or shape
         if len(run) == batch_size:
             yield run
-            run, shape = [], None
+            run = []
     if run:
         yield run
 
 
-def _batch_of(
-    run: Sequence[Pixels | None],
-    labels: np.ndarray,
-    indices: np.ndarray,
-    how: Preparation,
-    batch_size: int,
-) -> ImageBatch:
-    """Make a padded batch; where none of its images can be read, they have the model's size."""
+def _padded_batch(run: Sequence[Pixels | None], batch_size: int, how: Preparation) -> ImageBatch:
+    """Make a batch of images; where none of them can be read, they have the model's size."""
     sizes = (image.shape[:2] for image in run if image is not None)
     batch = ImageBatch(
         images=np.zeros((batch_size, *next(sizes, how.size_of(how.image_size)), 3), how.dtype),
@@ -462,7 +440,6 @@ def _batch_of(
         valid=np.zeros(batch_size, np.bool_),
         indices=np.full(batch_size, -1, np.int64),
     )
-    batch.labels[: len(run)], batch.indices[: len(run)] = labels, indices
     for slot, image in enumerate(run):
         if image is not None:
             batch.images[slot], batch.valid[slot] = image, True

@@ -1,11 +1,16 @@
-"""Training places of any images: a folder or a table that says them, or by position or order.
+"""Find training places: of GSV-Cities, of a folder or a table, or by position or order.
+
+GSV-Cities (Ali-bey et al. 2022) has `Dataframes/{city}.csv` with one row per image, which is
+`Images/{city_id}/{city_id}_{place_id:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{panoid}.jpg`.
 
 No two images of one batch are negatives of each other while they are as near as two images of one
 place may be: places that are too near for that are listed as such, and do not meet in a batch.
 """
 
 import collections
+import functools
 import math
+import operator
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -18,12 +23,15 @@ from crisalad_jax.data.images import OnBadImage, is_image, list_images
 from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.sources import ImageSource
-from crisalad_jax.data.tables import read_table
+from crisalad_jax.data.tables import Disk, normal_name, read_table
 from crisalad_jax.data.video import file_of, frame_time, is_video
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float64, Int64
 
+COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
+"""Of a table of GSV-Cities."""
+_IDS_PER_CITY = 10**5
 TABLE = "places.csv"
 _COLUMNS = "name,place[,lat,lon[,heading]]"
 _LAYOUTS = f"the layout of GSV-Cities (Dataframes/, Images/), {TABLE}, or one folder a place"
@@ -48,6 +56,81 @@ class FoundPlace(NamedTuple):
     near: Sequence[int] = ()
     """Numbers of the places that are too near to be in a batch with it."""
     city: int = 0
+
+
+def read_gsv_cities(
+    root: pathlib.Path, cities: Sequence[str] | None, on_bad_image: OnBadImage
+) -> tuple[tuple[str, ...], list[FoundPlace]]:
+    """Return the cities, and their places ascending by id.
+
+    Images may end in .jpg or .JPG, and may lie in a folder named by the city id or by the CSV file.
+
+    Raises:
+        InputError: a city that is unknown or named twice, a bad row, or a row without its image.
+    """
+    folder = root / "Dataframes"
+    tables = {path.stem: path for path in sorted(folder.glob("*.csv"))}
+    chosen = tuple(tables if cities is None else cities)
+    if not chosen or len(set(chosen)) < len(chosen) or not tables.keys() >= set(chosen):
+        raise InputError(
+            f"cities (--cities): found {', '.join(chosen) or 'none'}, expected some of those in "
+            f"{folder}, each once: {', '.join(tables) or 'found no CSV file'}"
+        )
+    return chosen, [
+        FoundPlace(number * _IDS_PER_CITY + place, f"{place} of {city}", images, city=number)
+        for number, city in enumerate(chosen)
+        for place, images in sorted(_read_city(root, tables[city], on_bad_image).items())
+    ]
+
+
+def _read_city(
+    root: pathlib.Path, path: pathlib.Path, on_bad_image: OnBadImage
+) -> dict[int, dict[str, View]]:
+    """Return each place's images; a row that repeats an earlier one counts once."""
+    disk = Disk()
+
+    @functools.cache
+    def listing(folder: str) -> tuple[str, dict[str, str]]:
+        """Return a folder's name on disk, and the names in it."""
+        there = disk.find(root / "Images", folder)
+        return ("", {}) if there is None else (there.name, disk.names(there))
+
+    places: dict[int, dict[str, View]] = collections.defaultdict(dict)
+    missing = 0
+    table = read_table(path, *COLUMNS)
+    fields = operator.itemgetter(*map(table.columns.index, COLUMNS))
+    for line, row in table.lines:
+        *numbers, city_id, latitude, longitude, panorama = fields(row)
+        try:
+            place, year, month, north = map(int, numbers)
+            view = (float(latitude), float(longitude), float(north))
+        except ValueError as error:
+            raise InputError(
+                f"{path}: line {line}: found {', '.join(fields(row)[:-1])}, expected whole numbers "
+                "for place_id, year, month and northdeg, and degrees for lat and lon"
+            ) from error
+        place %= _IDS_PER_CITY
+        date = f"{year:04d}_{month:02d}_{north:03d}"
+        stem = f"{city_id}_{place:07d}_{date}_{latitude}_{longitude}_{panorama}"
+        found = (
+            f"Images/{folder}/{file}"
+            for folder, files in map(listing, (city_id, path.stem))
+            for name in (f"{stem}.jpg", f"{stem}.JPG")
+            if (file := files.get(name) or files.get(normal_name(name)))
+        )
+        if (image := next(found, None)) is not None:
+            places[place][image] = view
+        elif on_bad_image == "skip":
+            missing += 1
+        else:
+            raise InputError(
+                f"{path}: line {line}: found no file Images/{city_id}/{stem}.jpg (nor .JPG, nor "
+                f"under Images/{path.stem}/), expected the images of all rows; --cities reads the "
+                "cities that it names alone"
+            )
+    if missing:
+        warn(f"{path}: left out {missing} rows, whose images are missing")
+    return places
 
 
 def read_named_places(

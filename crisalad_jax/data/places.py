@@ -13,13 +13,13 @@ import numpy as np
 
 from crisalad_jax.config.checks import PATH, choose, takes
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.gsv_cities import COLUMNS as COLUMNS
-from crisalad_jax.data.gsv_cities import read_gsv_cities
 from crisalad_jax.data.images import OnBadImage
+from crisalad_jax.data.named_places import COLUMNS as COLUMNS
 from crisalad_jax.data.named_places import (
     FoundPlace,
     places_by_order,
     places_by_position,
+    read_gsv_cities,
     read_named_places,
 )
 from crisalad_jax.data.sources import check_rate_used, open_source
@@ -125,14 +125,12 @@ def read_places(
     """
     root = pathlib.Path(root)
     is_gsv = (root / "Dataframes").is_dir()
-    by_position, by_order = place_radius is not None, place_frames is not None
-    is_grouped = by_position or by_order
+    groupings = (place_radius is not None) + (place_frames is not None)
     if (
-        (by_position and by_order)
-        or (positions is not None and not by_position)
-        or (fps is not None and not is_grouped)
+        groupings + is_gsv > 1
+        or (positions is not None and place_radius is None)
+        or (fps is not None and not groupings)
         or (cities is not None and not is_gsv)
-        or (is_gsv and is_grouped)
     ):
         raise InputError(
             f"{root}: found arguments that do not fit each other, expected --cities for the layout "
@@ -146,7 +144,7 @@ def read_places(
     names: tuple[str, ...] = ()
     if is_gsv:
         names, found = read_gsv_cities(root, cities, on_bad_image)
-    elif is_grouped:
+    elif groupings:
         source = open_source(root, fps=fps, on_bad_image=on_bad_image)
         check_rate_used(fps, source.paths)
         root = source.root
@@ -165,10 +163,10 @@ def _places(
     """Make arrays of the places that are large enough."""
     large = {i: place for i, place in enumerate(found) if len(place.images) >= min_images}
     if not large:
+        most = max((len(place.images) for place in found), default=0)
         raise InputError(
-            f"{root}: found no place with at least {min_images} images; the largest has "
-            f"{max((len(place.images) for place in found), default=0)}, of {len(found)} places "
-            "(--place-radius, --place-frames, --min-images)"
+            f"{root}: found no place with at least {min_images} images; the largest has {most}, of "
+            f"{len(found)} places (--place-radius, --place-frames, --min-images)"
         )
     if len(large) < len(found):
         warn(

@@ -83,14 +83,8 @@ class Positions(NamedTuple):
                     "a new map of all images can have lat, lon"
                 )
             fitted = np.round(zone.to_metres(latitude, longitude), 4)
-        return Positions(axes or metres, _by_name(self.of, fitted.T), zone)
-
-
-def _by_name(
-    names: Iterable[str], points: Float64[np.ndarray, "image 2"]
-) -> dict[str, tuple[float, float]]:
-    rows = zip(names, points.tolist(), strict=True)
-    return {name: (first, second) for name, (first, second) in rows}
+        of = dict(zip(self.of, map(tuple, fitted.T.tolist()), strict=True))
+        return Positions(axes or metres, of, zone)
 
 
 def utm_position(name: str) -> tuple[float, float] | None:
@@ -182,8 +176,8 @@ def utm_positions(names: Sequence[str]) -> Positions:
     zones = utm_zones(there)
     if len(set(zones)) <= 1:
         return Positions(AXES[0], of, zones[0] if zones else None)
-    degrees = utm_degrees(there, zones, np.array(list(of.values()), np.float64))
-    return Positions(AXES[1], _by_name(there, np.round(degrees, 9)))
+    degrees = np.round(utm_degrees(there, zones, np.array(list(of.values()), np.float64)), 9)
+    return Positions(AXES[1], dict(zip(there, map(tuple, degrees.tolist()), strict=True)))
 
 
 def read_positions(path: str | os.PathLike[str]) -> Positions:

@@ -9,7 +9,7 @@ import os
 import pathlib
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from crisalad_jax.data.video import spelled
 from crisalad_jax.utils.errors import InputError
@@ -63,15 +63,14 @@ class Table(NamedTuple):
     path: pathlib.Path
     columns: list[str]
     """The first row, without spaces around its fields."""
-    lines: Iterator[tuple[int, list[str]]]
-    """Number and fields of every further row, as many as there are columns; they are read once."""
+    lines: list[tuple[int, list[str]]]
+    """Number and fields of every further row, as many as there are columns."""
     has_commas: bool
 
     def rows(self) -> Iterator[Row]:
         """Yield the rows with their fields by column, without spaces around them."""
         for line, fields in self.lines:
-            texts = map(str.strip, fields)
-            by_column = dict(zip(self.columns, texts, strict=True))
+            by_column = dict(zip(self.columns, map(str.strip, fields), strict=True))
             yield Row(self.path, line, by_column, self.has_commas)
 
     def named_rows(self) -> Iterator[tuple[str, Row]]:
@@ -105,38 +104,31 @@ def read_table(path: pathlib.Path, *needed: str) -> Table:
             than as many fields as the header.
     """
     check_source(path, "a table of UTF-8 CSV", largest=LARGEST)
-    lines = _lines(path)
-    separator, columns = next(lines)
-    missing = [name for name in needed if name not in columns]
-    named = [name for name in columns if name]
-    if missing or (needed and len(set(named)) < len(named)):
-        found = ", ".join(columns) or "none"
-        lacking = f"; missing {', '.join(missing)}" if missing else ", expected each once"
-        raise InputError(f"{path}: found columns {found}{lacking}")
-    return Table(path, columns, lines, separator == ";")
-
-
-def _lines(path: pathlib.Path) -> Iterator[tuple[Any, list[str]]]:
-    """Yield the separator and the columns, then the number and the fields of every row."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             first = file.readline()
             file.seek(0)
             separator = ";" if first.count(";") > first.count(",") else ","
             reader = csv.reader(file, delimiter=separator)
-            columns = [column.strip() for column in next(filter(None, reader), [])]
-            yield separator, columns
-            for row in filter(None, reader):
-                if len(row) != len(columns):
-                    comma = len(row) > len(columns) and separator == ","
-                    hint = "; between commas a decimal is written with a point" if comma else ""
-                    raise InputError(
-                        f"{path}: line {reader.line_num}: found {len(row)} fields, expected "
-                        f"{len(columns)} ({separator.join(columns)}{hint})"
-                    )
-                yield reader.line_num, row
+            (_, header), *lines = [(reader.line_num, row) for row in reader if row] or [(0, [])]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as UTF-8 CSV: {error}") from error
+    columns = [column.strip() for column in header]
+    missing = [name for name in needed if name not in columns]
+    named = [name for name in columns if name]
+    if missing or (needed and len(set(named)) < len(named)):
+        found = ", ".join(columns) or "none"
+        lacking = f"; missing {', '.join(missing)}" if missing else ", expected each once"
+        raise InputError(f"{path}: found columns {found}{lacking}")
+    for line, row in lines:
+        if len(row) != len(columns):
+            comma = len(row) > len(columns) and separator == ","
+            hint = "; between commas a decimal is written with a point" if comma else ""
+            raise InputError(
+                f"{path}: line {line}: found {len(row)} fields, expected {len(columns)} "
+                f"({separator.join(columns)}{hint})"
+            )
+    return Table(path, columns, lines, separator == ";")
 
 
 def normal_name(name: str) -> str:
@@ -149,20 +141,19 @@ def normal_name(name: str) -> str:
     return unicodedata.normalize("NFC", name.replace("\\", "/"))
 
 
+def spellings(names: Collection[str]) -> dict[str, str]:
+    """Map each name, and its `normal_name`, to the name."""
+    return {normal_name(name): name for name in names} | {name: name for name in names}
+
+
 def matched(names: Iterable[str], there: Collection[str]) -> dict[str, str]:
     """Map each name to the existing name that it means; a name that means none is left out.
 
     That is the name itself, or else one that differs only in slashes or its normal form.
     """
-    found = {name: name for name in names}
-    if strange := [name for name in found if name not in there]:
-        by_normal_name = {normal_name(name): name for name in there}
-        for name in strange:
-            if (meant := by_normal_name.get(normal_name(name))) is None:
-                del found[name]
-            else:
-                found[name] = meant
-    return found
+    existing = spellings(there)
+    found = {name: existing.get(name, existing.get(normal_name(name))) for name in names}
+    return {name: meant for name, meant in found.items() if meant is not None}
 
 
 class Disk:
@@ -179,11 +170,10 @@ class Disk:
             return path.with_name(there)
         path = root
         for part in pathlib.PurePosixPath(normal_name(name)).parts:
-            if part not in ("/", ".."):
-                listing = self.names(path)
-                if (part := listing.get(part, "")) == "":
-                    return None
-            path = path / part
+            there = part if part in ("/", "..") else self.names(path).get(part)
+            if there is None:
+                return None
+            path = path / there
         return path
 
     def names(self, folder: pathlib.Path) -> dict[str, str]:
@@ -193,6 +183,5 @@ class Disk:
                 names = os.listdir(folder)
             except OSError:
                 names = []
-            by_name = {name: name for name in names}
-            self._listings[folder] = {normal_name(name): name for name in names} | by_name
+            self._listings[folder] = spellings(names)
         return self._listings[folder]

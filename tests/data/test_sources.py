@@ -135,7 +135,7 @@ def test_a_table(root, tmp_path, text, axes, of):
         ("none", None, "none: found no such file, expected a folder of images, an image, a video"),
         ("none.jpg", None, "none.jpg: found no such file, expected a folder of images, an image"),
         ("*.gif", None, r"\*.gif: found no image, expected files that end in .jpg"),
-        ("run/*.md", None, "found no image among 1 file"),
+        ("run/*.md", None, "found no image among 1 .md"),
         ("a.txt", "\n\n", "a.txt: found no image, expected images"),
         ("a.txt", "b.png\n", "a.txt: .*b.png: found no such file, expected an image file"),
         ("a.txt", "\n{run}/left/0.png\n{run}/right/../left/0.png", "a.txt: found .*0.png' twice"),

@@ -149,7 +149,7 @@ def test_options_that_a_layout_lacks_are_refused(tmp_path, layout):
     options = OF_LAYOUTS[layout]
     for option in OPTIONS.keys() - set(options):
         known = ", ".join(options) or "no option"
-        with refused(f"^{tmp_path}: found {option} for .*, which takes {known}$"):
+        with refused(f"^{tmp_path}: found {option} for the layout {layout}, which takes {known}$"):
             open_benchmark(tmp_path, layout=layout, **{option: OPTIONS[option]})
 
 
