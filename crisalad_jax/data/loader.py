@@ -11,13 +11,13 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar
 
+import cv2
 import numpy as np
 
 from crisalad_jax.config.checks import check_count, check_types, require_range, takes
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.config.short_repr import brief, with_field_docs
 from crisalad_jax.data.images import OnBadImage, read_pixels
-from crisalad_jax.data.opencv import ONE_THREAD
 from crisalad_jax.data.places import Order, Places, epoch_batches
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.resize import Pixels
@@ -52,6 +52,31 @@ class ImageBatch(NamedTuple):
     valid: Bool[np.ndarray, " batch"]
     indices: Int64[np.ndarray, " batch"]
     """Image index, also of an unreadable image; -1 for padding."""
+
+
+class _OneThread:
+    """A context without OpenCV's own threads, in which any number of threads may be."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users = self._before = 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._users == 0:
+                self._before = cv2.getNumThreads()
+                cv2.setNumThreads(1)
+            self._users += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                cv2.setNumThreads(self._before)
+
+
+_ONE_THREAD = _OneThread()
+"""For images that are already decoded on all cores."""
 
 
 class ImageCache:
@@ -189,7 +214,7 @@ class Reading:
 
         ahead = max(BATCHES_AHEAD * self.batch_size, threads)
         read = read_ahead(load_or_skip, slots.tolist(), ahead=ahead, threads=threads)
-        with ONE_THREAD, contextlib.closing(read):
+        with _ONE_THREAD, contextlib.closing(read):
             start = 0
             for run in _same_size_runs(read, self.batch_size):
                 batch = _padded_batch(run, self.batch_size, preparation)

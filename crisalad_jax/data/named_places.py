@@ -49,7 +49,6 @@ View = Sequence[float]
 class FoundPlace(NamedTuple):
     """A place as its reader finds it."""
 
-    id: int
     name: str
     images: Mapping[str, View | None]
     """Path relative to the root -> the view; None where positions are unknown."""
@@ -77,7 +76,7 @@ def read_gsv_cities(
             f"{folder}, each once: {', '.join(tables) or 'found no CSV file'}"
         )
     return chosen, [
-        FoundPlace(number * _IDS_PER_CITY + place, f"{place} of {city}", images, city=number)
+        FoundPlace(f"{place} of {city}", images, city=number)
         for number, city in enumerate(chosen)
         for place, images in sorted(_read_city(root, tables[city], on_bad_image).items())
     ]
@@ -164,7 +163,7 @@ def _read_folders(root: pathlib.Path) -> list[FoundPlace]:
     for path in list_images(root):
         name = path.relative_to(root)
         images[name.parent.as_posix()][name.as_posix()] = None
-    return _numbered(images)
+    return [FoundPlace(name, files) for name, files in images.items()]
 
 
 def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace]:
@@ -194,13 +193,7 @@ def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace
         places[place][file] = view if given else None
     if missing:
         warn(f"{path}: left out {missing} of {len(rows)} images, which are missing")
-    return _numbered(places)
-
-
-def _numbered(places: Mapping[str, Mapping[str, View | None]]) -> list[FoundPlace]:
-    return [
-        FoundPlace(number, name, images) for number, (name, images) in enumerate(places.items())
-    ]
+    return [FoundPlace(name, files) for name, files in places.items()]
 
 
 def places_by_position(
@@ -241,7 +234,7 @@ def places_by_position(
     for name, number in zip(names, place.tolist(), strict=True):
         images[number][name] = None
     return [
-        FoundPlace(number, names[centre], files, [other for other in others if other != number])
+        FoundPlace(names[centre], files, [other for other in others if other != number])
         for number, (centre, files, others) in enumerate(zip(centres, images, near, strict=True))
     ]
 
@@ -261,7 +254,7 @@ def places_by_order(source: ImageSource, frames: int) -> list[FoundPlace]:
             start = (number - first) * frames
             part = sequence[start : start + frames]
             near = [each for each in (number - 1, number + 1) if first <= each <= last]
-            places.append(FoundPlace(number, part[0], dict.fromkeys(part), near))
+            places.append(FoundPlace(part[0], dict.fromkeys(part), near))
     return places
 
 

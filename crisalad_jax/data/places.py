@@ -46,9 +46,6 @@ class Places:
     place_start: Int64[np.ndarray, " places+1"]
     place_city: Int32[np.ndarray, " places"]
     """Place -> position in `cities`, ascending."""
-    place_id: Int64[np.ndarray, " places"]
-    """In the layout of GSV-Cities the id in the CSV modulo 10**5, plus 10**5 times the position of
-    the city; else the place's number among all, also those that are too small."""
     names: tuple[str, ...]
     """Place -> its name."""
     views: Float64[np.ndarray, "images 3"] | None = None
@@ -64,7 +61,7 @@ class Places:
     @functools.cached_property
     def image_place(self) -> Int32[np.ndarray, " images"]:
         """Image -> place, ascending."""
-        return np.repeat(np.arange(len(self.place_id), dtype=np.int32), self.image_counts)
+        return np.repeat(np.arange(len(self.names), dtype=np.int32), self.image_counts)
 
     def path(self, image: int | np.integer) -> pathlib.Path:
         """Return the path of one image."""
@@ -187,7 +184,6 @@ def _places(
         files=tuple(file for file, _ in images),
         place_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         place_city=np.array([place.city for place in large.values()], np.int32),
-        place_id=np.array([place.id for place in large.values()], np.int64),
         names=tuple(place.name for place in large.values()),
         views=np.array(views) if views else None,
         near=near if any(place.near for place in found) else None,

@@ -17,13 +17,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from crisalad_jax.data.opencv import QUIET
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source
 from crisalad_jax.utils.shapes import UInt8
 
-# OpenCV reads this as it opens its first video: our errors say what the user needs.
+# Our errors say what the user needs. OpenCV reads this as it opens its first video.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 """Suffixes of videos, in lower case."""
@@ -171,23 +171,21 @@ class _Video:
 
     def _grabbed_times(self, *, decoded: bool) -> list[int]:
         capture = _opened(self._file)
-        with QUIET:
-            if not decoded:  # packets as they are, in the order of decoding
-                capture.set(cv2.CAP_PROP_FORMAT, -1)
-            times = set()
-            while capture.grab():
-                times.add(milliseconds_of(capture))
+        if not decoded:  # packets as they are, in the order of decoding
+            capture.set(cv2.CAP_PROP_FORMAT, -1)
+        times = set()
+        while capture.grab():
+            times.add(milliseconds_of(capture))
         return sorted(time for time in times if time >= 0)
 
     def read(self, wanted: int) -> UInt8[np.ndarray, "h w 3"] | None:
         """Read the first frame at or after a time; None behind the last one."""
-        with QUIET:
-            if not self._at <= wanted < self._at + _FAR:
-                self._seek(wanted)
-            while self._at < wanted:
-                if not self._grab():
-                    return None
-            found, image = self._capture.retrieve()
+        if not self._at <= wanted < self._at + _FAR:
+            self._seek(wanted)
+        while self._at < wanted:
+            if not self._grab():
+                return None
+        found, image = self._capture.retrieve()
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if found else None
 
     def _grab(self) -> bool:
@@ -203,8 +201,7 @@ class _Video:
 
 
 def _opened(video: str) -> cv2.VideoCapture:
-    with QUIET:
-        return cv2.VideoCapture(video, cv2.CAP_FFMPEG)
+    return cv2.VideoCapture(video, cv2.CAP_FFMPEG)
 
 
 _lock = threading.Lock()

@@ -282,17 +282,6 @@ def test_no_file(tmp_path):
         read_image(tmp_path)
 
 
-def test_the_log_level_is_restored(tmp_path):
-    before = cv2.utils.logging.getLogLevel()
-    for data in (encode(Image.new("RGB", (3, 2)), "PNG"), b"text"):
-        (tmp_path / "picture").write_bytes(data)
-        try:
-            read_image(tmp_path / "picture")
-        except InputError:
-            assert data == b"text"
-        assert cv2.utils.logging.getLogLevel() == before
-
-
 def test_photographs_read_and_resize_as_by_pillow():
     if not PHOTOGRAPHS.is_dir():
         pytest.skip("no photographs beside the checkout")

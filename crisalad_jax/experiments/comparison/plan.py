@@ -376,7 +376,7 @@ def _fitted(
         training, row = variant.training, variant.row
         sets = row.sets if row is not None else lambda flag: False
         views = training.images_per_place if sets("images-per-place") else typical
-        places = len(read(views, training.cities).place_id)
+        places = len(read(views, training.cities).names)
         training = _of_size(config, training, places, views)
         if row is not None:
             training = row.changed(training, config.preset)
