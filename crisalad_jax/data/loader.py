@@ -93,11 +93,7 @@ class ImageCache:
         self._lock = threading.Lock()
 
     def read(
-        self,
-        path: str | os.PathLike[str],
-        how: Preparation,
-        *,
-        quickly: bool = False,
+        self, path: str | os.PathLike[str], how: Preparation, *, quickly: bool = False
     ) -> Pixels:
         """Read and prepare an image, from memory if it is there; the array is read-only.
 
@@ -364,19 +360,17 @@ def batches_of_groups(
             f"start_step, part: found {start_step} and {part}, expected 0 to {len(chosen)}, and "
             f"the i-th of n equal parts of {batch_size} images"
         )
-    reading = Reading(
-        batch_size=batch_size // parts, on_bad_image=on_bad_image, threads=threads, cache=cache
-    )
-    how = Preparation(image_size, preprocessing.for_training())
     from crisalad_jax.data.augmentations.base import AUGMENTATIONS
 
+    augment = AUGMENTATIONS.resolve(augmentation, "augmentation")
+    reading = Reading(batch_size=batch_size // parts, on_bad_image=on_bad_image, threads=threads)
+    how = Preparation(image_size, preprocessing.for_training())
     cache = cache or ImageCache(0)
     if has_frames := _has_frames(files.files):
         # In order: the frames of a batch are far from each other, with all others in between.
         cache.fill(map(files.path, np.unique(chosen)), how)
     indices = chosen.reshape(-1)
     slots = np.arange(indices.size).reshape(len(chosen), parts, batch_size // parts)
-    augment = AUGMENTATIONS.resolve(augmentation, "augmentation")
 
     def load(number: int) -> Pixels:
         image = cache.read(files.path(indices[number]), how, quickly=True)
@@ -385,19 +379,17 @@ def batches_of_groups(
         place = (*seed, step, slot // images_per_group)
         of_place = np.random.default_rng(np.random.SeedSequence(place, spawn_key=(1,)))
         generator = np.random.default_rng((*seed, step, slot))
-        augmented = augment.apply(image, generator, of_place=of_place)
-        shape, dtype = np.shape(augmented), getattr(augmented, "dtype", type(augmented).__name__)
-        if shape != image.shape or dtype != np.uint8:
+        augmented = np.asarray(augment.apply(image, generator, of_place=of_place))
+        if augmented.shape != image.shape or augmented.dtype != np.uint8:
             raise InputError(
-                f"augmentation {augment.part_name}: found to return {dtype} of shape {shape}, "
-                f"expected uint8 of {image.shape}"
+                f"augmentation {augment.part_name}: found to return {augmented.dtype} of shape "
+                f"{augmented.shape}, expected uint8 of {image.shape}"
             )
         return augmented
 
-    chosen_slots = slots[start_step:, mine].reshape(-1)
-    own_labels = labels.reshape(-1)[chosen_slots]
+    own = slots[start_step:, mine].reshape(-1)
     return reading.read(
-        load, chosen_slots, indices[chosen_slots], own_labels, how, has_frames=has_frames
+        load, own, indices[own], labels.reshape(-1)[own], how, has_frames=has_frames
     )
 
 

@@ -207,11 +207,11 @@ def places_by_position(
     Args:
         source: the images.
         radius: in metres.
-        positions: a table (`read_positions`); None is what the source says, if that is a table,
+        positions: a table (`read_image_table`); None is what the source says, if that is a table,
             else what @UTM names say, else the EXIF data of JPEGs.
 
     Raises:
-        InputError: no image has a position, or what `read_positions` raises.
+        InputError: no image has a position, or what `read_image_table` raises.
     """
     found = _positions(source, positions)
     names = [name for name in source.names if name in found.of]

@@ -180,42 +180,32 @@ def utm_positions(names: Sequence[str]) -> Positions:
     return Positions(AXES[1], dict(zip(there, map(tuple, degrees.tolist()), strict=True)))
 
 
-def read_positions(path: str | os.PathLike[str]) -> Positions:
-    """Read a table of `name,east,north`, `name,lat,lon` or `name,x,y`; see `read_image_table`.
-
-    Raises:
-        InputError: as `read_image_table`; no columns of positions, or a row without one.
-    """
-    _, positions = read_image_table(path, all_positions=True)
-    assert positions is not None
-    return positions
-
-
 def positions_of(
-    given: Positions | str | os.PathLike[str],
-    names: Sequence[str],
-    images: str | os.PathLike[str],
+    given: Positions | str | os.PathLike[str], names: Sequence[str], images: str | os.PathLike[str]
 ) -> Positions:
     """Return given positions, or those of a table, under the names that images have on disk.
 
     Args:
-        given: by name, or a table's file; names of other images stay in it.
+        given: by name, or a table's file, which has a position in every row; names of other images
+            stay in it.
         names: of the images.
         images: where these are, for messages.
 
     Raises:
-        InputError: none of the images is named; or what `read_positions` raises.
+        InputError: none of the images is named; or what `read_image_table` raises.
     """
-    positions = given if isinstance(given, Positions) else read_positions(given)
+    if isinstance(given, Positions):
+        source, positions = "positions", given
+    else:
+        source, (_, positions) = given, read_image_table(given, all_positions=True)
+        assert positions is not None
     meant = matched(positions.of, frozenset(names))
     if not meant:
-        source = "positions" if isinstance(given, Positions) else given
         raise InputError(
             f"{source}: found none of the {len(names)} images of {images}, expected names such as "
             f"{names[0]!r}"
         )
-    of = {meant.get(name, name): position for name, position in positions.of.items()}
-    return positions._replace(of=of)
+    return positions._replace(of={meant.get(name, name): at for name, at in positions.of.items()})
 
 
 def read_image_table(
@@ -295,8 +285,7 @@ def _degrees(fields: dict[int, Any], reference: int, value: int, signs: bytes) -
     """Return degrees of degrees, minutes and seconds; NaN where a fraction is 0 / 0."""
     degrees, minutes, seconds = (float(part) for part in fields[value])
     sign = 1 - 2 * signs.decode().index(fields[reference].strip("\0 ").upper())
-    total = sign * (degrees + minutes / 60 + seconds / 3600)
-    return total if math.isfinite(total) else math.nan
+    return sign * (degrees + minutes / 60 + seconds / 3600)
 
 
 def exif_positions(images: Iterable[tuple[str, pathlib.Path]]) -> Positions:

@@ -47,10 +47,7 @@ class ImageSource(NamedTuple):
 
 
 def open_source(
-    images: str | os.PathLike[str],
-    *,
-    fps: float | None = None,
-    on_bad_image: OnBadImage = "stop",
+    images: str | os.PathLike[str], *, fps: float | None = None, on_bad_image: OnBadImage = "stop"
 ) -> ImageSource:
     """List the images of a source.
 

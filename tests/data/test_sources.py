@@ -12,7 +12,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.live import Camera
-from crisalad_jax.data.positions import Positions, exif_position, read_positions
+from crisalad_jax.data.positions import Positions, exif_position, read_image_table
 from crisalad_jax.data.reading import image_batches
 from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import file_of, frame_time, list_frames
@@ -211,7 +211,7 @@ def test_a_frame_has_one_name_however_it_is_written(root, tmp_path):
     named = Positions(("x", "y"), {"walk.avi#t=0.200": (1, 2)})
     assert open_source(work / "table.csv").positions == named
     (work / "positions.csv").write_text("name,x,y\nwalk.avi#t=0.2,1,2\n")
-    assert read_positions(work / "positions.csv").of == {"walk.avi#t=0.200": (1, 2)}
+    assert read_image_table(work / "positions.csv")[1].of == {"walk.avi#t=0.200": (1, 2)}
 
 
 def test_a_camera_and_a_list_call_a_frame_the_same(tmp_path):

@@ -53,7 +53,7 @@ def read_folders(
         InputError: a folder is missing or without images; a table that names an image that is not
             there, leaves one out, or contradicts itself; a negative number of frames, folders of
             different counts, `frames` with a table, a radius without positions to measure, one
-            side's table of positions without the other's, or what `read_positions` raises.
+            side's table of positions without the other's, or what `read_image_table` raises.
     """
     root = pathlib.Path(root)
     folder, name = find_split(root, split)
