@@ -302,24 +302,26 @@ def only_images(
     Raises:
         InputError: no image is among them.
     """
-    images = [file for file in files if is_image(file) or (videos and is_video(file))]
+    images, others = [], []
+    for file in files:
+        (images if is_image(file) or (videos and is_video(file)) else others).append(file)
     # Sidecars of images, such as 1.json or 1.jpg.xmp of 1.jpg, and tables need no note.
     known = {name for image in images for name in (image, image.with_suffix(""))}
-    others = collections.Counter(
+    skipped = collections.Counter(
         sorted(
             file.suffix.lower() or "without a suffix"
-            for file in files
+            for file in others
             if not known & {file, file.with_suffix("")} and file.suffix != ".csv"
         )
     )
-    kinds = ", ".join(f"{count:,} {kind}" for kind, count in others.most_common())
+    kinds = ", ".join(f"{count:,} {kind}" for kind, count in skipped.most_common())
     if not images:
         raise InputError(
             f"{source}: found no image{f' among {kinds}' if kinds else ''}, expected files that "
             f"end in {' '.join(IMAGE_SUFFIXES)}"
         )
-    if others:
-        warn(f"{source}: skipped {counted(others.total(), 'other file')}: {kinds}")
+    if skipped:
+        warn(f"{source}: skipped {counted(skipped.total(), 'other file')}: {kinds}")
     return images
 
 

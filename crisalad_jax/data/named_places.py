@@ -36,8 +36,8 @@ TABLE = "places.csv"
 _COLUMNS = "name,place[,lat,lon[,heading]]"
 _LAYOUTS = f"the layout of GSV-Cities (Dataframes/, Images/), {TABLE}, or one folder a place"
 _GROUPED = "--place-radius METRES makes places by positions, --place-frames N of images in order"
-_VIEW = {"lat": 90.0, "lon": 180.0, "heading": math.inf}
-"""Columns of where an image was taken, and their largest numbers."""
+_VIEW = ("lat", "lon", "heading")
+"""Columns of where an image was taken."""
 _APART = 4
 """Radii between the centres of two places of a batch, at least. Images of one place are at most two
 radii apart, and so those of two places are no nearer."""
@@ -94,6 +94,15 @@ def _read_city(
         there = disk.find(root / "Images", folder)
         return ("", {}) if there is None else (there.name, disk.names(there))
 
+    def find(folders: Sequence[str], stem: str) -> str | None:
+        """Return the path of an image relative to the root; None where there is none."""
+        for folder in folders:
+            there, files = listing(folder)
+            for name in (f"{stem}.jpg", f"{stem}.JPG"):
+                if (file := files.get(name) or files.get(normal_name(name))) is not None:
+                    return f"Images/{there}/{file}"
+        return None
+
     places: dict[int, dict[str, View]] = collections.defaultdict(dict)
     missing = 0
     table = read_table(path, *COLUMNS)
@@ -109,15 +118,11 @@ def _read_city(
                 "for place_id, year, month and northdeg, and degrees for lat and lon"
             ) from error
         place %= _IDS_PER_CITY
-        date = f"{year:04d}_{month:02d}_{north:03d}"
-        stem = f"{city_id}_{place:07d}_{date}_{latitude}_{longitude}_{panorama}"
-        found = (
-            f"Images/{folder}/{file}"
-            for folder, files in map(listing, (city_id, path.stem))
-            for name in (f"{stem}.jpg", f"{stem}.JPG")
-            if (file := files.get(name) or files.get(normal_name(name)))
+        stem = (
+            f"{city_id}_{place:07d}_{year:04d}_{month:02d}_{north:03d}"
+            f"_{latitude}_{longitude}_{panorama}"
         )
-        if (image := next(found, None)) is not None:
+        if (image := find((city_id, path.stem), stem)) is not None:
             places[place][image] = view
         elif on_bad_image == "skip":
             missing += 1
@@ -171,7 +176,7 @@ def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace
     table = read_table(path, "name")
     given = [column for column in _VIEW if column in table.columns]
     # A heading is of use with a position alone.
-    if "place" not in table.columns or given not in ([], [*_VIEW][:2], [*_VIEW]):
+    if "place" not in table.columns or given not in ([], ["lat", "lon"], [*_VIEW]):
         raise InputError(
             f"{path}: found columns {', '.join(table.columns)}, expected {_COLUMNS}; {_GROUPED}"
         )
@@ -186,10 +191,7 @@ def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace
             continue
         inside = image.is_relative_to(root)
         file = "/".join(image.parts[len(root.parts) :]) if inside else name
-        view = [
-            row.number(column, most) if column in given else math.nan
-            for column, most in _VIEW.items()
-        ]
+        view = [row.number(column) if column in given else math.nan for column in _VIEW]
         places[place][file] = view if given else None
     if missing:
         warn(f"{path}: left out {missing} of {len(rows)} images, which are missing")
@@ -217,9 +219,9 @@ def places_by_position(
     names = [name for name in source.names if name in found.of]
     if not names:
         raise InputError(
-            f"{source.root}: found no position of {len(source.names)} images, which --place-radius "
-            "asks for, expected --positions TABLE (name,lat,lon or name,east,north or name,x,y), "
-            "such a table as --data, @UTM names or EXIF data; --place-frames takes images in order"
+            f"{source.root}: found no position of {len(source.names)} images, expected --positions "
+            "TABLE (name,lat,lon or name,east,north or name,x,y), such a table as --data, @UTM "
+            "names or EXIF data; --place-frames takes images in order"
         )
     if len(names) < len(source.names):
         warn(

@@ -12,6 +12,7 @@ import numpy as np
 
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.metres import Zone
+from crisalad_jax.data.tables import MOST_METRES as MOST_METRES
 from crisalad_jax.data.tables import matched, read_table
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float64
@@ -20,10 +21,6 @@ AXES = (("east", "north"), ("lat", "lon"), ("x", "y"))
 """Names of a position's two numbers: metres of UTM, degrees, or metres of a frame of one's own."""
 
 
-MOST_METRES = 1e8
-"""Largest coordinate in metres: twice the Earth's circumference, and its square is finite."""
-_MOST = {"lat": 90.0, "lon": 180.0} | dict.fromkeys(("east", "north", "x", "y"), MOST_METRES)
-"""Largest number of a column."""
 _BANDS = "CDEFGHJKLMNPQRSTUVWX"
 """Letters of UTM's bands of latitude, from south to north; N is the first of the north."""
 _BAND_S = (3.4e6, 4.6e6)
@@ -234,7 +231,7 @@ def read_image_table(
     positions = None
     if axes is not None:
         of = {
-            name: (row.number(axes[0], _MOST[axes[0]]), row.number(axes[1], _MOST[axes[1]]))
+            name: (row.number(axes[0]), row.number(axes[1]))
             for name, row in rows
             if all_positions or any(row.fields[axis] for axis in axes)
         }

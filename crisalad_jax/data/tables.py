@@ -9,11 +9,16 @@ import os
 import pathlib
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from crisalad_jax.data.video import spelled
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
+
+MOST_METRES = 1e8
+"""Largest coordinate in metres: twice the Earth's circumference, and its square is finite."""
+_MOST = {"lat": 90.0, "lon": 180.0} | dict.fromkeys(("east", "north", "x", "y"), MOST_METRES)
+"""Largest number of a column of positions."""
 
 
 class Row(NamedTuple):
@@ -40,13 +45,13 @@ class Row(NamedTuple):
             raise InputError(f"{self.where}: found no {column}, expected one")
         return self.fields[column]
 
-    def number(self, column: str, most: float = math.inf) -> float:
-        """Return a finite number of at most this size; next to a point, commas mean thousands.
+    def number(self, column: str) -> float:
+        """Return a finite number; next to a point, commas mean thousands.
 
         Raises:
-            InputError: the field is not such a number.
+            InputError: the field is not one, or larger than such a position can be.
         """
-        text = self.fields[column]
+        text, most = self.fields[column], _MOST.get(column, math.inf)
         try:
             value = float(text.replace(",", ".") if self.has_commas and "." not in text else text)
         except ValueError:
@@ -63,8 +68,8 @@ class Table(NamedTuple):
     path: pathlib.Path
     columns: list[str]
     """The first row, without spaces around its fields."""
-    lines: list[tuple[int, list[str]]]
-    """Number and fields of every further row, as many as there are columns."""
+    lines: Iterator[tuple[int, list[str]]]
+    """Number and fields of every further row, as many as there are columns; they are read once."""
     has_commas: bool
 
     def rows(self) -> Iterator[Row]:
@@ -104,31 +109,38 @@ def read_table(path: pathlib.Path, *needed: str) -> Table:
             than as many fields as the header.
     """
     check_source(path, "a table of UTF-8 CSV", largest=LARGEST)
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            first = file.readline()
-            file.seek(0)
-            separator = ";" if first.count(";") > first.count(",") else ","
-            reader = csv.reader(file, delimiter=separator)
-            (_, header), *lines = [(reader.line_num, row) for row in reader if row] or [(0, [])]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: cannot be read as UTF-8 CSV: {error}") from error
-    columns = [column.strip() for column in header]
+    lines = _lines(path)
+    separator, columns = next(lines)
     missing = [name for name in needed if name not in columns]
     named = [name for name in columns if name]
     if missing or (needed and len(set(named)) < len(named)):
         found = ", ".join(columns) or "none"
         lacking = f"; missing {', '.join(missing)}" if missing else ", expected each once"
         raise InputError(f"{path}: found columns {found}{lacking}")
-    for line, row in lines:
-        if len(row) != len(columns):
-            comma = len(row) > len(columns) and separator == ","
-            hint = "; between commas a decimal is written with a point" if comma else ""
-            raise InputError(
-                f"{path}: line {line}: found {len(row)} fields, expected {len(columns)} "
-                f"({separator.join(columns)}{hint})"
-            )
     return Table(path, columns, lines, separator == ";")
+
+
+def _lines(path: pathlib.Path) -> Iterator[tuple[Any, list[str]]]:
+    """Yield the separator and the columns, then the number and the fields of every row."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            first = file.readline()
+            file.seek(0)
+            separator = ";" if first.count(";") > first.count(",") else ","
+            reader = csv.reader(file, delimiter=separator)
+            columns = [column.strip() for column in next(filter(None, reader), [])]
+            yield separator, columns
+            for row in filter(None, reader):
+                if len(row) != len(columns):
+                    comma = len(row) > len(columns) and separator == ","
+                    hint = "; between commas a decimal is written with a point" if comma else ""
+                    raise InputError(
+                        f"{path}: line {reader.line_num}: found {len(row)} fields, expected "
+                        f"{len(columns)} ({separator.join(columns)}{hint})"
+                    )
+                yield reader.line_num, row
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read as UTF-8 CSV: {error}") from error
 
 
 def normal_name(name: str) -> str:

@@ -355,7 +355,7 @@ class Spoilt(NoAugmentation):
     [
         (lambda image: image / np.float32(255), "float32 of shape "),
         (lambda image: image[1:], "uint8 of shape "),
-        (lambda image: None, "NoneType of shape "),
+        (lambda image: None, "object of shape "),
     ],
 )
 def test_an_augmentation_that_returns_something_else_is_named(places, change, words):
