@@ -112,10 +112,12 @@ def read_msls(
         rule += f" and compass angles at most {limit:g} degrees apart"
     if subtask:
         rule += "; queries of the subtask all with a database image in that distance"
-    images = (tuple(path for side in each for path in side.images) for each in (database, queries))
-    points = (_positions(each) for each in (database, queries))
+    images, asking = (
+        tuple(path for side in sides for path in side.images) for sides in (database, queries)
+    )
+    places, asked = _positions(database), _positions(queries)
     rule = f"{rule}; no panoramas"
-    return Benchmark(name, root, *images, tuple(positives), rule, *points, radius)
+    return Benchmark(name, root, images, asking, tuple(positives), rule, places, asked, radius)
 
 
 class _Side(NamedTuple):

@@ -68,10 +68,11 @@ def read_netvlad(
         raise InputError(
             f"{path}: found {', '.join(contents)} ({error}), expected a struct dbStruct of NetVLAD"
         ) from error
+    places, asked = metres
     database, queries = (
         find_images(path, names, images, on_bad_image, folders) for names, folders in images_of
     )
     name = f"{path.stem} (NetVLAD .mat, {which} set, {radius:g} m)"
     rule = f"UTM distance of at most {radius:g} m"
-    positives = within(*metres, radius)
-    return Benchmark(name, path, database, queries, positives, rule, *metres, radius)
+    positives = within(places, asked, radius)
+    return Benchmark(name, path, database, queries, positives, rule, places, asked, radius)
