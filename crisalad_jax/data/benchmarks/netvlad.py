@@ -55,13 +55,12 @@ def read_netvlad(
             names = [str(cell.item()) for cell in struct[field].reshape(-1)]
             positions = np.ascontiguousarray(struct[utm].T, np.float64)
             counted = float(struct[count].item())
-            if positions.shape != (len(names), 2) or not names or len(names) != counted:
+            right = positions.shape == (len(names), 2) and np.isfinite(positions).all()
+            if not right or not names or len(names) != counted:
                 raise ValueError(
                     f"{len(names)} names, a count of {counted:g} and positions of shape "
-                    f"{positions.T.shape}"
+                    f"{positions.T.shape}, which must be finite"
                 )
-            if not np.isfinite(positions).all():
-                raise ValueError(f"{utm} is not finite")
             images_of.append((names, folders))
             metres.append(positions)
     except (KeyError, IndexError, ValueError, TypeError) as error:
