@@ -106,37 +106,28 @@ def utm_zones(names: Sequence[str]) -> list[Zone | None]:
     Raises:
         InputError: several zones or hemispheres, and a name without one.
     """
-    fields = [_zone_fields(name.rpartition("/")[2]) for name in names]
-    numbers = {number for number, _ in fields if number is not None}
-    halves = {south for _, south in fields if south is not None}
-    if len(numbers) <= 1 and len(halves) <= 1:
-        common = Zone(numbers.pop(), halves.pop()) if numbers and halves else None
-        return [common] * len(fields)
-    zones = []
-    for name, (number, south) in zip(names, fields, strict=True):
-        if number is None or south is None:
-            raise InputError(
-                f"{name}: found no zone with a letter, expected @east@north@zone@letter@...: the "
-                "images are of several zones of UTM (evaluate --ignore-zones takes them as one)"
-            )
-        zones.append(Zone(number, south))
+    zones = [_zone_of(name.rpartition("/")[2]) for name in names]
+    known = set(zones) - {None}
+    if len(known) <= 1:
+        return [next(iter(known), None)] * len(zones)
+    if None in zones:
+        raise InputError(
+            f"{names[zones.index(None)]}: found no zone with a letter, expected "
+            "@east@north@zone@letter@...: the images are of several zones of UTM (evaluate "
+            "--ignore-zones takes them as one)"
+        )
     return zones
 
 
-def _zone_fields(name: str) -> tuple[int | None, bool | None]:
-    """Read the number of the zone, and whether it is south of the equator; None where unknown."""
-    _, _, north, number, letter, latitude, *_ = [*name.split("@"), *[""] * 6]
+def _zone_of(name: str) -> Zone | None:
+    _, _, north, number, letter, *_ = [*name.split("@"), *[""] * 5]
     letter = letter.upper()
-    if not (number.isdecimal() and 1 <= int(number) <= 60 and letter in ("", *_BANDS)):
-        return None, None
-    if not letter:
-        try:
-            return int(number), float(latitude) < 0
-        except ValueError:
-            return int(number), None
+    if not (number.isdecimal() and 1 <= int(number) <= 60 and letter and letter in _BANDS):
+        return None
+    south = letter < "N"
     if letter == "S":
-        return int(number), float(north) < _BAND_S[0] or float(north) > _BAND_S[1]
-    return int(number), letter < "N"
+        south = not _BAND_S[0] <= float(north) <= _BAND_S[1]
+    return Zone(int(number), south)
 
 
 def utm_degrees(

@@ -132,11 +132,9 @@ def _lines(path: pathlib.Path) -> Iterator[tuple[Any, list[str]]]:
             yield separator, columns
             for row in filter(None, reader):
                 if len(row) != len(columns):
-                    comma = len(row) > len(columns) and separator == ","
-                    hint = "; between commas a decimal is written with a point" if comma else ""
                     raise InputError(
                         f"{path}: line {reader.line_num}: found {len(row)} fields, expected "
-                        f"{len(columns)} ({separator.join(columns)}{hint})"
+                        f"{len(columns)} ({separator.join(columns)})"
                     )
                 yield reader.line_num, row
     except (OSError, UnicodeDecodeError, csv.Error) as error:

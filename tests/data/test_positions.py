@@ -43,7 +43,7 @@ def test_a_table_in_any_order_with_more_columns(tmp_path, axes):
         ),
         (  # decimal commas
             "name,east,north\na.jpg,500123,4,4500000,7\n",
-            r"line 2: found 5 fields, expected 3 \(name,east,north; between commas a decimal is",
+            r"line 2: found 5 fields, expected 3 \(name,east,north\)",
         ),
         ("name,lat,lon\na,91,0\n", "line 2: lat: found '91', expected a number from -90 to 90"),
         ("name,lat,lon\na,0,181\n", "line 2: lon: found '181', expected a number from -180 to 180"),
