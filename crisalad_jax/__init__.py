@@ -13,7 +13,7 @@ from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.version import VERSION
 
 __version__ = VERSION
-# OpenCV reads this limit when it is imported; see `data.opencv`.
+# OpenCV reads this limit when it is imported; see `data.images`.
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**28))
 _import, __dir__, _names = lazy_loader.attach_stub(__name__, __file__)
 __all__ = [*_names, "__version__"]

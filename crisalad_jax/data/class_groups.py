@@ -186,7 +186,7 @@ def _place_classes(
     """
     from scipy.spatial import KDTree  # takes a fifth of a second
 
-    group = np.full(len(places.place_id), -1)
+    group = np.full(len(places.names), -1)
     is_large = places.image_counts >= min_images
     start = places.place_start
     points = np.column_stack([views.east, views.north])
@@ -242,7 +242,6 @@ def _regrouped(places: Places, classes: Sequence[Class]) -> Places:
         files=tuple(places.files[image] for image in images),
         place_start=start,
         place_city=places.place_city[old],
-        place_id=places.place_id[old],
         names=tuple(places.names[place] for place in old),
         views=None if places.views is None else places.views[images],
         near=None,

@@ -16,7 +16,6 @@ import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.preprocessing import BitDepth
-from crisalad_jax.data.opencv import MAX_PIXELS, QUIET
 from crisalad_jax.data.prepare import as_rgb
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.data.video import frame_time, is_video, read_frame
@@ -25,6 +24,10 @@ from crisalad_jax.utils.files import read_bytes, real_path
 from crisalad_jax.utils.output import counted, warn
 from crisalad_jax.utils.shapes import UInt8
 
+_MAX_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS"
+"""Environment variable of the largest image in pixels, which OpenCV reads as it is imported and
+checks before it decodes. A small file can claim an image that fills the memory: this package sets
+2**28, which takes 0.8 GB, where the variable is not set."""
 OnBadImage = Literal["skip", "stop"]
 """What an image that is missing or cannot be read does: it is left out, or ends the work."""
 _OF_JPEG = (".jpg", ".jpeg", ".jpe", ".jfif")
@@ -93,8 +96,8 @@ def read_image(
 
     Raises:
         InputError: the file is missing, a folder, empty, cut short, larger than 2**28 pixels
-            (`opencv.MAX_PIXELS`), or no image of the formats above; never half a picture. Floats or
-            signed integers without "contrast-stretch". Or a `size` without a pixel.
+            (OPENCV_IO_MAX_IMAGE_PIXELS), or no image of the formats above; never half a picture. Or
+            floats or signed integers without "contrast-stretch", or a `size` without a pixel.
 
     Example:
         >>> read_image(pictures / "0.png").shape
@@ -142,12 +145,11 @@ def decode_image(
         if is_cut:
             found = f"an image cut short after {len(data)} bytes, or damaged"
         elif data:
-            with QUIET:
-                image = _decoded(np.frombuffer(data, np.uint8), data[:12], _reduction(data, enough))
+            image = _decoded(np.frombuffer(data, np.uint8), data[:12], _reduction(data, enough))
     except cv2.error as error:
         found = " ".join(error.err.split())
         if "MAX_IMAGE_PIXELS" in found:
-            found = f"more than {os.environ.get(MAX_PIXELS)} pixels (--max-pixels raises that)"
+            found = f"more than {os.environ.get(_MAX_PIXELS)} pixels (--max-pixels raises that)"
     if image is None:
         raise InputError(f"{path}: found {found}, expected {_FORMATS}")
     return _turned(image, data) if data[4:12] in _AVIF else image
@@ -287,19 +289,10 @@ def is_image(path: str | os.PathLike[str]) -> bool:
     return os.fspath(path).lower().endswith(IMAGE_SUFFIXES)
 
 
-_UNCOUNTED = (".csv", ".db", ".ini")
-"""Suffixes that no note counts: tables of positions, and what Windows leaves in folders."""
-_KINDS = 4
-"""Number of suffixes that a note names."""
-
-
 def only_images(
     files: Sequence[pathlib.Path], source: object, *, videos: bool = False
 ) -> list[pathlib.Path]:
-    """Return the images among files, and count the others in a note.
-
-    A file that is named as an image, such as its sidecar 1.json or 1.jpg.xmp of 1.jpg, is not
-    counted.
+    """Return the images among files, and count the others by suffix in a note.
 
     Args:
         files: what was found.
@@ -312,24 +305,23 @@ def only_images(
     images, others = [], []
     for file in files:
         (images if is_image(file) or (videos and is_video(file)) else others).append(file)
-    # The names of the images, with and without their suffixes.
+    # Sidecars of images, such as 1.json or 1.jpg.xmp of 1.jpg, and tables need no note.
     known = {name for image in images for name in (image, image.with_suffix(""))}
-    kinds = collections.Counter(
+    skipped = collections.Counter(
         sorted(
             file.suffix.lower() or "without a suffix"
             for file in others
-            if file.suffix.lower() not in _UNCOUNTED and not known & {file, file.with_suffix("")}
+            if not known & {file, file.with_suffix("")} and file.suffix != ".csv"
         )
     )
-    words = ", ".join(f"{count:,} {kind}" for kind, count in kinds.most_common(_KINDS))
+    kinds = ", ".join(f"{count:,} {kind}" for kind, count in skipped.most_common())
     if not images:
-        among = f" among {counted(kinds.total(), 'file')} ({words})" if kinds else ""
         raise InputError(
-            f"{source}: found no image{among}, expected files that end in "
-            f"{' '.join(IMAGE_SUFFIXES)}"
+            f"{source}: found no image{f' among {kinds}' if kinds else ''}, expected files that "
+            f"end in {' '.join(IMAGE_SUFFIXES)}"
         )
-    if kinds:
-        warn(f"{source}: skipped {counted(kinds.total(), 'other file')}: {words}")
+    if skipped:
+        warn(f"{source}: skipped {counted(skipped.total(), 'other file')}: {kinds}")
     return images
 
 

@@ -17,7 +17,6 @@ from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import SELF_CHECKED, check_folder, is_image, read_pixels
-from crisalad_jax.data.opencv import QUIET
 from crisalad_jax.data.video import check_rate, frame_name, milliseconds_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
@@ -174,9 +173,8 @@ class Camera:
         self._begins = pathlib.Path(given).name if self._is_file else self.name
         is_number = given.isdecimal() and not self._is_file
         known = self._is_file or is_number or "://" in given
-        with QUIET:
-            self._capture = cv2.VideoCapture(int(given) if is_number else given)
-            whole = known and self._capture.isOpened() and self._capture.grab()
+        self._capture = cv2.VideoCapture(int(given) if is_number else given)
+        whole = known and self._capture.isOpened() and self._capture.grab()
         if not whole:
             self._capture.release()
             raise InputError(
@@ -234,9 +232,8 @@ class Camera:
         """Take frames until there are no more; a video's at their times."""
         begun, grabbed = time.monotonic(), True  # the first frame was grabbed to try the camera
         while grabbed and not self._closing.is_set():
-            with QUIET:
-                at = milliseconds_of(self._capture)
-                found, image = self._capture.retrieve()
+            at = milliseconds_of(self._capture)
+            found, image = self._capture.retrieve()
             if self._is_file:
                 self._closing.wait(max(0.0, begun + at / 1000 - time.monotonic()))
             taken = time.perf_counter()
@@ -248,8 +245,7 @@ class Camera:
                     self.dropped += 1
                 name = frame_name(self._begins, when)
                 self._newest.put(Frame(name, when / 1000, image, taken))
-            with QUIET:
-                grabbed = self._capture.grab()
+            grabbed = self._capture.grab()
         self._capture.release()
 
     def close(self) -> None:

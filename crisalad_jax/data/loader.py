@@ -11,13 +11,13 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar
 
+import cv2
 import numpy as np
 
 from crisalad_jax.config.checks import check_count, check_types, require_range, takes
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.config.short_repr import brief, with_field_docs
 from crisalad_jax.data.images import OnBadImage, read_pixels
-from crisalad_jax.data.opencv import ONE_THREAD
 from crisalad_jax.data.places import Order, Places, epoch_batches
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.resize import Pixels
@@ -54,6 +54,31 @@ class ImageBatch(NamedTuple):
     """Image index, also of an unreadable image; -1 for padding."""
 
 
+class _OneThread:
+    """A context without OpenCV's own threads, in which any number of threads may be."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users = self._before = 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._users == 0:
+                self._before = cv2.getNumThreads()
+                cv2.setNumThreads(1)
+            self._users += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                cv2.setNumThreads(self._before)
+
+
+_ONE_THREAD = _OneThread()
+"""For images that are already decoded on all cores."""
+
+
 class ImageCache:
     """A cache of decoded and resized images in memory, up to a budget; threads may share it.
 
@@ -68,11 +93,7 @@ class ImageCache:
         self._lock = threading.Lock()
 
     def read(
-        self,
-        path: str | os.PathLike[str],
-        how: Preparation,
-        *,
-        quickly: bool = False,
+        self, path: str | os.PathLike[str], how: Preparation, *, quickly: bool = False
     ) -> Pixels:
         """Read and prepare an image, from memory if it is there; the array is read-only.
 
@@ -155,61 +176,51 @@ class Reading:
             InputError: while iterating under "stop" for an image that cannot be read.
         """
         cache = self.cache or ImageCache(0)
-        indices = np.arange(len(paths))
-        return self.read(
-            lambda position: cache.read(paths[position], preparation),
-            labels=indices,
-            indices=indices,
-            positions=indices,
-            preparation=preparation,
-            one_thread=_has_frames(paths),
-        )
+        slots = np.arange(len(paths))
+
+        def load(slot: int) -> Pixels:
+            return cache.read(paths[slot], preparation)
+
+        return self.read(load, slots, slots, slots, preparation, has_frames=_has_frames(paths))
 
     def read(
         self,
         load: Callable[[int], Pixels],
-        *,
-        labels: np.ndarray,
+        slots: np.ndarray,
         indices: np.ndarray,
-        positions: np.ndarray,
+        labels: np.ndarray,
         preparation: Preparation,
-        one_thread: bool = False,
+        *,
+        has_frames: bool,
     ) -> Iterator[ImageBatch]:
-        """Yield batches of what `load` returns for each of `positions`.
+        """Yield batches of what `load` returns for each of `slots`, with its index and label.
 
-        A batch holds the next `batch_size` of them, or fewer where the size changes.
-
-        Args:
-            load: reads the image at a position.
-            labels: label at each position.
-            indices: image index at each position.
-            positions: which to read, in order.
-            preparation: how the images are prepared.
-            one_thread: whether one thread at most reads: more would read a video each, from its
-                beginning.
+        A batch holds the next `batch_size` of them, or fewer where the size changes. Of images with
+        frames of videos one thread at most reads: more would read a video each, from its beginning.
         """
-        threads = min(self.threads, 1) if one_thread else self.threads
+        threads = min(self.threads, 1) if has_frames else self.threads
 
-        def load_or_skip(position: int) -> Pixels | None:
+        def load_or_skip(slot: int) -> Pixels | None:
             try:
-                return load(position)
+                return load(slot)
             except InputError as error:
                 if self.on_bad_image == "stop":
                     raise InputError(f"{error} (--on-bad-image skip leaves it out)") from error
                 return None
 
         ahead = max(BATCHES_AHEAD * self.batch_size, threads)
-        read = read_ahead(load_or_skip, positions.tolist(), ahead=ahead, threads=threads)
-        with ONE_THREAD, contextlib.closing(read):
+        read = read_ahead(load_or_skip, slots.tolist(), ahead=ahead, threads=threads)
+        with _ONE_THREAD, contextlib.closing(read):
             start = 0
             for run in _same_size_runs(read, self.batch_size):
-                part = positions[start : start + len(run)]
+                batch = _padded_batch(run, self.batch_size, preparation)
+                batch.indices[: len(run)] = indices[start : start + len(run)]
+                batch.labels[: len(run)] = labels[start : start + len(run)]
                 start += len(run)
-                yield _batch_of(run, labels[part], indices[part], preparation, self.batch_size)
+                yield batch
 
 
 def _has_frames(files: Iterable[str | os.PathLike[str]]) -> bool:
-    """Return whether any name may be that of a frame of a video."""
     return any("#t=" in os.fspath(file) for file in files)
 
 
@@ -343,49 +354,42 @@ def batches_of_groups(
     """
     _, groups, images_per_group = chosen.shape
     batch_size = groups * images_per_group
-    number, parts = part
-    if not (0 <= start_step <= len(chosen) and 0 <= number < parts and batch_size % parts == 0):
+    mine, parts = part
+    if not (0 <= start_step <= len(chosen) and 0 <= mine < parts and batch_size % parts == 0):
         raise InputError(
             f"start_step, part: found {start_step} and {part}, expected 0 to {len(chosen)}, and "
             f"the i-th of n equal parts of {batch_size} images"
         )
-    reading = Reading(
-        batch_size=batch_size // parts, on_bad_image=on_bad_image, threads=threads, cache=cache
-    )
-    how = Preparation(image_size, preprocessing.for_training())
     from crisalad_jax.data.augmentations.base import AUGMENTATIONS
 
+    augment = AUGMENTATIONS.resolve(augmentation, "augmentation")
+    reading = Reading(batch_size=batch_size // parts, on_bad_image=on_bad_image, threads=threads)
+    how = Preparation(image_size, preprocessing.for_training())
     cache = cache or ImageCache(0)
     if has_frames := _has_frames(files.files):
         # In order: the frames of a batch are far from each other, with all others in between.
         cache.fill(map(files.path, np.unique(chosen)), how)
     indices = chosen.reshape(-1)
     slots = np.arange(indices.size).reshape(len(chosen), parts, batch_size // parts)
-    augment = AUGMENTATIONS.resolve(augmentation, "augmentation")
 
-    def load(position: int) -> Pixels:
-        image = cache.read(files.path(indices[position]), how, quickly=True)
-        step, slot = divmod(position, batch_size)
+    def load(number: int) -> Pixels:
+        image = cache.read(files.path(indices[number]), how, quickly=True)
+        step, slot = divmod(number, batch_size)
         # The spawn key makes this stream, one for each place, independent of each image's.
         place = (*seed, step, slot // images_per_group)
         of_place = np.random.default_rng(np.random.SeedSequence(place, spawn_key=(1,)))
         generator = np.random.default_rng((*seed, step, slot))
-        augmented = augment.apply(image, generator, of_place=of_place)
-        shape, dtype = np.shape(augmented), getattr(augmented, "dtype", type(augmented).__name__)
-        if shape != image.shape or dtype != np.uint8:
+        augmented = np.asarray(augment.apply(image, generator, of_place=of_place))
+        if augmented.shape != image.shape or augmented.dtype != np.uint8:
             raise InputError(
-                f"augmentation {augment.part_name}: found to return {dtype} of shape {shape}, "
-                f"expected uint8 of {image.shape}"
+                f"augmentation {augment.part_name}: found to return {augmented.dtype} of shape "
+                f"{augmented.shape}, expected uint8 of {image.shape}"
             )
         return augmented
 
+    own = slots[start_step:, mine].reshape(-1)
     return reading.read(
-        load,
-        labels=labels.reshape(-1),
-        indices=indices,
-        positions=slots[start_step:, number].reshape(-1),
-        preparation=how,
-        one_thread=has_frames,
+        load, own, indices[own], labels.reshape(-1)[own], how, has_frames=has_frames
     )
 
 
@@ -432,29 +436,20 @@ def _same_size_runs(
 ) -> Iterator[list[Pixels | None]]:
     """Yield runs of at most `batch_size` consecutive images of one size; None is of any size."""
     run: list[Pixels | None] = []
-    shape: tuple[int, ...] | None = None
     for image in images:
-        own = None if image is None else image.shape
-        if None not in (own, shape) and own != shape:
+        if len({each.shape for each in (*run, image) if each is not None}) > 1:
             yield run
-            run, shape = [], None
+            run = []
         run.append(image)
-        shape = own or shape
         if len(run) == batch_size:
             yield run
-            run, shape = [], None
+            run = []
     if run:
         yield run
 
 
-def _batch_of(
-    run: Sequence[Pixels | None],
-    labels: np.ndarray,
-    indices: np.ndarray,
-    how: Preparation,
-    batch_size: int,
-) -> ImageBatch:
-    """Make a padded batch; where none of its images can be read, they have the model's size."""
+def _padded_batch(run: Sequence[Pixels | None], batch_size: int, how: Preparation) -> ImageBatch:
+    """Make a batch of images; where none of them can be read, they have the model's size."""
     sizes = (image.shape[:2] for image in run if image is not None)
     batch = ImageBatch(
         images=np.zeros((batch_size, *next(sizes, how.size_of(how.image_size)), 3), how.dtype),
@@ -462,7 +457,6 @@ def _batch_of(
         valid=np.zeros(batch_size, np.bool_),
         indices=np.full(batch_size, -1, np.int64),
     )
-    batch.labels[: len(run)], batch.indices[: len(run)] = labels, indices
     for slot, image in enumerate(run):
         if image is not None:
             batch.images[slot], batch.valid[slot] = image, True

@@ -5,6 +5,7 @@ Transverse Mercator with an accuracy of a few nanometers (J. Geodesy 2011), eqs.
 exact to a millimetre in a zone and its neighbours.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,18 @@ _SQUARE = _FLATTENING * (2 - _FLATTENING)
 _THIRD = _FLATTENING / (2 - _FLATTENING)
 _RADIUS = 0.9996 * (_EQUATOR / (1 + _THIRD) * (1 + _THIRD**2 / 4 + _THIRD**4 / 64))
 """Metres of a meridian's arc of one radian on the mean, times UTM's scale."""
+_FORWARD = (
+    _THIRD / 2 - 2 * _THIRD**2 / 3 + 5 * _THIRD**3 / 16,
+    13 * _THIRD**2 / 48 - 3 * _THIRD**3 / 5,
+    61 * _THIRD**3 / 240,
+)
+"""Series from the sphere to the plane (eq. 35)."""
+_INVERSE = (
+    -(_THIRD / 2 - 2 * _THIRD**2 / 3 + 37 * _THIRD**3 / 96),
+    -(_THIRD**2 / 48 + _THIRD**3 / 15),
+    -17 * _THIRD**3 / 480,
+)
+"""Series from the plane to the sphere (eq. 36)."""
 _FALSE_EAST, _FALSE_NORTH = 500_000.0, 10_000_000.0
 
 _Points = Float64[np.ndarray, " point"]
@@ -72,37 +85,27 @@ def transverse_mercator(
         latitude: degrees on WGS84.
         longitude: degrees from the zone's central meridian.
     """
-    n = _THIRD
-    series = (
-        n / 2 - 2 * n**2 / 3 + 5 * n**3 / 16,
-        13 * n**2 / 48 - 3 * n**3 / 5,
-        61 * n**3 / 240,
-    )
     eccentricity = np.sqrt(_SQUARE)
     sine, turn = np.sin(np.deg2rad(latitude)), np.deg2rad(longitude)
     conformal = np.sinh(np.arctanh(sine) - eccentricity * np.arctanh(eccentricity * sine))
     along = np.arctan2(conformal, np.cos(turn))
     across = np.arcsinh(np.sin(turn) / np.hypot(conformal, np.cos(turn)))
-    east, north = across.copy(), along.copy()
-    for order, weight in enumerate(series, start=1):
-        north += weight * np.sin(2 * order * along) * np.cosh(2 * order * across)
-        east += weight * np.cos(2 * order * along) * np.sinh(2 * order * across)
+    north, east = _corrected(along, across, _FORWARD)
     return _FALSE_EAST + _RADIUS * east, _RADIUS * north
+
+
+def _corrected(along: _Points, across: _Points, series: Sequence[float]) -> tuple[_Points, _Points]:
+    """Add a series to a point on the sphere, or on the ellipsoid."""
+    first, second = along.copy(), across.copy()
+    for order, weight in enumerate(series, start=1):
+        first += weight * np.sin(2 * order * along) * np.cosh(2 * order * across)
+        second += weight * np.cos(2 * order * along) * np.sinh(2 * order * across)
+    return first, second
 
 
 def _inverse(east: _Points, north: _Points) -> tuple[_Points, _Points]:
     """Compute latitude, and longitude from the central meridian, in degrees."""
-    n = _THIRD
-    series = (
-        n / 2 - 2 * n**2 / 3 + 37 * n**3 / 96,
-        n**2 / 48 + n**3 / 15,
-        17 * n**3 / 480,
-    )
-    along, across = north / _RADIUS, (east - _FALSE_EAST) / _RADIUS
-    angle, away = along.copy(), across.copy()
-    for order, weight in enumerate(series, start=1):
-        angle -= weight * np.sin(2 * order * along) * np.cosh(2 * order * across)
-        away -= weight * np.cos(2 * order * along) * np.sinh(2 * order * across)
+    angle, away = _corrected(north / _RADIUS, (east - _FALSE_EAST) / _RADIUS, _INVERSE)
     conformal = np.arcsinh(np.sin(angle) / np.hypot(np.sinh(away), np.cos(angle)))
     eccentricity = np.sqrt(_SQUARE)
     sine = np.tanh(conformal)

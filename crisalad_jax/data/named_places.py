@@ -1,11 +1,16 @@
-"""Training places of any images: a folder or a table that says them, or by position or order.
+"""Find training places: of GSV-Cities, of a folder or a table, or by position or order.
+
+GSV-Cities (Ali-bey et al. 2022) has `Dataframes/{city}.csv` with one row per image, which is
+`Images/{city_id}/{city_id}_{place_id:07d}_{year:04d}_{month:02d}_{northdeg:03d}_{lat}_{lon}_{panoid}.jpg`.
 
 No two images of one batch are negatives of each other while they are as near as two images of one
 place may be: places that are too near for that are listed as such, and do not meet in a batch.
 """
 
 import collections
+import functools
 import math
+import operator
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -18,18 +23,21 @@ from crisalad_jax.data.images import OnBadImage, is_image, list_images
 from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.sources import ImageSource
-from crisalad_jax.data.tables import read_table
+from crisalad_jax.data.tables import Disk, normal_name, read_table
 from crisalad_jax.data.video import file_of, frame_time, is_video
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float64, Int64
 
+COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
+"""Of a table of GSV-Cities."""
+_IDS_PER_CITY = 10**5
 TABLE = "places.csv"
 _COLUMNS = "name,place[,lat,lon[,heading]]"
 _LAYOUTS = f"the layout of GSV-Cities (Dataframes/, Images/), {TABLE}, or one folder a place"
 _GROUPED = "--place-radius METRES makes places by positions, --place-frames N of images in order"
-_VIEW = {"lat": 90.0, "lon": 180.0, "heading": math.inf}
-"""Columns of where an image was taken, and their largest numbers."""
+_VIEW = ("lat", "lon", "heading")
+"""Columns of where an image was taken."""
 _APART = 4
 """Radii between the centres of two places of a batch, at least. Images of one place are at most two
 radii apart, and so those of two places are no nearer."""
@@ -41,13 +49,92 @@ View = Sequence[float]
 class FoundPlace(NamedTuple):
     """A place as its reader finds it."""
 
-    id: int
     name: str
     images: Mapping[str, View | None]
     """Path relative to the root -> the view; None where positions are unknown."""
     near: Sequence[int] = ()
     """Numbers of the places that are too near to be in a batch with it."""
     city: int = 0
+
+
+def read_gsv_cities(
+    root: pathlib.Path, cities: Sequence[str] | None, on_bad_image: OnBadImage
+) -> tuple[tuple[str, ...], list[FoundPlace]]:
+    """Return the cities, and their places ascending by id.
+
+    Images may end in .jpg or .JPG, and may lie in a folder named by the city id or by the CSV file.
+
+    Raises:
+        InputError: a city that is unknown or named twice, a bad row, or a row without its image.
+    """
+    folder = root / "Dataframes"
+    tables = {path.stem: path for path in sorted(folder.glob("*.csv"))}
+    chosen = tuple(tables if cities is None else cities)
+    if not chosen or len(set(chosen)) < len(chosen) or not tables.keys() >= set(chosen):
+        raise InputError(
+            f"cities (--cities): found {', '.join(chosen) or 'none'}, expected some of those in "
+            f"{folder}, each once: {', '.join(tables) or 'found no CSV file'}"
+        )
+    return chosen, [
+        FoundPlace(f"{place} of {city}", images, city=number)
+        for number, city in enumerate(chosen)
+        for place, images in sorted(_read_city(root, tables[city], on_bad_image).items())
+    ]
+
+
+def _read_city(
+    root: pathlib.Path, path: pathlib.Path, on_bad_image: OnBadImage
+) -> dict[int, dict[str, View]]:
+    """Return each place's images; a row that repeats an earlier one counts once."""
+    disk = Disk()
+
+    @functools.cache
+    def listing(folder: str) -> tuple[str, dict[str, str]]:
+        """Return a folder's name on disk, and the names in it."""
+        there = disk.find(root / "Images", folder)
+        return ("", {}) if there is None else (there.name, disk.names(there))
+
+    def find(folders: Sequence[str], stem: str) -> str | None:
+        """Return the path of an image relative to the root; None where there is none."""
+        for folder in folders:
+            there, files = listing(folder)
+            for name in (f"{stem}.jpg", f"{stem}.JPG"):
+                if (file := files.get(name) or files.get(normal_name(name))) is not None:
+                    return f"Images/{there}/{file}"
+        return None
+
+    places: dict[int, dict[str, View]] = collections.defaultdict(dict)
+    missing = 0
+    table = read_table(path, *COLUMNS)
+    fields = operator.itemgetter(*map(table.columns.index, COLUMNS))
+    for line, row in table.lines:
+        *numbers, city_id, latitude, longitude, panorama = fields(row)
+        try:
+            place, year, month, north = map(int, numbers)
+            view = (float(latitude), float(longitude), float(north))
+        except ValueError as error:
+            raise InputError(
+                f"{path}: line {line}: found {', '.join(fields(row)[:-1])}, expected whole numbers "
+                "for place_id, year, month and northdeg, and degrees for lat and lon"
+            ) from error
+        place %= _IDS_PER_CITY
+        stem = (
+            f"{city_id}_{place:07d}_{year:04d}_{month:02d}_{north:03d}"
+            f"_{latitude}_{longitude}_{panorama}"
+        )
+        if (image := find((city_id, path.stem), stem)) is not None:
+            places[place][image] = view
+        elif on_bad_image == "skip":
+            missing += 1
+        else:
+            raise InputError(
+                f"{path}: line {line}: found no file Images/{city_id}/{stem}.jpg (nor .JPG, nor "
+                f"under Images/{path.stem}/), expected the images of all rows; --cities reads the "
+                "cities that it names alone"
+            )
+    if missing:
+        warn(f"{path}: left out {missing} rows, whose images are missing")
+    return places
 
 
 def read_named_places(
@@ -81,7 +168,7 @@ def _read_folders(root: pathlib.Path) -> list[FoundPlace]:
     for path in list_images(root):
         name = path.relative_to(root)
         images[name.parent.as_posix()][name.as_posix()] = None
-    return _numbered(images)
+    return [FoundPlace(name, files) for name, files in images.items()]
 
 
 def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace]:
@@ -89,7 +176,7 @@ def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace
     table = read_table(path, "name")
     given = [column for column in _VIEW if column in table.columns]
     # A heading is of use with a position alone.
-    if "place" not in table.columns or given not in ([], [*_VIEW][:2], [*_VIEW]):
+    if "place" not in table.columns or given not in ([], ["lat", "lon"], [*_VIEW]):
         raise InputError(
             f"{path}: found columns {', '.join(table.columns)}, expected {_COLUMNS}; {_GROUPED}"
         )
@@ -104,20 +191,11 @@ def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace
             continue
         inside = image.is_relative_to(root)
         file = "/".join(image.parts[len(root.parts) :]) if inside else name
-        view = [
-            row.number(column, most) if column in given else math.nan
-            for column, most in _VIEW.items()
-        ]
+        view = [row.number(column) if column in given else math.nan for column in _VIEW]
         places[place][file] = view if given else None
     if missing:
         warn(f"{path}: left out {missing} of {len(rows)} images, which are missing")
-    return _numbered(places)
-
-
-def _numbered(places: Mapping[str, Mapping[str, View | None]]) -> list[FoundPlace]:
-    return [
-        FoundPlace(number, name, images) for number, (name, images) in enumerate(places.items())
-    ]
+    return [FoundPlace(name, files) for name, files in places.items()]
 
 
 def places_by_position(
@@ -131,19 +209,19 @@ def places_by_position(
     Args:
         source: the images.
         radius: in metres.
-        positions: a table (`read_positions`); None is what the source says, if that is a table,
+        positions: a table (`read_image_table`); None is what the source says, if that is a table,
             else what @UTM names say, else the EXIF data of JPEGs.
 
     Raises:
-        InputError: no image has a position, or what `read_positions` raises.
+        InputError: no image has a position, or what `read_image_table` raises.
     """
     found = _positions(source, positions)
     names = [name for name in source.names if name in found.of]
     if not names:
         raise InputError(
-            f"{source.root}: found no position of {len(source.names)} images, which --place-radius "
-            "asks for, expected --positions TABLE (name,lat,lon or name,east,north or name,x,y), "
-            "such a table as --data, @UTM names or EXIF data; --place-frames takes images in order"
+            f"{source.root}: found no position of {len(source.names)} images, expected --positions "
+            "TABLE (name,lat,lon or name,east,north or name,x,y), such a table as --data, @UTM "
+            "names or EXIF data; --place-frames takes images in order"
         )
     if len(names) < len(source.names):
         warn(
@@ -158,7 +236,7 @@ def places_by_position(
     for name, number in zip(names, place.tolist(), strict=True):
         images[number][name] = None
     return [
-        FoundPlace(number, names[centre], files, [other for other in others if other != number])
+        FoundPlace(names[centre], files, [other for other in others if other != number])
         for number, (centre, files, others) in enumerate(zip(centres, images, near, strict=True))
     ]
 
@@ -178,7 +256,7 @@ def places_by_order(source: ImageSource, frames: int) -> list[FoundPlace]:
             start = (number - first) * frames
             part = sequence[start : start + frames]
             near = [each for each in (number - 1, number + 1) if first <= each <= last]
-            places.append(FoundPlace(number, part[0], dict.fromkeys(part), near))
+            places.append(FoundPlace(part[0], dict.fromkeys(part), near))
     return places
 
 

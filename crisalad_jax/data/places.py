@@ -13,13 +13,13 @@ import numpy as np
 
 from crisalad_jax.config.checks import PATH, choose, takes
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.gsv_cities import COLUMNS as COLUMNS
-from crisalad_jax.data.gsv_cities import read_gsv_cities
 from crisalad_jax.data.images import OnBadImage
+from crisalad_jax.data.named_places import COLUMNS as COLUMNS
 from crisalad_jax.data.named_places import (
     FoundPlace,
     places_by_order,
     places_by_position,
+    read_gsv_cities,
     read_named_places,
 )
 from crisalad_jax.data.sources import check_rate_used, open_source
@@ -46,9 +46,6 @@ class Places:
     place_start: Int64[np.ndarray, " places+1"]
     place_city: Int32[np.ndarray, " places"]
     """Place -> position in `cities`, ascending."""
-    place_id: Int64[np.ndarray, " places"]
-    """In the layout of GSV-Cities the id in the CSV modulo 10**5, plus 10**5 times the position of
-    the city; else the place's number among all, also those that are too small."""
     names: tuple[str, ...]
     """Place -> its name."""
     views: Float64[np.ndarray, "images 3"] | None = None
@@ -64,7 +61,7 @@ class Places:
     @functools.cached_property
     def image_place(self) -> Int32[np.ndarray, " images"]:
         """Image -> place, ascending."""
-        return np.repeat(np.arange(len(self.place_id), dtype=np.int32), self.image_counts)
+        return np.repeat(np.arange(len(self.names), dtype=np.int32), self.image_counts)
 
     def path(self, image: int | np.integer) -> pathlib.Path:
         """Return the path of one image."""
@@ -106,8 +103,8 @@ def read_places(
             place with the nearest. Centres of a batch are more than four radii apart.
         place_frames: number of consecutive images of a folder, or frames of a video, that are a
             place. The next place is not in a batch with it.
-        positions: table of positions (`read_positions`) for `place_radius`. None is what the source
-            says, if that is a table, else what @UTM names say, else the EXIF data of JPEGs.
+        positions: table of positions for `place_radius` (`read_image_table`). None is what the
+            source says, if that is a table, else what @UTM names say, else the EXIF data of JPEGs.
         fps: frames a second taken of videos; None is one.
         on_bad_image: "stop" where an image that a table names is missing, or "skip" it.
 
@@ -125,14 +122,12 @@ def read_places(
     """
     root = pathlib.Path(root)
     is_gsv = (root / "Dataframes").is_dir()
-    by_position, by_order = place_radius is not None, place_frames is not None
-    is_grouped = by_position or by_order
+    groupings = (place_radius is not None) + (place_frames is not None)
     if (
-        (by_position and by_order)
-        or (positions is not None and not by_position)
-        or (fps is not None and not is_grouped)
+        groupings + is_gsv > 1
+        or (positions is not None and place_radius is None)
+        or (fps is not None and not groupings)
         or (cities is not None and not is_gsv)
-        or (is_gsv and is_grouped)
     ):
         raise InputError(
             f"{root}: found arguments that do not fit each other, expected --cities for the layout "
@@ -146,7 +141,7 @@ def read_places(
     names: tuple[str, ...] = ()
     if is_gsv:
         names, found = read_gsv_cities(root, cities, on_bad_image)
-    elif is_grouped:
+    elif groupings:
         source = open_source(root, fps=fps, on_bad_image=on_bad_image)
         check_rate_used(fps, source.paths)
         root = source.root
@@ -165,10 +160,10 @@ def _places(
     """Make arrays of the places that are large enough."""
     large = {i: place for i, place in enumerate(found) if len(place.images) >= min_images}
     if not large:
+        most = max((len(place.images) for place in found), default=0)
         raise InputError(
-            f"{root}: found no place with at least {min_images} images; the largest has "
-            f"{max((len(place.images) for place in found), default=0)}, of {len(found)} places "
-            "(--place-radius, --place-frames, --min-images)"
+            f"{root}: found no place with at least {min_images} images; the largest has {most}, of "
+            f"{len(found)} places (--place-radius, --place-frames, --min-images)"
         )
     if len(large) < len(found):
         warn(
@@ -189,7 +184,6 @@ def _places(
         files=tuple(file for file, _ in images),
         place_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         place_city=np.array([place.city for place in large.values()], np.int32),
-        place_id=np.array([place.id for place in large.values()], np.int64),
         names=tuple(place.name for place in large.values()),
         views=np.array(views) if views else None,
         near=near if any(place.near for place in found) else None,

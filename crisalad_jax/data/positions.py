@@ -12,6 +12,7 @@ import numpy as np
 
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.metres import Zone
+from crisalad_jax.data.tables import MOST_METRES as MOST_METRES
 from crisalad_jax.data.tables import matched, read_table
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float64
@@ -20,10 +21,6 @@ AXES = (("east", "north"), ("lat", "lon"), ("x", "y"))
 """Names of a position's two numbers: metres of UTM, degrees, or metres of a frame of one's own."""
 
 
-MOST_METRES = 1e8
-"""Largest coordinate in metres: twice the Earth's circumference, and its square is finite."""
-_MOST = {"lat": 90.0, "lon": 180.0} | dict.fromkeys(("east", "north", "x", "y"), MOST_METRES)
-"""Largest number of a column."""
 _BANDS = "CDEFGHJKLMNPQRSTUVWX"
 """Letters of UTM's bands of latitude, from south to north; N is the first of the north."""
 _BAND_S = (3.4e6, 4.6e6)
@@ -83,14 +80,8 @@ class Positions(NamedTuple):
                     "a new map of all images can have lat, lon"
                 )
             fitted = np.round(zone.to_metres(latitude, longitude), 4)
-        return Positions(axes or metres, _by_name(self.of, fitted.T), zone)
-
-
-def _by_name(
-    names: Iterable[str], points: Float64[np.ndarray, "image 2"]
-) -> dict[str, tuple[float, float]]:
-    rows = zip(names, points.tolist(), strict=True)
-    return {name: (first, second) for name, (first, second) in rows}
+        of = dict(zip(self.of, map(tuple, fitted.T.tolist()), strict=True))
+        return Positions(axes or metres, of, zone)
 
 
 def utm_position(name: str) -> tuple[float, float] | None:
@@ -115,37 +106,28 @@ def utm_zones(names: Sequence[str]) -> list[Zone | None]:
     Raises:
         InputError: several zones or hemispheres, and a name without one.
     """
-    fields = [_zone_fields(name.rpartition("/")[2]) for name in names]
-    numbers = {number for number, _ in fields if number is not None}
-    halves = {south for _, south in fields if south is not None}
-    if len(numbers) <= 1 and len(halves) <= 1:
-        common = Zone(numbers.pop(), halves.pop()) if numbers and halves else None
-        return [common] * len(fields)
-    zones = []
-    for name, (number, south) in zip(names, fields, strict=True):
-        if number is None or south is None:
-            raise InputError(
-                f"{name}: found no zone with a letter, expected @east@north@zone@letter@...: the "
-                "images are of several zones of UTM (evaluate --ignore-zones takes them as one)"
-            )
-        zones.append(Zone(number, south))
+    zones = [_zone_of(name.rpartition("/")[2]) for name in names]
+    known = set(zones) - {None}
+    if len(known) <= 1:
+        return [next(iter(known), None)] * len(zones)
+    if None in zones:
+        raise InputError(
+            f"{names[zones.index(None)]}: found no zone with a letter, expected "
+            "@east@north@zone@letter@...: the images are of several zones of UTM (evaluate "
+            "--ignore-zones takes them as one)"
+        )
     return zones
 
 
-def _zone_fields(name: str) -> tuple[int | None, bool | None]:
-    """Read the number of the zone, and whether it is south of the equator; None where unknown."""
-    _, _, north, number, letter, latitude, *_ = [*name.split("@"), *[""] * 6]
+def _zone_of(name: str) -> Zone | None:
+    _, _, north, number, letter, *_ = [*name.split("@"), *[""] * 5]
     letter = letter.upper()
-    if not (number.isdecimal() and 1 <= int(number) <= 60 and letter in ("", *_BANDS)):
-        return None, None
-    if not letter:
-        try:
-            return int(number), float(latitude) < 0
-        except ValueError:
-            return int(number), None
+    if not (number.isdecimal() and 1 <= int(number) <= 60 and letter and letter in _BANDS):
+        return None
+    south = letter < "N"
     if letter == "S":
-        return int(number), float(north) < _BAND_S[0] or float(north) > _BAND_S[1]
-    return int(number), letter < "N"
+        south = not _BAND_S[0] <= float(north) <= _BAND_S[1]
+    return Zone(int(number), south)
 
 
 def utm_degrees(
@@ -182,46 +164,36 @@ def utm_positions(names: Sequence[str]) -> Positions:
     zones = utm_zones(there)
     if len(set(zones)) <= 1:
         return Positions(AXES[0], of, zones[0] if zones else None)
-    degrees = utm_degrees(there, zones, np.array(list(of.values()), np.float64))
-    return Positions(AXES[1], _by_name(there, np.round(degrees, 9)))
-
-
-def read_positions(path: str | os.PathLike[str]) -> Positions:
-    """Read a table of `name,east,north`, `name,lat,lon` or `name,x,y`; see `read_image_table`.
-
-    Raises:
-        InputError: as `read_image_table`; no columns of positions, or a row without one.
-    """
-    _, positions = read_image_table(path, all_positions=True)
-    assert positions is not None
-    return positions
+    degrees = np.round(utm_degrees(there, zones, np.array(list(of.values()), np.float64)), 9)
+    return Positions(AXES[1], dict(zip(there, map(tuple, degrees.tolist()), strict=True)))
 
 
 def positions_of(
-    given: Positions | str | os.PathLike[str],
-    names: Sequence[str],
-    images: str | os.PathLike[str],
+    given: Positions | str | os.PathLike[str], names: Sequence[str], images: str | os.PathLike[str]
 ) -> Positions:
     """Return given positions, or those of a table, under the names that images have on disk.
 
     Args:
-        given: by name, or a table's file; names of other images stay in it.
+        given: by name, or a table's file, which has a position in every row; names of other images
+            stay in it.
         names: of the images.
         images: where these are, for messages.
 
     Raises:
-        InputError: none of the images is named; or what `read_positions` raises.
+        InputError: none of the images is named; or what `read_image_table` raises.
     """
-    positions = given if isinstance(given, Positions) else read_positions(given)
+    if isinstance(given, Positions):
+        source, positions = "positions", given
+    else:
+        source, (_, positions) = given, read_image_table(given, all_positions=True)
+        assert positions is not None
     meant = matched(positions.of, frozenset(names))
     if not meant:
-        source = "positions" if isinstance(given, Positions) else given
         raise InputError(
             f"{source}: found none of the {len(names)} images of {images}, expected names such as "
             f"{names[0]!r}"
         )
-    of = {meant.get(name, name): position for name, position in positions.of.items()}
-    return positions._replace(of=of)
+    return positions._replace(of={meant.get(name, name): at for name, at in positions.of.items()})
 
 
 def read_image_table(
@@ -250,7 +222,7 @@ def read_image_table(
     positions = None
     if axes is not None:
         of = {
-            name: (row.number(axes[0], _MOST[axes[0]]), row.number(axes[1], _MOST[axes[1]]))
+            name: (row.number(axes[0]), row.number(axes[1]))
             for name, row in rows
             if all_positions or any(row.fields[axis] for axis in axes)
         }
@@ -301,8 +273,7 @@ def _degrees(fields: dict[int, Any], reference: int, value: int, signs: bytes) -
     """Return degrees of degrees, minutes and seconds; NaN where a fraction is 0 / 0."""
     degrees, minutes, seconds = (float(part) for part in fields[value])
     sign = 1 - 2 * signs.decode().index(fields[reference].strip("\0 ").upper())
-    total = sign * (degrees + minutes / 60 + seconds / 3600)
-    return total if math.isfinite(total) else math.nan
+    return sign * (degrees + minutes / 60 + seconds / 3600)
 
 
 def exif_positions(images: Iterable[tuple[str, pathlib.Path]]) -> Positions:

@@ -3,7 +3,7 @@
 import dataclasses
 import threading
 from collections.abc import Callable
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -57,25 +57,23 @@ def as_rgb(
     if not right or image.dtype != np.uint8:
         found = f"{image.dtype} of shape {shape}" if shape else type(image).__name__
         if right and image.dtype.kind in "iuf":
-            low, high = _range(image, (0, 100), name)
-            found += f", values from {low:,.6g} to {high:,.6g}"
             expected = "uint8 or uint16; --resize contrast-stretch spreads such values over 8 bits"
         raise InputError(f"{name}: found {found}, expected {expected}")
     return np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2) if grey else image
 
 
-def _range(image: np.ndarray, percentiles: tuple[int, int], name: str) -> tuple[float, float]:
-    """Return percentiles of the values that are finite: values, so that grey and RGB agree."""
+def _range(image: np.ndarray, name: str) -> tuple[float, float]:
+    """Return `PERCENTILES` of the values that are finite: values, so that grey and RGB agree."""
     values = image[np.isfinite(image)] if image.dtype.kind == "f" else image
     if not values.size:
         raise InputError(f"{name}: found no finite value, expected some")
-    low, high = np.percentile(values, percentiles, method="inverted_cdf")
+    low, high = np.percentile(values, PERCENTILES, method="inverted_cdf")
     return float(low), float(high)
 
 
 def _stretched(image: np.ndarray, name: str) -> UInt8[np.ndarray, "..."]:
     """Spread the values between the percentiles over 0 to 255; what is not finite becomes 0."""
-    low, high = _range(image, PERCENTILES, name)
+    low, high = _range(image, name)
     share = (image - np.float64(low)) / ((high - low) or 1.0)
     return np.rint(255 * np.clip(np.nan_to_num(share), 0, 1)).astype(np.uint8)
 
@@ -84,25 +82,13 @@ def _note_narrow(image: UInt16[np.ndarray, "..."], name: str) -> None:
     """Say, once, that 16-bit values of a narrow range lose most of what they show."""
     if _noted.locked():
         return
-    low, high = _range(image, PERCENTILES, name)
+    low, high = _range(image, name)
     if high - low < _NARROW and _noted.acquire(blocking=False):
         levels = int(high) // 256 - int(low) // 256 + 1
         warn(
             f"{name}: 16-bit values from {low:,.0f} to {high:,.0f} of 65,535 become {levels} of "
             "256 grey levels; --resize contrast-stretch spreads them over all"
         )
-
-
-class _Model(Protocol):
-    """What a `ModelConfig` says of images."""
-
-    @property
-    def image_size(self) -> Size: ...
-    @property
-    def preprocessing(self) -> PreprocessingConfig: ...
-    @property
-    def side_multiple(self) -> int: ...
-    def check_image_size(self, image_size: Size, /) -> None: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,8 +112,8 @@ class Preparation:
             )
 
     @classmethod
-    def of(cls, model: _Model) -> Self:
-        """Return how the photographs of a model are prepared."""
+    def of(cls, model: Any) -> Self:
+        """Return how the photographs of a model are prepared, as its configuration says."""
         return cls(
             model.image_size, model.preprocessing, model.side_multiple, model.check_image_size
         )

@@ -60,15 +60,12 @@ def resize_image(
     choose("pixels", pixels, {"bytes": None, "floats": None})
     choose("filter", filter, {**_KERNELS, "area": None})
     kinds = (np.uint8,) if pixels == "bytes" else (np.uint8, np.float32)
-    shape = image.shape if isinstance(image, np.ndarray) else ()
-    is_image = len(shape) == 3 and shape[2] == 3 and 0 not in shape and image.dtype in kinds
-    sides = image_size if isinstance(image_size, tuple | list) else ()
-    is_size = [isinstance(side, int | np.integer) and side >= 1 for side in sides] == [True, True]
-    if not (is_image and is_size):
-        found = f"{image.dtype} of shape {shape}" if shape else type(image).__name__
+    shape, dtype = np.shape(image), getattr(image, "dtype", type(image).__name__)
+    is_image = shape[2:] == (3,) and 0 not in shape and dtype in kinds
+    if not is_image or np.shape(image_size) != (2,) or min(image_size) < 1:
         raise InputError(
-            f"image, image_size: found {found} and {image_size!r}, expected uint8 of shape (height,"
-            " width, 3), as of `read_image`, and two whole numbers; all sides at least 1"
+            f"image, image_size: found {dtype} of shape {shape} and {image_size!r}, expected uint8 "
+            "of shape (height, width, 3), and two whole numbers; all sides at least 1"
         )
     if filter == "area":
         grows = any(new > old for new, old in zip(image_size, shape, strict=False))
@@ -76,10 +73,7 @@ def resize_image(
         given: Any = image if pixels == "bytes" else image.astype(np.float32)
         return cv2.resize(given, image_size[::-1], interpolation=how)
     height, width = image.shape[:2]
-    taps = (
-        _taps(height, image_size[0], filter, antialias),
-        _taps(width, image_size[1], filter, antialias),
-    )
+    taps = [_taps(old, new, filter, antialias) for old, new in zip(shape, image_size, strict=False)]
     flat = np.ascontiguousarray(image).reshape(height, 3 * width)
     once = (filter, antialias, pixels) == ("bilinear", True, "bytes")
     resized = np.empty((image_size[0], 3 * image_size[1]), np.uint8 if once else np.float32)

@@ -1,5 +1,6 @@
 """Sources of images: a folder, a file, a pattern, a list, a table or a video."""
 
+import collections
 import glob
 import os
 import pathlib
@@ -29,7 +30,6 @@ _FORMS = (
     "table (.csv)"
 )
 _PATTERN = re.compile(r"[*?\[]")
-_AN_IMAGE = "an image file"
 
 
 @brief
@@ -47,10 +47,7 @@ class ImageSource(NamedTuple):
 
 
 def open_source(
-    images: str | os.PathLike[str],
-    *,
-    fps: float | None = None,
-    on_bad_image: OnBadImage = "stop",
+    images: str | os.PathLike[str], *, fps: float | None = None, on_bad_image: OnBadImage = "stop"
 ) -> ImageSource:
     """List the images of a source.
 
@@ -154,10 +151,6 @@ def check_rate_used(fps: float | None, paths: Iterable[pathlib.Path]) -> None:
         raise InputError(f"--fps: found {fps:g} without a video among the images, expected both")
 
 
-def _is_below(root: pathlib.Path, path: pathlib.Path) -> bool:
-    return path.is_relative_to(root) and ".." not in path.relative_to(root).parts
-
-
 def _source(
     root: pathlib.Path,
     paths: list[pathlib.Path],
@@ -165,9 +158,9 @@ def _source(
     positions: Positions | None = None,
 ) -> ImageSource:
     names = names_in(root, paths)
-    if len(set(names)) < len(names):
-        twice = next(name for number, name in enumerate(names) if name in names[:number])
-        raise InputError(f"{given}: found {twice!r} twice, expected it once")
+    twice = [name for name, count in collections.Counter(names).items() if count > 1]
+    if twice:
+        raise InputError(f"{given}: found {twice[0]!r} twice, expected it once")
     return ImageSource(root, paths, names, positions)
 
 
@@ -202,11 +195,12 @@ def _listed(
         videos = f"the video {next(filter(is_video, found))}" if found else "no image"
         raise InputError(f"{source}: found {videos}, expected images, or frames as walk.mp4#t=12.5")
     try:
-        paths = _frames(found, source, _AN_IMAGE, fps, on_bad_image)
+        paths = _frames(found, source, "an image file", fps, on_bad_image)
     except InputError as error:
         raise InputError(f"{source}: {error}") from error
     root = pathlib.Path(os.path.normpath(folder))
-    if not all(_is_below(root, path) for path in paths):
+    below = [path.relative_to(root).parts for path in paths if path.is_relative_to(root)]
+    if len(below) < len(paths) or any(".." in parts for parts in below):
         paths = [pathlib.Path(os.path.abspath(path)) for path in paths]
         root = pathlib.Path(paths[0].anchor)
     if positions is not None:

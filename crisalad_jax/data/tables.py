@@ -15,6 +15,11 @@ from crisalad_jax.data.video import spelled
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
 
+MOST_METRES = 1e8
+"""Largest coordinate in metres: twice the Earth's circumference, and its square is finite."""
+_MOST = {"lat": 90.0, "lon": 180.0} | dict.fromkeys(("east", "north", "x", "y"), MOST_METRES)
+"""Largest number of a column of positions."""
+
 
 class Row(NamedTuple):
     """A row of a `Table`, with its fields by column."""
@@ -40,13 +45,13 @@ class Row(NamedTuple):
             raise InputError(f"{self.where}: found no {column}, expected one")
         return self.fields[column]
 
-    def number(self, column: str, most: float = math.inf) -> float:
-        """Return a finite number of at most this size; next to a point, commas mean thousands.
+    def number(self, column: str) -> float:
+        """Return a finite number; next to a point, commas mean thousands.
 
         Raises:
-            InputError: the field is not such a number.
+            InputError: the field is not one, or larger than such a position can be.
         """
-        text = self.fields[column]
+        text, most = self.fields[column], _MOST.get(column, math.inf)
         try:
             value = float(text.replace(",", ".") if self.has_commas and "." not in text else text)
         except ValueError:
@@ -70,8 +75,7 @@ class Table(NamedTuple):
     def rows(self) -> Iterator[Row]:
         """Yield the rows with their fields by column, without spaces around them."""
         for line, fields in self.lines:
-            texts = map(str.strip, fields)
-            by_column = dict(zip(self.columns, texts, strict=True))
+            by_column = dict(zip(self.columns, map(str.strip, fields), strict=True))
             yield Row(self.path, line, by_column, self.has_commas)
 
     def named_rows(self) -> Iterator[tuple[str, Row]]:
@@ -128,11 +132,9 @@ def _lines(path: pathlib.Path) -> Iterator[tuple[Any, list[str]]]:
             yield separator, columns
             for row in filter(None, reader):
                 if len(row) != len(columns):
-                    comma = len(row) > len(columns) and separator == ","
-                    hint = "; between commas a decimal is written with a point" if comma else ""
                     raise InputError(
                         f"{path}: line {reader.line_num}: found {len(row)} fields, expected "
-                        f"{len(columns)} ({separator.join(columns)}{hint})"
+                        f"{len(columns)} ({separator.join(columns)})"
                     )
                 yield reader.line_num, row
     except (OSError, UnicodeDecodeError, csv.Error) as error:
@@ -149,20 +151,19 @@ def normal_name(name: str) -> str:
     return unicodedata.normalize("NFC", name.replace("\\", "/"))
 
 
+def spellings(names: Collection[str]) -> dict[str, str]:
+    """Map each name, and its `normal_name`, to the name."""
+    return {normal_name(name): name for name in names} | {name: name for name in names}
+
+
 def matched(names: Iterable[str], there: Collection[str]) -> dict[str, str]:
     """Map each name to the existing name that it means; a name that means none is left out.
 
     That is the name itself, or else one that differs only in slashes or its normal form.
     """
-    found = {name: name for name in names}
-    if strange := [name for name in found if name not in there]:
-        by_normal_name = {normal_name(name): name for name in there}
-        for name in strange:
-            if (meant := by_normal_name.get(normal_name(name))) is None:
-                del found[name]
-            else:
-                found[name] = meant
-    return found
+    existing = spellings(there)
+    found = {name: existing.get(name, existing.get(normal_name(name))) for name in names}
+    return {name: meant for name, meant in found.items() if meant is not None}
 
 
 class Disk:
@@ -179,11 +180,10 @@ class Disk:
             return path.with_name(there)
         path = root
         for part in pathlib.PurePosixPath(normal_name(name)).parts:
-            if part not in ("/", ".."):
-                listing = self.names(path)
-                if (part := listing.get(part, "")) == "":
-                    return None
-            path = path / part
+            there = part if part in ("/", "..") else self.names(path).get(part)
+            if there is None:
+                return None
+            path = path / there
         return path
 
     def names(self, folder: pathlib.Path) -> dict[str, str]:
@@ -193,6 +193,5 @@ class Disk:
                 names = os.listdir(folder)
             except OSError:
                 names = []
-            by_name = {name: name for name in names}
-            self._listings[folder] = {normal_name(name): name for name in names} | by_name
+            self._listings[folder] = spellings(names)
         return self._listings[folder]

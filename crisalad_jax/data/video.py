@@ -12,19 +12,18 @@ import os
 import pathlib
 import re
 import threading
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from crisalad_jax.data.opencv import QUIET
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source
 from crisalad_jax.utils.shapes import UInt8
 
-# OpenCV reads this as it opens its first video: our errors say what the user needs.
+# Our errors say what the user needs. OpenCV reads this as it opens its first video.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 """Suffixes of videos, in lower case."""
@@ -113,7 +112,7 @@ def list_frames(video: str | os.PathLike[str], fps: float = 1.0) -> list[pathlib
     """
     chosen: list[pathlib.Path] = []
     due = 0.0
-    for time in _frame_times(video):
+    for time in _video(video).times:
         if time + 1 > due:  # times are rounded to a millisecond
             chosen.append(pathlib.Path(frame_name(video, time)))
             due = (int((time + 1) * fps / 1000) + 1) * 1000 / fps
@@ -126,7 +125,7 @@ def count_frames(video: str | os.PathLike[str]) -> int:
     Raises:
         InputError: no file, or no video.
     """
-    return len(_frame_times(video))
+    return len(_video(video).times)
 
 
 def name_frame(path: pathlib.Path) -> pathlib.Path:
@@ -145,69 +144,48 @@ def name_frame(path: pathlib.Path) -> pathlib.Path:
     if time is None:
         return path
     video, wanted = file_of(path), round(1000 * time)
-    times = _frame_times(video)
+    times = _video(video).times
     at = bisect.bisect_left(times, wanted)
     return pathlib.Path(frame_name(video, times[at] if at < len(times) else wanted))
 
 
-def _identity(video: str | os.PathLike[str]) -> tuple[str, int, int]:
-    """Return the name, size and time of change of a video that is there."""
-    check_source(video, _VIDEO)
-    there = os.stat(video)
-    return os.path.abspath(video), there.st_size, there.st_mtime_ns
+class _Video:
+    """A video, which is read forwards as far as possible."""
 
+    def __init__(self, file: str) -> None:
+        self._file = file
+        self._capture = _opened(file)
+        self._at = -1
+        """Time of the last frame in milliseconds; -1 before the first."""
 
-def _frame_times(video: str | os.PathLike[str]) -> Sequence[int]:
-    """Read the times of all frames in milliseconds, in order, each once."""
-    return _times_as_of(*_identity(video))
+    @functools.cached_property
+    def times(self) -> list[int]:
+        """Times of all frames in milliseconds, in order, each once."""
+        times = self._grabbed_times(decoded=False)
+        # A video that was trimmed without encoding it again keeps frames that are not shown.
+        if not times or _Video(self._file).read(times[-1]) is None:
+            times = self._grabbed_times(decoded=True)
+        if not times:
+            raise InputError(f"{self._file}: found no frame, expected {_VIDEO}")
+        return times
 
-
-@functools.lru_cache(maxsize=_OPEN)  # a list may name thousands of frames of a video
-def _times_as_of(video: str, size: int, changed: int) -> tuple[int, ...]:
-    """Read the times of the frames of a file of this size and time of change."""
-    times = _grabbed_times(video, decoded=False)
-    # A video that was trimmed without encoding it again keeps frames that are not shown.
-    if not times or _Reader(video).read(times[-1]) is None:
-        times = _grabbed_times(video, decoded=True)
-    if not times:
-        raise InputError(f"{video}: found no frame, expected {_VIDEO}")
-    return tuple(times)
-
-
-def _grabbed_times(video: str, *, decoded: bool) -> list[int]:
-    capture = _opened(video)
-    with QUIET:
+    def _grabbed_times(self, *, decoded: bool) -> list[int]:
+        capture = _opened(self._file)
         if not decoded:  # packets as they are, in the order of decoding
             capture.set(cv2.CAP_PROP_FORMAT, -1)
         times = set()
         while capture.grab():
             times.add(milliseconds_of(capture))
-    return sorted(time for time in times if time >= 0)
-
-
-def _opened(video: str) -> cv2.VideoCapture:
-    with QUIET:
-        return cv2.VideoCapture(video, cv2.CAP_FFMPEG)
-
-
-class _Reader:
-    """An open video, which is read forwards as far as possible."""
-
-    def __init__(self, video: str) -> None:
-        self._video = video
-        self._capture = _opened(video)
-        self._at = -1
-        """Time of the last frame in milliseconds; -1 before the first."""
+        return sorted(time for time in times if time >= 0)
 
     def read(self, wanted: int) -> UInt8[np.ndarray, "h w 3"] | None:
         """Read the first frame at or after a time; None behind the last one."""
-        with QUIET:
-            if not self._at <= wanted < self._at + _FAR:
-                self._seek(wanted)
-            while self._at < wanted:
-                if not self._grab():
-                    return None
-            found, image = self._capture.retrieve()
+        if not self._at <= wanted < self._at + _FAR:
+            self._seek(wanted)
+        while self._at < wanted:
+            if not self._grab():
+                return None
+        found, image = self._capture.retrieve()
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if found else None
 
     def _grab(self) -> bool:
@@ -219,17 +197,28 @@ class _Reader:
     def _seek(self, wanted: int) -> None:
         self._capture.set(cv2.CAP_PROP_POS_MSEC, max(0, wanted - _BEFORE_KEY))
         if not self._grab() or self._at > wanted:
-            self._capture, self._at = _opened(self._video), -1
+            self._capture, self._at = _opened(self._file), -1
+
+
+def _opened(video: str) -> cv2.VideoCapture:
+    return cv2.VideoCapture(video, cv2.CAP_FFMPEG)
 
 
 _lock = threading.Lock()
-"""Lock of all readers: OpenCV's may not be used by two threads at once."""
+"""Lock of all videos: OpenCV's may not be used by two threads at once."""
 
 
-@functools.lru_cache(maxsize=_OPEN)
-def _reader_of(video: str, size: int, changed: int) -> _Reader:
-    """Open a file of this size and time of change; the last ones stay open."""
-    return _Reader(video)
+def _video(path: str | os.PathLike[str]) -> _Video:
+    """Return a video as it is now; the last ones stay open."""
+    check_source(path, _VIDEO)
+    there = os.stat(path)
+    return _as_of(os.path.abspath(path), there.st_size, there.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=_OPEN)  # a list may name thousands of frames of a video
+def _as_of(file: str, size: int, changed: int) -> _Video:
+    """Open a file of this size and time of change."""
+    return _Video(file)
 
 
 def read_frame(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
@@ -242,9 +231,9 @@ def read_frame(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
     """
     time = frame_time(path)
     assert time is not None
-    identity = _identity(file_of(path))
+    video = _video(file_of(path))
     with _lock:
-        image = _reader_of(*identity).read(round(time * 1000))
+        image = video.read(round(time * 1000))
     if image is None:
         raise InputError(f"{path}: found no frame there, expected a time in the video")
     return image

@@ -115,7 +115,7 @@ def train(
     if isinstance(places, QuerySet):
         groups = f"{len(places.queries)} queries with positives"
     else:
-        groups = f"{len(places.place_id)} places"
+        groups = f"{len(places.names)} places"
     on = "" if benchmark is None else f"; validation on {benchmark.name}"
     say(f"{data}: {groups}, {len(places.files)} images{on}")
     if weights is None:

@@ -46,7 +46,7 @@ class PlaceBatches:
                 min_images=config.min_images,
                 places_per_batch=config.places_per_batch,
             )
-            self.classes = tuple(len(group.place_id) for group in self._groups)
+            self.classes = tuple(len(group.names) for group in self._groups)
         self._drawing: Any = {
             "places_per_batch": config.places_per_batch,
             "images_per_place": config.images_per_place,

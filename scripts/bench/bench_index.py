@@ -59,12 +59,12 @@ batches = training_batches(
 next(batches)
 first = time.perf_counter()
 found = dict(
-    images=len(places.files), places=len(places.place_id), cities=len(places.cities),
+    images=len(places.files), places=len(places.names), cities=len(places.cities),
     imports=loaded - started, index=indexed - loaded, first_batch=first - indexed,
     memory_before=before, memory=index_memory,
 )
 if sys.argv[2] == "epoch":
-    steps = len(places.place_id) // 48
+    steps = len(places.names) // 48
     with progress_bar("epoch", steps, "steps", quiet=False, done=1) as bar:
         for batch in batches:
             assert batch.valid.all()

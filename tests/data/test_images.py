@@ -147,11 +147,9 @@ def test_a_tiff_of_floats_is_stretched_on_request(tmp_path, dtype, unit):
     values = (np.arange(101).reshape(1, 101) + 7200) * unit
     data = cv2.imencode(".tif", values.astype(dtype))[1].tobytes()
     (tmp_path / "t.tif").write_bytes(data)
-    low, high = sorted((values[0, 0], values[0, -1]))
     with pytest.raises(InputError, match=r"t\.tif: found .*, expected uint8") as caught:
         read_image(tmp_path / "t.tif")
     assert f"{np.dtype(dtype)} of shape" in str(caught.value)
-    assert f"values from {low:,.6g} to {high:,.6g}," in str(caught.value)
     assert "contrast-stretch" in str(caught.value)
     grey = np.clip(255 * (np.arange(101) - 1) / 98, 0, 255)[:: int(np.sign(unit))]
     found = read_image(tmp_path / "t.tif", bit_depth="contrast-stretch")
@@ -284,17 +282,6 @@ def test_no_file(tmp_path):
         read_image(tmp_path)
 
 
-def test_the_log_level_is_restored(tmp_path):
-    before = cv2.utils.logging.getLogLevel()
-    for data in (encode(Image.new("RGB", (3, 2)), "PNG"), b"text"):
-        (tmp_path / "picture").write_bytes(data)
-        try:
-            read_image(tmp_path / "picture")
-        except InputError:
-            assert data == b"text"
-        assert cv2.utils.logging.getLogLevel() == before
-
-
 def test_photographs_read_and_resize_as_by_pillow():
     if not PHOTOGRAPHS.is_dir():
         pytest.skip("no photographs beside the checkout")
@@ -318,17 +305,18 @@ def test_list_images(tmp_path):
 
 
 def test_what_is_no_image_is_counted_in_one_note(tmp_path):
-    """Not counted: hidden files, Windows' own, tables, and what is named as an image (sidecars)."""
+    """Not counted: hidden files, tables, and what is named as an image (sidecars)."""
     names = ["1.jpg", "4.raw.jpg", "sub/2.png"]
     counted = ["3.heic", "a.txt", "sub/b.TXT", "walk.mp4", "c.npy", "d.json", "e.xml", "f.dng"]
-    quiet = [".DS_Store", "Thumbs.db", "desktop.ini", "positions.csv", "1.json", "sub/2.png.xmp"]
-    quiet += ["4.raw"]
+    quiet = [".DS_Store", "positions.csv", "1.json", "sub/2.png.xmp", "4.raw"]
     touch_all(tmp_path, [*names, *counted, *quiet, "1.heic"])
     with pytest.warns(Note) as notes:
         assert list_images(tmp_path) == [tmp_path / name for name in names]
     (line,) = (str(note.message) for note in notes)
-    assert line == (f"{tmp_path}: skipped 8 other files: 2 .txt, 1 .dng, 1 .heic, 1 .json")
-    with pytest.warns(Note, match=r"\*: skipped 6 other files: 1 .dng, 1 .heic, 1 .json, 1 .npy$"):
+    rest = "1 .dng, 1 .heic, 1 .json, 1 .mp4, 1 .npy, 1 .xml"
+    assert line == f"{tmp_path}: skipped 8 other files: 2 .txt, {rest}"
+    rest = "1 .dng, 1 .heic, 1 .json, 1 .npy, 1 .txt, 1 .xml$"
+    with pytest.warns(Note, match=rf"\*: skipped 6 other files: {rest}"):
         source = open_source(tmp_path / "[13acdef]*")
     assert source.names == ["1.jpg"]
 
@@ -345,7 +333,7 @@ def test_list_images_of_nothing(tmp_path):
     with pytest.raises(InputError, match=f"{tmp_path.name}: found no image, expected files that"):
         list_images(tmp_path)
     (tmp_path / "notes.txt").touch()
-    with pytest.raises(InputError, match=r"found no image among 1 file \(1 \.txt\), expected"):
+    with pytest.raises(InputError, match=r"found no image among 1 \.txt, expected"):
         list_images(tmp_path)
     with pytest.raises(InputError, match=r"notes\.txt: found a file, expected a folder"):
         list_images(tmp_path / "notes.txt")

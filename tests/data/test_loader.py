@@ -16,7 +16,7 @@ from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data import loader
 from crisalad_jax.data.augmentations import AUGMENTATIONS, NoAugmentation
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
-from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig, rand_augment
+from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.loader import ImageBatch, ImageCache, training_batches
 from crisalad_jax.data.places import Places, epoch_batches, read_places
@@ -189,7 +189,7 @@ def test_augmentation_draws_from_seed_epoch_step_and_slot(places):
     for step, batch in enumerate(train(places, augmentation=config)):
         for slot, index in enumerate(batch.indices):
             generator = np.random.default_rng((1, 4, step, slot))
-            expected = rand_augment(plain(places.path(index)), config, generator)
+            expected = config.apply(plain(places.path(index)), generator, of_place=generator)
             np.testing.assert_array_equal(batch.images[slot], expected)
 
 
@@ -355,7 +355,7 @@ class Spoilt(NoAugmentation):
     [
         (lambda image: image / np.float32(255), "float32 of shape "),
         (lambda image: image[1:], "uint8 of shape "),
-        (lambda image: None, "NoneType of shape "),
+        (lambda image: None, "object of shape "),
     ],
 )
 def test_an_augmentation_that_returns_something_else_is_named(places, change, words):

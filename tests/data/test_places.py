@@ -67,7 +67,6 @@ def uneven(cities: int, places_per_city: int) -> Places:
         files=tuple(f"{i}.jpg" for i in range(counts.sum())),
         place_start=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         place_city=np.repeat(np.arange(cities, dtype=np.int32), places_per_city),
-        place_id=np.arange(len(counts), dtype=np.int64),
         names=tuple(
             f"{i % places_per_city} of city{i // places_per_city}" for i in range(len(counts))
         ),
@@ -78,11 +77,10 @@ def test_reads_what_was_written(two_cities):
     with pytest.warns(Note, match="left out 1 of 6 places, with fewer than 4 images"):
         places = read_places(two_cities)
     assert places.cities == ("A", "B")
-    # The ids of B, whose CSV starts again at 0, are 10**5 up; its place 3 has too few images.
-    assert places.place_id.tolist() == [0, 7, 99, 100007, 100012]
     assert places.place_city.tolist() == [0, 0, 0, 1, 1]
     assert places.image_counts.tolist() == [4, 4, 4, 5, 5]
     assert places.place_start.tolist() == [0, 4, 8, 12, 17, 22]
+    # Place 3 of B has too few images.
     assert places.names == ("0 of A", "7 of A", "99 of A", "7 of B", "12 of B")
     assert places.views[:2].tolist() == [[48.85, -2.0, 355.0], [48.85, -2.0, 356.0]]
     for image, place in enumerate(places.image_place):
@@ -90,7 +88,7 @@ def test_reads_what_was_written(two_cities):
         assert path.is_file()
         city_id, place_id = path.name.split("_")[:2]
         assert city_id == ("A" if place < 3 else "Bid")
-        assert int(place_id) == places.place_id[place] % 10**5
+        assert f"{int(place_id)} of {city_id[0]}" == places.names[place]
     assert len(set(places.files)) == 22
     assert places.files[0] == "Images/A/A_0000000_2013_08_355_48.850_-2.0e0_pano0.jpg"
     assert {Path(file).suffix for file in places.files[12:]} == {".JPG"}
@@ -99,7 +97,7 @@ def test_reads_what_was_written(two_cities):
 def test_chosen_cities_keep_their_order(two_cities):
     places = read_places(two_cities, cities=["B", "A"], min_images=3)
     assert places.cities == ("B", "A")
-    assert places.place_id.tolist() == [3, 7, 12, 100000, 100007, 100099]
+    assert places.names == ("3 of B", "7 of B", "12 of B", "0 of A", "7 of A", "99 of A")
 
 
 def test_a_city_that_was_not_downloaded(two_cities):
@@ -114,7 +112,7 @@ def test_ids_with_an_offset_name_files_without_it(tmp_path):
     write_city(tmp_path, "A", make_rows("A", 300042, 4))
     places = read_places(tmp_path)
     assert "A_0000042_" in places.files[0]
-    assert places.place_id.tolist() == [42]
+    assert places.names == ("42 of A",)
 
 
 def test_a_repeated_row_is_one_image(tmp_path):
@@ -157,7 +155,7 @@ def test_a_missing_image_is_named_with_its_line_or_left_out_with_a_note(two_citi
         "left out 1 rows, whose images are missing",
         "left out 2 of 6 places, with fewer than 4 images",  # place 7 of A has 3 now
     ]
-    assert places.place_id.tolist() == [0, 99, 100_007, 100_012]
+    assert places.names == ("0 of A", "99 of A", "7 of B", "12 of B")
     assert places.image_counts.tolist() == [4, 4, 5, 5]
 
 

@@ -42,13 +42,14 @@ def test_grey_is_repeated(shape):
         (np.zeros((0, 6), np.uint8), r"found uint8 of shape \(0, 6\), .* sides of at least 1"),
         (np.zeros((6,), np.uint8), r"found uint8 of shape \(6,\), expected"),
         (np.zeros((4, 6), bool), r"found bool of shape \(4, 6\), expected"),
-        (np.full((4, 6, 3), 0.5), r"\(4, 6, 3\), values from 0.5 to 0.5, .*contrast-stretch"),
-        (np.full((4, 6), np.nan), "image: found no finite value"),
+        (np.full((4, 6, 3), 0.5), r"\(4, 6, 3\), .*contrast-stretch"),
     ],
 )
 def test_what_is_no_picture(image, words):
     with pytest.raises(InputError, match=words):
         as_rgb(image)
+    with pytest.raises(InputError, match="image: found no finite value"):
+        as_rgb(np.full((4, 6), np.nan), "contrast-stretch")
 
 
 def test_a_dead_pixel_takes_no_range():

@@ -12,7 +12,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.live import Camera
-from crisalad_jax.data.positions import Positions, exif_position, read_positions
+from crisalad_jax.data.positions import Positions, exif_position, read_image_table
 from crisalad_jax.data.reading import image_batches
 from crisalad_jax.data.sources import open_source
 from crisalad_jax.data.video import file_of, frame_time, list_frames
@@ -135,7 +135,7 @@ def test_a_table(root, tmp_path, text, axes, of):
         ("none", None, "none: found no such file, expected a folder of images, an image, a video"),
         ("none.jpg", None, "none.jpg: found no such file, expected a folder of images, an image"),
         ("*.gif", None, r"\*.gif: found no image, expected files that end in .jpg"),
-        ("run/*.md", None, "found no image among 1 file"),
+        ("run/*.md", None, "found no image among 1 .md"),
         ("a.txt", "\n\n", "a.txt: found no image, expected images"),
         ("a.txt", "b.png\n", "a.txt: .*b.png: found no such file, expected an image file"),
         ("a.txt", "\n{run}/left/0.png\n{run}/right/../left/0.png", "a.txt: found .*0.png' twice"),
@@ -211,7 +211,7 @@ def test_a_frame_has_one_name_however_it_is_written(root, tmp_path):
     named = Positions(("x", "y"), {"walk.avi#t=0.200": (1, 2)})
     assert open_source(work / "table.csv").positions == named
     (work / "positions.csv").write_text("name,x,y\nwalk.avi#t=0.2,1,2\n")
-    assert read_positions(work / "positions.csv").of == {"walk.avi#t=0.200": (1, 2)}
+    assert read_image_table(work / "positions.csv")[1].of == {"walk.avi#t=0.200": (1, 2)}
 
 
 def test_a_camera_and_a_list_call_a_frame_the_same(tmp_path):

@@ -557,7 +557,7 @@ def test_the_wrong_kind_of_set_is_refused(street, shared, tmp_path):
         train(CONFIG, shared / "city", out, quiet=True)
     with pytest.raises(InputError, match="--data-images: found for a recipe"):
         train(RECIPE, shared / "city", out, images=tmp_path, quiet=True)
-    with pytest.raises(InputError, match="found images for a folder of @UTM names, which"):
+    with pytest.raises(InputError, match="found images for the layout utm, which"):
         train(CONFIG, street, out, images=tmp_path, quiet=True)
     assert not out.exists()
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Image, fraction, from_zero
-from crisalad_jax.data.augmentations.light import LightAugmentConfig, light_augment
+from crisalad_jax.data.augmentations.light import LightAugmentConfig
 
 _QUALITY = (12, 85)
 """Least and most quality of a JPEG."""
@@ -48,7 +48,7 @@ class CameraAugmentConfig(LightAugmentConfig):
             image = _textured(image, generator.uniform(0, self.texture), generator)
         if generator.random() < self.filters:
             image = _filtered(image, generator)
-        image = light_augment(image, self, generator)
+        image = self.change_light(image, generator)
         if generator.random() < self.occlusion:
             image = _covered(image, generator)
         if generator.random() < self.motion:

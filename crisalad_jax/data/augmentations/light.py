@@ -48,48 +48,44 @@ class LightAugmentConfig(Augmentation):
         """Mirror all images of a place alike, then change this one."""
         if self.flip > 0 and of_place.random() < self.flip:
             image = cv2.flip(image, 1)
-        return light_augment(image, self, generator)
+        return self.change_light(image, generator)
 
+    def change_light(self, image: Image, generator: np.random.Generator) -> Image:
+        """Warp and blur an image a little, and change its light, contrast and colour.
 
-def light_augment(
-    image: Image, config: LightAugmentConfig, generator: np.random.Generator
-) -> Image:
-    """Warp and blur an image a little, and change its light, contrast and colour.
+        Every call draws the same number of random values, whatever the fields.
+        """
+        height, width = image.shape[:2]
+        scale = generator.uniform(1 - self.crop, 1)
+        shift = generator.uniform(-self.shift, self.shift, size=2) * (width, height)
+        angle = math.radians(generator.uniform(-self.rotation, self.rotation))
+        sigma = generator.uniform(0, self.blur)
+        brightness, contrast, saturation = generator.uniform(1 - self.colour, 1 + self.colour, 3)
+        if generator.random() < self.grey:
+            saturation = 0.0
+        exponent = math.exp(generator.uniform(-self.gamma, self.gamma))
+        light = generator.uniform(-self.illumination, self.illumination, (3, 3))
 
-    The caller handles `config.flip`, because all images of a place are mirrored alike. Every call
-    draws the same number of random values, whatever the config.
-    """
-    height, width = image.shape[:2]
-    scale = generator.uniform(1 - config.crop, 1)
-    shift = generator.uniform(-config.shift, config.shift, size=2) * (width, height)
-    angle = math.radians(generator.uniform(-config.rotation, config.rotation))
-    sigma = generator.uniform(0, config.blur)
-    brightness, contrast, saturation = generator.uniform(1 - config.colour, 1 + config.colour, 3)
-    if generator.random() < config.grey:
-        saturation = 0.0
-    exponent = math.exp(generator.uniform(-config.gamma, config.gamma))
-    light = generator.uniform(-config.illumination, config.illumination, (3, 3))
-
-    turn = scale * np.array(
-        [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-    )
-    centre = np.array([width - 1, height - 1]) / 2
-    matrix = np.column_stack([turn, centre + shift - turn @ centre])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    image = cv2.warpAffine(
-        image, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REFLECT
-    )
-    if sigma > 0:
-        image = cv2.GaussianBlur(image, (0, 0), sigma)
-    if exponent != 1:
-        levels = np.arange(256) / 255
-        image = cv2.LUT(image, np.round(255 * levels**exponent).astype(np.uint8))
-    if light.any():
-        field = cv2.resize(light, (width, height), interpolation=cv2.INTER_CUBIC)
-        image = np.clip(np.exp(field)[..., None] * image, 0, 255).round().astype(np.uint8)
-    # The three factors are one affine map of the colours: brightness scales, contrast stretches
-    # about the mean luma, saturation stretches about each pixel's luma.
-    colour = saturation * np.eye(3) + (1 - saturation) * _LUMA
-    offset = (1 - contrast) * brightness * (_LUMA @ cv2.mean(image)[:3])
-    matrix = np.column_stack([brightness * contrast * colour, np.full(3, offset)])
-    return cv2.transform(image, matrix)
+        turn = scale * np.array(
+            [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+        )
+        centre = np.array([width - 1, height - 1]) / 2
+        matrix = np.column_stack([turn, centre + shift - turn @ centre])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        image = cv2.warpAffine(
+            image, matrix, (width, height), flags=flags, borderMode=cv2.BORDER_REFLECT
+        )
+        if sigma > 0:
+            image = cv2.GaussianBlur(image, (0, 0), sigma)
+        if exponent != 1:
+            levels = np.arange(256) / 255
+            image = cv2.LUT(image, np.round(255 * levels**exponent).astype(np.uint8))
+        if light.any():
+            field = cv2.resize(light, (width, height), interpolation=cv2.INTER_CUBIC)
+            image = np.clip(np.exp(field)[..., None] * image, 0, 255).round().astype(np.uint8)
+        # The three factors are one affine map of the colours: brightness scales, contrast stretches
+        # about the mean luma, saturation stretches about each pixel's luma.
+        colour = saturation * np.eye(3) + (1 - saturation) * _LUMA
+        offset = (1 - contrast) * brightness * (_LUMA @ cv2.mean(image)[:3])
+        matrix = np.column_stack([brightness * contrast * colour, np.full(3, offset)])
+        return cv2.transform(image, matrix)

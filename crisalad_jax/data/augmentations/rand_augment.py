@@ -32,24 +32,19 @@ class RandAugmentConfig(Augmentation):
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
     ) -> Image:
-        """Apply randomly drawn operations of `OPERATIONS`."""
-        return rand_augment(image, self, generator)
+        """Apply some of `OPERATIONS`, drawn uniformly with replacement, of random sign.
 
-
-def rand_augment(image: Image, config: RandAugmentConfig, generator: np.random.Generator) -> Image:
-    """Apply `config.operations` of OPERATIONS, drawn uniformly with replacement, of random sign.
-
-    The result is that of torchvision's RandAugment on Pillow images, with bilinear interpolation
-    and black fill. Images must already have the size of the model.
-    """
-    names = list(OPERATIONS)
-    for name in (names[i] for i in generator.integers(len(names), size=config.operations)):
-        operation = OPERATIONS[name]
-        strength = operation.strength(config.magnitude / (MAGNITUDE_BINS - 1), *image.shape[:2])
-        if operation.signed and generator.integers(2):
-            strength = -strength
-        image = operation.apply(image, strength)
-    return image
+        The result is that of torchvision's RandAugment on Pillow images, with bilinear
+        interpolation and black fill. Images must already have the size of the model.
+        """
+        names = list(OPERATIONS)
+        for number in generator.integers(len(names), size=self.operations):
+            operation = OPERATIONS[names[number]]
+            strength = operation.strength(self.magnitude / (MAGNITUDE_BINS - 1), *image.shape[:2])
+            if operation.signed and generator.integers(2):
+                strength = -strength
+            image = operation.apply(image, strength)
+        return image
 
 
 def _affine(image: Image, a: float, b: float, c: float, d: float, e: float, f: float) -> Image:

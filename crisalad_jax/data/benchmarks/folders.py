@@ -12,6 +12,7 @@ from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.positions import AXES, positions_of
 from crisalad_jax.data.tables import matched, read_table
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.output import counted
 from crisalad_jax.utils.shapes import Float64, Int64
 
 TRUTH = "ground_truth.csv"
@@ -52,7 +53,7 @@ def read_folders(
         InputError: a folder is missing or without images; a table that names an image that is not
             there, leaves one out, or contradicts itself; a negative number of frames, folders of
             different counts, `frames` with a table, a radius without positions to measure, one
-            side's table of positions without the other's, or what `read_positions` raises.
+            side's table of positions without the other's, or what `read_image_table` raises.
     """
     root = pathlib.Path(root)
     folder, name = find_split(root, split)
@@ -89,21 +90,15 @@ def _by_frames(
             "queries, expected at least 0 frames, and as many images in both folders: a frame "
             "matches those of the same moment"
         )
-    count = len(queries)
-    title, rule = f"{name} (two folders", f"at most {frames} frames apart"
+    count, apart = len(queries), counted(frames, "frame")
+    name, rule = f"{name} (two folders, +-{apart})", f"at most {frames} frames apart"
     if (count, frames) == (3450, 2):
-        title = "Nordland-test (SelaVPR: 3450 + 3450 images"
+        name = "Nordland-test (SelaVPR: 3450 + 3450 images, +-2 frames)"
         rule += "; by its number of images it is SelaVPR's Nordland-test"
-    return Benchmark(
-        name=f"{title}, +-{frames} frame{'s' * (frames != 1)})",
-        root=root,
-        database=tuple(sorted(database, key=_in_numbers)),
-        queries=tuple(sorted(queries, key=_in_numbers)),
-        positives=tuple(
-            np.arange(max(0, i - frames), min(count, i + frames + 1)) for i in range(count)
-        ),
-        rule=rule,
-    )
+    database, queries = (tuple(sorted(side, key=_in_numbers)) for side in (database, queries))
+    windows = (range(max(0, i - frames), min(count, i + frames + 1)) for i in range(count))
+    positives = tuple(np.array(window, np.int64) for window in windows)
+    return Benchmark(name, root, database, queries, positives, rule)
 
 
 def _in_numbers(path: pathlib.Path) -> list[str | int]:
@@ -161,15 +156,16 @@ def _read_positions(
     found, points = [], []
     for table, names_from, images in sides:
         names = _names(names_from, images)
-        found.append(positions_of(table, names, folder))
-        missing = [name for name in names if name not in found[-1].of]
-        if missing or found[-1].axes != found[0].axes:
+        positions = positions_of(table, names, folder)
+        found.append(positions)
+        missing = [name for name in names if name not in positions.of]
+        if missing or positions.axes != found[0].axes:
             raise InputError(
-                f"{table}: found columns {','.join(found[-1].axes)}, and {len(missing)} of "
+                f"{table}: found columns {','.join(positions.axes)}, and {len(missing)} of "
                 f"{len(names)} images without a line ({''.join(missing[:1])}), expected "
                 f"{','.join(found[0].axes)}, and all images"
             )
-        points.append(np.array([found[-1].of[name] for name in names], np.float64))
+        points.append(np.array([positions.of[name] for name in names], np.float64))
     if found[0].axes == AXES[1]:
         points = np.split(comparable(*np.concatenate(points).T), [len(database)])
     return points[0], points[1]

@@ -20,7 +20,7 @@ from crisalad_jax.data.metres import on_ellipsoid
 from crisalad_jax.data.tables import read_table
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
-from crisalad_jax.utils.shapes import Float, Float64, Int64
+from crisalad_jax.utils.shapes import Float, Float64
 
 MSLS_CITIES = {
     "val": ("cph", "sf"),
@@ -84,10 +84,7 @@ def read_msls(
             f"{parent}: found {listing(parent)}, expected some of "
             f"{shown(f'{city}/' for city in cities)} for {split or 'val'}"
         )
-    database: list[_Side] = []
-    queries: list[_Side] = []
-    positives: list[Int64[np.ndarray, " _"]] = []
-    start = 0
+    database, queries, positives = [], [], []
     for folder in folders:
         there, asked = (
             _read_side(folder / part, on_bad_image, headings=limit is not None, subtask=subtask)
@@ -95,15 +92,15 @@ def read_msls(
         )
         near = within(there.metres, asked.metres, radius)
         chosen = [query for query, matches in enumerate(near) if matches.size or not subtask]
-        asked = _Side(*(part[chosen] for part in asked))
-        for query, heading in zip(chosen, asked.headings, strict=True):
+        start = sum(len(side.images) for side in database)
+        for query in chosen:
             matches = near[query]
             if limit is not None:
-                matches = matches[heading_difference(there.headings[matches], heading) <= limit]
+                turn = heading_difference(there.headings[matches], asked.headings[query])
+                matches = matches[turn <= limit]
             positives.append(matches + start)
         database.append(there)
-        queries.append(asked)
-        start += len(there.images)
+        queries.append(_Side(*(part[chosen] for part in asked)))
     if not positives:
         raise InputError(f"{root}: found no query within {radius:g} m of the database")
 
@@ -115,17 +112,12 @@ def read_msls(
         rule += f" and compass angles at most {limit:g} degrees apart"
     if subtask:
         rule += "; queries of the subtask all with a database image in that distance"
-    return Benchmark(
-        name=name,
-        root=root,
-        database=tuple(path for side in database for path in side.images),
-        queries=tuple(path for side in queries for path in side.images),
-        positives=tuple(positives),
-        rule=f"{rule}; no panoramas",
-        database_positions=_positions(database),
-        query_positions=_positions(queries),
-        radius=radius,
+    images, asking = (
+        tuple(path for side in sides for path in side.images) for sides in (database, queries)
     )
+    places, asked = _positions(database), _positions(queries)
+    rule = f"{rule}; no panoramas"
+    return Benchmark(name, root, images, asking, tuple(positives), rule, places, asked, radius)
 
 
 class _Side(NamedTuple):

@@ -46,7 +46,7 @@ def read_netvlad(
     """
     path = pathlib.Path(path)
     contents = load_mat(path, "a .mat file with dbStruct", damaged="cannot be read as a .mat file")
-    found, sides = [], []
+    images_of, metres = [], []
     try:
         struct = contents["dbStruct"].reshape(-1)[0]
         which = str(struct["whichSet"].item())
@@ -54,20 +54,23 @@ def read_netvlad(
         for field, utm, count, folders in _SIDES:
             names = [str(cell.item()) for cell in struct[field].reshape(-1)]
             positions = np.ascontiguousarray(struct[utm].T, np.float64)
-            found.append((names, positions, float(struct[count].item()), folders))
+            counted = float(struct[count].item())
+            right = positions.shape == (len(names), 2) and np.isfinite(positions).all()
+            if not right or not names or len(names) != counted:
+                raise ValueError(
+                    f"{len(names)} names, a count of {counted:g} and positions of shape "
+                    f"{positions.T.shape}, which must be finite"
+                )
+            images_of.append((names, folders))
+            metres.append(positions)
     except (KeyError, IndexError, ValueError, TypeError) as error:
         raise InputError(
             f"{path}: found {', '.join(contents)} ({error}), expected a struct dbStruct of NetVLAD"
         ) from error
-    for names, positions, count, folders in found:
-        right = positions.shape == (len(names), 2) and np.isfinite(positions).all()
-        if not right or not names or len(names) != count:
-            raise InputError(
-                f"{path}: found {len(names)} names, a count of {count:g} and positions of shape "
-                f"{positions.T.shape}, expected the same number of each, and finite positions"
-            )
-        sides.append(find_images(path, names, images, on_bad_image, folders))
-    (database, queries), (places, asked) = sides, (positions for _, positions, _, _ in found)
+    places, asked = metres
+    database, queries = (
+        find_images(path, names, images, on_bad_image, folders) for names, folders in images_of
+    )
     name = f"{path.stem} (NetVLAD .mat, {which} set, {radius:g} m)"
     rule = f"UTM distance of at most {radius:g} m"
     positives = within(places, asked, radius)

@@ -5,13 +5,18 @@ VPR-Bench (Zaffar et al., IJCV 2021): `ref/`, `query/`, `ground_truth_new.npy`.
 The lists: `pitts30k_test_dbImages.npy`, `..._qImages.npy` and `..._gt.npy`. MSLS has
 `..._qIdx.npy` (indices of the evaluated queries) and `..._pIdx.npy` (their matches) in place of
 `gt`.
+
+Published ground truths are arrays of lists, which numpy can only save as a pickle. They are read
+without running code from them.
 """
 
 import collections
+import io
 import os
 import pathlib
+import pickle
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,10 +25,9 @@ from crisalad_jax.config.checks import kind_of
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
 from crisalad_jax.data.benchmarks.msls import msls_title
 from crisalad_jax.data.benchmarks.on_disk import find_images, list_part
-from crisalad_jax.data.benchmarks.safe_npy import read_npy
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import real_path
+from crisalad_jax.utils.files import read_bytes, real_path
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Int64
 
@@ -37,7 +41,6 @@ _NORDLAND_RULE = ", which are 10i - 1, 10i and 10i + 1 for query i: by that it i
 _MOST = 2**62
 _Lists = dict[str, pathlib.Path]
 """The files of a set, by their kind."""
-_Matches = tuple[Int64[np.ndarray, " _"], ...]
 
 
 def read_vpr_bench(root: str | os.PathLike[str]) -> Benchmark:
@@ -183,24 +186,23 @@ def _read_rows(path: pathlib.Path, queries: int, *columns: int) -> np.ndarray:
     return rows
 
 
-def _chosen(path: pathlib.Path, rows: np.ndarray, queries: int) -> Int64[np.ndarray, " _"]:
+def _chosen(path: pathlib.Path, rows: np.ndarray, queries: int) -> list[int]:
     """Return the indices of queries in some rows, of which each may be there once."""
-    indices = [index for row in _rows(path, np.atleast_1d(rows)) for index in row.tolist()]
+    indices = [index for row in _indices(path, np.atleast_1d(rows)) for index in row.tolist()]
     if not indices or len({*indices} & {*range(queries)}) < len(indices):
         raise InputError(
             f"{path}: found queries {indices[:8]}..., expected some from 0 to {queries - 1}, each "
             "once"
         )
-    return np.array(indices, np.int64)
+    return indices
 
 
-def _rows(path: pathlib.Path, rows: Iterable[Any]) -> _Matches:
-    """Convert the rows of a file, which are numbers, flat lists or integer arrays, to indices.
+def _indices(path: pathlib.Path, rows: Iterable[Any]) -> Iterator[Int64[np.ndarray, " _"]]:
+    """Yield the indices of each row of a file: a number, a flat list or an integer array.
 
     Nested lists are refused, not flattened: a pickle of a few hundred bytes can hold nested lists
     of any size.
     """
-    found = []
     for number, row in enumerate(rows):
         items = row.reshape(-1).tolist() if isinstance(row, np.ndarray) else row
         items = items if isinstance(items, list | tuple) else [items]
@@ -210,28 +212,18 @@ def _rows(path: pathlib.Path, rows: Iterable[Any]) -> _Matches:
                 f"{path}: row {number}: found values of type {type(wrong[0]).__name__}, expected "
                 "whole numbers of 64 bits"
             )
-        found.append(np.array(items, np.int64))
-    return tuple(found)
+        yield np.array(items, np.int64)
 
 
 def _read_matches(
     path: pathlib.Path, rows: Iterable[Any], database: int, *, windows: bool = False
-) -> _Matches:
-    """Return the unique database indices of each row, ascending.
+) -> tuple[Int64[np.ndarray, " _"], ...]:
+    """Return the unique database indices of each row, ascending; -1 for no match is dropped.
 
-    An index of -1 stands for no match (VPR-Bench) and is dropped.
-
-    Args:
-        path: the file, for messages.
-        rows: its rows: numbers, flat lists or integer arrays.
-        database: the number of images.
-        windows: whether indices after the last image are dropped too, where others are left.
-
-    Raises:
-        InputError: a row holds anything but indices of images.
+    With `windows`, indices after the last image are dropped too, where others are left.
     """
     matches, beyond = [], 0
-    for number, row in enumerate(_rows(path, rows)):
+    for number, row in enumerate(_indices(path, rows)):
         found = np.unique(row[row != -1])
         if windows and found.size and 0 <= found[0] < database:
             beyond += int((row >= database).sum())
@@ -256,7 +248,65 @@ def _is_nordland_star(positives: Sequence[Int64[np.ndarray, " _"]], database: in
     Its queries (2,760, summer) are every tenth frame of its database (27,592, winter).
     """
     return len(positives) > 1 and all(
-        references.tolist()
-        == [i for i in range(10 * query - 1, 10 * query + 2) if 0 <= i < database]
+        references.tolist() == [*range(max(0, 10 * query - 1), min(10 * query + 2, database))]
         for query, references in enumerate(positives)
     )
+
+
+_SAFE_NAMES = frozenset(
+    (
+        ("numpy", "ndarray"),
+        ("numpy", "dtype"),
+        ("numpy._core.multiarray", "_reconstruct"),
+        ("numpy._core.multiarray", "scalar"),
+        ("numpy._core.numeric", "_frombuffer"),
+        ("_codecs", "encode"),
+        ("__builtin__", "bytes"),
+    )
+)
+"""All that a pickled array asks for; the last two spell bytes for Python 2. None of it runs code of
+the file, calls back into it, or can be changed by it."""
+
+
+def read_npy(path: pathlib.Path) -> np.ndarray:
+    """Read a .npy file; a pickled one may hold lists, tuples, text, bytes, numbers and arrays.
+
+    Raises:
+        InputError: the file is missing, damaged, or holds anything else.
+    """
+    file = io.BytesIO(read_bytes(path, "a .npy file"))
+    try:
+        return _read_array(file)
+    except Exception as error:  # a damaged pickle can raise anything at all
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"{path}: cannot be read as an array: {type(error).__name__}: {reason}"
+        ) from error
+
+
+def _read_array(file: io.BytesIO) -> np.ndarray:
+    version = np.lib.format.read_magic(file)
+    wide = version > (1, 0)
+    header = np.lib.format.read_array_header_2_0 if wide else np.lib.format.read_array_header_1_0
+    shape, _, dtype = header(file)
+    if not dtype.hasobject:
+        file.seek(0)
+        return np.lib.format.read_array(file, allow_pickle=False)
+    array = _Unpickler(file, encoding="latin1").load()
+    if not isinstance(array, np.ndarray) or array.shape != shape:
+        raise ValueError(f"found a pickled {type(array).__name__}, expected an array of {shape}")
+    return array
+
+
+class _Unpickler(pickle._Unpickler):
+    """Looks up `_SAFE_NAMES` alone.
+
+    Python's own: the one in C allocates as much memory as a damaged file says.
+    """
+
+    def find_class(self, module_name: str, global_name: str, /) -> Any:
+        # numpy 2 moved its modules, and files of numpy 1 and 2 both exist.
+        module = module_name.replace("numpy.core.", "numpy._core.")
+        if (module, global_name) not in _SAFE_NAMES:
+            raise pickle.UnpicklingError(f"the file asks for {module}.{global_name}")
+        return super().find_class(module, global_name)

@@ -5,7 +5,7 @@ import inspect
 import os
 import pathlib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from crisalad_jax.config.checks import PATH, choose, takes
 from crisalad_jax.data.benchmarks.benchmark import Benchmark
@@ -23,30 +23,16 @@ from crisalad_jax.data.benchmarks.utm import QUERIES, has_utm_names, read_utm
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
 
-
-class Layout(NamedTuple):
-    """A layout of evaluation sets on disk."""
-
-    words: str
-    read: Callable[..., Benchmark]
-    """Takes a path, then any of `open_benchmark`'s options by their names."""
-
-    @property
-    def options(self) -> tuple[str, ...]:
-        """Names of what the reader takes after the path."""
-        return tuple(inspect.signature(self.read).parameters)[1:]
-
-
-LAYOUTS = {
-    "utm": Layout("a folder of @UTM names", read_utm),
-    "vpr-bench": Layout("a VPR-Bench folder", read_vpr_bench),
-    "netvlad": Layout("a .mat file of NetVLAD", read_netvlad),
-    "salad": Layout(".npy lists of GSV-Cities or SALAD", read_salad_lists),
-    "msls": Layout("raw MSLS", read_msls),
-    "msls-subtask": Layout("raw MSLS, subtask all", functools.partial(read_msls, subtask=True)),
-    "folders": Layout("two plain folders", read_folders),
+LAYOUTS: dict[str, Callable[..., Benchmark]] = {
+    "utm": read_utm,
+    "vpr-bench": read_vpr_bench,
+    "netvlad": read_netvlad,
+    "salad": read_salad_lists,
+    "msls": read_msls,
+    "msls-subtask": functools.partial(read_msls, subtask=True),
+    "folders": read_folders,
 }
-"""Layouts by the name that `open_benchmark` takes."""
+"""Reader of each layout. It takes a path, then any of `open_benchmark`'s options by their names."""
 
 
 @takes(root=PATH)
@@ -97,7 +83,7 @@ def open_benchmark(
     """
     root = pathlib.Path(root)
     layout = _find_layout(root, split, queries) if layout is None else layout
-    chosen = choose("layout", layout, LAYOUTS)
+    read = choose("layout", layout, LAYOUTS)
     options = {
         "split": split,
         "radius": radius,
@@ -108,15 +94,16 @@ def open_benchmark(
         "ignore_zones": ignore_zones or None,
     }
     given: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
-    known = [name for name in chosen.options if name in options]
-    if unknown := given.keys() - {*known}:
+    takes_these = inspect.signature(read).parameters
+    if unknown := given.keys() - takes_these:
+        known = ", ".join(name for name in takes_these if name in options) or "no option"
         raise InputError(
-            f"{root}: found {', '.join(sorted(unknown))} for {chosen.words}, which takes "
-            f"{', '.join(known) or 'no option'}"
+            f"{root}: found {', '.join(sorted(unknown))} for the layout {layout}, which takes "
+            f"{known}"
         )
-    if "on_bad_image" in chosen.options:
+    if "on_bad_image" in takes_these:
         given["on_bad_image"] = on_bad_image
-    return chosen.read(root, **given)
+    return read(root, **given)
 
 
 def _find_layout(root: pathlib.Path, split: str | None, queries: str | None) -> str:

@@ -17,6 +17,7 @@ from crisalad_jax.data.benchmarks.on_disk import find_database, find_split, list
 from crisalad_jax.data.metres import Zone, on_ellipsoid
 from crisalad_jax.data.positions import utm_degrees, utm_position, utm_zones
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.output import counted
 from crisalad_jax.utils.shapes import Float64, Int64
 
 QUERIES = "queries"
@@ -32,7 +33,6 @@ _NORDLANDS = {
 # Names have one decimal, truncated.
 _NAME_METRES = 0.1
 _Points = Float64[np.ndarray, "images axis"]
-_Matches = tuple[Int64[np.ndarray, " _"], ...]
 _MSLS_NOTE = re.compile(r"(?:day|night)_[a-z]+_([a-z]+)")
 
 
@@ -81,10 +81,10 @@ def read_utm(
         # Count in whole frames: the names' truncated decimals would make the radius inexact.
         frames = float(np.floor(radius / metres + 1e-9))
         positives = within(there, here, frames)
-        words = f"{frames:g} frame{'s' * (frames != 1)}"
-        name = f"{_NORDLANDS[metres]}{which}, +-{words}"
+        apart = counted(int(frames), "frame")
+        name = f"{_NORDLANDS[metres]}{which}, +-{apart}"
         rule = (
-            f"at most {words} apart ({radius:g} m); it is Nordland by eastings of 0 and "
+            f"at most {apart} apart ({radius:g} m); it is Nordland by eastings of 0 and "
             f"northings of {metres:.4g} m a frame"
         )
         return Benchmark(name, root, database, asking, positives, rule)
@@ -124,7 +124,7 @@ def _across_zones(
     places: _Points,
     asked: _Points,
     radius: float,
-) -> tuple[_Matches, _Points, _Points]:
+) -> tuple[tuple[Int64[np.ndarray, " _"], ...], _Points, _Points]:
     """Find the positives of a set of several zones, and both sides' points on the ellipsoid.
 
     Images of one zone match by its metres, so that published sets such as MSLS, with a city a

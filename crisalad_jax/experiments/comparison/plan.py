@@ -360,7 +360,7 @@ def _fitted(config: ComparisonConfig, variants: list[Variant]) -> list[Variant]:
         training, row = variant.training, variant.row
         sets = row.sets if row is not None else lambda flag: False
         views = training.images_per_place if sets("images-per-place") else typical
-        places = len(read(cities=training.cities, min_images=views).place_id)
+        places = len(read(cities=training.cities, min_images=views).names)
         training = _of_size(config, training, places, views)
         if row is not None:
             training = row.changed(training, config.preset)

@@ -33,7 +33,7 @@ def test_open_benchmark_finds_the_layout(tmp_path):
     assert open_benchmark(tmp_path / "b").name == "b (@UTM, 25 m)"
     write_vpr_bench(tmp_path / "c", truth_rows((0, [0]), (1, [1]), (2, [2])))
     assert open_benchmark(tmp_path / "c").name == "c (VPR-Bench)"
-    with refused("c: found split for a VPR-Bench folder"):
+    with refused("c: found split for the layout vpr-bench"):
         open_benchmark(tmp_path / "c", "val")
 
 
@@ -149,7 +149,7 @@ def test_options_that_a_layout_lacks_are_refused(tmp_path, layout):
     options = OF_LAYOUTS[layout]
     for option in OPTIONS.keys() - set(options):
         known = ", ".join(options) or "no option"
-        with refused(f"^{tmp_path}: found {option} for .*, which takes {known}$"):
+        with refused(f"^{tmp_path}: found {option} for the layout {layout}, which takes {known}$"):
             open_benchmark(tmp_path, layout=layout, **{option: OPTIONS[option]})
 
 

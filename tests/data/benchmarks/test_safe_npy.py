@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from crisalad_jax.data.benchmarks.safe_npy import read_npy
+from crisalad_jax.data.benchmarks.npy_lists import read_npy
 from tests.data.benchmarks.trees import ragged, refused
 
 

@@ -148,8 +148,3 @@ def test_a_name_without_its_zone_among_several_is_refused(tmp_path, name, words)
     with refused(words):
         read_utm(tmp_path)
     assert read_utm(tmp_path, ignore_zones=True).positives is not None
-
-
-def test_a_latitude_says_the_hemisphere_where_no_letter_does(tmp_path):
-    write_sides(tmp_path, [EQUATOR[0].replace("@N@", "@@")], [EQUATOR[1].replace("@M@", "@@")])
-    assert lists_of(read_utm(tmp_path).positives) == [[0]]

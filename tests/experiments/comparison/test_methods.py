@@ -235,7 +235,7 @@ def test_what_a_row_sets_stays_as_it_is(ablation):
 def test_the_cities_of_a_row_are_its_training_set(ablation):
     config = ComparisonConfig(**ablation | {"names": (), "rows": ("half: cities=Brill",)})
     (variant,) = prepare(config).variants
-    assert (variant.places.cities, len(variant.places.place_id)) == (("Brill",), 4)
+    assert (variant.places.cities, len(variant.places.names)) == (("Brill",), 4)
 
 
 def test_a_table_says_what_a_row_changes(ablation):
