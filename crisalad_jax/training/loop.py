@@ -36,7 +36,6 @@ from crisalad_jax.training.run_files import (
     checksum_of_benchmark,
     checksum_of_places,
 )
-from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.training.trainer import LossNotFiniteError, Trainer, run_keys
 from crisalad_jax.training.validation import Validator
 from crisalad_jax.utils.errors import InputError, Interrupted
@@ -118,7 +117,6 @@ def fit(
         >>> fit(config, read_places(places, min_images=3), folder / "run", quiet=True).steps
         2
     """
-    check_learns(config)
     threads = THREADS if num_threads is None else num_threads
     require(threads >= 0, f"num_threads: found {threads}, expected at least 0")
     if initial is None:
@@ -160,25 +158,6 @@ def fit(
     best = record.best[0][0] if record.best else None
     return FitResult(
         trainer.params(), record.step, best, record.stopped_early, record.skipped_images
-    )
-
-
-def check_learns(config: TrainConfig) -> None:
-    """Check that a model trains; AnyLoc's does not, whose vocabulary fits one backbone.
-
-    Raises:
-        InputError: nothing of the model trains.
-    """
-    model, what = config.model, config.trainable
-    require(
-        model.aggregator.trainable,
-        f"aggregator: found {model.aggregator.part_name}, with which nothing trains, expected "
-        "another; `crisalad vocabulary` makes its models",
-    )
-    require(
-        count_trainable(model, what) > 0,
-        f"trainable: found {what}, of which backbone {model.backbone.part_name} with aggregator "
-        f"{model.aggregator.part_name} has no parameters, expected some",
     )
 
 
