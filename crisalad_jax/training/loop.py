@@ -145,9 +145,14 @@ def fit(
         trainer.resume(state.training)
         data.mined = jax.tree.map(np.asarray, state.mined)
         del state  # whose arrays the trainer has copied
-        if files.is_extended and files.record.step:
-            _warn_of_extension(config, files.record, files.out)
         steps, done = data.steps_per_epoch * config.epochs, files.record.step
+        falls = config.optimiser.schedule == "linear" and config.optimiser.decay_steps is None
+        if falls and files.is_extended and done and not files.record.stopped_early:
+            warn(
+                f"{out}: the learning rate falls over the whole run, so that it jumps at step "
+                f"{done}: this is not the run of {config.epochs} epochs at once; "
+                "--optimiser.decay-steps keeps a fall's length"
+            )
         silent = quiet or not distributed.is_primary()
         bar = progress_bar("training", steps, "steps", quiet=silent, done=done)
         with defer_signals() as signals, bar as bar:
@@ -175,22 +180,6 @@ def _open_data(
     return make(config, places, **reading)
 
 
-def _warn_of_extension(config: TrainConfig, record: RunRecord, out: pathlib.Path) -> None:
-    """Warn if a run that is given more epochs differs from one that had them from the start."""
-    optimiser = config.optimiser
-    if record.stopped_early:
-        warn(
-            f"{out}: the run stopped early at step {record.step}, by patience {config.patience}, "
-            "which more epochs do not change"
-        )
-    elif optimiser.schedule == "linear" and optimiser.decay_steps is None:
-        warn(
-            f"{out}: the learning rate falls over the whole run, so that it jumps at step "
-            f"{record.step}: this is not the run of {config.epochs} epochs at once; "
-            "--optimiser.decay-steps keeps a fall's length"
-        )
-
-
 @dataclasses.dataclass(frozen=True)
 class _Loop:
     """The parts of a run, and the phases in which they act."""
@@ -205,9 +194,6 @@ class _Loop:
 
     def train(self, steps: int) -> None:
         """Take the steps that are left of so many; at an interruption, save the state."""
-        if self.data.classes:
-            sizes = f"{min(self.data.classes)} to {max(self.data.classes)}"
-            self.bar.say(f"classes in {len(self.data.classes)} groups: {sizes}")
         try:
             self._take_rounds(steps)
             # A signal may have come while the last validation was saved.
@@ -300,10 +286,7 @@ class _Loop:
             self.files.log({"step": record.step, "epoch": epoch, **values})
             name = "accuracy" if "accuracy" in values else "easy_anchor_fraction"
             note = f"loss {values['loss']:.3f}  {name.split('_')[0]} {values[name]:.2f}"
-            note += f"  {values['images_per_second']:.0f} images/s"
-            if record.best:
-                note += f"  best {self.config.monitor} {100 * record.best[0][0]:.1f}"
-            self.bar.advance(1, note=note)
+            self.bar.advance(1, note=f"{note}  {values['images_per_second']:.0f} images/s")
 
     def _validate(self) -> RunRecord:
         """Log the recalls, save the best weights, and decide on an early stop."""

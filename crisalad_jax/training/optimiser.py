@@ -123,13 +123,11 @@ def warn_of_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: in
     longest = steps // WARMUP_SHARE
     if warmup <= longest:
         return
-    flag, found = "steps", str(warmup)
-    if config.warmup_epochs:
-        flag, found = "epochs", f"{config.warmup_epochs}, which are {warmup} steps,"
-    quarter = f"; at most {longest} steps would be a quarter" if longest else ""
+    flag = "epochs" if config.warmup_epochs else "steps"
     warn(
-        f"--optimiser.warmup-{flag}: found {found} for a run of {steps} steps, which leaves "
-        f"{max(steps - warmup, 0)} at the learning rate and its decay{quarter}"
+        f"--optimiser.warmup-{flag}: found {warmup} steps for a run of {steps}, which leaves "
+        f"{max(steps - warmup, 0)} at the learning rate and its decay; at most {longest} would be "
+        "a quarter"
     )
 
 

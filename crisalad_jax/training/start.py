@@ -70,15 +70,13 @@ def read_inputs(
     quiet = quiet or not distributed.is_primary()
 
     def read() -> RunInputs:
-        expected = "--val-images: found no --val, expected it beside --val"
-        require(validation is not None or validation_images is None, expected)
         initial = read_start(config, weights=weights, backbone=backbone, quiet=quiet)
         places = _read_set(config, data, images, on_bad_image, grouping)
-        benchmark = None
-        if validation is not None:
-            how: Any = {"images": validation_images, "on_bad_image": on_bad_image}
-            benchmark = open_benchmark(validation, **how)
-        return RunInputs(places, benchmark, initial)
+        if validation is None:
+            require(validation_images is None, "--val-images: found no --val, expected it with it")
+            return RunInputs(places, None, initial)
+        how: Any = {"images": validation_images, "on_bad_image": on_bad_image}
+        return RunInputs(places, open_benchmark(validation, **how), initial)
 
     distributed.run_on_primary(lambda: check_run(pathlib.Path(out), config))
     inputs = distributed.raise_together(read)
