@@ -77,7 +77,7 @@ def train(
         >>> train(config, places, folder / "run", quiet=True).steps
         2
     """
-    inputs = read_inputs(
+    places, benchmark, initial = read_inputs(
         config,
         data,
         out,
@@ -98,18 +98,18 @@ def train(
             "Note: no --weights or --backbone, so the frozen part of the model "
             f"({config.trainable} trains) is random. --trainable all trains everything."
         )
-    if isinstance(inputs.places, QuerySet):
-        groups = f"{len(inputs.places.queries)} queries with positives"
+    if isinstance(places, QuerySet):
+        groups = f"{len(places.queries)} queries with positives"
     else:
-        groups = f"{len(inputs.places.place_id)} places"
-    on = "" if inputs.validation is None else f"; validation on {inputs.validation.name}"
-    say(f"{data}: {groups}, {len(inputs.places.files)} images{on}")
+        groups = f"{len(places.place_id)} places"
+    on = "" if benchmark is None else f"; validation on {benchmark.name}"
+    say(f"{data}: {groups}, {len(places.files)} images{on}")
     result = fit(
         config,
-        inputs.places,
+        places,
         out,
-        validation=inputs.validation,
-        initial=inputs.initial,
+        validation=benchmark,
+        initial=initial,
         on_bad_image=on_bad_image,
         num_threads=num_threads,
         shard_state=shard_state,

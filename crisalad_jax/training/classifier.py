@@ -42,8 +42,9 @@ def init_classifiers(
         return None
     if key is None or (loss.grouping is not None and not classes):
         raise InputError(
-            f"key, classes: found {key} and {classes} for {name}, expected a jax.random.key and, "
-            "where it classifies, the number of classes of each group (step_config(..., classes=))"
+            f"{name}: found {'no ' if key is None else 'a '}key and classes {classes}, expected a "
+            "jax.random.key and, where it classifies, the number of classes of each group "
+            "(step_config(..., classes=))"
         )
     counts = classes or (0,)
     keys = jax.random.split(key, len(counts))

@@ -2,7 +2,7 @@
 
 import os
 import pathlib
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 
@@ -24,12 +24,8 @@ from crisalad_jax.utils.output import warn
 Path = str | os.PathLike[str]
 
 
-class RunInputs(NamedTuple):
-    """What a run reads before its first step, as `fit` takes it."""
-
-    places: Places | QuerySet
-    validation: Benchmark | None
-    initial: Crisalad | None
+RunInputs = tuple[Places | QuerySet, Benchmark | None, Crisalad | None]
+"""The training set, the validation set, and the parameters to start from, as `fit` takes them."""
 
 
 def read_inputs(
@@ -64,6 +60,9 @@ def read_inputs(
         quiet: no progress bars.
         **grouping: how images become places; see `read_places`.
 
+    Returns:
+        (places, validation, initial).
+
     Raises:
         InputError: in every process, where one cannot read its files or they do not fit.
     """
@@ -74,17 +73,16 @@ def read_inputs(
         places = _read_set(config, data, images, on_bad_image, grouping)
         if validation is None:
             require(validation_images is None, "--val-images: found no --val, expected it with it")
-            return RunInputs(places, None, initial)
+            return places, None, initial
         how: Any = {"images": validation_images, "on_bad_image": on_bad_image}
-        return RunInputs(places, open_benchmark(validation, **how), initial)
+        return places, open_benchmark(validation, **how), initial
 
     distributed.run_on_primary(lambda: check_run(pathlib.Path(out), config))
-    inputs = distributed.raise_together(read)
-    if weights is not None or not config.model.aggregator.trainable:
-        return inputs
-    initial, places = inputs.initial, inputs.places
-    initial = with_vocabulary_of(initial, config, places, on_bad_image=on_bad_image, quiet=quiet)
-    return inputs._replace(initial=initial)
+    places, benchmark, initial = distributed.raise_together(read)
+    if weights is None and config.model.aggregator.trainable:
+        how: Any = {"on_bad_image": on_bad_image, "quiet": quiet}
+        initial = with_vocabulary_of(initial, config, places, **how)
+    return places, benchmark, initial
 
 
 def _read_set(

@@ -587,11 +587,16 @@ def test_a_classification_by_hand_trains_its_vectors() -> None:
     np.testing.assert_allclose(moved, loss.kind.learning_rate, rtol=1e-3)
 
 
-@pytest.mark.parametrize(("classes", "key"), [((), jax.random.key(0)), ((3,), None)])
-def test_a_classification_needs_classes_and_a_key(params, classes, key) -> None:
+@pytest.mark.parametrize(
+    ("classes", "key", "words"),
+    [
+        ((), jax.random.key(0), "large-margin-cosine: found a key and classes (), expected"),
+        ((3,), None, "large-margin-cosine: found no key and classes (3,), expected"),
+    ],
+)
+def test_a_classification_needs_classes_and_a_key(params, classes, key, words) -> None:
     loss = LossConfig(kind="large-margin-cosine", miner="none")
     static = step_config(TrainConfig(model=MODEL, loss=loss), steps=5, classes=classes)
-    words = f"key, classes: found {key} and {classes} for loss large-margin-cosine, expected a jax"
     with pytest.raises(InputError, match=re.escape(words)):
         init_train_state(params, "head", static, key=key)
 
