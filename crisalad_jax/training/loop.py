@@ -39,7 +39,6 @@ from crisalad_jax.training.run_files import (
 from crisalad_jax.training.trainer import LossNotFiniteError, Trainer, run_keys
 from crisalad_jax.training.validation import Validator
 from crisalad_jax.utils.errors import InputError, Interrupted
-from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.signals import SignalState, defer_signals
 
@@ -117,6 +116,12 @@ def fit(
         >>> fit(config, read_places(places, min_images=3), folder / "run", quiet=True).steps
         2
     """
+    expected = QuerySet if config.mines else Places
+    require(
+        isinstance(places, expected),
+        f"places: found {type(places).__name__} with mining {config.mining.kind!r}, expected "
+        f"{expected.__name__}",
+    )
     threads = THREADS if num_threads is None else num_threads
     require(threads >= 0, f"num_threads: found {threads}, expected at least 0")
     if initial is None:
@@ -133,8 +138,10 @@ def fit(
     )
     cache = ImageCache()
     part = jax.process_index(), jax.process_count()
-    reading = {"part": part, "on_bad_image": on_bad_image, "threads": threads, "cache": cache}
-    data = _open_data(config, places, **reading)
+    make: Any = Miner if config.mines else PlaceBatches
+    data: PlaceBatches | Miner = make(
+        config, places, part=part, on_bad_image=on_bad_image, threads=threads, cache=cache
+    )
     trainer = Trainer(config, data, initial, shard_state=shard_state)
     del initial  # the trainer has copied what it needs
     record = RunRecord(checksums, {name: [*source] for name, source in sources_of(config).items()})
@@ -146,13 +153,6 @@ def fit(
         data.mined = jax.tree.map(np.asarray, state.mined)
         del state  # whose arrays the trainer has copied
         steps, done = data.steps_per_epoch * config.epochs, files.record.step
-        falls = config.optimiser.schedule == "linear" and config.optimiser.decay_steps is None
-        if falls and files.is_extended and done and not files.record.stopped_early:
-            warn(
-                f"{out}: the learning rate falls over the whole run, so that it jumps at step "
-                f"{done}: this is not the run of {config.epochs} epochs at once; "
-                "--optimiser.decay-steps keeps a fall's length"
-            )
         silent = quiet or not distributed.is_primary()
         bar = progress_bar("training", steps, "steps", quiet=silent, done=done)
         with defer_signals() as signals, bar as bar:
@@ -164,20 +164,6 @@ def fit(
     return FitResult(
         trainer.params(), record.step, best, record.stopped_early, record.skipped_images
     )
-
-
-def _open_data(
-    config: TrainConfig, places: Places | QuerySet, **reading: Any
-) -> PlaceBatches | Miner:
-    """Make the batches of a training set, of places or of mined tuples."""
-    found, expected = type(places), QuerySet if config.mines else Places
-    require(
-        found is expected,
-        f"places: found {found.__name__} with mining {config.mining.kind!r}, expected "
-        f"{expected.__name__}",
-    )
-    make: Any = Miner if config.mines else PlaceBatches
-    return make(config, places, **reading)
 
 
 @dataclasses.dataclass(frozen=True)
