@@ -118,9 +118,7 @@ class MiningConfig:
     hardest in any case."""
 
     def __post_init__(self) -> None:
-        """Check the ranges, where tuples are mined."""
-        if self.kind == "none":
-            return
+        """Check the ranges of the fields."""
         require_positive(self, "negatives", "candidates", "queries_per_round")
         require_positive(self, "queries_per_epoch", "margin")
         require_range(self, self.negatives, math.inf, "candidates")
