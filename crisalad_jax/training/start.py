@@ -72,7 +72,9 @@ def read_inputs(
         initial = read_start(config, weights=weights, backbone=backbone, quiet=quiet)
         places = _read_set(config, data, images, on_bad_image, grouping)
         if validation is None:
-            require(validation_images is None, "--val-images: found no --val, expected it with it")
+            require(
+                validation_images is None, "--val-images: found no --val, expected both or none"
+            )
             return places, None, initial
         how: Any = {"images": validation_images, "on_bad_image": on_bad_image}
         return places, open_benchmark(validation, **how), initial
