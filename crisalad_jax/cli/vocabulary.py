@@ -7,12 +7,7 @@ from typing import Annotated, Any
 from crisalad_jax.cli.common import echo, find_given, load_model, pick, refuse_with
 from crisalad_jax.cli.flags import WEIGHTS, JsonFlag, ReadFlags, SizeFlags
 from crisalad_jax.nn.model import Model
-from crisalad_jax.training.vocabulary import (
-    IMAGES,
-    build_vocabulary,
-    start_vocabulary,
-    vocabulary_words,
-)
+from crisalad_jax.training.vocabulary import IMAGES, build_vocabulary, start_vocabulary
 
 COMMON = (
     "images out weights backbone preset aggregator clusters image-size max-images batch-size "
@@ -72,14 +67,14 @@ def run(arguments: Vocabulary) -> dict[str, Any]:
         arguments.out,
         **pick(arguments, "fps", "max_images", "seed", "batch_size", "on_bad_image", "quiet"),
     )
-    words, config = vocabulary_words(model.config), model.config
+    config, name = model.config, model.config.aggregator.part_name
     echo(
-        f"{arguments.out}: {words}, {built.words} words from {built.images} images at "
+        f"{arguments.out}: {name}, {built.words} words from {built.images} images at "
         f"{config.images_in_words}, descriptors of {config.descriptor_dim} numbers"
     )
     return {
         "out": str(arguments.out),
-        "vocabulary": words,
+        "vocabulary": name,
         "words": built.words,
         "images": built.images,
         "length": config.descriptor_dim,

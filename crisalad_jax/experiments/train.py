@@ -2,22 +2,17 @@
 
 import os
 import pathlib
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 from crisalad_jax.config.checks import PATH, takes
-from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.images import OnBadImage
-from crisalad_jax.data.places import Places, read_places
-from crisalad_jax.data.query_set import QuerySet, read_query_set
+from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.experiments.report import save, training_curves
-from crisalad_jax.training import distributed
 from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.distributed import is_primary
 from crisalad_jax.training.log import read_metrics
-from crisalad_jax.training.loop import FitResult, check_learns, fit
-from crisalad_jax.training.run_files import check_run
-from crisalad_jax.training.start import read_start, with_vocabulary_of
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.training.loop import FitResult, fit
+from crisalad_jax.training.start import read_inputs
 
 Path = str | os.PathLike[str]
 
@@ -72,7 +67,7 @@ def train(
 
     Raises:
         InputError: what `read_start`, `read_places`, `read_query_set`, `open_benchmark` and `fit`
-            raise.
+            raise; `out` holds something else than a run with this configuration.
         Interrupted: what `fit` raises; the same call resumes.
 
     Example:
@@ -82,31 +77,22 @@ def train(
         >>> train(config, places, folder / "run", quiet=True).steps
         2
     """
-    out = pathlib.Path(out)
-    check_learns(config)
-    if validation is None and validation_images is not None:
-        raise InputError("--val-images: found no --val, expected it beside --val")
-
-    grouping = {
-        "place_radius": place_radius,
-        "place_frames": place_frames,
-        "positions": positions,
-        "fps": fps,
-    }
-
-    def read() -> tuple:
-        initial = read_start(
-            config, weights=weights, backbone=backbone, quiet=quiet or not distributed.is_primary()
-        )
-        places = _read_set(config, data, images, grouping, on_bad_image)
-        benchmark = None
-        if validation is not None:
-            benchmark = open_benchmark(
-                validation, images=validation_images, on_bad_image=on_bad_image
-            )
-        return initial, places, benchmark
-
-    initial, places, benchmark = distributed.raise_together(read)
+    places, benchmark, initial = read_inputs(
+        config,
+        data,
+        out,
+        images=images,
+        validation=validation,
+        validation_images=validation_images,
+        weights=weights,
+        backbone=backbone,
+        on_bad_image=on_bad_image,
+        quiet=quiet,
+        place_radius=place_radius,
+        place_frames=place_frames,
+        positions=positions,
+        fps=fps,
+    )
     if (weights, backbone) == (None, None) and config.trainable != "all":
         say(
             "Note: no --weights or --backbone, so the frozen part of the model "
@@ -118,11 +104,6 @@ def train(
         groups = f"{len(places.names)} places"
     on = "" if benchmark is None else f"; validation on {benchmark.name}"
     say(f"{data}: {groups}, {len(places.files)} images{on}")
-    if weights is None:
-        distributed.run_on_primary(lambda: check_run(out, config))
-        initial = with_vocabulary_of(
-            initial, config, places, on_bad_image=on_bad_image, quiet=quiet
-        )
     result = fit(
         config,
         places,
@@ -134,38 +115,7 @@ def train(
         shard_state=shard_state,
         quiet=quiet,
     )
-    if distributed.is_primary():
+    if is_primary():
+        out = pathlib.Path(out)
         save(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
     return result
-
-
-def _read_set(
-    config: TrainConfig,
-    data: Path,
-    images: Path | None,
-    grouping: Mapping[str, Any],
-    on_bad_image: OnBadImage,
-) -> Places | QuerySet:
-    """Read the training set: places, or queries of which tuples are mined."""
-    unused = grouping if config.mines else {"data_images": images}
-    given = [f"--{name.replace('_', '-')}" for name, value in unused.items() if value is not None]
-    if given:
-        what = "mines tuples of queries" if config.mines else "trains on places"
-        raise InputError(
-            f"{', '.join(given)}: found for a recipe that {what}, expected no such flag"
-        )
-    if not config.mines:
-        return read_places(
-            data,
-            cities=config.cities,
-            min_images=config.min_images_of_place,
-            on_bad_image=on_bad_image,
-            **grouping,
-        )
-    return read_query_set(
-        data,
-        positive_radius=config.mining.positive_radius,
-        negative_radius=config.mining.negative_radius,
-        images=images,
-        on_bad_image=on_bad_image,
-    )

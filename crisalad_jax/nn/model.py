@@ -559,6 +559,39 @@ def attend_across_images(
         return project(params.projection, descriptors, config.projection)
 
 
+def describe_training_batch(
+    params: Crisalad,
+    images: Images,
+    config: ModelConfig,
+    *,
+    valid: Bool[Array, " image"],
+    measured: Bool[Array, " image"] | None,
+    key: Key[Array, ""],
+    micro_batch: int | None = None,
+) -> tuple[Float[Array, "image descriptor"], Tokens, Crisalad | None]:
+    """Describe a batch in the trace of a training step.
+
+    Args:
+        params: see `describe`.
+        images: see `describe`.
+        config: see `describe`.
+        valid: images that attend to each other; the others attend to themselves.
+        measured: images that batch norms take their statistics of; None takes the stored ones.
+        key: draws the dropout.
+        micro_batch: see `extract_tokens`.
+
+    Returns:
+        (descriptors, tokens, statistics), the last as `tokens_and_statistics` returns them.
+    """
+    tokens_key, cross_key = split_key(key, 2)
+    tokens, statistics = tokens_and_statistics(
+        params, images, config, valid=measured, key=tokens_key, micro_batch=micro_batch
+    )
+    mask = valid_mask(valid)
+    descriptors = attend_across_images(params, tokens, config, mask=mask, key=cross_key)
+    return descriptors, tokens, statistics
+
+
 @_of_images()
 def transport_masses(
     params: Crisalad, images: Images, config: ModelConfig

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
-from crisalad_jax.config.checks import require
 from crisalad_jax.training.losses import Loss
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import check_drawn
 
 
@@ -40,16 +40,12 @@ def init_classifiers(
     shapes = jax.eval_shape(lambda key: loss.init(key, 1, dim), jax.random.key(0))
     if not jax.tree.leaves(shapes):
         return None
-    require(
-        bool(classes) or loss.grouping is None,
-        f"classes: found none for {name}, which classifies, expected the number of classes of "
-        "each group (step_config(..., classes=))",
-    )
-    require(
-        key is not None,
-        f"key: found None for {name}, which has parameters, expected a jax.random.key",
-    )
-    assert key is not None
+    if key is None or (loss.grouping is not None and not classes):
+        raise InputError(
+            f"{name}: found {'no ' if key is None else 'a '}key and classes {classes}, expected a "
+            "jax.random.key and, where it classifies, the number of classes of each group "
+            "(step_config(..., classes=))"
+        )
     counts = classes or (0,)
     keys = jax.random.split(key, len(counts))
     groups = [loss.init(each, count, dim) for each, count in zip(keys, counts, strict=True)]

@@ -62,7 +62,7 @@ class OptimiserConfig:
     clip_norm: float | None = None
     """Largest norm of the whole gradient."""
     clip_value: float | None = None
-    """Largest absolute value of each number of the gradient."""
+    """Largest absolute value of each number of the gradient, after `clip_norm`."""
     accumulate: int = 1
     """Number of batches whose gradients are averaged for one step of the optimiser. The steps above
     are these. As in Lightning, the last batch of an epoch steps too; the sum of the gradients that
@@ -77,13 +77,10 @@ class OptimiserConfig:
         require_range(self, 0, math.inf, *names)
         require_fraction(self, "b1", "b2", "momentum")
         rises = bool(self.milestones) and all(a < b for a, b in pairwise((0, *self.milestones)))
-        steps, norm = self.warmup_steps, self.clip_norm
-        for name, fits, expected in (
-            ("warmup_epochs", not (steps and self.warmup_epochs), f"0 with warmup_steps {steps}"),
-            ("milestones", rises or self.schedule != "milestones", "numbers of epochs that rise"),
-            ("clip_value", None in (norm, self.clip_value), f"None with clip_norm {norm}"),
-        ):
-            require_field(self, name, fits, expected)
+        fits = rises or self.schedule != "milestones"
+        require_field(self, "milestones", fits, "numbers of epochs that rise")
+        one, steps = not (self.warmup_steps and self.warmup_epochs), self.warmup_steps
+        require_field(self, "warmup_epochs", one, f"0 with warmup_steps {steps}")
 
 
 @short_repr(switch=("kind", "none"))
@@ -121,9 +118,7 @@ class MiningConfig:
     hardest in any case."""
 
     def __post_init__(self) -> None:
-        """Check the ranges, where tuples are mined."""
-        if self.kind == "none":
-            return
+        """Check the ranges of the fields."""
         require_positive(self, "negatives", "candidates", "queries_per_round")
         require_positive(self, "queries_per_epoch", "margin")
         require_range(self, self.negatives, math.inf, "candidates")

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.utils.errors import InputError, Interrupted
 
 _MESSAGE = 2**16
@@ -47,23 +48,16 @@ def join_processes(
     Raises:
         InputError: the arguments do not fit each other, or the others cannot be met.
     """
-    port = coordinator.rpartition(":")[2]
-    if coordinator == "auto":
-        is_valid = count is None and index is None
-    else:
-        is_valid = (
-            count is not None
-            and index is not None
-            and 0 <= index < count
-            and re.fullmatch(r".+:\d{1,5}", coordinator) is not None
-            and 0 < int(port) < 2**16
-        )
-    if not is_valid:
-        raise InputError(
-            f"processes: found process {index} of {count} with {coordinator}, expected "
-            "--coordinator-address HOST:PORT --num-processes COUNT --process-id INDEX, with a port "
-            "of 1 to 65535, and an index from 0 and below the count; or auto alone"
-        )
+    is_valid = count is None and index is None
+    if coordinator != "auto":
+        fits = count is not None and index is not None and 0 <= index < count
+        is_valid = fits and re.fullmatch(r".+:\d{1,5}", coordinator) is not None
+    require(
+        is_valid,
+        f"processes: found process {index} of {count} with {coordinator}, expected "
+        "--coordinator-address HOST:PORT --num-processes COUNT --process-id INDEX, with an index "
+        "from 0 and below the count; or auto alone",
+    )
     given: dict[str, Any] = {}
     if coordinator != "auto":
         given = {"num_processes": count, "process_id": index, "coordinator_address": coordinator}
@@ -74,11 +68,11 @@ def join_processes(
         if index == 0:
             _check_port(coordinator)
     if local_device_ids is not None:
-        if not local_device_ids or min(local_device_ids) < 0:
-            raise InputError(
-                f"--local-device-ids: found {tuple(local_device_ids)}, expected numbers of this "
-                "host's GPUs, from 0"
-            )
+        require(
+            len(local_device_ids) > 0 and min(local_device_ids) >= 0,
+            f"--local-device-ids: found {tuple(local_device_ids)}, expected numbers of this host's "
+            "GPUs, from 0",
+        )
         given["local_device_ids"] = list(local_device_ids)
     jax.config.update("jax_num_cpu_devices", 1)
     # JAX's own handler of SIGTERM would hide the signal from this program.
@@ -133,7 +127,7 @@ def _check_port(address: str) -> None:
         with socket.socket(socket.AF_INET) as listener:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(("", int(port)))
-    except (OSError, UnicodeError) as error:
+    except (OSError, OverflowError, UnicodeError) as error:
         raise InputError(
             f"--coordinator-address: found {address}, which cannot be listened at "
             f"({getattr(error, 'strerror', None) or error}), expected this host and a free port"
@@ -155,8 +149,7 @@ def run_on_primary(work: Callable[[], _T]) -> _T:
     if jax.process_count() == 1:
         return value
     text = json.dumps(value).encode()
-    if len(text) > _MESSAGE:
-        raise ValueError(f"found a message of {len(text)} bytes, expected at most {_MESSAGE}")
+    assert len(text) <= _MESSAGE
     padded = np.frombuffer(text.ljust(_MESSAGE), np.uint8)
     received = np.asarray(multihost_utils.broadcast_one_to_all(padded), np.uint8)
     return json.loads(received.tobytes())

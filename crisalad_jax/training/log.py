@@ -30,7 +30,7 @@ class MetricsLog:
         records = read_metrics(self._path) if self._path.exists() else []
         with atomic_path(self._path) as temporary:
             lines = [
-                _line(record)
+                json.dumps(record) + "\n"
                 for record in records
                 if record["step"] <= (keep_up_to if "loss" in record else validated)
             ]
@@ -55,7 +55,7 @@ class MetricsLog:
         from tensorboardX.summary import scalar
 
         with self._path.open("a", encoding="utf-8") as file:
-            file.write(_line(values))
+            file.write(json.dumps(values) + "\n")
         for name, value in values.items():
             if name not in ("step", "epoch"):
                 tag = f"{of}/{name.replace('@', '')}" if of else name
@@ -71,10 +71,6 @@ class MetricsLog:
 
         event: Any = event_pb2.Event  # pyright: ignore[reportAttributeAccessIssue]
         self._events.write_event(event(step=step, wall_time=time.time(), **what))
-
-
-def _line(values: Mapping[str, int | float]) -> str:
-    return json.dumps(values) + "\n"
 
 
 def read_metrics(path: pathlib.Path) -> list[dict[str, Any]]:

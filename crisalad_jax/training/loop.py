@@ -36,11 +36,9 @@ from crisalad_jax.training.run_files import (
     checksum_of_benchmark,
     checksum_of_places,
 )
-from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.training.trainer import LossNotFiniteError, Trainer, run_keys
 from crisalad_jax.training.validation import Validator
 from crisalad_jax.utils.errors import InputError, Interrupted
-from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.signals import SignalState, defer_signals
 
@@ -118,7 +116,12 @@ def fit(
         >>> fit(config, read_places(places, min_images=3), folder / "run", quiet=True).steps
         2
     """
-    check_learns(config)
+    expected = QuerySet if config.mines else Places
+    require(
+        isinstance(places, expected),
+        f"places: found {type(places).__name__} with mining {config.mining.kind!r}, expected "
+        f"{expected.__name__}",
+    )
     threads = THREADS if num_threads is None else num_threads
     require(threads >= 0, f"num_threads: found {threads}, expected at least 0")
     if initial is None:
@@ -135,8 +138,10 @@ def fit(
     )
     cache = ImageCache()
     part = jax.process_index(), jax.process_count()
-    reading = {"part": part, "on_bad_image": on_bad_image, "threads": threads, "cache": cache}
-    data = _open_data(config, places, **reading)
+    make: Any = Miner if config.mines else PlaceBatches
+    data: PlaceBatches | Miner = make(
+        config, places, part=part, on_bad_image=on_bad_image, threads=threads, cache=cache
+    )
     trainer = Trainer(config, data, initial, shard_state=shard_state)
     del initial  # the trainer has copied what it needs
     record = RunRecord(checksums, {name: [*source] for name, source in sources_of(config).items()})
@@ -147,8 +152,6 @@ def fit(
         trainer.resume(state.training)
         data.mined = jax.tree.map(np.asarray, state.mined)
         del state  # whose arrays the trainer has copied
-        if files.is_extended and files.record.step:
-            _warn_of_extension(config, files.record, files.out)
         steps, done = data.steps_per_epoch * config.epochs, files.record.step
         silent = quiet or not distributed.is_primary()
         bar = progress_bar("training", steps, "steps", quiet=silent, done=done)
@@ -161,55 +164,6 @@ def fit(
     return FitResult(
         trainer.params(), record.step, best, record.stopped_early, record.skipped_images
     )
-
-
-def check_learns(config: TrainConfig) -> None:
-    """Check that a model trains; AnyLoc's does not, whose vocabulary fits one backbone.
-
-    Raises:
-        InputError: nothing of the model trains.
-    """
-    model, what = config.model, config.trainable
-    require(
-        model.aggregator.trainable,
-        f"aggregator: found {model.aggregator.part_name}, with which nothing trains, expected "
-        "another; `crisalad vocabulary` makes its models",
-    )
-    require(
-        count_trainable(model, what) > 0,
-        f"trainable: found {what}, of which backbone {model.backbone.part_name} with aggregator "
-        f"{model.aggregator.part_name} has no parameters, expected some",
-    )
-
-
-def _open_data(
-    config: TrainConfig, places: Places | QuerySet, **reading: Any
-) -> PlaceBatches | Miner:
-    """Make the batches of a training set, of places or of mined tuples."""
-    found, expected = type(places), QuerySet if config.mines else Places
-    require(
-        found is expected,
-        f"places: found {found.__name__} with mining {config.mining.kind!r}, expected "
-        f"{expected.__name__}",
-    )
-    make: Any = Miner if config.mines else PlaceBatches
-    return make(config, places, **reading)
-
-
-def _warn_of_extension(config: TrainConfig, record: RunRecord, out: pathlib.Path) -> None:
-    """Warn if a run that is given more epochs differs from one that had them from the start."""
-    optimiser = config.optimiser
-    if record.stopped_early:
-        warn(
-            f"{out}: the run stopped early at step {record.step}, by patience {config.patience}, "
-            "which more epochs do not change"
-        )
-    elif optimiser.schedule == "linear" and optimiser.decay_steps is None:
-        warn(
-            f"{out}: the learning rate falls over the whole run, so that it jumps at step "
-            f"{record.step}: this is not the run of {config.epochs} epochs at once; "
-            "--optimiser.decay-steps keeps a fall's length"
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,9 +180,6 @@ class _Loop:
 
     def train(self, steps: int) -> None:
         """Take the steps that are left of so many; at an interruption, save the state."""
-        if self.data.classes:
-            sizes = f"{min(self.data.classes)} to {max(self.data.classes)}"
-            self.bar.say(f"classes in {len(self.data.classes)} groups: {sizes}")
         try:
             self._take_rounds(steps)
             # A signal may have come while the last validation was saved.
@@ -321,10 +272,7 @@ class _Loop:
             self.files.log({"step": record.step, "epoch": epoch, **values})
             name = "accuracy" if "accuracy" in values else "easy_anchor_fraction"
             note = f"loss {values['loss']:.3f}  {name.split('_')[0]} {values[name]:.2f}"
-            note += f"  {values['images_per_second']:.0f} images/s"
-            if record.best:
-                note += f"  best {self.config.monitor} {100 * record.best[0][0]:.1f}"
-            self.bar.advance(1, note=note)
+            self.bar.advance(1, note=f"{note}  {values['images_per_second']:.0f} images/s")
 
     def _validate(self) -> RunRecord:
         """Log the recalls, save the best weights, and decide on an early stop."""

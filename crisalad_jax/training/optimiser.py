@@ -1,28 +1,17 @@
 """The optimiser and its learning rate, equal to torch's."""
 
 import dataclasses
-from typing import Any, NamedTuple, TypeVar
+from typing import TypeVar
 
-import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Int, PyTree
+from jaxtyping import Array
 
 from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.utils.output import warn
 
 WARMUP_SHARE = 4
 """Divisor of a run's steps: a warm-up takes a quarter of them at most, as BoQ's 10 of 40 epochs."""
-
-
-class Accumulated(NamedTuple):
-    """State of an optimiser that steps once for several batches."""
-
-    batch: Int[Array, ""]
-    """Number of batches before this one, in all epochs."""
-    gradient: PyTree
-    """Sum of the gradients since the last step."""
-    optimiser: PyTree
 
 
 _Count = TypeVar("_Count", int, Array)
@@ -134,13 +123,11 @@ def warn_of_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: in
     longest = steps // WARMUP_SHARE
     if warmup <= longest:
         return
-    flag, found = "steps", str(warmup)
-    if config.warmup_epochs:
-        flag, found = "epochs", f"{config.warmup_epochs}, which are {warmup} steps,"
-    quarter = f"; at most {longest} steps would be a quarter" if longest else ""
+    flag = "epochs" if config.warmup_epochs else "steps"
     warn(
-        f"--optimiser.warmup-{flag}: found {found} for a run of {steps} steps, which leaves "
-        f"{max(steps - warmup, 0)} at the learning rate and its decay{quarter}"
+        f"--optimiser.warmup-{flag}: found {warmup} steps for a run of {steps}, which leaves "
+        f"{max(steps - warmup, 0)} at the learning rate and its decay; at most {longest} would be "
+        "a quarter"
     )
 
 
@@ -180,27 +167,14 @@ def make_optimiser(
 def _accumulated(
     optimiser: optax.GradientTransformation, accumulate: int, batches_per_epoch: int
 ) -> optax.GradientTransformation:
-    """Step once for several batches, and at an epoch's last; optax.MultiSteps knows no epochs."""
+    """Step once for several batches, and at the last of an epoch."""
+    per_epoch = -(-batches_per_epoch // accumulate)
 
-    def init(params: PyTree) -> Accumulated:
-        zeros = jax.tree.map(jnp.zeros_like, params)
-        return Accumulated(jnp.zeros((), jnp.int32), zeros, optimiser.init(params))
+    def count_batches(step: Array) -> Array:
+        return jnp.minimum(accumulate, batches_per_epoch - step % per_epoch * accumulate)
 
-    def update(
-        updates: PyTree, state: Any, params: PyTree | None = None
-    ) -> tuple[PyTree, Accumulated]:
-        total = jax.tree.map(jnp.add, state.gradient, updates)
-        mean = jax.tree.map(lambda each: each / accumulate, total)
-        step, after = optimiser.update(mean, state.optimiser, params)
-        number = state.batch % batches_per_epoch + 1
-        is_last = (number % accumulate == 0) | (number == batches_per_epoch)
-
-        def chosen(stepped: PyTree, waiting: PyTree) -> PyTree:
-            return jax.tree.map(lambda *each: jnp.where(is_last, *each), stepped, waiting)
-
-        zeros = jax.tree.map(jnp.zeros_like, total)
-        return chosen(step, zeros), Accumulated(
-            state.batch + 1, chosen(zeros, total), chosen(after, state.optimiser)
-        )
-
-    return optax.GradientTransformation(init, update)
+    of_mean = optax.chain(optax.scale(1 / accumulate), optimiser)
+    several = optax.MultiSteps(
+        of_mean, count_batches, use_grad_mean=False, accumulator_dtype=jnp.dtype(float)
+    )
+    return several.gradient_transformation()

@@ -27,6 +27,7 @@ from crisalad_jax.training.mining import Mined
 from crisalad_jax.training.step import TrainState
 from crisalad_jax.utils.files import read_json, wrap_os_errors, write_json
 from crisalad_jax.utils.locks import lock
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remove_temporaries
 
 SAVE_SECONDS = 300
@@ -78,8 +79,6 @@ class RunFiles:
     def __init__(self, out: pathlib.Path, config: TrainConfig, record: RunRecord) -> None:
         """Take the folder, which `load` acquires, and the record of a run before its first step."""
         self.out, self.record, self._config = out, record, config
-        self.is_extended = False
-        """Whether the configuration gives more epochs than the run had before."""
         self._opened = contextlib.ExitStack()
         self._saved: RunRecord | None = None
         self._saved_at = time.monotonic()
@@ -110,7 +109,7 @@ class RunFiles:
 
     def _load(self, state: RunState) -> RunState:
         out, config = self.out, self._config
-        self.is_extended = check_run(out, config)
+        has_fewer_epochs = check_run(out, config)
         with contextlib.ExitStack() as opened:
             opened.enter_context(lock(out))
             if not (out / "config.json").exists():
@@ -128,8 +127,8 @@ class RunFiles:
                 self._saved = copy.deepcopy(self.record)
             step, validated = self.record.step, self.record.validated
             with wrap_os_errors(out):
-                if self.is_extended:
-                    extend_run(out, config, step)
+                if has_fewer_epochs:
+                    extend_run(out, config, self.record)
                 self._drop_old_best()
                 # A validation after the saved state will be repeated, so its line is dropped.
                 self._log = MetricsLog(out, keep_up_to=step, validated=validated)
@@ -202,23 +201,31 @@ def _check_start(
     )
 
 
-def extend_run(out: pathlib.Path, config: TrainConfig, step: int) -> None:
+def extend_run(out: pathlib.Path, config: TrainConfig, record: RunRecord) -> None:
     """Write the configuration of a run that resumes for more epochs, and how it came to them.
 
     `epochs.json` lists the epochs that the run had before, each with the step that it had come to.
+    A warning says if the learning rate is not that of a run that had them from the start.
 
     Args:
         out: the run's folder.
         config: its configuration, with more epochs than the one there.
-        step: the step that it resumes from.
+        record: what it resumes from.
     """
     path, history = out / "config.json", out / "epochs.json"
     before = read_config(TrainConfig, path).epochs
     known = read_json(history, "the epochs of a run")["before"] if history.exists() else []
     # After a kill between the two files, the last entry is there already.
     known = [each for each in known if each["epochs"] != before]
-    write_json(history, {"before": [*known, {"epochs": before, "step": step}]})
+    write_json(history, {"before": [*known, {"epochs": before, "step": record.step}]})
     write_json(path, to_plain(config))
+    falls = config.optimiser.schedule == "linear" and config.optimiser.decay_steps is None
+    if falls and record.step and not record.stopped_early:
+        warn(
+            f"{out}: the learning rate falls over the whole run, so that it jumps at step "
+            f"{record.step}: this is not the run of {config.epochs} epochs at once; "
+            "--optimiser.decay-steps keeps a fall's length"
+        )
 
 
 def check_run(out: pathlib.Path, config: TrainConfig) -> bool:

@@ -1,29 +1,127 @@
-"""The parameters that a run starts from: a whole model, a backbone, or random numbers."""
+"""What a run reads before its first step: its images, and the parameters that it starts from."""
 
-import functools
 import os
+import pathlib
+from typing import Any
 
 import jax
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.public import with_backbone_of
 from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.config.checks import require
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.images import OnBadImage
-from crisalad_jax.data.places import Places
-from crisalad_jax.data.query_set import QuerySet
+from crisalad_jax.data.places import Places, read_places
+from crisalad_jax.data.query_set import QuerySet, read_query_set
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.training import distributed
 from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.run_files import check_run
 from crisalad_jax.training.vocabulary import with_vocabulary
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
+
+Path = str | os.PathLike[str]
+
+
+RunInputs = tuple[Places | QuerySet, Benchmark | None, Crisalad | None]
+"""The training set, the validation set, and the parameters to start from, as `fit` takes them."""
+
+
+def read_inputs(
+    config: TrainConfig,
+    data: Path,
+    out: Path,
+    *,
+    images: Path | None = None,
+    validation: Path | None = None,
+    validation_images: Path | None = None,
+    weights: Path | None = None,
+    backbone: Path | None = None,
+    on_bad_image: OnBadImage = "stop",
+    quiet: bool = False,
+    **grouping: Any,
+) -> RunInputs:
+    """Read the training set, the validation set and the start of a run; see `experiments.train`.
+
+    All processes call it together. Without `weights`, an aggregator's centroids are fitted to the
+    training images.
+
+    Args:
+        config: the run's.
+        data: the training set.
+        out: folder of the run, which is checked first.
+        images: folder of the images that a file of queries names.
+        validation: evaluation set.
+        validation_images: folder of the images that a file at `validation` names.
+        weights: see `read_start`.
+        backbone: see `read_start`.
+        on_bad_image: "stop", or "skip" to leave unreadable images out.
+        quiet: no progress bars.
+        **grouping: how images become places; see `read_places`.
+
+    Returns:
+        (places, validation, initial).
+
+    Raises:
+        InputError: in every process, where one cannot read its files or they do not fit.
+    """
+    quiet = quiet or not distributed.is_primary()
+
+    def read() -> RunInputs:
+        initial = read_start(config, weights=weights, backbone=backbone, quiet=quiet)
+        places = _read_set(config, data, images, on_bad_image, grouping)
+        if validation is None:
+            require(
+                validation_images is None, "--val-images: found no --val, expected both or none"
+            )
+            return places, None, initial
+        how: Any = {"images": validation_images, "on_bad_image": on_bad_image}
+        return places, open_benchmark(validation, **how), initial
+
+    distributed.run_on_primary(lambda: check_run(pathlib.Path(out), config))
+    places, benchmark, initial = distributed.raise_together(read)
+    if weights is None and config.model.aggregator.trainable:
+        how: Any = {"on_bad_image": on_bad_image, "quiet": quiet}
+        initial = with_vocabulary_of(initial, config, places, **how)
+    return places, benchmark, initial
+
+
+def _read_set(
+    config: TrainConfig,
+    data: Path,
+    images: Path | None,
+    on_bad_image: OnBadImage,
+    grouping: dict[str, Any],
+) -> Places | QuerySet:
+    """Read the training set: places, or queries of which tuples are mined."""
+    unused = grouping if config.mines else {"data_images": images}
+    given = [f"--{name.replace('_', '-')}" for name, value in unused.items() if value is not None]
+    what = "mines tuples of queries" if config.mines else "trains on places"
+    expected = f"found for a recipe that {what}, expected no such flag"
+    require(not given, f"{', '.join(given)}: {expected}")
+    if config.mines:
+        return read_query_set(
+            data,
+            positive_radius=config.mining.positive_radius,
+            negative_radius=config.mining.negative_radius,
+            images=images,
+            on_bad_image=on_bad_image,
+        )
+    return read_places(
+        data,
+        cities=config.cities,
+        min_images=config.min_images_of_place,
+        on_bad_image=on_bad_image,
+        **grouping,
+    )
 
 
 def read_start(
     config: TrainConfig,
     *,
-    weights: str | os.PathLike[str] | None = None,
-    backbone: str | os.PathLike[str] | None = None,
+    weights: Path | None = None,
+    backbone: Path | None = None,
     quiet: bool = False,
 ) -> Crisalad | None:
     """Read the parameters that a run starts from.
@@ -43,9 +141,9 @@ def read_start(
     Raises:
         InputError: both are given, or a file cannot be read or does not fit the model.
     """
+    both = weights is not None and backbone is not None
+    require(not both, "--backbone: found beside --weights, expected only one of the two")
     if weights is not None:
-        if backbone is not None:
-            raise InputError("--backbone: found beside --weights, expected only one of the two")
         file = find_weights(weights, quiet=quiet)
         params, theirs = load_weights(file, expected=config.model)
         if theirs.images_in_words != config.model.images_in_words:
@@ -92,12 +190,10 @@ def with_vocabulary_of(
     if initial is None:
         initial = init_crisalad(jax.random.key(config.seed), config.model)
     count = places.database if isinstance(places, QuerySet) else len(places.files)
-    build = functools.partial(
-        with_vocabulary,
-        *(Model(initial, config.model), [places.path(image) for image in range(count)]),
-        images=config.model.aggregator.centroid_images,
-        seed=config.seed,
-        on_bad_image=on_bad_image,
-        quiet=quiet or not distributed.is_primary(),
+    model, paths = Model(initial, config.model), [places.path(image) for image in range(count)]
+    images, seed = config.model.aggregator.centroid_images, config.seed
+    how: Any = {"on_bad_image": on_bad_image, "quiet": quiet}
+    fitted = distributed.raise_together(
+        lambda: with_vocabulary(model, paths, images=images, seed=seed, **how)
     )
-    return distributed.broadcast(distributed.raise_together(build))
+    return distributed.broadcast(fitted)

@@ -13,16 +13,11 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt8
 
-from crisalad_jax.config.checks import takes
+from crisalad_jax.config.checks import require, takes
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.layers import split_key, split_statistics
-from crisalad_jax.nn.model import (
-    Crisalad,
-    attend_across_images,
-    tokens_and_statistics,
-    valid_mask,
-)
+from crisalad_jax.nn.layers import split_statistics
+from crisalad_jax.nn.model import Crisalad, describe_training_batch
 from crisalad_jax.nn.pixels import check_pixels
 from crisalad_jax.nn.tokens import TransportStatistics
 from crisalad_jax.training import distributed
@@ -158,7 +153,8 @@ def init_train_state(
         (state, frozen). The state is a copy, so `params` stay of use.
 
     Raises:
-        InputError: what `split_params` raises; or the loss needs a key, or classes.
+        InputError: what `split_params` raises; nothing of the model trains, as of AnyLoc's, whose
+            vocabulary fits one backbone; or the loss needs a key, or classes.
 
     Example:
         >>> import jax
@@ -174,6 +170,12 @@ def init_train_state(
         if isinstance(config.optimiser, OptimiserConfig) and distributed.is_primary():
             warn_of_long_warmup(config.optimiser, config.steps, config.steps_per_epoch)
         chosen, frozen = split_params(params, config.model, trainable)
+        require(
+            config.model.aggregator.trainable and bool(jax.tree.leaves(chosen)),
+            f"trainable: found {trainable}, of which backbone {config.model.backbone.part_name} "
+            f"with aggregator {config.model.aggregator.part_name} trains nothing, expected another "
+            "(`crisalad vocabulary` makes AnyLoc's models)",
+        )
         statistics = None
         if config.batch_norm == "batch":
             statistics, frozen = split_statistics(frozen)
@@ -308,7 +310,7 @@ def train_step(
     and `Metrics.updated` is False. Passed to the next step as `proceed`, it skips that step too. So
     a loop may read metrics one step late, and still have the state before the failed step.
     """
-    tokens_key, cross_key = split_key(jax.random.fold_in(key, state.step), 2)
+    dropout_key = jax.random.fold_in(key, state.step)
     group = state.step // config.steps_per_epoch % max(len(config.classes), 1)
     classifier = None
     if state.classifiers is not None:
@@ -322,30 +324,24 @@ def train_step(
         learnt, classifier = trained
         params = eqx.combine(learnt, statistics, frozen)
         updates_statistics = bool(jax.tree.leaves(statistics))
-        # The two halves of `describe`, because the tokens carry the transport's statistics.
-        tokens, measured = tokens_and_statistics(
+        descriptors, tokens, measured = describe_training_batch(
             params,
             images,
             config.model,
-            valid=valid if updates_statistics else None,
-            key=tokens_key,
+            valid=all_valid,
+            measured=valid if updates_statistics else None,
+            key=dropout_key,
             micro_batch=config.micro_batch,
-        )
-        descriptors = attend_across_images(
-            params, tokens, config.model, mask=valid_mask(all_valid), key=cross_key
         )
         descriptors = devices.gather_images(descriptors)
         reads_dense = config.loss.kind.reads_dense
         dense = devices.gather_images(tokens.dense) if reads_dense else None
-        loss = functools.partial(_loss, config=config)
+        compute = functools.partial(_loss, config=config)
         if len(all_labels) <= WHOLE_LOSS:
-            loss = devices.whole_on_each(loss)
-        result = loss(descriptors, dense, all_labels, all_valid, classifier, group)
-        return result.loss, (
-            result,
-            tokens.transport,
-            measured if updates_statistics else statistics,
-        )
+            compute = devices.whole_on_each(compute)
+        result = compute(descriptors, dense, all_labels, all_valid, classifier, group)
+        updated = measured if updates_statistics else statistics
+        return result.loss, (result, tokens.transport, updated)
 
     (loss, (result, transport, statistics)), (gradient, classifier_gradient) = jax.value_and_grad(
         loss_of, has_aux=True

@@ -89,10 +89,9 @@ class Trainer:
         self.state = _copied(self._place(state))
 
     def on_devices(self, batches: Iterator[ImageBatch]) -> Generator[Batch, None, None]:
-        """Yield batches on the devices, each copied while they compute the one before."""
-        yield from one_ahead(
-            self._batch(batch.images, batch.labels, batch.valid) for batch in batches
-        )
+        """Return batches on the devices, each copied while they compute the one before."""
+        placed = (self._batch(batch.images, batch.labels, batch.valid) for batch in batches)
+        return one_ahead(placed)
 
     def start_step(self, batch: Batch | None, waited: float) -> None:
         """Start a step, while the devices may still compute the one before.

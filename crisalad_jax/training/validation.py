@@ -59,14 +59,11 @@ class Validator:
         if benchmark is not None:
             benchmark.ground_truth()
         self._config, self._benchmark = config, benchmark
+        self.name = "" if benchmark is None else benchmark.name
+        """Name of the benchmark."""
         size = config.validation_size or config.model.image_size
         self._model = dataclasses.replace(config.model, image_size=size)
         self._reading = Reading(on_bad_image=on_bad_image, cache=cache, quiet=True)
-
-    @property
-    def name(self) -> str:
-        """Name of the benchmark."""
-        return "" if self._benchmark is None else self._benchmark.name
 
     def is_due(self, step: int, steps_per_epoch: int, *, last: int) -> bool:
         """Return whether the epoch that ends with this step needs a validation.

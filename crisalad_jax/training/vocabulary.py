@@ -25,14 +25,13 @@ from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.nn.aggregators import AGGREGATORS
-from crisalad_jax.nn.backbones import FeatureSpec
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, cast_params, init_crisalad, unit_features
 from crisalad_jax.retrieval.chunks import sample
 from crisalad_jax.training.recipes import RECIPES, mines_tuples, recipe
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import devices_for
-from crisalad_jax.utils.files import check_source, check_target
+from crisalad_jax.utils.files import check_target
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import progress_bar
 
@@ -160,8 +159,6 @@ def start_vocabulary(
         )
     part = dataclasses.replace(part, **(fields or {}))
     config = dataclasses.replace(config, aggregator=part).resized(image_size, resize)
-    if backbone is not None:
-        check_source(backbone, "a checkpoint")  # drawing parameters takes seconds
     params = init_crisalad(jax.random.key(seed), config)
     if backbone is not None:
         params = with_backbone_of(params, config, backbone)
@@ -229,27 +226,6 @@ def build_vocabulary(
     save_weights(out, Model(params, model.config))
     words = model.config.aggregator.count_centroids(model.config.backbone.dim)
     return Vocabulary(params, words, min(max_images, len(paths)))
-
-
-def vocabulary_words(config: ModelConfig) -> str:
-    """Name an aggregator, and the features of its vocabulary if they are not the last.
-
-    Args:
-        config: the model.
-
-    Returns:
-        A few words.
-
-    Example:
-        >>> from crisalad_jax import recipe
-        >>> vocabulary_words(recipe("b14", "anyloc").model)
-        'anyloc (value of block 3)'
-    """
-    name, request = config.aggregator.part_name, config.aggregator.features(config.backbone.depth)
-    if request.levels is None:
-        return name if request == FeatureSpec() else f"{name} ({request.facet})"
-    blocks = ", ".join(str(level - 1) for level in request.levels)
-    return f"{name} ({request.facet} of block {blocks})"
 
 
 def _check_vocabulary(config: ModelConfig) -> None:

@@ -29,7 +29,7 @@ def test_it_leaves_a_whole_model(capfd, shared, tmp_path):
     save_weights(start, Model(fresh, ANYLOC))
     command = ("vocabulary", "--weights", start, "--images", shared / "town", "--out", out)
     said = succeeds(capfd, *command, "--seed", 3, "--batch-size", BATCH, "--quiet")
-    words = "anyloc (key of block 0), 4 words from 12 images"
+    words = "anyloc, 4 words from 12 images"
     assert said == f"{out}: {words} {AT}, descriptors of 128 numbers"
     found, config = load_weights(out)
     assert config == ANYLOC

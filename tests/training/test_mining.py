@@ -403,7 +403,7 @@ def test_training_reads_the_set_as_configured(street, tmp_path, monkeypatch):
         asked.update(options, data=data)
         raise InputError("read")
 
-    monkeypatch.setattr("crisalad_jax.experiments.train.read_query_set", read)
+    monkeypatch.setattr("crisalad_jax.training.start.read_query_set", read)
     mining = dataclasses.replace(CONFIG.mining, positive_radius=4.0, negative_radius=50.0)
     config = dataclasses.replace(CONFIG, mining=mining, epochs=1)
     file = tmp_path / "set.mat"

@@ -47,28 +47,28 @@ BOQ = recipe("b14", "boq").optimiser
     [
         (
             *(OptimiserConfig(warmup_steps=30), 32, 1),
-            *("steps: found 30 for a run of 32 steps, which leaves 2 at .*; at most 8 steps", 8),
+            *("steps: found 30 steps for a run of 32, which leaves 2 at .*; at most 8 would", 8),
         ),
         (
             *(OptimiserConfig(warmup_steps=30), 3, 1),
-            *("steps: found 30 for a run of 3 steps, which leaves 0 at [^;]* and its decay$", 0),
+            *("steps: found 30 steps for a run of 3, which leaves 0 at .*; at most 0 would", 0),
         ),
         (OptimiserConfig(warmup_steps=30), 150, 1, None, None),
         (OptimiserConfig(warmup_steps=9), 36, 1, None, None),
         (OptimiserConfig(), 1, 1, None, None),
         (
             *(BOQ, 5 * 7, 7),
-            *("epochs: found 10, which are 70 steps, for a run of 35 steps, which leaves 0 at", 8),
+            *("epochs: found 70 steps for a run of 35, which leaves 0 at", 8),
         ),
         (BOQ, 40 * 7, 7, None, None),
         # Twenty epochs of 7 batches are 40 of the optimiser's steps, and 10 epochs of them 20.
         (
             *(OptimiserConfig(warmup_steps=20, accumulate=4), 20 * 7, 7),
-            *("steps: found 20 for a run of 40 steps, which leaves 20 at .*; at most 10 steps", 10),
+            *("steps: found 20 steps for a run of 40, which leaves 20 at .*; at most 10 would", 10),
         ),
         (
             *(OptimiserConfig(warmup_epochs=10, accumulate=4), 20 * 7, 7),
-            *("epochs: found 10, which are 20 steps, for a run of 40 steps", 10),
+            *("epochs: found 20 steps for a run of 40", 10),
         ),
     ],
 )
@@ -90,7 +90,7 @@ def test_it_is_told_once_and_before_the_first_step(shared, tmp_path, monkeypatch
     config = dataclasses.replace(RECIPE, optimiser=OptimiserConfig(warmup_steps=STEPS))
     places = read_places(shared / "city", min_images=2)
     fail_at(monkeypatch, "train_step", 1)
-    note = f"found {STEPS} for a run of {STEPS} steps"
+    note = f"found {STEPS} steps for a run of {STEPS}"
     with pytest.warns(Note, match=note) as caught, pytest.raises(Interrupted):
         fit(config, places, tmp_path / "run", quiet=True)
     assert len([each for each in caught if each.category is Note]) == 1
@@ -220,10 +220,6 @@ def test_several_batches_share_a_step_and_its_learning_rate(epoch: int) -> None:
         ),
         ({"accumulate": 0}, r"OptimiserConfig\.accumulate: found 0, expected more than 0"),
         ({"clip_value": 0.0}, r"OptimiserConfig\.clip_value: found 0\.0, expected more than 0"),
-        (
-            {"clip_value": 0.5, "clip_norm": 1.0},
-            r"clip_value: found 0\.5, expected None",
-        ),
         ({"momentum": 1.0}, r"OptimiserConfig\.momentum: found 1\.0"),
     ],
 )

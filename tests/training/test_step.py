@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 from typing import Literal
 
 import jax
@@ -589,14 +590,14 @@ def test_a_classification_by_hand_trains_its_vectors() -> None:
 @pytest.mark.parametrize(
     ("classes", "key", "words"),
     [
-        ((), jax.random.key(0), "^classes: found none for loss large-margin-cosine, which class"),
-        ((3,), None, "^key: found None for loss large-margin-cosine, which has parameters, exp"),
+        ((), jax.random.key(0), "large-margin-cosine: found a key and classes (), expected"),
+        ((3,), None, "large-margin-cosine: found no key and classes (3,), expected"),
     ],
 )
 def test_a_classification_needs_classes_and_a_key(params, classes, key, words) -> None:
     loss = LossConfig(kind="large-margin-cosine", miner="none")
     static = step_config(TrainConfig(model=MODEL, loss=loss), steps=5, classes=classes)
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=re.escape(words)):
         init_train_state(params, "head", static, key=key)
 
 

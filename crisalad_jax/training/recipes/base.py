@@ -206,14 +206,10 @@ def find_part(
         'newton'
     """
     kind, colon, part = name.rpartition(":")
-
-    def matches() -> list[str]:
-        kinds = [each for each in _KINDS if each == kind or not colon]
-        return [each for each in kinds if part in REGISTRIES[each]]
-
-    if not matches():
+    kinds = [each for each in _KINDS if each == kind or not colon]
+    if not any(part in REGISTRIES[each] for each in kinds):
         load_entry_points()
-    found = matches()
+    found = [each for each in kinds if part in REGISTRIES[each]]
     require(
         bool(found),
         f"{what}: found {name!r}, expected one of {', '.join(sorted(others))}, or a registered "
@@ -294,11 +290,8 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
     augmentation = config.augmentation
     if type(augmentation).__module__.startswith("crisalad_jax."):
         augmentation = LightAugmentConfig(colour=0.4, gamma=0.5, illumination=0.6)
-    batches = {
-        "places_per_batch": TrainConfig.places_per_batch,
-        "images_per_place": 2,
-        "min_images": 2,
-    }
+    places = TrainConfig.places_per_batch
+    batches = {"places_per_batch": places, "images_per_place": 2, "min_images": 2}
     return dataclasses.replace(
         config,
         model=dataclasses.replace(config.model, compute_dtype="float32"),
