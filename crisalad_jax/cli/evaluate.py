@@ -73,6 +73,7 @@ def run(arguments: Evaluate) -> None:
     drawn = pick(arguments, "seed", "seeds", "precision")
     check_evaluation(groupings, **drawn)
     _check_flags(arguments)
+    reading = arguments.reading
     rerank = _reranking(arguments)
     benchmark = open_set(arguments)
     if arguments.preset is not None:
@@ -91,7 +92,7 @@ def run(arguments: Evaluate) -> None:
         pca=pca,
         observe=None if arguments.report is None else similarities,
         rerank=rerank,
-        reading=arguments.reading,
+        reading=reading,
         **drawn,
     )
     asked = {"weights": arguments.weights or file} | pick(

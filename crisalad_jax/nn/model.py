@@ -192,28 +192,24 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
     return jax.tree_util.tree_map_with_path(cast, params)
 
 
-def _of_images(*static: str) -> Callable[[_F], _F]:
-    """Make a decorator that compiles a function of images, which knows the devices they are on.
+def _of_images(function: _F) -> _F:
+    """Make a compiled function of images know the devices that they are on.
 
-    The pixels' values, which a trace does not know, are checked before the compiled function runs.
+    The pixels' values, which a trace does not know, are checked before it is called.
     """
+    spread = over_images("images", 1)(function)
 
-    def decorate(function: _F) -> _F:
-        compiled = compiler.jit(function, static_argnames=("config", *static))
-        spread = over_images("images", 1)(compiled)
+    @takes(params=Crisalad, config=ModelConfig)
+    @functools.wraps(spread)
+    def call(params: Any, images: Any, config: Any, **options: Any) -> Any:
+        check_pixels(images, config.preprocessing)
+        return spread(params, images, config, **options)
 
-        @takes(params=Crisalad, config=ModelConfig)
-        @functools.wraps(spread)
-        def call(params: Any, images: Any, config: Any, **options: Any) -> Any:
-            check_pixels(images, config.preprocessing)
-            return spread(params, images, config, **options)
-
-        return cast(_F, call)
-
-    return decorate
+    return cast(_F, call)
 
 
-@_of_images("micro_batch")
+@_of_images
+@functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
 def describe(
     params: Crisalad,
     images: Images,
@@ -265,7 +261,8 @@ def describe(
     return attend_across_images(params, tokens, config, mask=mask, key=cross_key)
 
 
-@_of_images("micro_batch")
+@_of_images
+@functools.partial(compiler.jit, static_argnames=("config", "micro_batch"))
 def extract_tokens(
     params: Crisalad,
     images: Images,
@@ -405,7 +402,8 @@ def _tokens_in_parts(
     return jax.tree.map(join, tokens), statistics
 
 
-@_of_images()
+@_of_images
+@functools.partial(compiler.jit, static_argnames="config")
 def extract_features(params: Crisalad, images: Images, config: ModelConfig) -> Features:
     """Extract the features of every image that the aggregator requests.
 
@@ -474,7 +472,8 @@ def _widened(params: Crisalad, config: ModelConfig) -> Crisalad:
     return cast_params(params, config) if config.compute_dtype == "float64" else params
 
 
-@_of_images()
+@_of_images
+@functools.partial(compiler.jit, static_argnames="config")
 def unit_features(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image patch dim"]:
@@ -592,7 +591,8 @@ def describe_training_batch(
     return descriptors, tokens, statistics
 
 
-@_of_images()
+@_of_images
+@functools.partial(compiler.jit, static_argnames="config")
 def transport_masses(
     params: Crisalad, images: Images, config: ModelConfig
 ) -> Float[Array, "image patch column"]:

@@ -469,7 +469,10 @@ def test_convert_refuses_in_one_line(capfd, tmp_path, public):
     for arguments, words in (
         ((public, tmp_path / "x.pth"), ("x.pth: found the suffix '.pth', expected .safetensors",)),
         ((tmp_path / "none", tmp_path / "x.safetensors"), ("none: found no such file",)),
-        ((public, tmp_path / "x.safetensors", "--format", "timm"), ("format: found 'timm'",)),
+        (
+            (public, tmp_path / "x.safetensors", "--format", "timm"),
+            ("found a public checkpoint (dinov2) and format",),
+        ),
         ((public,), ("DST",)),
     ):
         fails(capfd, "convert", *arguments, words=words)
@@ -643,6 +646,7 @@ def test_extract_writes_descriptors_names_and_configuration(
         "grouping": "single",
         "batch_size": BATCH,
         "seed": 0,
+        "fps": None,
         "pca": None,
         "skipped": [],
         "model": to_plain(MODEL),

@@ -52,7 +52,7 @@ def test_flags_reach_the_reader(capfd, tmp_path, shared, streets, weights):
     town = (*start, "--data", shared / "town")
     for flag, value in (("--frames", "2"), ("--max-heading-difference", "40.0"), ("--images", "a")):
         option = flag[2:].replace("-", "_")
-        words = (f"/town: found {option} for a folder of @UTM", "which takes split, radius")
+        words = (f"/town: found {option} for the layout utm, which takes split, radius",)
         fails(capfd, *town, flag, value, words=words)
     words = ("test: found database/, queries/, expected a folder queries_night",)
     fails(capfd, *town, "--queries", "queries_night", words=words)

@@ -126,8 +126,7 @@ def test_fields_that_nothing_uses_are_not_compared(found, expected, count):
 
 
 def test_fields_that_nothing_uses_are_not_checked():
-    CrossImageConfig(layers=0, heads=0, feedforward=0)
-    AdapterConfig(kind="none", bottleneck=0.0, kernel_size=2)
+    AdapterConfig(kind="none", kernel_size=2)
     AdapterConfig(kind="mlp", kernel_size=2)
     MiningConfig(negatives=5, candidates=1)
     dataclasses.replace(LOCAL, deviation=(0.0, 0.0, 0.0))

@@ -253,10 +253,7 @@ def test_differences_are_told_of_names_shapes_and_types() -> None:
 
 
 PICTURES: dict[str, tuple[Any, str]] = {
-    "a list": (
-        list(IMAGES),
-        "found list, expected an array of shape (image, height, width, 3) (np",
-    ),
+    "a list": (list(IMAGES), "found list, expected an array of shape (image, height, width, 3)"),
     "a name": ("a.jpg", "found str, expected an array of shape (image, height, width, 3)"),
     "one image": (IMAGES[0], "found uint8 of shape (42, 56, 3), expected uint8 pixels, or floats"),
     "channels": (IMAGES[..., :1], "found uint8 of shape (2, 42, 56, 1), expected"),

@@ -223,17 +223,23 @@ class EdtFormerConfig(Aggregator):
     def apply(
         self, params: EdtFormer, features: Features, grid: Grid, *, key: Keys | None
     ) -> Tokens:
-        """Return a token of `channels` numbers for each row.
-
-        The first layer's self-attention does not depend on the image: it runs once for a batch.
-        """
-        whole = jnp.concatenate([features.class_token[..., None, :], features.patches], axis=-2)
-        memory = linear(params.fc, whole)
-        queries = params.queries.astype(memory.dtype)
-        for layer in params.layers:
-            queries = queries + attention(layer.self_attn, queries, self.heads)
-            queries = layer_norm(layer.norm1, queries)
-            queries = queries + cross_attention(layer.multihead_attn, queries, memory, self.heads)
-            queries = layer_norm(layer.norm2, queries)
-        channels = linear(params.channel_proj, queries).swapaxes(-2, -1)
+        """Return a token of `channels` numbers for each row."""
+        answers = decode(params, features, self.heads)
+        channels = linear(params.channel_proj, answers).swapaxes(-2, -1)
         return Tokens.of_local(at_least_float32(linear(params.row_proj, channels)).swapaxes(-2, -1))
+
+
+def decode(params: EdtFormer, features: Features, heads: int) -> Float[Array, "*batch query width"]:
+    """Ask the class token and all patches.
+
+    The first layer's self-attention does not depend on the image: it runs once for a whole batch.
+    """
+    whole = jnp.concatenate([features.class_token[..., None, :], features.patches], axis=-2)
+    memory = linear(params.fc, whole)
+    queries = params.queries.astype(memory.dtype)
+    for layer in params.layers:
+        queries = queries + attention(layer.self_attn, queries, heads)
+        queries = layer_norm(layer.norm1, queries)
+        queries = queries + cross_attention(layer.multihead_attn, queries, memory, heads)
+        queries = layer_norm(layer.norm2, queries)
+    return queries

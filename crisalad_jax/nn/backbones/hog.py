@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from crisalad_jax.config.checks import require
+from crisalad_jax.config.checks import require, require_range
 from crisalad_jax.nn.backbones.base import (
     BACKBONES,
     Backbone,
@@ -37,10 +37,14 @@ class HogConfig(Backbone):
     class token is the descriptor. Images are bytes, with a mean of 0 and a deviation of 1/255.
     """
 
-    # Annotated anew so that they are no fields.
-    dim: ClassVar[int] = _DIM  # pyright: ignore[reportIncompatibleVariableOverride]
-    depth: ClassVar[int] = 1  # pyright: ignore[reportIncompatibleVariableOverride]
+    dim: int = _DIM
+    depth: int = 1
     patch_size: ClassVar[int] = _SIDE
+
+    def __post_init__(self) -> None:
+        """Check that its sizes are the only ones."""
+        require_range(self, _DIM, _DIM, "dim")
+        require_range(self, 1, 1, "depth")
 
     def grid(self, image_size: tuple[int, int]) -> Grid:
         """Return 1 x 1: the whole image is one patch."""
