@@ -244,7 +244,7 @@ def test_each_generation_keeps_to_its_layouts() -> None:
     for layout in ("dinov2", "huggingface"):
         with pytest.raises(InputError, match="found a model of backbone dinov3, expected vit"):
             check_holds(BACKBONE, layout)
-    with pytest.raises(InputError, match="expected aggregator class-token, backbone dinov3,"):
+    with pytest.raises(InputError, match="found a model of backbone vit, expected dinov3"):
         check_holds(dataclasses.replace(BACKBONE, backbone="vit"), "huggingface-dinov3")
     with pytest.raises(InputError, match="expected aggregator any, backbone vit or resnet or vgg"):
         check_holds(BACKBONE, "reference")
