@@ -8,7 +8,6 @@ import argparse
 import collections
 import enum
 import pathlib
-import subprocess
 import warnings
 from typing import Any
 
@@ -23,6 +22,7 @@ from crisalad_jax.nn.backbones.base import FeatureSpec
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from parity.reference.vit import ViT
+from tests.checkpoints.test_public import Opens
 from tests.conftest import assert_equal
 from tests.random_checkpoints import (
     bare_vit,
@@ -63,10 +63,8 @@ class Lightning(nn.Module):
 
 WRAPPED = {
     "compiled": lambda net: torch.compile(net),
-    "compiled, parallel": lambda net: nn.DataParallel(torch.compile(net)),
     "parallel, compiled": lambda net: torch.compile(nn.DataParallel(net)),
     "Lightning": Lightning,
-    "compiled in Lightning": lambda net: Lightning(torch.compile(net)),
     "all of it twice": lambda net: torch.compile(
         nn.DataParallel(Lightning(torch.compile(nn.DataParallel(Lightning(net)))))
     ),
@@ -172,18 +170,8 @@ def test_weights_in_a_defaultdict_are_weights(tmp_path: pathlib.Path) -> None:
     assert_equal(found.params, plain.params)
 
 
-class Runs:
-    """What an attacker puts beside weights: unpickling it would run a command."""
-
-    def __init__(self, path: pathlib.Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> Any:
-        return subprocess.check_call, (["touch", str(self.path)],)
-
-
 def test_nothing_of_a_file_is_run(tmp_path: pathlib.Path) -> None:
-    content = {"args": Runs(tmp_path / "made"), "model": network().state_dict()}
+    content = {"args": Opens(tmp_path / "made"), "model": network().state_dict()}
     read_quietly(save(tmp_path / "file.pth", content))
     assert not (tmp_path / "made").exists()
 

@@ -17,6 +17,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.utils.errors import InputError
 from parity.reference.model import Crisalad
+from tests.random_checkpoints import blank
 
 CHILDREN = {"0": "conv1", "1": "bn1"} | {str(4 + i): f"layer{1 + i}" for i in range(4)}
 """torchvision's names of a ResNet's children, by their places."""
@@ -83,13 +84,5 @@ def test_vgg_16s_names_and_shapes() -> None:
     # 13 convolutions and 3 linear layers; 138,357,544 parameters, as torchvision's page says.
     assert len(shapes) == 32
     assert sum(int(np.prod(shape)) for shape in shapes.values()) == 138_357_544
-    blank = {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
-    layout, found = infer(blank, source="vgg16.pth")
+    layout, found = infer(blank(shapes), source="vgg16.pth")
     assert (layout, found.backbone) == ("torchvision-vgg", VggConfig())
-
-
-def test_another_resnet_is_told(tmp_path: pathlib.Path) -> None:
-    _, state = resnet(counts=True)
-    torch.save({n: x for n, x in state.items() if "layer2.1" not in n}, tmp_path / "odd.pth")
-    with pytest.raises(InputError, match=r"found a ResNet of \(2, 1, 2, 2\) blocks of two conv"):
-        read_checkpoint(tmp_path / "odd.pth")
