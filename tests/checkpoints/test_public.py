@@ -35,7 +35,6 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, describe, init_crisalad, self_mask
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
-from parity import zoo
 from tests.checkpoints.test_weights import put
 from tests.conftest import MODEL, assert_equal, random_params
 from tests.random_checkpoints import (
@@ -114,25 +113,16 @@ def test_there_and_back_are_the_same_bytes(tmp_path: pathlib.Path, name: str) ->
     there_and_back(tmp_path, written(tmp_path, name), WIDTHS[name])
 
 
-@pytest.mark.parametrize("format", ["salad-indoor", "cosplace"])
-def test_indoor_vprs_files_are_the_same_network_within_a_module(
-    tmp_path: pathlib.Path, format: str
-) -> None:
-    if format == "salad-indoor":
-        state = random_state(SMALL["dino-salad"])
-    else:
-        arrays = zoo.random_state("cosplace_resnet18_512")
-        state = {name: torch.tensor(array) for name, array in arrays.items()}
+def test_indoor_vprs_file_is_the_same_network_within_a_module(tmp_path: pathlib.Path) -> None:
+    state, format = random_state(SMALL["dino-salad"]), "salad-indoor"
     outside = read_checkpoint(save(tmp_path / "plain.pth", state))
     within = save(tmp_path / "within.pth", {f"model.{name}": x for name, x in state.items()})
     inside = read_checkpoint(within)
     assert inside.format == format
-    assert inside.config.aggregator == outside.config.aggregator
     assert_equal(inside.params, outside.params)
-    if format == "salad-indoor":
-        convert(within, tmp_path / "ours.safetensors")
-        convert(tmp_path / "ours.safetensors", tmp_path / "back.pth", format)
-        assert (tmp_path / "back.pth").read_bytes() == within.read_bytes()
+    convert(within, tmp_path / "ours.safetensors")
+    convert(tmp_path / "ours.safetensors", tmp_path / "back.pth", format)
+    assert (tmp_path / "back.pth").read_bytes() == within.read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -141,11 +131,6 @@ def test_indoor_vprs_files_are_the_same_network_within_a_module(
         ("dinov2_vits14_reg4", 384),
         pytest.param("dino_salad", 8448, marks=pytest.mark.slow),
         pytest.param("CricaVPR", 10752, marks=pytest.mark.slow),
-        pytest.param("dinov2_vitb14", 768, marks=pytest.mark.slow),
-        pytest.param("dinov2_vitb14_reg4", 768, marks=pytest.mark.slow),
-        pytest.param("dinov2_vitl14", 1024, marks=pytest.mark.slow),
-        pytest.param("dinov2_vitl14_reg4", 1024, marks=pytest.mark.slow),
-        pytest.param("dinov2_vitg14", 1536, marks=pytest.mark.slow),
         pytest.param("dinov2_vitg14_reg4", 1536, marks=pytest.mark.slow),
     ],
 )
@@ -168,13 +153,12 @@ def test_hugging_face_there_and_back(tmp_path: pathlib.Path, registers: int, ffn
     convert(ours, back)
     assert back.read_bytes() == source.read_bytes()
     assert back.stat().st_mode & 0o777 == 0o644  # the library's own would be 0600
-    found = safetensors.numpy.load_file(back)
     # By way of the other layout for the same model.
     convert(ours, tmp_path / "dinov2.pth", "dinov2")
     again = read_checkpoint(tmp_path / "dinov2.pth")
     assert again.format == "dinov2"
     theirs = to_state(again.params, again.config, "huggingface", again.extras)
-    assert all(theirs[name].tobytes() == found[name].tobytes() for name in found)
+    assert all(theirs[name].tobytes() == array.numpy().tobytes() for name, array in state.items())
 
 
 @pytest.mark.parametrize(
@@ -243,10 +227,8 @@ def test_a_vocabulary_comes_back_with_its_backbones_digest(tmp_path: pathlib.Pat
     )
     params = random_params(config)
     bound = config.aggregator.attach_backbone_hash(params.aggregator, params.backbone)
-    save_weights(
-        tmp_path / "ours.safetensors", Model(dataclasses.replace(params, aggregator=bound), config)
-    )
-    convert(tmp_path / "ours.safetensors", tmp_path / "back.pth", "reference")
+    params = dataclasses.replace(params, aggregator=bound)
+    write_checkpoint(tmp_path / "back.pth", params, config, "reference", {})
     again = read_checkpoint(tmp_path / "back.pth")
     assert again.params.aggregator.backbone == bound.backbone is not None
     content = torch.load(tmp_path / "back.pth")
@@ -402,9 +384,9 @@ def small(**changes: Any) -> dict[str, Any]:
     return state | {name.replace("norm_", "norm."): value for name, value in changes.items()}
 
 
-def whole(state: Any = None, *, new: bool = True) -> bytes:
+def whole(state: Any, *, new: bool = True) -> bytes:
     data = io.BytesIO()
-    torch.save(small() if state is None else state, data, _use_new_zipfile_serialization=new)
+    torch.save(state, data, _use_new_zipfile_serialization=new)
     return data.getvalue()
 
 
@@ -414,10 +396,9 @@ DECLARED = json.dumps({"format": "reference", "config": DEEP, "aggregator": {}})
 COUNT = next(name for name in SMALL["cricavpr"] if name.endswith("num_batches_tracked"))
 BAD: dict[str, tuple[Callable[[], Any], str]] = {
     "empty": (lambda: b"", "not a whole torch checkpoint"),
-    "cut": (lambda: whole()[:9999], "not a whole torch checkpoint: "),
-    "old, cut": (lambda: whole(new=False)[:338], "not a whole torch checkpoint"),
+    "cut": (lambda: whole(small())[:9999], "not a whole torch checkpoint: "),
+    "old, cut": (lambda: whole(small(), new=False)[:338], "not a whole torch checkpoint"),
     "a list": (lambda: [1, 2], "found list, expected nothing but tensors by name"),
-    "no tensor": (lambda: small(epoch=3), "found epoch, expected nothing but tensors"),
     "a number for a name": (lambda: {**small(), 3: BIAS}, "found 3, expected nothing but"),
     "double": (
         lambda: small(norm_bias=BIAS.double()),
@@ -477,26 +458,16 @@ def test_a_file_that_is_no_model(tmp_path: pathlib.Path, monkeypatch, kind: str)
     refused(path, words)
 
 
-def test_no_file(tmp_path: pathlib.Path) -> None:
-    refused(tmp_path / "none.pth", "found no such file, expected a checkpoint")
-
-
 def test_targets_and_layouts_that_do_not_fit(tmp_path: pathlib.Path) -> None:
     public, ours = written(tmp_path, "dino-salad"), tmp_path / "ours.safetensors"
-    for target, layout, words in (
-        ("x.pth", None, "x.pth: found the suffix '.pth', expected .safetensors"),
-        ("x.safetensors", "dinov2", "found a public checkpoint .dino-salad. and format dinov2"),
-    ):
-        with pytest.raises(InputError, match=words):
-            convert(public, tmp_path / target, layout)
+    with pytest.raises(InputError, match=r"found a public checkpoint .dino-salad. and format d"):
+        convert(public, tmp_path / "x.safetensors", "dinov2")
     convert(public, ours)
     for target, layout, words in (
         ("x.pth", "dinov2", "format dinov2: found a model of aggregator salad"),
-        ("x.pth", "timm", "format: found 'timm'"),
         ("x.onnx", None, "x.onnx: found suffix '.onnx', expected .pth or .pt or .ckpt$"),
         ("x" * 300 + ".pth", None, "too long"),
         ("x.pth", "huggingface", "x.pth: found suffix '.pth', expected .safetensors$"),
-        ("x.safetensors", "reference", "suffix '.safetensors', expected .pth or .pt or .ckpt"),
     ):
         with pytest.raises(InputError, match=words):
             convert(ours, tmp_path / target, layout)

@@ -37,7 +37,7 @@ from crisalad_jax.training.losses.pairwise import (
     ContrastiveConfig,
     SupConConfig,
 )
-from crisalad_jax.training.recipes import RECIPES, from_scratch, recipe
+from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 
@@ -298,19 +298,6 @@ def test_methods_to_compare_differ_in_the_aggregator_alone(name, width):
         found.model, aggregator="salad", cross_image=paper.model.cross_image
     )
     assert dataclasses.replace(found, model=as_paper) == paper
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize(
-    "name", [*RECIPES, *(f"crisalad+aggregator:{name}" for name in AGGREGATORS)]
-)
-def test_every_recipe_fits_every_preset(preset, name):
-    found = recipe(preset, name)
-    assert from_scratch(found).trainable == "all"
-    if isinstance(found.model.backbone, ViTConfig):
-        assert found.model.backbone.dim == PRESETS[preset].backbone.dim
-    else:  # the published sizes, for every preset but one
-        assert (found.model == recipe("b14", name).model) == (preset != "tiny")
 
 
 def test_the_recipe_of_starter_is_that_of_its_last_run():

@@ -15,7 +15,6 @@ from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.config.short_repr import field_docs
 from crisalad_jax.evaluation.results import GroupingResult
-from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.retrieval.maps.map import Answer, MapImage
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.training.recipes import RECIPES
@@ -104,15 +103,6 @@ def test_a_result_takes_a_line_for_each_field_whatever_its_size():
     ]
     lines = repr(benchmark).splitlines()
     assert lines[-3:] == ["    database_positions=float64[10000, 2],", "    radius=54321.5,", ")"]
-
-
-def test_a_runs_result_prints_the_number_of_parameters():
-    params = parameter_shapes(cj.PRESETS["b14"])
-    text = repr(cj.FitResult(params, 10, 0.5, False, 0))  # type: ignore[arg-type]
-    assert len(text.splitlines()) == 7
-    # docs/architecture.md: 11,495,105 trainable and 86,579,712 frozen.
-    assert f"leaves, {11_495_105 + 86_579_712:,} parameters, 392.3 MB" in text
-    assert "qkv" not in text
 
 
 def test_an_answer_of_a_map_prints_in_short_lines():
