@@ -6,7 +6,7 @@ import pytest
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
-from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.utils.errors import InputError
@@ -75,23 +75,17 @@ def test_a_model_rounds_where_its_backbone_needs_it():
 
 
 def test_a_backbone_of_any_size_is_not_rounded():
-    @dataclasses.dataclass(frozen=True)
-    class AnySize(ViTConfig):
-        any_size = True
-
-        def grid(self, image_size: tuple[int, int]) -> tuple[int, int]:
-            return -(-image_size[0] // 16), -(-image_size[1] // 16)
-
-    AnySize.part_name = "any-size"
     config = ModelConfig(
-        image_size=(512, 512),
+        image_size=(500, 512),
         preprocessing=PreprocessingConfig(size_rule="shorter-side"),
-        backbone=AnySize(),
+        backbone=ResNetConfig(layers=18),
+        aggregator="gem",
+        cross_image=CrossImageConfig(layers=0),
     )
-    assert (config.side_multiple, config.input_size, config.grid) == (1, (512, 512), (32, 32))
-    assert config.images_in_words == "shorter side 512, bilinear, antialiased, on bytes"
-    rounding = config.resized(None, ["round"])
-    assert (rounding.side_multiple, rounding.input_size, rounding.grid) == (1, (512, 512), (32, 32))
+    assert config.images_in_words == "shorter side 500, bilinear, antialiased, on bytes"
+    for each in (config, config.resized(None, ["round"])):
+        # ResNet-18 halves sides five times, each time rounded up.
+        assert (each.side_multiple, each.input_size, each.grid) == (1, (500, 512), (16, 16))
 
 
 def test_a_size_beside_a_native_rule_is_told():

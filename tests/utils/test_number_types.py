@@ -19,18 +19,15 @@ import pytest
 from crisalad_jax.checkpoints.export import ExportConfig, export_model
 from crisalad_jax.checkpoints.starter import FILE
 from crisalad_jax.checkpoints.weights import load_weights, model_hash, read_weights, save_weights
-from crisalad_jax.data.places import read_places
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.aggregators.base import TokenShape
 from crisalad_jax.nn.config import PRESETS, ModelConfig, with_aggregator
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, check_params, describe, init_crisalad
 from crisalad_jax.nn.tokens import Tokens
-from crisalad_jax.training.loop import fit
 from crisalad_jax.training.losses import LOSSES, LossConfig, metric_loss
 from crisalad_jax.training.optimiser import make_optimiser
 from crisalad_jax.training.step import init_train_state, make_train_step, step_config
-from crisalad_jax.training.vocabulary import with_vocabulary
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL, RECIPE, assert_equal, random_params
 
@@ -85,17 +82,14 @@ def test_so_are_those_and_the_descriptors_of_a_plug_in() -> None:
     in_both_modes(lambda: describe(params, IMAGES, config))
 
 
-def test_descriptors_are_the_same() -> None:
+def test_descriptors_and_gradients_are_the_same_within_a_program_of_the_users() -> None:
     how = dataclasses.replace(MODEL.preprocessing, normalisation="local-contrast")
     config = dataclasses.replace(MODEL, preprocessing=how)
-    in_both_modes(lambda: describe(PARAMS, IMAGES, config, key=jax.random.key(1)))  # of dropout
 
-
-def test_so_are_gradients_within_a_program_of_the_users() -> None:
     @jax.jit
-    @jax.grad
+    @jax.value_and_grad
     def slope(params: Any) -> jax.Array:
-        return describe(params, IMAGES, MODEL, key=jax.random.key(1))[:, ::7].sum()
+        return describe(params, IMAGES, config, key=jax.random.key(1))[:, ::7].sum()  # of dropout
 
     in_both_modes(lambda: slope(PARAMS))
 
@@ -169,34 +163,6 @@ def test_an_exported_program_is_the_same() -> None:
     expected = exported()
     with jax.enable_x64(True):
         assert exported() == expected
-
-
-def test_a_vocabulary_is_the_same(shared: pathlib.Path) -> None:
-    alone = CrossImageConfig(layers=0)
-    config = dataclasses.replace(
-        with_aggregator(PRESETS["tiny"], "netvlad", "tiny", cross_image=alone), image_size=(42, 56)
-    )
-    params = init_crisalad(jax.random.key(0), config)
-    paths = sorted((shared / "city" / "Images").rglob("*.jpg"))
-    in_both_modes(lambda: with_vocabulary(Model(params, config), paths))
-
-
-def test_a_run_that_is_extended_in_the_other_mode_is_the_run_itself(
-    shared: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
-    places = read_places(shared / "city", min_images=2)
-    half = dataclasses.replace(
-        RECIPE, epochs=1, optimiser=dataclasses.replace(RECIPE.optimiser, decay_steps=6)
-    )
-    whole = dataclasses.replace(half, epochs=2)
-    expected = fit(whole, places, tmp_path / "whole", quiet=True)
-    for first in (False, True):
-        run = tmp_path / f"{first}"
-        with jax.enable_x64(first):
-            fit(half, places, run, quiet=True)
-        with jax.enable_x64(not first):
-            found = fit(whole, places, run, quiet=True)
-        assert_equal(found.params, expected.params)
 
 
 BY_ITSELF = """
