@@ -222,7 +222,9 @@ def _separable(params: DepthwiseAdapter, x: Map) -> Map:
     return jax.nn.relu(checkpoint_name(linear(params.pointwise, filtered), "mixed"))
 
 
-def _multi_resolution(params: MultiResolutionAdapter, x: Map, valid: Valid) -> tuple[Map, Adapter]:
+def _multi_resolution(
+    params: MultiResolutionAdapter, x: Map, valid: Valid
+) -> tuple[Map, MultiResolutionAdapter]:
     outputs, updated = [], []
     for branch in ((params.branch1,), params.branch2, params.branch3):
         y, layers = x, []

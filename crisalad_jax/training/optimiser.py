@@ -5,6 +5,7 @@ from typing import TypeVar
 
 import jax.numpy as jnp
 import optax
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from crisalad_jax.training.config import OptimiserConfig
@@ -170,8 +171,10 @@ def _accumulated(
     """Step once for several batches, and at the last of an epoch."""
     per_epoch = -(-batches_per_epoch // accumulate)
 
-    def count_batches(step: Array) -> Array:
-        return jnp.minimum(accumulate, batches_per_epoch - step % per_epoch * accumulate)
+    def count_batches(step: ArrayLike) -> Array:
+        return jnp.minimum(
+            accumulate, batches_per_epoch - jnp.asarray(step) % per_epoch * accumulate
+        )
 
     of_mean = optax.chain(optax.scale(1 / accumulate), optimiser)
     several = optax.MultiSteps(

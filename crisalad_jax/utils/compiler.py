@@ -12,6 +12,7 @@ from jax.extend.core import get_opaque_trace_state
 from crisalad_jax.utils.executable_cache import cached_executable
 from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.host import usable_cores
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.target import lowering_platforms, machine, over_devices_of, target
 
 _P = ParamSpec("_P")
@@ -23,15 +24,27 @@ _LEAST_MEMORY: dict[str, bool | str] = {
 much memory again, and 3 to 5 % slower (`scripts/bench/study_compiler.py`)."""
 _AT_REST = get_opaque_trace_state()
 """What JAX traces while it traces nothing."""
+_TESTED = ((0, 10), (0, 12))
+"""Versions of JAX that the tests run with: those that pyproject.toml requires."""
+
+
+if jax.__version_info__[:2] not in _TESTED:  # before a crash, whichever way the package is used
+    tested = " and ".join(".".join(map(str, version)) for version in _TESTED)
+    warn(
+        f"found jax {jax.__version__}, tested are {tested}: results are not checked, and 0.11 "
+        "crashes on several devices; pip install --upgrade 'jax>=0.12,<0.13'"
+    )
 
 
 def compiler_options(*, runs_long: bool = False) -> dict[str, bool | str]:
-    """Return XLA's options for a program: none but on a CPU.
+    """Return XLA's options for a program: none but on a CPU, with a tested version of JAX.
 
-    A program that `runs_long`, such as a training step, has none: the order of the least memory
-    takes it 6 % longer.
+    Another version may lack an option, or crash with it; without any a program is as right, and
+    slower at most. A program that `runs_long`, such as a training step, has none: the order of the
+    least memory takes it 6 % longer.
     """
-    return _LEAST_MEMORY if target().platform == "cpu" and not runs_long else {}
+    tested = jax.__version_info__[:2] in _TESTED
+    return _LEAST_MEMORY if target().platform == "cpu" and tested and not runs_long else {}
 
 
 class Jitted(Protocol[_P, _R]):

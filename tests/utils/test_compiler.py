@@ -34,12 +34,37 @@ def in_a_program(source: str, home: pathlib.Path, *arguments: str, **environment
     return done.stdout
 
 
+START = """
+import sys, jax
+jax.__version__, jax.__version_info__ = sys.argv[1], tuple(map(int, sys.argv[1].split(".")))
+from crisalad_jax.cli import main
+sys.stderr = sys.stdout
+main(["info", "--preset", "tiny", "--json", "-"])
+"""
+
+
+@pytest.mark.parametrize(("version", "warned"), [("0.10.2", 0), ("0.11.2", 1)])
+def test_an_untested_jax_is_said_in_one_line(
+    tmp_path: pathlib.Path, version: str, warned: int
+) -> None:
+    printed = in_a_program(START, tmp_path, version).splitlines()
+    lines = [line for line in printed if "jax" in line]
+    assert len(lines) == warned
+    for line in lines:
+        assert line.startswith(f"crisalad: note: found jax {version}, tested are 0.10 and 0.12: ")
+
+
 @pytest.mark.parametrize("chosen", [CPU, GPU, TPU, PORTABLE], ids=lambda chosen: chosen.platform)
+@pytest.mark.parametrize("version", [(0, 10, 2), (0, 11, 2), (0, 12, 0, 1), (0, 13, 0)])
 @pytest.mark.parametrize("runs_long", [False, True])
-def test_only_a_cpu_has_options(chosen: Target, runs_long: bool) -> None:
+def test_only_a_cpu_with_a_tested_jax_has_options(
+    monkeypatch: pytest.MonkeyPatch, chosen: Target, version: tuple[int, ...], runs_long: bool
+) -> None:
+    monkeypatch.setattr(jax, "__version_info__", version)
     with lowering_for(chosen):
         options = compiler.compiler_options(runs_long=runs_long)
-    assert bool(options) == (chosen == CPU and not runs_long)
+    expected = chosen == CPU and version[1] in (10, 12) and not runs_long
+    assert bool(options) == expected
 
 
 def test_the_options_reach_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:

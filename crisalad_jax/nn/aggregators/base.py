@@ -195,13 +195,11 @@ def check_tokens(tokens: Any, aggregator: Aggregator, dim: int, batch: tuple[int
     """
     shape = TokenShape(*aggregator.token_shape(dim))
     wide = jnp.result_type(jnp.float32, *jax.tree.leaves(tokens))
-    expected = Tokens(
-        jax.ShapeDtypeStruct((*batch, shape.global_dim), wide),
-        jax.ShapeDtypeStruct((*batch, shape.tokens, shape.token_dim), wide),
-    )
+    sizes = (shape.global_dim,), (shape.tokens, shape.token_dim)
+    arrays: Any = [jax.ShapeDtypeStruct((*batch, *size), wide) for size in sizes]
     if isinstance(tokens, Tokens):
         tokens = Tokens(tokens.global_token, tokens.local)
-    expect_like(f"aggregator {aggregator.part_name}", tokens, expected)
+    expect_like(f"aggregator {aggregator.part_name}", tokens, Tokens(*arrays))
 
 
 def require_side(name: str, grid: Grid, regions: int, patch_size: int) -> None:

@@ -24,7 +24,7 @@ from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 if TYPE_CHECKING:
     from crisalad_jax.retrieval.faiss_index import Index
 
-SEARCHES = dict.fromkeys(("exact", "hnsw", "ivf-pq"))
+SEARCHES: dict[str, None] = dict.fromkeys(("exact", "hnsw", "ivf-pq"))
 """How a map is searched: every descriptor is compared; by a graph over the descriptors, which are
 all in memory; or by codes of at most 128 bytes in memory, and the files rank the answers."""
 FOLDER = "approximate"
