@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
@@ -89,40 +88,25 @@ MODELS = {
         for name, fields in BACKBONES.items()
     },
     "netvlad": dataclasses.replace(MODEL, aggregator="netvlad"),
+    **{
+        f"dustbin {name}": dataclasses.replace(
+            MODEL, aggregator=dataclasses.replace(MODEL.aggregator, dustbin=name)
+        )
+        for name in ("token", "mass", "none")
+    },
     **OTHERS,
 }
 
 
-def check_reference(config: ModelConfig) -> dict[str, np.ndarray]:
-    """A model's state in the reference format, from which the same parameters come back."""
+@pytest.mark.parametrize("name", MODELS)
+def test_any_model_survives_the_reference_format_bit_for_bit(name: str) -> None:
+    config = MODELS[name]
     params = random_params(config)
     state = to_state(params, config, "reference", {})
     assert {key: array.shape for key, array in state.items()} == public_shapes(config, "reference")
     back, extras = to_params(state, config, "reference", source="state")
     assert all(not array.any() for array in extras.values())
     assert_equal(back, params)
-    return state
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_any_model_survives_the_reference_format_bit_for_bit(name: str) -> None:
-    check_reference(MODELS[name])
-
-
-def test_every_number_has_its_own_place() -> None:
-    """Numbered numbers come back as a permutation: nothing is dropped, doubled or made up."""
-    config = dataclasses.replace(MODELS["multi-resolution"], aggregator="gem-pyramid")
-    shapes = public_shapes(config, "cricavpr")
-    sizes = [int(np.prod(shape)) for shape in shapes.values()]
-    numbers = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
-    state = {
-        name: part.reshape(shape)
-        for (name, shape), part in zip(shapes.items(), numbers, strict=True)
-    }
-    params, extras = to_params(state, config, "cricavpr", source="state")
-    leaves = [*jax.tree.leaves(params), *extras.values()]
-    together = np.concatenate([np.asarray(leaf).ravel() for leaf in leaves])
-    np.testing.assert_array_equal(np.sort(together), np.arange(sum(sizes)))
 
 
 def small_state() -> dict[str, np.ndarray]:
@@ -171,15 +155,6 @@ def test_what_is_no_model_is_refused(change, words: str) -> None:
         infer(change(small_state()), source="file.pth")
 
 
-def test_a_missing_block_leaves_those_after_it_unknown() -> None:
-    shapes = inner("dinov2_vits14")
-    state = blank({k: s for k, s in shapes.items() if not k.startswith("blocks.5.")})
-    layout, config = infer(state, source="file.pth")
-    assert config.backbone.depth == 5
-    with pytest.raises(InputError, match=r"and 5 blocks: blocks\.10\.attn\.proj\.bias unknown"):
-        to_params(state, config, layout, source="file.pth")
-
-
 @pytest.mark.parametrize("layout", ["dinov2", "huggingface", "dino-salad", "cricavpr"])
 def test_a_format_holds_its_own_models_only(layout: str) -> None:
     part = "adapter depthwise" if layout == "dino-salad" else "aggregator salad"
@@ -211,13 +186,10 @@ def bare_salad(**fields: Any) -> ModelConfig:
     return dataclasses.replace(bare_vit(), aggregator=aggregator)
 
 
-@pytest.mark.parametrize("dustbin", ["token", "mass", "none"])
-def test_other_dustbins_go_to_the_reference_alone(dustbin) -> None:
-    config = bare_salad(dustbin=dustbin)
-    with pytest.raises(InputError, match=f"format dino-salad: cannot tell.*dustbin.*{dustbin}"):
+def test_another_dustbin_is_no_dino_salad() -> None:
+    config = bare_salad(dustbin="token")
+    with pytest.raises(InputError, match="format dino-salad: cannot tell.*dustbin.*token"):
         check_holds(config, "dino-salad")
-    state = check_reference(config)
-    assert ("aggregator.dust_bin" in state) == (dustbin == "mass")
 
 
 @pytest.mark.parametrize("name", ["reference", "dino-salad"])
