@@ -224,7 +224,6 @@ def test_the_server_has_another_file_later(model, server, tmp_path):
 
 def test_changed_bytes_in_the_cache_are_told(model, server, tmp_path):
     weights = cached_weights(model, quiet=True)
-    published = weights.with_name(FILE)
     whole = weights.read_bytes()
     weights.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
     with pytest.raises(InputError, match=f"^{weights}: .*bytes than were.*remove it, and the same"):

@@ -188,7 +188,7 @@ def bare_salad(**fields: Any) -> ModelConfig:
 
 def test_another_dustbin_is_no_dino_salad() -> None:
     config = bare_salad(dustbin="token")
-    with pytest.raises(InputError, match="format dino-salad: cannot tell.*dustbin.*token"):
+    with pytest.raises(InputError, match=r"format dino-salad: cannot tell.*dustbin.*token"):
         check_holds(config, "dino-salad")
 
 
