@@ -82,6 +82,9 @@ def test_a_file_is_hlocs_module_and_the_mean_its_first_pixel(tmp_path: pathlib.P
     np.testing.assert_array_equal(mean.astype(np.float32), average[0, 0])
     params, _ = to_params(state, read.config, FORMAT, source="hloc")
     jax.tree.map(np.testing.assert_array_equal, read.params, params)
+    # hloc's descriptor has the first channel of both clusters, then the second; ours has clusters.
+    whitening = np.asarray(params.projection.weight).reshape(2, -1, 3)
+    np.testing.assert_array_equal(whitening[1, 7], state["whiten.weight"][:, 2 * 7 + 1])
     convert(tmp_path / "net.mat", tmp_path / "ours.safetensors")
     assert read_checkpoint(tmp_path / "ours.safetensors").config == read.config
 

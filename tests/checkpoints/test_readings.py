@@ -8,6 +8,7 @@ import argparse
 import collections
 import enum
 import pathlib
+import subprocess
 import warnings
 from typing import Any
 
@@ -22,7 +23,6 @@ from crisalad_jax.nn.backbones.base import FeatureSpec
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from parity.reference.vit import ViT
-from tests.checkpoints.test_public import Opens
 from tests.conftest import assert_equal
 from tests.random_checkpoints import (
     bare_vit,
@@ -176,8 +176,18 @@ def test_weights_in_a_defaultdict_are_weights(tmp_path: pathlib.Path, plain: Che
     assert_equal(read_quietly(save(tmp_path / "d.pth", state)).params, plain.params)
 
 
+class Runs:
+    """What an attacker puts beside weights: unpickling it would run a command."""
+
+    def __init__(self, path: pathlib.Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return subprocess.check_call, (["touch", str(self.path)],)
+
+
 def test_nothing_of_a_file_is_run(tmp_path: pathlib.Path) -> None:
-    content = {"args": Opens(tmp_path / "made"), "model": network().state_dict()}
+    content = {"args": Runs(tmp_path / "made"), "model": network().state_dict()}
     read_quietly(save(tmp_path / "file.pth", content))
     assert not (tmp_path / "made").exists()
 
