@@ -3,6 +3,7 @@
 import json
 import pathlib
 import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -63,6 +64,11 @@ def narrow(shapes: dict[str, tuple[int, ...]], by: int) -> dict[str, tuple[int, 
         return number if head or number not in widths else number // by
 
     return {name: tuple(size(name, number) for number in shape) for name, shape in shapes.items()}
+
+
+def blank(shapes: Mapping[str, Sequence[int]]) -> dict[str, np.ndarray]:
+    """Arrays of these shapes, which take no memory."""
+    return {name: np.broadcast_to(np.float32(0), tuple(shape)) for name, shape in shapes.items()}
 
 
 def random_state(shapes: dict[str, tuple[int, ...]], seed: int = 0) -> dict[str, torch.Tensor]:

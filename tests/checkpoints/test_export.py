@@ -12,7 +12,6 @@ from typing import Any
 
 import cv2
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
@@ -36,12 +35,9 @@ from crisalad_jax.nn.aggregators.queries import BoqConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, describe, init_crisalad, self_mask
 from crisalad_jax.sinkhorn import SinkhornConfig
-from crisalad_jax.utils import compiler
-from crisalad_jax.utils import target as targets
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.pytree import named_leaves
-from crisalad_jax.utils.target import GPU, PORTABLE, lowering_for, target
 from tests.conftest import BATCH, MODEL, write_picture
 
 pytestmark = pytest.mark.usefixtures("symbolic_shapes")
@@ -78,26 +74,15 @@ def pictures(count: int) -> np.ndarray:
 
 
 def run_script(*arguments: object, cwd: pathlib.Path) -> subprocess.CompletedProcess[str]:
-    """Run the script by an interpreter that refuses to import this package."""
+    """Run the script by an interpreter that cannot import this package."""
     program = (
         "import runpy, sys\n"
-        "class Refuse:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name.partition('.')[0] == 'crisalad_jax':\n"
-        "            raise ImportError('refused: ' + name)\n"
-        "sys.meta_path.insert(0, Refuse())\n"
-        "try:\n"
-        "    import crisalad_jax\n"
-        "except ImportError:\n"
-        "    sys.argv = sys.argv[1:]\n"
-        "    runpy.run_path(sys.argv[0], run_name='__main__')\n"
+        "sys.modules['crisalad_jax'] = None\n"
+        "sys.argv = sys.argv[1:]\n"
+        "runpy.run_path(sys.argv[0], run_name='__main__')\n"
     )
-    return subprocess.run(
-        [sys.executable, "-I", "-c", program, str(SCRIPT), *map(str, arguments)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-    )
+    command = [sys.executable, "-I", "-c", program, str(SCRIPT), *map(str, arguments)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True)
 
 
 def alone(params: Crisalad, images: np.ndarray, config: ModelConfig = MODEL) -> np.ndarray:
@@ -150,18 +135,14 @@ def test_the_program_gives_our_descriptors_for_any_number_of_images(
 
 
 def test_a_batch_of_one_size_with_the_weights_inside(params: Crisalad, tmp_path: pathlib.Path):
+    out = tmp_path / "inside"
     how = ExportConfig("batch", batch_size=BATCH, weights_inside=True, platforms=("cpu",))
-    manifest = write_export(tmp_path / "inside", Model(params, MODEL), how)
-    program = export.deserialize(
-        bytearray((tmp_path / "inside" / "describe.jax_export").read_bytes())
-    )
+    manifest = write_export(out, Model(params, MODEL), how)
+    program = export.deserialize(bytearray((out / "describe.jax_export").read_bytes()))
     check_batch(program.call, params)
     assert manifest["weights"] is None
     assert manifest["images"]["shape"] == [BATCH, *MODEL.image_size, 3]
-    assert sorted(p.name for p in (tmp_path / "inside").iterdir()) == [
-        "describe.jax_export",
-        "manifest.json",
-    ]
+    assert {path.name for path in out.iterdir()} == {"describe.jax_export", "manifest.json"}
     with pytest.raises(ValueError, match="shape"):
         program.call(pictures(1))
 
@@ -187,11 +168,8 @@ def test_a_script_without_this_package(
     names = ["a.png", "b.PNG", "c.png", "deep/a.png", "deep/b.png"]
     for name, image in zip(names, images, strict=True):
         assert cv2.imwrite(str(folder / name), image[..., ::-1])
-    done = run_script(
-        beside,
-        *("--images", folder, "--out", "found.npy", "--batch-size", BATCH),
-        cwd=tmp_path,
-    )
+    flags = ("--images", folder, "--out", "found.npy", "--batch-size", BATCH)
+    done = run_script(beside, *flags, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "found.names.txt").read_text().splitlines() == names
     found = np.load(tmp_path / "found.npy")
@@ -278,39 +256,14 @@ def test_other_models_for_all_platforms(name: str):
     np.testing.assert_allclose(found, alone(params, images, config), rtol=0, atol=tolerance)
 
 
-def test_nothing_is_chosen_by_the_platform_that_exports(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(targets, "machine", lambda: GPU)
-    traced = []
-
-    @compiler.jit
-    def choices(x: jax.Array) -> jax.Array:
-        traced.append((target().cudnn, target().product_dtype(x.dtype)))
-        return x
-
-    x = jnp.ones(3, jnp.bfloat16)
-    jax.make_jaxpr(lambda x: choices(x))(x)
-    with lowering_for(PORTABLE):
-        jax.make_jaxpr(lambda x: choices(x))(x)
-    jax.make_jaxpr(lambda x: choices(x))(x)
-    # The second would else find the first's trace, as the third does.
-    assert traced == [(True, jnp.bfloat16), (False, jnp.float32)]
-    assert target() == GPU
-
-
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"platforms": ("cpu", "metal")}, "ExportConfig.platforms: found"),
         ({"platforms": ()}, "format: found stablehlo with grouping single, 0 platforms"),
         ({"grouping": "any"}, "format: found stablehlo with grouping any"),
         (
             {"format": "openvino", "weights_inside": True},
             "format: found openvino with grouping single, 2 platforms and weights inside True",
-        ),
-        ({"batch_size": 0}, "batch size: found 0, expected at least 1"),
-        (
-            {"grouping": "shuffled"},
-            "grouping: found 'shuffled', expected one of any, batch, single",
         ),
     ],
 )
@@ -326,10 +279,3 @@ def test_weights_that_are_too_many_to_be_inside():
     check_exportable(shapes, config, ExportConfig())
     with pytest.raises(InputError, match=r"^weights inside: found 4\.\d GiB of parameters, exp"):
         check_exportable(shapes, config, ExportConfig(weights_inside=True))
-
-
-def test_a_folder_in_use_is_left_as_it_is(params: Crisalad, tmp_path: pathlib.Path):
-    write_json(tmp_path / "out" / "other.json", {})
-    with pytest.raises(InputError, match=f"^{tmp_path}/out: found a folder with files in it"):
-        write_export(tmp_path / "out", Model(params, MODEL))
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["other.json"]

@@ -1,13 +1,12 @@
 """The tables of names against the stored layouts of the public checkpoints."""
 
 import dataclasses
+from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.formats import (
-    FORMATS,
     check_holds,
     infer,
     public_shapes,
@@ -23,11 +22,10 @@ from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.pytree import named_leaves
 from tests.checkpoints.test_export import OTHERS
-from tests.conftest import MODEL, random_params
+from tests.conftest import MODEL, assert_equal, random_params
 from tests.random_checkpoints import LAYOUTS as FOLDER
-from tests.random_checkpoints import UNDER, as_arrays, bare_vit, public_layout, random_state
+from tests.random_checkpoints import UNDER, as_arrays, bare_vit, blank, public_layout, random_state
 
 PUBLIC = sorted(path.stem for path in FOLDER.glob("*.json"))
 BARE = CrossImageConfig(layers=0)
@@ -40,11 +38,6 @@ def inner(name: str) -> dict[str, tuple[int, ...]]:
         key.removeprefix(UNDER).removeprefix("module."): shape
         for key, shape in public_layout(name).items()
     }
-
-
-def blank(shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    """Arrays of these shapes that take no memory."""
-    return {name: np.broadcast_to(np.float32(0), shape) for name, shape in shapes.items()}
 
 
 def expected(name: str) -> tuple[str, ModelConfig]:
@@ -95,6 +88,12 @@ MODELS = {
         for name, fields in BACKBONES.items()
     },
     "netvlad": dataclasses.replace(MODEL, aggregator="netvlad"),
+    **{
+        f"dustbin {name}": dataclasses.replace(
+            MODEL, aggregator=dataclasses.replace(MODEL.aggregator, dustbin=name)
+        )
+        for name in ("token", "mass", "none")
+    },
     **OTHERS,
 }
 
@@ -107,55 +106,26 @@ def test_any_model_survives_the_reference_format_bit_for_bit(name: str) -> None:
     assert {key: array.shape for key, array in state.items()} == public_shapes(config, "reference")
     back, extras = to_params(state, config, "reference", source="state")
     assert all(not array.any() for array in extras.values())
-    found, wanted = named_leaves(back), named_leaves(params)
-    assert found.keys() == wanted.keys()
-    for key, array in found.items():
-        np.testing.assert_array_equal(array, wanted[key])
-        assert array.dtype == wanted[key].dtype
+    assert_equal(back, params)
 
 
-def test_every_number_has_its_own_place() -> None:
-    """Numbered numbers come back as a permutation: nothing is dropped, doubled or made up."""
-    config = dataclasses.replace(MODELS["multi-resolution"], aggregator="gem-pyramid")
-    shapes = public_shapes(config, "cricavpr")
-    sizes = [int(np.prod(shape)) for shape in shapes.values()]
-    numbers = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
-    state = {
-        name: part.reshape(shape)
-        for (name, shape), part in zip(shapes.items(), numbers, strict=True)
-    }
-    params, extras = to_params(state, config, "cricavpr", source="state")
-    leaves = [*jax.tree.leaves(params), *extras.values()]
-    together = np.concatenate([np.asarray(leaf).ravel() for leaf in leaves])
-    np.testing.assert_array_equal(np.sort(together), np.arange(sum(sizes)))
+def small_state() -> dict[str, np.ndarray]:
+    """A small DINOv2's."""
+    return as_arrays(random_state(public_shapes(bare_vit(), "dinov2")))
 
 
-def small(name: str) -> tuple[dict[str, np.ndarray], ModelConfig]:
-    """A small DINOv2, by the names of a format."""
-    config = bare_vit()
-    return as_arrays(random_state(public_shapes(config, name))), config
-
-
-@pytest.mark.parametrize("layout", ["dinov2", "huggingface"])
-def test_the_first_of_what_is_wrong_is_listed(layout: str) -> None:
-    state, config = small(layout)
-    norm, token = {
-        "dinov2": ("norm.weight", "cls_token"),
-        "huggingface": ("layernorm.weight", "embeddings.cls_token"),
-    }[layout]
-    del state[norm]
-    state[token] = np.zeros((1, 64), np.float32)
+def test_the_first_of_what_is_wrong_is_listed() -> None:
+    state, config = small_state(), bare_vit()
+    del state["norm.weight"]
+    state["cls_token"] = np.zeros((1, 64), np.float32)
     state |= {"head.weight": np.zeros(1), "blocks.10.x": np.zeros(1), "blocks.9.x": np.zeros(1)}
     with pytest.raises(InputError) as caught:
-        to_params(state, config, layout, source="file.pth")
-    message = str(caught.value)
-    assert message.startswith(
-        f"file.pth: does not fit the format {layout} of width 64 and 2 blocks"
-    )
+        to_params(state, config, "dinov2", source="file.pth")
     # The others are `head.weight`, unknown, and the norm, missing.
-    first = f"blocks.10.x unknown; blocks.9.x unknown; {token} found (1, 64), expected (1, 1, 64)"
-    assert message.endswith(f": {first}; and 2 more")
-    assert "\n" not in message
+    assert str(caught.value).endswith(
+        "width 64 and 2 blocks: blocks.10.x unknown; blocks.9.x unknown; "
+        "cls_token found (1, 64), expected (1, 1, 64); and 2 more"
+    )
 
 
 def without(state: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
@@ -165,14 +135,7 @@ def without(state: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda s: {}, "found no checkpoint that we know .its first names: none"),
-        (lambda s: {"stem.weight": s["norm.bias"]}, "its first names: stem.weight"),
         (lambda s: without(s, "cls_token"), "found no cls_token"),
-        (lambda s: without(s, "pos_embed"), "found no pos_embed"),
-        (
-            lambda s: s | {"cls_token": np.zeros(64)},
-            "found cls_token of shape .64,., expected an",
-        ),
         (
             lambda s: s | {"cls_token": np.zeros((1, 1, 48))},
             "backbone of width 48, expected a multiple of 64",
@@ -188,20 +151,8 @@ def without(state: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
     ],
 )
 def test_what_is_no_model_is_refused(change, words: str) -> None:
-    state, _ = small("dinov2")
-    with pytest.raises(InputError, match=words) as caught:
-        infer(change(state), source="file.pth")
-    assert str(caught.value).startswith("file.pth: ")
-    assert "\n" not in str(caught.value)
-
-
-def test_a_missing_block_leaves_those_after_it_unknown() -> None:
-    shapes = inner("dinov2_vits14")
-    state = blank({k: s for k, s in shapes.items() if not k.startswith("blocks.5.")})
-    layout, config = infer(state, source="file.pth")
-    assert config.backbone.depth == 5
-    with pytest.raises(InputError, match=r"and 5 blocks: blocks\.10\.attn\.proj\.bias unknown"):
-        to_params(state, config, layout, source="file.pth")
+    with pytest.raises(InputError, match=rf"^file\.pth: .*{words}"):
+        infer(change(small_state()), source="file.pth")
 
 
 @pytest.mark.parametrize("layout", ["dinov2", "huggingface", "dino-salad", "cricavpr"])
@@ -210,13 +161,6 @@ def test_a_format_holds_its_own_models_only(layout: str) -> None:
     with pytest.raises(InputError, match=f"format {layout}: found a model of {part}, expected"):
         table(MODEL, layout)
     assert table(MODEL, "reference")
-
-
-def test_an_unknown_format_is_named() -> None:
-    known = ", ".join(sorted(FORMATS))
-    assert "dinov2, " in known
-    with pytest.raises(InputError, match=f"format: found 'timm', expected one of {known}"):
-        table(MODEL, "timm")
 
 
 def test_unusual_widths_are_inferred() -> None:
@@ -236,33 +180,20 @@ def test_unusual_widths_are_inferred() -> None:
     assert infer(state, source="state") == ("reference", config)
 
 
-@pytest.mark.parametrize("dustbin", ["token", "mass", "none"])
-def test_other_dustbins_go_to_the_reference_alone(dustbin) -> None:
-    config = dataclasses.replace(
-        MODEL,
-        backbone=dataclasses.replace(MODEL.backbone, dim=64, heads=1, adapter=NO_ADAPTER),
-        aggregator=dataclasses.replace(MODEL.aggregator, dustbin=dustbin),
-        cross_image=BARE,
-    )
-    with pytest.raises(InputError, match=f"format dino-salad: cannot tell.*dustbin.*{dustbin}"):
+def bare_salad(**fields: Any) -> ModelConfig:
+    """SALAD over a DINOv2, with other fields."""
+    aggregator = dataclasses.replace(MODEL.aggregator, **fields)
+    return dataclasses.replace(bare_vit(), aggregator=aggregator)
+
+
+def test_another_dustbin_is_no_dino_salad() -> None:
+    config = bare_salad(dustbin="token")
+    with pytest.raises(InputError, match=r"format dino-salad: cannot tell.*dustbin.*token"):
         check_holds(config, "dino-salad")
-    params = random_params(config)
-    state = to_state(params, config, "reference", {})
-    assert ("aggregator.dust_bin" in state) == (dustbin == "mass")
-    again, _ = to_params(state, config, "reference", source="it")
-    wanted = named_leaves(params)
-    for name, leaf in named_leaves(again).items():
-        np.testing.assert_array_equal(leaf, wanted[name])
 
 
 @pytest.mark.parametrize("name", ["reference", "dino-salad"])
 def test_no_array_is_left_out_of_a_file_in_silence(name) -> None:
-    aggregator = dataclasses.replace(MODEL.aggregator, learn_epsilon=True)
-    config = dataclasses.replace(
-        MODEL,
-        backbone=dataclasses.replace(MODEL.backbone, adapter=NO_ADAPTER),
-        aggregator=aggregator,
-        cross_image=BARE,
-    )
+    config = bare_salad(learn_epsilon=True)
     with pytest.raises(InputError, match=f"format {name}: found aggregator.log_epsilon, expected"):
         table(config, name)

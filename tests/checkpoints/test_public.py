@@ -20,6 +20,7 @@ import torch
 
 from crisalad_jax.checkpoints.formats import public_shapes, to_state
 from crisalad_jax.checkpoints.public import (
+    Checkpoint,
     convert,
     read_backbone,
     read_checkpoint,
@@ -34,7 +35,6 @@ from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, describe, init_crisalad, self_mask
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
-from parity import zoo
 from tests.checkpoints.test_weights import put
 from tests.conftest import MODEL, assert_equal, random_params
 from tests.random_checkpoints import (
@@ -67,8 +67,24 @@ def written(folder: pathlib.Path, name: str) -> pathlib.Path:
     return save(folder / f"public{SUFFIX.get(name, '.pth')}", nested(random_state(SMALL[name])))
 
 
+def hugging_face(path: pathlib.Path) -> pathlib.Path:
+    return save(path, random_state(public_shapes(HUGGING_FACE, "huggingface")))
+
+
+def state_of(found: Checkpoint) -> dict[str, torch.Tensor]:
+    """The tensors of a model by the names of its file."""
+    state = to_state(found.params, found.config, found.format, found.extras)
+    return {name: torch.tensor(array) for name, array in state.items()}
+
+
 def files(folder: pathlib.Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
+
+
+def with_values(config: ModelConfig, values: dict[str, Any]) -> ModelConfig:
+    for name, value in values.items():
+        config = put(config, name, value)
+    return config
 
 
 def pictures(config: ModelConfig, count: int = 2) -> np.ndarray:
@@ -97,26 +113,16 @@ def test_there_and_back_are_the_same_bytes(tmp_path: pathlib.Path, name: str) ->
     there_and_back(tmp_path, written(tmp_path, name), WIDTHS[name])
 
 
-@pytest.mark.parametrize("kind", ["salad-indoor", "eigenplaces-indoor"])
-def test_indoor_vprs_files_are_the_same_network_within_a_module(
-    tmp_path: pathlib.Path, kind: str
-) -> None:
-    state = {
-        "salad-indoor": lambda: random_state(SMALL["dino-salad"]),
-        "eigenplaces-indoor": lambda: {
-            name: torch.tensor(x) for name, x in zoo.random_state("cosplace_resnet18_512").items()
-        },
-    }[kind]()
+def test_indoor_vprs_file_is_the_same_network_within_a_module(tmp_path: pathlib.Path) -> None:
+    state, format = random_state(SMALL["dino-salad"]), "salad-indoor"
     outside = read_checkpoint(save(tmp_path / "plain.pth", state))
     within = save(tmp_path / "within.pth", {f"model.{name}": x for name, x in state.items()})
     inside = read_checkpoint(within)
-    assert inside.format == ("salad-indoor" if kind == "salad-indoor" else "cosplace")
-    assert inside.config.aggregator == outside.config.aggregator
+    assert inside.format == format
     assert_equal(inside.params, outside.params)
-    if kind == "salad-indoor":
-        convert(within, tmp_path / "ours.safetensors")
-        convert(tmp_path / "ours.safetensors", tmp_path / "back.pth", kind)
-        assert (tmp_path / "back.pth").read_bytes() == within.read_bytes()
+    convert(within, tmp_path / "ours.safetensors")
+    convert(tmp_path / "ours.safetensors", tmp_path / "back.pth", format)
+    assert (tmp_path / "back.pth").read_bytes() == within.read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -125,11 +131,6 @@ def test_indoor_vprs_files_are_the_same_network_within_a_module(
         ("dinov2_vits14_reg4", 384),
         pytest.param("dino_salad", 8448, marks=pytest.mark.slow),
         pytest.param("CricaVPR", 10752, marks=pytest.mark.slow),
-        pytest.param("dinov2_vitb14", 768, marks=pytest.mark.slow),
-        pytest.param("dinov2_vitb14_reg4", 768, marks=pytest.mark.slow),
-        pytest.param("dinov2_vitl14", 1024, marks=pytest.mark.slow),
-        pytest.param("dinov2_vitl14_reg4", 1024, marks=pytest.mark.slow),
-        pytest.param("dinov2_vitg14", 1536, marks=pytest.mark.slow),
         pytest.param("dinov2_vitg14_reg4", 1536, marks=pytest.mark.slow),
     ],
 )
@@ -152,27 +153,20 @@ def test_hugging_face_there_and_back(tmp_path: pathlib.Path, registers: int, ffn
     convert(ours, back)
     assert back.read_bytes() == source.read_bytes()
     assert back.stat().st_mode & 0o777 == 0o644  # the library's own would be 0600
-    found = safetensors.numpy.load_file(back)
     # By way of the other layout for the same model.
     convert(ours, tmp_path / "dinov2.pth", "dinov2")
     again = read_checkpoint(tmp_path / "dinov2.pth")
     assert again.format == "dinov2"
     theirs = to_state(again.params, again.config, "huggingface", again.extras)
-    assert all(theirs[name].tobytes() == found[name].tobytes() for name in found)
+    assert all(theirs[name].tobytes() == array.numpy().tobytes() for name, array in state.items())
 
 
 @pytest.mark.parametrize(
     ("layout", "changed", "words"),
     [
         ("dino-salad", {"aggregator.sinkhorn.iterations": 10}, "iterations: found 3, expected 10"),
-        (
-            "dino-salad",
-            {"preprocessing.normalisation": "local-contrast"},
-            "preprocessing.normalisation: found mean-deviation",
-        ),
         ("dinov2", {"backbone.heads": 2}, "backbone.heads: found 1, expected 2"),
         ("cricavpr", {"backbone.adapter.alpha": 0.5}, "alpha: found 0.2, expected 0.5"),
-        ("cricavpr", {"cross_image.heads": 4}, "cross_image.heads: found 16, expected 4"),
     ],
 )
 def test_what_a_layout_cannot_tell_goes_to_the_reference(
@@ -180,9 +174,7 @@ def test_what_a_layout_cannot_tell_goes_to_the_reference(
 ) -> None:
     """Else the way back would give another model, with other descriptors."""
     public = read_checkpoint(written(tmp_path, layout))
-    config = public.config
-    for name, value in changed.items():
-        config = put(config, name, value)
+    config = with_values(public.config, changed)
     ours, back = tmp_path / "ours.safetensors", tmp_path / "back.pth"
     save_weights(ours, Model(public.params, config), extras=public.extras)
     with pytest.raises(InputError, match=f"^format {layout}: cannot tell .*{words}"):
@@ -198,7 +190,7 @@ def test_what_no_description_depends_on_comes_back(tmp_path: pathlib.Path, layou
     suffix = {"dino-salad": ".ckpt", "huggingface": ".safetensors"}.get(layout, ".pth")
     source = tmp_path / f"public{suffix}"
     if layout == "huggingface":
-        save(source, random_state(public_shapes(HUGGING_FACE, layout)))
+        hugging_face(source)
     elif layout == "reference":
         write_checkpoint(source, random_params(MODEL), MODEL, layout, {})
     else:
@@ -214,9 +206,7 @@ def test_what_no_description_depends_on_comes_back(tmp_path: pathlib.Path, layou
         "cross_image.dropout": 0.2,
         **({"aggregator.dropout": 0.1} if layout == "dino-salad" else {}),
     }
-    config = public.config
-    for name, value in changes.items():
-        config = put(config, name, value)
+    config = with_values(public.config, changes)
     ours, back = tmp_path / "ours.safetensors", tmp_path / f"back{suffix}"
     save_weights(ours, Model(public.params, config), extras=public.extras)
     assert convert(ours, back, layout).target == layout
@@ -237,10 +227,8 @@ def test_a_vocabulary_comes_back_with_its_backbones_digest(tmp_path: pathlib.Pat
     )
     params = random_params(config)
     bound = config.aggregator.attach_backbone_hash(params.aggregator, params.backbone)
-    save_weights(
-        tmp_path / "ours.safetensors", Model(dataclasses.replace(params, aggregator=bound), config)
-    )
-    convert(tmp_path / "ours.safetensors", tmp_path / "back.pth", "reference")
+    params = dataclasses.replace(params, aggregator=bound)
+    write_checkpoint(tmp_path / "back.pth", params, config, "reference", {})
     again = read_checkpoint(tmp_path / "back.pth")
     assert again.params.aggregator.backbone == bound.backbone is not None
     content = torch.load(tmp_path / "back.pth")
@@ -250,8 +238,7 @@ def test_a_vocabulary_comes_back_with_its_backbones_digest(tmp_path: pathlib.Pat
 
 
 def test_the_source_is_never_written_over(tmp_path: pathlib.Path) -> None:
-    state = random_state(public_shapes(HUGGING_FACE, "huggingface"))
-    source = save(tmp_path / "model.safetensors", state)
+    source = hugging_face(tmp_path / "model.safetensors")
     before = source.read_bytes()
     (tmp_path / "link.safetensors").symlink_to(source)
     for target in (source, tmp_path / "link.safetensors"):
@@ -260,60 +247,25 @@ def test_the_source_is_never_written_over(tmp_path: pathlib.Path) -> None:
     assert source.read_bytes() == before
 
 
-@pytest.mark.parametrize("under", [None, "state_dict", "model_state_dict", "model"])
-@pytest.mark.parametrize("prefix", ["", "module."])
-@pytest.mark.parametrize("name", ["dinov2", "cricavpr"])
-def test_any_nesting_and_prefix_is_read(tmp_path: pathlib.Path, name: str, under, prefix) -> None:
-    plain = {
-        key.removeprefix(UNDER).removeprefix("module."): tensor
-        for key, tensor in random_state(SMALL[name]).items()
-    }
-    state = {prefix + key: tensor for key, tensor in plain.items()}
-    content = state if under is None else {under: state, "epoch": 3}
-    found = read_checkpoint(save(tmp_path / "file.pth", content))
-    again = to_state(found.params, found.config, found.format, found.extras)
-    assert same_bits({k: torch.tensor(v) for k, v in again.items()}, plain)
-
-
 @pytest.mark.parametrize("core", ["numpy._core", "numpy.core"])
-@pytest.mark.parametrize("new", [True, False])
-def test_numpys_records_beside_the_weights_are_not_read(
-    tmp_path: pathlib.Path, core: str, new: bool
-) -> None:
+def test_numpys_records_beside_the_weights_are_not_read(tmp_path: pathlib.Path, core: str) -> None:
     """As CricaVPR's code and those that began from it save them; NumPy 1 has the second name."""
     content = nested(random_state(SMALL["cricavpr"]))
     content |= {"recalls": np.array([90.5, 97.1]), "best_r5": np.float64(97.1), "n": np.int64(3)}
     path = tmp_path / "file.pth"
-    torch.save(content, path, _use_new_zipfile_serialization=new)
-    whole = {path.name: path.read_bytes()}
-    if new:
-        with zipfile.ZipFile(path) as archive:
-            whole = {name: archive.read(name) for name in archive.namelist()}
-    assert any(b"numpy._core" in data for data in whole.values())
-    named = {name: data.replace(b"numpy._core", core.encode()) for name, data in whole.items()}
-    if new:
-        with zipfile.ZipFile(path, "w") as archive:
-            for name, data in named.items():
-                archive.writestr(name, data)
-    else:
-        path.write_bytes(named[path.name])
-    found = read_checkpoint(path)
-    again = to_state(found.params, found.config, "cricavpr", found.extras)
+    path.write_bytes(whole(content, new=False).replace(b"numpy._core", core.encode()))
     state = {key.removeprefix("module."): x for key, x in content[UNDER[:-1]].items()}
-    assert same_bits({k: torch.tensor(v) for k, v in again.items()}, state)
+    assert same_bits(state_of(read_checkpoint(path)), state)
 
 
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-@pytest.mark.parametrize("kind", ["torch", "safetensors"])
-def test_half_precision_is_widened_exactly(tmp_path: pathlib.Path, dtype, kind: str) -> None:
-    shapes = SMALL["dinov2"] if kind == "torch" else public_shapes(HUGGING_FACE, "huggingface")
+@pytest.mark.parametrize(
+    ("dtype", "suffix"), [(torch.float16, ".pth"), (torch.bfloat16, ".safetensors")]
+)
+def test_half_precision_is_widened_exactly(tmp_path: pathlib.Path, dtype, suffix: str) -> None:
+    shapes = SMALL["dinov2"] if suffix == ".pth" else public_shapes(HUGGING_FACE, "huggingface")
     state = {name: tensor.to(dtype) for name, tensor in random_state(shapes).items()}
-    suffix = ".pth" if kind == "torch" else ".safetensors"
-    found = read_checkpoint(save(tmp_path / f"half{suffix}", state))
-    again = to_state(found.params, found.config, found.format, found.extras)
-    for name, tensor in state.items():
-        np.testing.assert_array_equal(again[name], tensor.float().numpy())
-        assert again[name].dtype == np.float32
+    found = state_of(read_checkpoint(save(tmp_path / f"half{suffix}", state)))
+    assert same_bits(found, {name: tensor.float() for name, tensor in state.items()})
 
 
 # A backbone to start from
@@ -327,17 +279,16 @@ def fresh(adapter: str, **fields) -> tuple[ModelConfig, object]:
     return config, init_crisalad(jax.random.key(1), config).backbone
 
 
-@pytest.mark.parametrize("kind", ["dinov2", "huggingface", "dino-salad", "ours"])
+@pytest.mark.parametrize("kind", ["huggingface", "dino-salad", "ours"])
 def test_a_backbone_of_any_file(tmp_path: pathlib.Path, kind: str) -> None:
     if kind == "huggingface":
-        state = random_state(public_shapes(HUGGING_FACE, "huggingface"))
-        source = save(tmp_path / "model.safetensors", state)
+        source = hugging_face(tmp_path / "model.safetensors")
     else:
         source = written(tmp_path, "dinov2" if kind == "ours" else kind)
     theirs = read_checkpoint(source)
     if kind == "ours":
         source = tmp_path / "ours.safetensors"
-        save_weights(source, Model(theirs.params, theirs.config), extras=theirs.extras)
+        save_weights(source, theirs.model, extras=theirs.extras)
     config, start = fresh("depthwise")
     wanted = named_leaves(theirs.params.backbone)
     for name, leaf in named_leaves(read_backbone(source, config.backbone, start)).items():
@@ -359,7 +310,6 @@ def test_adapters_come_along_where_they_are_the_same(tmp_path: pathlib.Path, kin
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"heads": 2}, "backbone.heads: found 1, expected 2"),
         (
             {"depth": 3, "registers": 4},
             "backbone.depth: found 2, exp.* backbone.registers: found 0",
@@ -403,9 +353,9 @@ def small(**changes: Any) -> dict[str, Any]:
     return state | {name.replace("norm_", "norm."): value for name, value in changes.items()}
 
 
-def whole(state: Any = None, *, new: bool = True) -> bytes:
+def whole(state: Any, *, new: bool = True) -> bytes:
     data = io.BytesIO()
-    torch.save(small() if state is None else state, data, _use_new_zipfile_serialization=new)
+    torch.save(state, data, _use_new_zipfile_serialization=new)
     return data.getvalue()
 
 
@@ -415,11 +365,9 @@ DECLARED = json.dumps({"format": "reference", "config": DEEP, "aggregator": {}})
 COUNT = next(name for name in SMALL["cricavpr"] if name.endswith("num_batches_tracked"))
 BAD: dict[str, tuple[Callable[[], Any], str]] = {
     "empty": (lambda: b"", "not a whole torch checkpoint"),
-    "cut": (lambda: whole()[:9999], "not a whole torch checkpoint: "),
-    "old, cut": (lambda: whole(new=False)[:338], "not a whole torch checkpoint"),
-    "text": (lambda: b"no checkpoint", "not a whole torch checkpoint|refused"),
+    "cut": (lambda: whole(small())[:9999], "not a whole torch checkpoint: "),
+    "old, cut": (lambda: whole(small(), new=False)[:338], "not a whole torch checkpoint"),
     "a list": (lambda: [1, 2], "found list, expected nothing but tensors by name"),
-    "no tensor": (lambda: small(epoch=3), "found epoch, expected nothing but tensors"),
     "a number for a name": (lambda: {**small(), 3: BIAS}, "found 3, expected nothing but"),
     "double": (
         lambda: small(norm_bias=BIAS.double()),
@@ -427,17 +375,9 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "nan": (lambda: small(norm_bias=BIAS * float("nan")), "norm.bias holds NaN or inf"),
     "sparse": (lambda: small(norm_bias=BIAS.to_sparse()), "norm.bias is no plain tensor: .*Sparse"),
-    "eight bits": (
-        lambda: small(norm_bias=BIAS.to(torch.float8_e4m3fn)),
-        "norm.bias is no plain tensor: .*Float8",
-    ),
     "a float count": (
         lambda: nested(random_state(SMALL["cricavpr"]) | {COUNT: torch.zeros(())}),
         "num_batches_tracked found float32, expected int64",
-    ),
-    "no width": (
-        lambda: small(cls_token=torch.zeros(1, 1, 0)),
-        "found cls_token of shape .1, 1, 0., expected an array of more than 2 axes, none of",
     ),
     "extra and missing": (
         lambda: {k.replace("norm.bias", "norm.shift"): v for k, v in small().items()},
@@ -451,10 +391,6 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: {"state_dict": declaring(small(), "[" * 10**5)},
         "found no JSON .nested too deep",
     ),
-    "half a configuration": (
-        lambda: declaring(small(), '{"config": {}}'),
-        "found no aggregator, format",
-    ),
     "code": (
         lambda: small(norm_weight=Opens(pathlib.Path("made"))),
         "refused: it asks for [a-z]+.mkdir, expected nothing but tenso",
@@ -467,10 +403,6 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
     "safetensors: eight bits": (
         lambda: safetensors.torch.save({"layernorm.bias": BIAS.to(torch.float8_e4m3fn)}),
         "found a type that numpy does not know: .*float8",
-    ),
-    "safetensors: another model": (
-        lambda: safetensors.numpy.save({"stem.weight": np.zeros(3)}),
-        "found no checkpoint that we know .*stem.weight",
     ),
 }
 
@@ -495,32 +427,16 @@ def test_a_file_that_is_no_model(tmp_path: pathlib.Path, monkeypatch, kind: str)
     refused(path, words)
 
 
-def test_no_file_or_a_folder(tmp_path: pathlib.Path) -> None:
-    refused(tmp_path / "none.pth", "found no such file, expected a checkpoint")
-    (tmp_path / "folder.pth").mkdir()
-    refused(tmp_path / "folder.pth", "found a folder, expected a checkpoint")
-
-
 def test_targets_and_layouts_that_do_not_fit(tmp_path: pathlib.Path) -> None:
     public, ours = written(tmp_path, "dino-salad"), tmp_path / "ours.safetensors"
-    for target, layout, words in (
-        ("x.pth", None, "x.pth: found the suffix '.pth', expected .safetensors"),
-        ("x.safetensors", "dinov2", "found a public checkpoint .dino-salad. and format dinov2"),
-        (".", None, "found a folder, expected a file"),
-    ):
-        with pytest.raises(InputError, match=words):
-            convert(public, tmp_path / target, layout)
+    with pytest.raises(InputError, match=r"found a public checkpoint .dino-salad. and format d"):
+        convert(public, tmp_path / "x.safetensors", "dinov2")
     convert(public, ours)
     for target, layout, words in (
         ("x.pth", "dinov2", "format dinov2: found a model of aggregator salad"),
-        ("x.pth", "timm", "format: found 'timm'"),
         ("x.onnx", None, "x.onnx: found suffix '.onnx', expected .pth or .pt or .ckpt$"),
-        ("x", None, "x: found suffix '', expected .pth"),
-        ("x\0.pth", None, "cannot be made"),
         ("x" * 300 + ".pth", None, "too long"),
         ("x.pth", "huggingface", "x.pth: found suffix '.pth', expected .safetensors$"),
-        ("x.safetensors", None, "format huggingface: found a model of aggregator salad"),
-        ("x.safetensors", "reference", "suffix '.safetensors', expected .pth or .pt or .ckpt"),
     ):
         with pytest.raises(InputError, match=words):
             convert(ours, tmp_path / target, layout)

@@ -63,20 +63,25 @@ class Lightning(nn.Module):
 
 WRAPPED = {
     "compiled": lambda net: torch.compile(net),
-    "compiled, parallel": lambda net: nn.DataParallel(torch.compile(net)),
     "parallel, compiled": lambda net: torch.compile(nn.DataParallel(net)),
     "Lightning": Lightning,
-    "compiled in Lightning": lambda net: Lightning(torch.compile(net)),
     "all of it twice": lambda net: torch.compile(
         nn.DataParallel(Lightning(torch.compile(nn.DataParallel(Lightning(net)))))
     ),
 }
 
 
+@pytest.fixture
+def plain(tmp_path: pathlib.Path) -> Checkpoint:
+    """The parameters of `network()` as torch's documentation has them saved."""
+    return read_quietly(save(tmp_path / "plain.pth", network().state_dict()))
+
+
 @pytest.mark.parametrize("kind", WRAPPED)
-def test_what_wraps_a_network_leaves_no_name(tmp_path: pathlib.Path, kind: str) -> None:
+def test_what_wraps_a_network_leaves_no_name(
+    tmp_path: pathlib.Path, plain: Checkpoint, kind: str
+) -> None:
     net = network()
-    plain = read_quietly(save(tmp_path / "plain.pth", net.state_dict()))
     state = WRAPPED[kind](net).state_dict()
     assert state.keys().isdisjoint(net.state_dict())
     for name, content in (("bare.pth", state), ("under.ckpt", {"state_dict": state, "epoch": 3})):
@@ -158,18 +163,17 @@ OBJECTS = {
 
 
 @pytest.mark.parametrize("kind", OBJECTS)
-def test_objects_with_the_weights_are_not_made(tmp_path: pathlib.Path, kind: str) -> None:
-    net = network()
-    content = {"hyper_parameters": OBJECTS[kind], "state_dict": net.state_dict(), "epoch": 3}
-    found = read_quietly(save(tmp_path / "file.ckpt", content))
-    assert_equal(found.params, read_quietly(save(tmp_path / "p.pth", net.state_dict())).params)
-
-
-def test_weights_in_a_defaultdict_are_weights(tmp_path: pathlib.Path) -> None:
+def test_objects_with_the_weights_are_not_made(
+    tmp_path: pathlib.Path, plain: Checkpoint, kind: str
+) -> None:
     state = network().state_dict()
-    plain = read_quietly(save(tmp_path / "plain.pth", state))
-    found = read_quietly(save(tmp_path / "d.pth", collections.defaultdict(list, state)))
-    assert_equal(found.params, plain.params)
+    content = {"hyper_parameters": OBJECTS[kind], "state_dict": state, "epoch": 3}
+    assert_equal(read_quietly(save(tmp_path / "file.ckpt", content)).params, plain.params)
+
+
+def test_weights_in_a_defaultdict_are_weights(tmp_path: pathlib.Path, plain: Checkpoint) -> None:
+    state = collections.defaultdict(list, network().state_dict())
+    assert_equal(read_quietly(save(tmp_path / "d.pth", state)).params, plain.params)
 
 
 class Runs:
@@ -249,9 +253,9 @@ def training(kind: str, net: ViT) -> tuple[dict[str, Any], int]:
     """A file, and how many tensors a note says are left out of it."""
     plain = {f"backbone.{name}": array for name, array in net.state_dict().items()}
     both = heads("dino_head.") | heads("ibot_head.")
-    if kind == "teacher_checkpoint":
+    if kind == "the teacher":
         return {"teacher": chunked(net, "backbone.", 2) | both}, 8
-    if kind == "teacher_checkpoint without a mask token":
+    if kind == "without a mask token":
         state = {n: x for n, x in plain.items() if n != "backbone.mask_token"}
         return {"teacher": state | heads("dino_head.")}, 4
     other = {f"student.{n}": x for n, x in chunked(network(1), "backbone.", 4).items()}
@@ -268,24 +272,18 @@ def training(kind: str, net: ViT) -> tuple[dict[str, Any], int]:
 
 
 @pytest.mark.parametrize(
-    "kind",
-    [
-        "teacher_checkpoint",
-        "teacher_checkpoint without a mask token",
-        "the whole training",
-        "wrapped by FSDP",
-    ],
+    "kind", ["the teacher", "without a mask token", "the whole training", "wrapped by FSDP"]
 )
-def test_the_teacher_of_a_training_is_a_backbone(tmp_path: pathlib.Path, kind: str) -> None:
+def test_the_teacher_of_a_training_is_a_backbone(
+    tmp_path: pathlib.Path, plain: Checkpoint, kind: str
+) -> None:
     net = network()
     content, left_out = training(kind, net)
     path = save(tmp_path / "training.pth", content)
-    with pytest.warns(
-        Note, match=rf"under (teacher\.)?backbone, and left out {left_out} other tensors$"
-    ) as notes:
+    words = rf"under (teacher\.)?backbone, and left out {left_out} other tensors$"
+    with pytest.warns(Note, match=words) as notes:
         found = read_checkpoint(path)
     assert len(notes) == 1
-    plain = read_quietly(save(tmp_path / "plain.pth", net.state_dict()))
     assert (found.format, found.config) == ("dinov2", plain.config)
     assert_equal(found.params, plain.params)
     assert_same_outputs(found, net)

@@ -5,12 +5,10 @@ import warnings
 
 import jax
 import numpy as np
-import pytest
 import safetensors
 
 from crisalad_jax.checkpoints import starter
-from crisalad_jax.checkpoints.load import find_weights, load
-from crisalad_jax.checkpoints.published import PUBLISHED
+from crisalad_jax.checkpoints.load import load
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
@@ -47,17 +45,6 @@ def test_it_has_the_sources_of_its_parts() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error", Note)
         load("starter")
-
-
-def test_its_name_is_its_file_and_no_weights_mean_it_with_a_note() -> None:
-    assert find_weights("starter") == starter.FILE
-    with pytest.warns(Note, match=r"no --weights: taking starter.*--weights megaloc"):
-        assert find_weights(None) == starter.FILE
-
-
-def test_the_names_are_of_different_models() -> None:
-    assert starter.BEST in PUBLISHED
-    assert starter.NAME not in PUBLISHED
 
 
 def test_it_tells_places_apart_that_it_never_saw(tmp_path: pathlib.Path) -> None:

@@ -5,21 +5,17 @@ import json
 import os
 import pathlib
 import struct
-import typing
-from collections.abc import Iterator
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 import safetensors.numpy
 
-import crisalad_jax
 from crisalad_jax.checkpoints import weights
 from crisalad_jax.checkpoints.safetensors_io import write_sealed
 from crisalad_jax.checkpoints.weights import load_weights, model_hash, save_weights
 from crisalad_jax.config.io import to_plain
-from crisalad_jax.config.part import Part
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.model import Model, parameter_shapes
@@ -44,13 +40,13 @@ REGISTERS = dataclasses.replace(
 @pytest.mark.parametrize("config", [MODEL, WITHOUT_ENCODER, REGISTERS])
 def test_weights_survive_a_file_bit_for_bit(tmp_path, config):
     params = random_params(config)
-    save_weights(tmp_path / "new" / "w.safetensors", Model(params, config))
+    first, again = tmp_path / "new" / "w.safetensors", tmp_path / "again.safetensors"
+    save_weights(first, Model(params, config))
     assert os.listdir(tmp_path / "new") == ["w.safetensors"]
-    found, found_config = load_weights(tmp_path / "new" / "w.safetensors")
+    found, found_config = load_weights(first)
     assert found_config == config
     assert_equal(found, params)
-    save_weights(tmp_path / "again.safetensors", Model(params, config))
-    again, first = (tmp_path / name for name in ("again.safetensors", "new/w.safetensors"))
+    save_weights(again, Model(params, config))
     assert again.read_bytes() == first.read_bytes()
 
 
@@ -64,7 +60,6 @@ def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
     told = json.loads(metadata["crisalad-jax 4"])
     assert list(told) == [*("checksum", "config", "version", "parts", "aggregator", "model_sha256")]
     assert told["config"] == to_plain(MODEL)
-    assert told["version"] == crisalad_jax.__version__
     assert {field: name for field, (name, _) in told["parts"].items()} == {
         "backbone": "vit",
         "aggregator": "salad",
@@ -123,8 +118,8 @@ def test_only_what_parameters_do_not_depend_on_is_free(shared):
     load_weights(path, expected=other)
     with pytest.raises(InputError, match=f"^{path}: these weights are of another model: ") as error:
         load_weights(path, expected=PRESETS["tiny"])
-    assert "backbone.dim: found 32, expected 128" in str(error.value)
-    assert "aggregator.clusters: found 4, expected 16" in str(error.value)
+    for words in ("backbone.dim: found 32, expected 128", "clusters: found 4, expected 16"):
+        assert words in str(error.value)
     assert "image_size" not in str(error.value)
 
 
@@ -143,37 +138,26 @@ def test_parameters_of_one_image_size_keep_it(tmp_path):
     assert model_hash(params, turned) != model_hash(params, config)
 
 
-def reseal(shared: pathlib.Path, path: pathlib.Path, value, change=lambda arrays: None) -> None:
+def reseal(shared: pathlib.Path, path: pathlib.Path, value, change=None, form=weights.FORMAT):
     """The shared weights with other values in the metadata, where None leaves one out, and with
     changed arrays, and the checksum of all."""
     arrays = safetensors.numpy.load_file(shared / "weights.safetensors")
-    change(arrays)
-    told = told_of(shared / "weights.safetensors", weights.FORMAT) | value
-    told = {key: each for key, each in told.items() if each is not None}
-    write_sealed(path, arrays, weights.FORMAT, told)
-
-
-def told_of(path: pathlib.Path, key: str) -> dict[str, Any]:
-    with safetensors.safe_open(path, framework="numpy") as file:
-        told = json.loads(file.metadata()[key])
+    if change is not None:
+        change(arrays)
+    with safetensors.safe_open(shared / "weights.safetensors", framework="numpy") as file:
+        told = json.loads(file.metadata()[weights.FORMAT]) | value
     del told["checksum"]
-    return told
+    write_sealed(path, arrays, form, {k: each for k, each in told.items() if each is not None})
 
 
 def test_a_file_of_another_format_is_refused(tmp_path, shared):
-    """With a right checksum, too, and whatever has no array of its own."""
+    """With a right checksum, too."""
     path = tmp_path / "w.safetensors"
-    arrays = safetensors.numpy.load_file(shared / "weights.safetensors")
     for form in ("crisalad-jax 3", "crisalad-jax 5", "crisalad-jax pca 2"):
-        told = told_of(shared / "weights.safetensors", "crisalad-jax 4")
-        write_sealed(path, arrays, form, told)
-        with pytest.raises(InputError) as error:
+        reseal(shared, path, {}, form=form)
+        words = rf"found metadata \['{form}'\], expected .*'crisalad-jax 4'.*`crisalad convert`"
+        with pytest.raises(InputError, match=f"^{path}: {words}"):
             load_weights(path)
-        assert str(error.value) == (
-            f"{path}: found metadata [{form!r}], expected a .safetensors file of weights "
-            "('crisalad-jax 4'), as this package writes it; `crisalad convert` reads public "
-            "checkpoints"
-        )
 
 
 @pytest.mark.parametrize("inside", [True, False])
@@ -205,7 +189,6 @@ SCORE, DUST = "aggregator.score.fc1.weight", "aggregator.dust_bin"
         (lambda a: a.update({SCORE: a[SCORE].T.copy()}), [SCORE, "(16, 32), expected", "(32, 16)"]),
         (lambda a: a.update({SCORE: a[SCORE].astype("f8")}), ["float64", "expected float32"]),
         (lambda a: a.update({DUST: np.float32(np.nan)[...]}), [f"{DUST} holds NaN or infinity"]),
-        (lambda a: (a.pop(SCORE), a.pop(DUST)), [f"{SCORE} missing", f"{DUST} missing"]),
         (
             lambda a: [a.pop(name) for name in list(a) if name.startswith("aggregator.")],
             ["aggregator.cluster_features.fc1.bias missing; ", " more"],
@@ -227,13 +210,9 @@ def test_weights_that_do_not_fit_are_listed(tmp_path, shared, change, words):
     [
         ({"config": None}, "found no config, expected config, version"),
         ({"config": []}, r"found \[\], expected an object of fields @ config"),
-        ({"config": {"clusters": 3}}, "clusters"),
         ({"parts": []}, r"found \[\], expected dict @ config.parts"),
-        ({"version": None}, "found no version, expected config, version"),
         ({"model_sha256": 7}, "found 7, expected text @ config.model_sha256"),
         ({"config": {"cross_image": {"layers": 900}}}, "far from the sizes"),
-        ({"config": {"cross_image": {"layers": 99999999999}}}, "up to 99999999999"),
-        ({"config": {"aggregator": {"name": "boq", "layers": 900}}}, "far from the sizes"),
         ({"config": {"backbone": {"name": "vit", "dim": 9 * 10**12}}}, "up to 9000000000000"),
     ],
 )
@@ -250,59 +229,55 @@ def test_no_file_or_another_one_is_refused(tmp_path):
     for path, what in ((tmp_path, "a folder"), (tmp_path / "none.safetensors", "no such file")):
         with pytest.raises(InputError, match=f"^{path}: found {what}, expected a .safetensors"):
             load_weights(path)
-    (tmp_path / "w.safetensors").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(1000))
-    with pytest.raises(InputError, match=r"w\.safetensors: not a whole safetensors file"):
-        load_weights(tmp_path / "w.safetensors")
 
 
-def test_the_hash_is_of_every_number(shared):
-    """Of the configuration: see below."""
-    params, config = load_weights(shared / "weights.safetensors")
-    found = model_hash(params, config)
-    assert len(found) == 64
-    assert model_hash(random_params(MODEL), MODEL) == found
+def test_the_hash_is_of_every_number(params):
     leaves, structure = jax.tree.flatten(params)
-    for number in (0, len(leaves) // 2, len(leaves) - 1):
+    for number in (0, len(leaves) - 1):
         changed = np.array(leaves[number])
         changed.flat[-1] = np.nextafter(changed.flat[-1], 2)
         others = jax.tree.unflatten(structure, [*leaves[:number], changed, *leaves[number + 1 :]])
-        assert model_hash(others, config) != found
-
-
-def fields_of(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:
-    """Fields with a value of their own, or a part: the names, what has them, and the fields."""
-    for field in dataclasses.fields(config):
-        value, name = getattr(config, field.name), f"{prefix}{field.name}"
-        if isinstance(value, Part) or not dataclasses.is_dataclass(value):
-            yield name, config, field
-        if dataclasses.is_dataclass(value):
-            yield from fields_of(value, f"{name}.")
-
-
-def other_values(config: Any, field: dataclasses.Field[Any]) -> Iterator[Any]:
-    """Values that a field might have as well; some do not fit the other fields."""
-    value = getattr(config, field.name)
-    hint = typing.get_type_hints(type(config))[field.name]
-    if isinstance(value, Part):
-        yield from (name for name in value.registry if name != value.part_name)
-        kind = type("Another", (type(value),), {"part_name": "another"})
-        yield dataclasses.dataclass(frozen=True)(kind)(**vars(value))
-    elif typing.get_origin(hint) is Literal:
-        yield from (each for each in typing.get_args(hint) if each != value)
-    elif isinstance(value, bool):
-        yield not value
-    elif isinstance(value, int):
-        yield from {value + 1, value + 2, 2 * value, 1} - {value}
-    elif isinstance(value, float):
-        yield from (value / 2, value + 0.5)
-    elif isinstance(value, tuple):
-        yield tuple(2 * each for each in value)
-    else:
-        yield 0.5  # of what is None
+        assert model_hash(others, MODEL) != model_hash(params, MODEL)
 
 
 SINKHORN = dataclasses.replace(MODEL.aggregator.sinkhorn, tolerance=1e-3, gradient="stop")
 CONVERGING = put(MODEL, "aggregator.sinkhorn", SINKHORN)
+FREE = {
+    "image_size": (84, 112),
+    "compute_dtype": "bfloat16",
+    "precision": "high",
+    "remat": "full",
+    "aggregator.dropout": 0.5,
+    "cross_image.dropout": 0.5,
+    "backbone.position_init": "sincos",
+    "backbone.layer_scale_init": 0.5,
+    "preprocessing.size_rule": "native",
+    "preprocessing.filter": "bicubic",
+    "preprocessing.antialias": False,
+    "preprocessing.pixels": "floats",
+    "preprocessing.round_to_patch": True,
+    "preprocessing.bit_depth": "contrast-stretch",
+}
+"""How parameters start, dropout, rounding, and what a step keeps in memory do not matter."""
+MATTERS = {
+    "preprocessing.normalisation": "local-contrast",
+    "preprocessing.mean": (0.5, 0.5, 0.5),
+    "backbone.heads": 4,
+    "backbone.adapter.alpha": 0.5,
+    "aggregator.dustbin": "token",
+    "aggregator.epsilon": 0.5,
+    "aggregator.sinkhorn.step": "newton",
+    "aggregator.sinkhorn.iterations": 4,
+    "aggregator.sinkhorn.tolerance": 1e-4,
+    "cross_image.heads": 4,
+    "cross_image.global_token": False,
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [*FREE.items(), *MATTERS.items()])
+def test_the_hash_changes_with_every_field_that_matters(params, name, value):
+    same = model_hash(params, put(CONVERGING, name, value)) == model_hash(params, CONVERGING)
+    assert same == (name in FREE)
 
 
 def test_the_hash_is_read_with_the_weights(shared, monkeypatch):
@@ -311,29 +286,6 @@ def test_the_hash_is_read_with_the_weights(shared, monkeypatch):
     expected = model_hash(*load_weights(path))
     monkeypatch.setattr(weights, "model_hash", None)
     assert weights.read_weights(path).digest == expected
-
-
-@pytest.mark.parametrize("name", [name for name, _, _ in fields_of(CONVERGING)])
-def test_the_hash_changes_with_every_field_that_matters(params, name):
-    """How parameters start, dropout, rounding, and what a step keeps in memory do not matter."""
-    free = {
-        *("image_size", "compute_dtype", "precision", "remat"),
-        *("aggregator.dropout", "cross_image.dropout"),
-        *("backbone.position_init", "backbone.layer_scale_init"),
-        *("preprocessing.size_rule", "preprocessing.filter", "preprocessing.antialias"),
-        *("preprocessing.pixels", "preprocessing.round_to_patch", "preprocessing.bit_depth"),
-    }
-    config, field = next((has, field) for each, has, field in fields_of(CONVERGING) if each == name)
-    tried = 0
-    for value in other_values(config, field):
-        try:
-            other = put(CONVERGING, name, value)
-        except InputError:
-            continue
-        tried += 1
-        same = model_hash(params, other) == model_hash(params, CONVERGING)
-        assert same == (name in free), value
-    assert tried
 
 
 @pytest.mark.parametrize(

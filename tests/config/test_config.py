@@ -11,41 +11,31 @@ from crisalad_jax.checkpoints.export import ExportConfig
 from crisalad_jax.checkpoints.load import load
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.classes import ClassesConfig
-from crisalad_jax.config.io import from_plain, read_config
+from crisalad_jax.config.io import read_config
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
-from crisalad_jax.experiments.demo import DemoConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
-from crisalad_jax.nn.aggregators.gem import CosPlaceConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.queries import BoqConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
-from crisalad_jax.nn.aggregators.vlad import AnyLocConfig, NetVladConfig, VladBuffConfig
+from crisalad_jax.nn.aggregators.vlad import AnyLocConfig, VladBuffConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.retrieval.pca import PcaConfig
 from crisalad_jax.sinkhorn import SinkhornConfig
-from crisalad_jax.synthetic import SyntheticCityConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.losses.large_margin_cosine import LargeMarginCosineConfig
 from crisalad_jax.training.losses.pairwise import (
-    CircleConfig,
     ContrastiveConfig,
-    FastAPConfig,
-    MultiSimilarityConfig,
-    SupConConfig,
-    TripletConfig,
 )
-from crisalad_jax.training.recipes import RECIPES, from_scratch, recipe
+from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 
@@ -109,10 +99,6 @@ def test_the_recipes_are_their_papers():
     assert (optimiser.schedule, optimiser.step_epochs, optimiser.step_gamma) == ("step", 3, 0.5)
     assert (cricavpr.epochs, cricavpr.patience, cricavpr.monitor) == (10, 10, "R@5")
     paper = recipe("b14")
-    netvlad = recipe("b14", "crisalad+netvlad")
-    assert (netvlad.places_per_batch, netvlad.images_per_place) == (48, 4)
-    assert netvlad.loss.kind.part_name == "multi-similarity"
-    assert netvlad.model.descriptor_dim == 64 * 768
     for name, change in (
         ("crisalad-1e-4", {"learning_rate": 1e-4}),
         ("crisalad-step", {"schedule": "step"}),
@@ -299,7 +285,7 @@ def test_a_classification_needs_no_second_image_of_a_place():
 @pytest.mark.parametrize(
     ("name", "width"),
     # The published descriptors of b14: BoQ's, and 4,096 of MixVPR and Conv-AP.
-    [("gem", 768), ("conv-ap", 4096), ("mixvpr", 4096), ("boq", 12_288)],
+    [("gem", 768), ("conv-ap", 4096), ("mixvpr", 4096), ("boq", 12_288), ("netvlad", 64 * 768)],
 )
 def test_methods_to_compare_differ_in_the_aggregator_alone(name, width):
     found, paper = recipe("b14", f"crisalad+{name}"), recipe("b14")
@@ -310,19 +296,6 @@ def test_methods_to_compare_differ_in_the_aggregator_alone(name, width):
         found.model, aggregator="salad", cross_image=paper.model.cross_image
     )
     assert dataclasses.replace(found, model=as_paper) == paper
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize(
-    "name", [*RECIPES, *(f"crisalad+aggregator:{name}" for name in AGGREGATORS)]
-)
-def test_every_recipe_fits_every_preset(preset, name):
-    found = recipe(preset, name)
-    assert from_scratch(found).trainable == "all"
-    if isinstance(found.model.backbone, ViTConfig):
-        assert found.model.backbone.dim == PRESETS[preset].backbone.dim
-    else:  # the published sizes, for every preset but one
-        assert (found.model == recipe("b14", name).model) == (preset != "tiny")
 
 
 def test_the_recipe_of_starter_is_that_of_its_last_run():
@@ -344,15 +317,6 @@ def test_the_run_without_the_cameras_faults_is_an_epoch_of_starters_but_for_them
     names = [field.name for field in dataclasses.fields(LightAugmentConfig)]
     light = LightAugmentConfig(**{name: getattr(run.augmentation, name) for name in names})
     assert without == dataclasses.replace(run, augmentation=light, epochs=1)
-
-
-def test_augmentation_is_the_one_named():
-    light = LightAugmentConfig(blur=3.0)
-    config = TrainConfig(augmentation=light)
-    assert config.augmentation is light
-    assert TrainConfig(augmentation="light").augmentation == LightAugmentConfig()
-    assert TrainConfig(augmentation="rand-augment").augmentation == RandAugmentConfig()
-    assert TrainConfig(augmentation="none").augmentation == NoAugmentation()
 
 
 def test_an_unknown_name_lists_the_known():
@@ -385,9 +349,7 @@ def test_sides_are_multiples_of_14(height, width, nearest):
         of_clusters(4).check_image_size((height, width))
 
 
-@pytest.mark.parametrize(
-    ("clusters", "side"), [(3, 28), (4, 42), (8, 42), (9, 56), (64, 126), (63, 112)]
-)
+@pytest.mark.parametrize(("clusters", "side"), [(3, 28), (4, 42), (64, 126), (63, 112)])
 def test_more_patches_than_clusters(clusters, side):
     """The message's smallest square works, and the next smaller one does not."""
     of_clusters(clusters).check_image_size((side, side))
@@ -397,75 +359,38 @@ def test_more_patches_than_clusters(clusters, side):
         of_clusters(clusters).check_image_size((smaller, smaller))
 
 
-def test_one_patch_more_than_clusters_is_enough():
-    of_clusters(4).check_image_size((14, 70))
-    with pytest.raises(InputError, match="5 patches for 5 clusters"):
-        of_clusters(5).check_image_size((14, 70))
-
-
 @pytest.mark.parametrize(
     ("kind", "fields", "words"),
     [
         (AdapterConfig, {"kind": "linear"}, "AdapterConfig.kind: found 'linear', expected one of"),
         (AdapterConfig, {"kernel_size": 4}, "AdapterConfig.kernel_size: found 4, expected an odd"),
-        (AdapterConfig, {"bottleneck": 0.0}, "AdapterConfig.bottleneck: found 0.0"),
         (ViTConfig, {"heads": 7}, "ViTConfig.dim: found 768, expected a multiple of the 7 heads"),
-        (ViTConfig, {"depth": 0}, "ViTConfig.depth: found 0, expected a whole number of"),
         (ViTConfig, {"registers": -1}, "ViTConfig.registers: found -1, expected .* of at least 0"),
         (ViTConfig, {"dim": 6, "heads": 1, "position_init": "sincos"}, "dim: found 6, .* of 4"),
         (ViTConfig, NARROW, "found 0.25, expected a width for dim 96, 24, .* of 16"),
-        (ModelConfig, {"aggregator": "vlad"}, "^ModelConfig.aggregator: found 'vlad'"),
         (ModelConfig, {"aggregator": "gem-pyramid", "image_size": (28, 56)}, "at least 42 x 42, a"),
         (ModelConfig, FIVE_HEADS, "CrossImageConfig.heads: found 5, .*divisor of the 768 numbers"),
-        (ModelConfig, {"aggregator": "class-token", "image_size": (28, 57)}, "found 28 x 57"),
-        (
-            ModelConfig,
-            {"aggregator": AnyLocConfig(layer=12)},
-            "found 12, expected -12 to 11",
-        ),
-        (ModelConfig, {"aggregator": AnyLocConfig(layer=-13)}, "found -13, expected -12 to 11"),
+        (ModelConfig, {"aggregator": AnyLocConfig(layer=12)}, "found 12, expected -12 to 11"),
         (ModelConfig, {"aggregator": "anyloc"}, "found 2, expected 0 for aggregator anyloc, wi"),
         (ModelConfig, {"aggregator": ConvApConfig(side=3), "image_size": (28, 56)}, "42 x 42, a p"),
-        (ModelConfig, {"image_size": (224, 225)}, "image size: found 224 x 225"),
-        (ModelConfig, {"image_size": (112, 112)}, "64 patches for 64 clusters"),
         (ModelConfig, {"cross_image": CrossImageConfig(heads=12)}, "found 12, .* of the 128 num"),
         (ModelConfig, {"aggregator": SaladConfig(token_dim=200)}, "token: found True, expected F"),
-        (NetVladConfig, {"clusters": 1}, "NetVladConfig.clusters: found 1, expected at least 2"),
         (BoqConfig, {"channels": 200}, "found 200, expected a multiple of its 3 heads, one for"),
-        (MixVprConfig, {"rows": 0}, "MixVprConfig.rows: found 0"),
-        (CosPlaceConfig, {"dim": -1}, "CosPlaceConfig.dim: found -1"),
-        (SinkhornConfig, {"iterations": 0}, "SinkhornConfig.iterations: found 0"),
-        (SaladConfig, {"epsilon": -1.0}, "SaladConfig.epsilon: found -1.0"),
-        (SaladConfig, {"epsilon": float("nan")}, "SaladConfig.epsilon: found nan"),
         (SaladConfig, {"dropout": 1.0}, "SaladConfig.dropout: found 1.0, expected .* less than 1"),
-        (CrossImageConfig, {"dropout": float("nan")}, "CrossImageConfig.dropout: found nan"),
         (PreprocessingConfig, {"deviation": (1.0, 0.0, 1.0)}, "found mean .* deviations above"),
-        (PreprocessingConfig, {"mean": (0.0, 0.0, float("nan"))}, "found mean .* finite numbers"),
-        (PreprocessingConfig, {"mean": (0.5, 0.5)}, "Config.mean: found .* tuple of 3"),
         (PreprocessingConfig, LOCAL_FLOATS, "pixels: found floats with normalisation local-contr"),
-        (MultiSimilarityConfig, {"beta": 0.0}, "MultiSimilarityConfig.beta: found 0.0"),
         (LossConfig, {"miner_margin": -0.1}, "LossConfig.miner_margin: found -0.1"),
-        (LossConfig, {"kind": "softmax"}, "^LossConfig.kind: found 'softmax', expected one of c"),
         (LossConfig, {"kind": "fast-ap"}, "expected 'none' for loss fast-ap, which ranks all"),
         (ContrastiveConfig, {"negative_margin": 2.1}, "margin: found 2.1, expected 0 to 2"),
-        (TripletConfig, {"margin": 0.0}, "TripletConfig.margin: found 0.0"),
-        (CircleConfig, {"margin": 1.0}, "CircleConfig.margin: found 1.0"),
-        (SupConConfig, {"temperature": 0.0}, "SupConConfig.temperature: found 0.0"),
-        (FastAPConfig, {"bins": 0}, "FastAPConfig.bins: found 0"),
         (LargeMarginCosineConfig, {"margin": 1.0}, "LargeMarginCosineConfig.margin: found 1.0"),
         (ClassesConfig, {"groups": 0}, "ClassesConfig.groups: found 0"),
-        (ClassesConfig, {"steps": 0}, "ClassesConfig.steps: found 0"),
         (ClassesConfig, {"sector": 50.0}, "found 2 sectors of 50 degrees, expected a divisor of"),
         (RandAugmentConfig, {"magnitude": 31}, "RandAugmentConfig.magnitude: found 31"),
         (LightAugmentConfig, {"crop": 1.0}, "LightAugmentConfig.crop: found 1.0"),
-        (LightAugmentConfig, {"grey": 1.1}, "LightAugmentConfig.grey: found 1.1"),
-        (OptimiserConfig, {"learning_rate": 0.0}, "OptimiserConfig.learning_rate: found 0.0"),
         (OptimiserConfig, {"b2": 1.0}, "OptimiserConfig.b2: found 1.0"),
-        (TrainConfig, {"augmentation": "heavy"}, "^TrainConfig.augmentation: found 'heavy'"),
         (TrainConfig, {"images_per_place": 1}, "TrainConfig.images_per_place: found 1"),
         (TrainConfig, {"min_images": 3}, "TrainConfig.min_images: found 3, expected at least 4"),
         (TrainConfig, {"trainable": "tail"}, "TrainConfig.trainable: found 'tail', expected head"),
-        (TrainConfig, {"trainable": "last--1-blocks+head"}, "TrainConfig.trainable"),
         (TrainConfig, {"validation_size": (320, 322)}, "image size: found 320 x 322, expected"),
         (TrainConfig, {"seed": -1}, "TrainConfig.seed: found -1"),
     ],
@@ -482,26 +407,15 @@ def test_what_does_not_fit_is_refused_in_one_line(kind, fields, words):
     [
         (CrossImageConfig, {"layers": 1.5}, "1.5", "a whole number"),
         (CrossImageConfig, {"layers": True}, "True", "a whole number"),
-        (CrossImageConfig, {"heads": "4"}, "'4'", "a whole number"),
         (CrossImageConfig, {"dropout": None}, "None", "a number"),
         (CrossImageConfig, {"global_token": 1}, "1", "True or False"),
-        (AdapterConfig, {"kind": None}, "None", "one of depthwise, mlp, multi-resolution, none"),
         (ViTConfig, {"adapter": "mlp"}, "'mlp'", "AdapterConfig"),
         (SaladConfig, {"sinkhorn": 3}, "3", "SinkhornConfig"),
         (SinkhornConfig, {"tolerance": "1e-3"}, "'1e-3'", "a finite number above 0, or None"),
-        (ModelConfig, {"image_size": 224}, "224", "a tuple of 2, each a whole number"),
         (ModelConfig, {"image_size": [224, 224]}, "[224, 224]", "a tuple of 2, each a whole num"),
         (ModelConfig, {"image_size": (224, 2.5)}, "(224, 2.5)", "a tuple of 2, each a whole num"),
-        (ModelConfig, {"remat": ["dots"]}, "['dots']", "one of dots, full, none"),
-        (OptimiserConfig, {"decay_steps": 10.5}, "10.5", "a whole number, or None"),
-        (TrainConfig, {"trainable": None}, "None", "text"),
         (TrainConfig, {"cities": "Bath"}, "'Bath'", "a tuple, each text, or None"),
-        (TrainConfig, {"cities": ("Bath", 3)}, "('Bath', 3)", "a tuple, each text, or None"),
-        (LightAugmentConfig, {"blur": "1"}, "'1'", "a number"),
         (ExportConfig, {"platforms": "cpu"}, "'cpu'", "a tuple, each one of cpu"),
-        (PcaConfig, {"whiten": "no"}, "'no'", "True or False"),
-        (DemoConfig, {"epochs": 1.5}, "1.5", "a whole number"),
-        (SyntheticCityConfig, {"test_places": "150"}, "'150'", "a whole number"),
     ],
 )
 @pytest.mark.usefixtures("_unchecked")
@@ -511,18 +425,6 @@ def test_a_field_of_another_type_is_refused_by_its_name(kind, fields, found, exp
     with pytest.raises(InputError, match=words) as caught:
         kind(**fields)
     assert "\n" not in str(caught.value)
-
-
-@dataclasses.dataclass(frozen=True)
-class Described:
-    config: CrossImageConfig
-
-
-def test_a_field_called_config_is_said_once():
-    """A map's description has one."""
-    words = r"^map\.json: found 'two', expected a whole number @ config\.layers$"
-    with pytest.raises(InputError, match=words):
-        from_plain(Described, {"config": {"layers": "two"}}, source="map.json")
 
 
 @pytest.mark.usefixtures("_unchecked")

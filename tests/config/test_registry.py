@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 import functools
+import re
 from typing import Any
 
 import pytest
@@ -49,19 +50,8 @@ class Plain(Duck):
 
 
 @dataclasses.dataclass(frozen=True)
-class Stone:
-    def call(self) -> str:
-        return ""
-
-
-@dataclasses.dataclass(frozen=True)
 class Named(Duck):
     name: str = "Donald"
-
-
-@dataclasses.dataclass(frozen=True)
-class Plugged(Duck):
-    plugin: str = "ducks.py"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,34 +96,24 @@ def test_a_part_is_found_and_made_by_its_name(birds):
 
 
 def test_a_name_that_is_taken_is_refused(birds):
-    words = (
-        f"^register_bird 'duck': found the name taken by {__name__}.Duck, expected another name "
-        "for Goose$"
-    )
+    words = rf"^register_bird 'duck': found the name taken by {__name__}.Duck, .* for Goose$"
     with pytest.raises(InputError, match=words):
         birds.register("duck")(Goose)
-    assert birds.find("duck") is Duck
     assert birds.make("duck", "loud") == Duck(volume=3)
 
 
 def test_a_class_has_one_name(birds):
     """Files would name the other one."""
-    with pytest.raises(
-        InputError, match=r"^register_bird 'drake': found Duck registered as 'duck'"
-    ):
+    words = "^register_bird 'drake': found Duck registered as 'duck'"
+    with pytest.raises(InputError, match=words):
         birds.register("drake")(Duck)
     assert list(birds) == ["duck"]
-    assert birds.make("duck").part_name == "duck"
 
 
 def test_a_cell_that_runs_again_brings_the_same_part(birds):
-    again = dataclasses.make_dataclass(
-        "Duck",
-        [("volume", int, 5)],
-        bases=(Bird,),
-        frozen=True,
-        namespace={"call": lambda self: "", "__module__": __name__},
-    )
+    names = {"call": lambda self: "", "__module__": __name__}
+    fields = [("volume", int, 5)]
+    again = dataclasses.make_dataclass("Duck", fields, bases=(Bird,), frozen=True, namespace=names)
     assert birds.register("duck")(again) is again
     assert birds.make("duck").volume == 5
 
@@ -143,13 +123,9 @@ def test_a_cell_that_runs_again_brings_the_same_part(birds):
     [
         *(
             (part, f"found {name}, expected a subclass of Bird with @dataclasses.dataclass\\(froz")
-            for part, name in (
-                *((each, each.__name__) for each in (Thawed, Plain, int, Stone, chirp)),
-                *((3, "int"), (Duck(), "Duck")),
-            )
+            for part, name in ((Thawed, "Thawed"), (Plain, "Plain"), (chirp, "chirp"), (3, "int"))
         ),
         (Named, "found a field 'name', which has another meaning here$"),
-        (Plugged, "found a field 'plugin', which has another meaning here$"),
         (Needy, ".* missing 1 required keyword-only argument: 'weight'; expected all methods, a"),
         (Listed, "unhashable type: 'list'; expected all methods, a default for every field"),
         (Mute, ".* abstract class Mute with.* abstract method '?call'?; expected all methods"),
@@ -173,19 +149,14 @@ def test_a_function_is_a_part_where_the_kind_says_so(monkeypatch):
         birds.register("three")(3)  # type: ignore[type-var]
 
 
-@pytest.mark.parametrize("name", ["swan", "", None, ["duck"], {}])
+@pytest.mark.parametrize("name", ["swan", "", None, ["duck"]])
 def test_an_unknown_name_lists_the_known_and_tells_of_plug_ins(birds, name):
-    with pytest.raises(InputError) as caught:
+    words = rf"^bird: found {re.escape(repr(name))}, expected one of duck .*--plugin FILE\.py"
+    with pytest.raises(InputError, match=words):
         birds.find(name)
-    assert str(caught.value) == (
-        f"bird: found {name!r}, expected one of duck (is a plug-in missing? --plugin FILE.py or "
-        "MODULE, or load_plugin)"
-    )
-    with pytest.raises(InputError, match=r"^bird: found "):
-        birds.make(name)
 
 
-def test_a_field_takes_a_part_or_its_name(birds):
+def test_a_field_takes_a_registered_part_or_its_name(birds):
     @dataclasses.dataclass(frozen=True)
     class Pond:
         bird: Any = part_field(birds, "duck")
@@ -193,47 +164,30 @@ def test_a_field_takes_a_part_or_its_name(birds):
         def __post_init__(self) -> None:
             resolve_names(self)
 
-    assert Pond().bird == Pond(bird="duck").bird == Duck()
-    assert Pond(bird=Duck(volume=2)).bird == Duck(volume=2)
-    with pytest.raises(InputError, match=r"^Pond.bird: found 'swan', expected one of duck "):
-        Pond(bird="swan")
-    for other in (3, None, Stone(), Duck):
-        with pytest.raises(InputError, match=r"^Pond.bird: found .*, expected a bird or its name$"):
-            Pond(bird=other)
-
-
-def test_an_unregistered_subclass_is_refused_where_a_part_is_expected(birds):
-    """A file would keep it under its parent's name, and load the parent."""
-    birds.register("duck")(Duck)
-
-    @dataclasses.dataclass(frozen=True)
-    class Pond:
-        bird: Bird = part_field(birds, "duck")
-
-        def __post_init__(self) -> None:
-            resolve_names(self)
-
     @dataclasses.dataclass(frozen=True)
     class Loud(Duck):
-        pass
+        """A file would keep it under its parent's name, and load the parent."""
 
-    with pytest.raises(
-        InputError, match=r"^Pond.bird: found .*Loud.*, which is not registered, exp"
+    assert Pond().bird == Pond(bird="duck").bird == Duck()
+    assert Pond(bird=Duck(volume=2)).bird == Duck(volume=2)
+    for value, words in (
+        ("swan", "found 'swan', expected one of duck "),
+        (3, "found 3, expected a bird or its name$"),
+        (Duck, "found .*, expected a bird or its name$"),
+        (Loud(), "found .*Loud.*, which is not registered, exp"),
     ):
-        Pond(Loud())
+        with pytest.raises(InputError, match=f"^Pond.bird: {words}"):
+            Pond(bird=value)
 
 
 @pytest.mark.parametrize(
     ("function", "count"),
     [
         (lambda a, b: 0, 2),
-        (lambda a, b, valid: 0, 3),
         (lambda a, b, valid=None: 0, 3),
         (lambda a, b, temperature=0.1: 0, 2),
-        (lambda a, b, c, temperature=0.1: 0, 3),
         (lambda a, *, temperature=0.1: 0, 1),
         (lambda *arguments: 0, 3),
-        (lambda a, **settings: 0, 1),
         (functools.partial(lambda a, b, c, scale: 0, scale=2), 3),
     ],
 )
@@ -251,17 +205,13 @@ def test_a_function_that_requires_more_is_refused(function):
 
 
 def test_fields_of_a_plug_ins_part_are_checked_before_its_own_check(birds):
-    @birds.register("goose")
+    @birds.register("swan")
     @dataclasses.dataclass(frozen=True)
-    class Goose(Bird):
+    class Swan(Duck):
         eggs: int = 3
 
         def __post_init__(self) -> None:
             assert self.eggs > 0
 
-        def call(self) -> str:
-            return "honk"
-
-    assert Goose(eggs=4).eggs == 4
-    with pytest.raises(InputError, match=r"^Goose\.eggs: found 'four', expected a whole number$"):
-        birds.make("goose", eggs="four")
+    with pytest.raises(InputError, match=r"^Swan\.eggs: found 'four', expected a whole number$"):
+        birds.make("swan", eggs="four")

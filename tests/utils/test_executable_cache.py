@@ -143,43 +143,27 @@ def test_only_the_latest_are_kept(folder, monkeypatch):
     assert len(programs(folder)) == 2
 
 
-def test_nothing_is_kept_unasked(tmp_path, monkeypatch):
-    monkeypatch.setattr(executable_cache._Folder, "path", None)
-    function, traces = counting()
-    assert executable_cache.cached_executable(some, None, (), {}) is None
-    np.testing.assert_array_equal(function(TREE, factor=1)["total"], [2, 3, 4])
-    assert traces == [1]
-
-
-def test_the_command_line_keeps_programs_unless_a_plugin_is_loaded(tmp_path):
+def test_the_command_line_keeps_programs_unless_a_plugin_is_loaded(shared, tmp_path):
     """As a process: `crisalad.main` within another one must not."""
     plugin = tmp_path / "plugin.py"
     plugin.write_text("import crisalad_jax\n")
-    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
-    image = tmp_path / "images" / "a.png"
-    image.parent.mkdir()
-    program = """
-import sys, jax
-from crisalad_jax import PRESETS, Model, init_crisalad, save_weights
-config = PRESETS["tiny"]
-save_weights(sys.argv[1], Model(init_crisalad(jax.random.key(0), config), config))
-import cv2, numpy
-cv2.imwrite(sys.argv[2], numpy.zeros((50, 60, 3), numpy.uint8))
-"""
-    weights = tmp_path / "w.safetensors"
-    subprocess.run([sys.executable, "-c", program, weights, image], env=environment, check=True)
-    extract = [sys.executable, "-m", "crisalad_jax", "extract", "--weights", str(weights)]
-    extract += ["--images", str(image.parent), "--quiet", "--out"]
     folder = tmp_path / "cache" / "crisalad-jax" / "programs"
-    run = [*extract, str(tmp_path / "1.npy"), "--plugin", str(plugin)]
-    subprocess.run(run, env=environment, check=True, capture_output=True)
-    assert not folder.exists()
-    for out in ("2.npy", "3.npy"):
-        run = [*extract, str(tmp_path / out)]
+
+    def extract(*flags):
+        images = shared / "town" / "images" / "test" / "queries"
+        given = ["--weights", shared / "weights.safetensors", "--images", images, "--quiet"]
+        run = [sys.executable, "-m", "crisalad_jax", "extract", *given]
+        environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+        out = tmp_path / "out.npy"
+        run += ["--out", out, *flags]
         subprocess.run(run, env=environment, check=True, capture_output=True)
+        return out.read_bytes()
+
+    expected = extract("--plugin", plugin)
+    assert not folder.exists()
+    for _ in range(2):
+        assert extract() == expected
         assert len(programs(folder)) == 2  # tokens, and descriptors from them
-    files = [(tmp_path / f"{n}.npy").read_bytes() for n in (1, 2, 3)]
-    assert files[0] == files[1] == files[2]
 
 
 def some(first, unused, last, *, config):
@@ -199,6 +183,5 @@ def test_many_arguments_keep_their_places(folder, monkeypatch):
 def test_what_a_function_has_from_another_is_not_part_of_the_key(folder):
     """So none of their programs is cached: that of one factor would answer for the other."""
     for factor in (2, 3):
-        function = compiler.jit(lambda x, factor=factor: x * factor)
-        assert function(jnp.ones(())) == factor
+        assert compiler.jit(lambda x, factor=factor: x * factor)(jnp.ones(())) == factor
     assert programs(folder) == []

@@ -12,7 +12,6 @@ from crisalad_jax.utils.files import (
     atomic_path,
     check_new_folder,
     check_target,
-    read_json,
     write_json,
     write_npy,
 )
@@ -92,17 +91,6 @@ def test_a_check_makes_nothing(tmp_path: pathlib.Path, monkeypatch: pytest.Monke
     for path in ("x.json", "new/x.json", tmp_path / "new" / "deep" / "x.json"):
         check_target(path)
     assert os.listdir(tmp_path) == []
-
-
-def test_json_is_written_whole_or_not_at_all(tmp_path: pathlib.Path):
-    path = tmp_path / "x.json"
-    write_json(path, {"a": [1, 2.5, None]})
-    whole = path.read_bytes()
-    assert read_json(path, "numbers") == {"a": [1, 2.5, None]}
-    with pytest.raises(TypeError):
-        write_json(path, {"a": object()})
-    assert path.read_bytes() == whole
-    assert os.listdir(tmp_path) == ["x.json"]
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32"])

@@ -45,14 +45,3 @@ def test_a_model_is_printed_without_its_values(monkeypatch):
     assert len(text.splitlines()) <= 26
     # docs/architecture.md: 11,495,105 trainable and 86,579,712 frozen.
     assert text.endswith(f"{11_495_105 + 86_579_712:,} parameters, 392.3 MB")
-
-
-def test_a_class_keeps_its_own_repr():
-    @cj.pytree_dataclass
-    class Named:
-        value: float
-
-        def __repr__(self):
-            return "mine"
-
-    assert repr(Named(1.0)) == "mine"
