@@ -24,6 +24,7 @@ from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import image_batches
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.utils.errors import InputError
+from tests.conftest import write_picture
 from tests.data.benchmarks.trees import refused
 
 SIZE = (28, 42)
@@ -35,12 +36,8 @@ STILL = LightAugmentConfig(
 
 @pytest.fixture
 def places(tmp_path: Path) -> Places:
-    generator = np.random.default_rng(0)
     for place, view in itertools.product(range(7), range(3)):
-        coarse = generator.integers(0, 256, (4, 5, 3), dtype=np.uint8)
-        path = tmp_path / "A" / str(place) / f"{view}.jpg"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        assert cv2.imwrite(str(path), cv2.resize(coarse, (60, 40)))
+        write_picture(tmp_path / "A" / str(place) / f"{view}.jpg", 3 * place + view)
     return read_places(tmp_path / "A", min_images=3)
 
 
@@ -127,7 +124,6 @@ def test_an_augmentation_goes_by_its_name(places, name):
     ("wrong", "words"),
     [
         ("nonne", r"^augmentation: found 'nonne', expected one of .*none"),
-        (None, r"^augmentation: found None, expected .* or its name$"),
         (RandAugmentConfig, r"^augmentation: found .*, expected .* or its name$"),
     ],
 )
@@ -324,7 +320,6 @@ def test_an_abandoned_iterator_does_not_hold_up_the_exit(places):
     ("changes", "message"),
     [
         ({"start_step": 4}, "start_step, part: found 4 .*, expected 0 to 3"),
-        ({"start_step": -1}, "start_step, part: found -1"),
         ({"image_size": (0, 14)}, "image_size"),
         ({"images_per_place": 4}, "place 0 has 3 images"),
         ({"batch_size": 0}, "batch size: found 0"),
