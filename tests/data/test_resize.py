@@ -41,14 +41,6 @@ GOLDENS = np.load(pathlib.Path(__file__).parent / "goldens" / "resize_chains.npz
 8th) row and column."""
 
 
-@pytest.fixture(params=["numba", "numpy"])
-def both(request, monkeypatch):
-    """Machine code, and what stands in for it without numba."""
-    if request.param == "numpy":
-        monkeypatch.setattr(resize, "_machine_code", lambda *_: None)
-
-
-@pytest.mark.usefixtures("both")
 @pytest.mark.parametrize("image_size", [(84, 98), (154, 126)])
 @pytest.mark.parametrize("filter", ["bilinear", "bicubic"])
 def test_public_chains(filter, image_size):
@@ -86,7 +78,6 @@ def test_floats_are_torchs(filter, antialias, shape):
         image, tensor = expected[0].permute(1, 2, 0).numpy(), expected
 
 
-@pytest.mark.usefixtures("both")
 @pytest.mark.parametrize(
     ("image", "image_sizes"),
     [

@@ -107,17 +107,6 @@ def test_without_ground_truth_there_is_none(tmp_path):
     assert "no ground truth" in benchmark.rule
 
 
-def test_nordland_star(tmp_path):
-    database = [f"ref/{i:07d}.jpg" for i in range(42)]
-    queries = [f"query/{i:07d}.jpg" for i in range(5)]
-    touch_all(tmp_path, database + queries)
-    truth = ragged(*(np.array(found) for found in every_tenth(5, 42)))
-    write_lists(tmp_path, "Nordland_", dbImages=database, qImages=queries, gt=truth)
-    benchmark = read_salad_lists(tmp_path)
-    assert benchmark.name == "Nordland*, winter database, summer queries (SALAD's lists)"
-    assert lists_of(benchmark.positives) == every_tenth(5, 42)
-
-
 def test_a_folder_of_several_sets(tmp_path):
     for prefix in ("pitts30k_val_", "pitts30k_test_"):
         write_set(tmp_path, prefix)
