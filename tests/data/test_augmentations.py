@@ -245,6 +245,29 @@ def test_light_colour_is_brightness_then_contrast_then_saturation(seed):
     np.testing.assert_allclose(light(image, seed, colour=0.3), expected, atol=1, rtol=0)
 
 
+def test_light_gamma_is_one_exponent_of_all_intensities():
+    levels = np.arange(256)
+    ramp = np.repeat(levels.astype(np.uint8)[None, :, None], 3, axis=-1)
+    logarithms = []
+    for seed in range(20):
+        found = light(ramp, seed, gamma=0.5)[0, :, 0]
+        exponent = np.log(found[128] / 255) / np.log(128 / 255)
+        # Half a level from rounding, and up to 0.7 from the rounding of the level of the exponent.
+        np.testing.assert_allclose(found, 255 * (levels / 255) ** exponent, atol=1.3)
+        logarithms.append(np.log(exponent))
+    assert 0.35 < np.abs(logarithms).max() < 0.51  # rounding changes a logarithm by up to 0.01
+    assert min(logarithms) < 0 < max(logarithms)
+
+
+def test_light_illumination_is_smooth_and_as_strong_as_asked():
+    grey = np.full((60, 80, 3), 128, np.uint8)
+    found = np.array([light(grey, seed, illumination=0.3) for seed in range(10)], float)
+    # Cubic interpolation overshoots the draws by up to a half.
+    assert 0.2 < np.abs(np.log(found / 128)).max() < 0.45
+    # A row is 20 pixels from draw to draw, which are at most 0.6 apart: 128 x 0.6 x 1.5 / 20 = 6.
+    assert np.abs(np.diff(found, axis=1)).max() <= 8
+
+
 def test_light_grey_has_equal_channels():
     image = picture()
     grey = light(image, grey=1.0)

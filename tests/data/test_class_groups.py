@@ -56,15 +56,6 @@ def test_cells_are_squares_and_sectors():
     assert len({each.group for each in classes}) == 50
 
 
-def test_focal_points_lie_across_and_along_the_street():
-    """A street to the north-east, walked to and fro: 10 m from its middle, by hand."""
-    positions = np.array([50, 80]) + np.array([[s] for s in (-5, -2, 2, 5)]) * [0.6, 0.8]
-    points = focal_points(positions, 10.0)
-    expected = [[[58, 74], [42, 86]], [[56, 88], [44, 72]]]
-    np.testing.assert_allclose(points, expected, atol=1e-12)
-    assert focal_points(np.full((4, 2), 7.0), 10.0) is None  # no street
-
-
 def test_a_class_looks_at_its_focal_point():
     """A cell whose street runs to the east: who looks south, north, or along it, by hand."""
     # Focal points, 10 m from (7, 7): (7, 17), (7, -3), (17, 7), (-3, 7).
@@ -84,6 +75,10 @@ def test_a_class_looks_at_its_focal_point():
     assert [(sorted(images.tolist()), group) for images, group in frontal] == [([4, 5, 6], 0)]
     lateral, frontal = focal_classes(views, EIGENPLACES, 4)
     assert (len(lateral), len(frontal)) == (1, 0)
+
+
+def test_a_cell_without_a_street_has_no_focal_points():
+    assert focal_points(np.full((4, 2), 7.0), 10.0) is None
 
 
 def test_viewpoints_of_a_city_are_what_their_definition_says():
@@ -240,6 +235,7 @@ ROW = [(100.0 * i, 0.0) for i in range(9)]
         ),
         (city_of(ROW, [4] * 9), {"groups": 2}, "found 4 classes of .* places_per_batch 5; fewer"),
         (city_of([(0, 0)] * 4, [1] * 4), {"kind": "cells"}, "found .*one position for all images"),
+        (located((0, 1, np.nan), (1, 2, np.nan)), {"kind": "cells"}, "found no headings"),
         (located((0, -60, 0), (0, 100, 0)), {}, "found the images of city0 over 160 degrees"),
     ],
 )

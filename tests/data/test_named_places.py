@@ -293,25 +293,6 @@ def test_a_table_with_positions_makes_classes(folders):
 
 
 @pytest.mark.parametrize(
-    "table",
-    ["name,place\nbridge/1.JPG,a\n", "name,place,lat,lon\nbridge/1.JPG,a,1,2\n", None],
-)
-def test_classes_by_position_say_what_they_lack(folders, table):
-    if table:
-        (folders / "places.csv").write_text(table)
-    places = read_places(folders, min_images=1)
-    message = r"^.*mine: found no headings, or no positions, .*'cells'; --loss[^\n]*$"
-    with pytest.raises(InputError, match=message):
-        class_groups(places, ClassesConfig(kind="cells"), min_images=1, places_per_batch=1)
-    # Classes that are the places need none.
-    one = ClassesConfig(groups=1)
-    (group,) = class_groups(places, one, min_images=1, places_per_batch=1)
-    assert len(group.files) == len(places.files)
-    if table and "lat" in table:
-        assert math.isnan(places.views[0, 2])
-
-
-@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", r"places\.csv: found columns none; missing name$"),

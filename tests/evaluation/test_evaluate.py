@@ -217,8 +217,8 @@ def test_shares_are_told_by_positions_or_else_by_the_truth(params, benchmark):
     assert shares(benchmark) == (0, (0.5 + 0.5) / 7)
     # The query at 205 has both of them as positives.
     assert shares(unplaced) == (0, (0.5 + 0.5) / 7)
-    # Queries at 3, 45 and 130 m look at 0, 1 and 0 within 45 m of those before them, of 0, 1 and 2;
-    # database images by fours at their neighbours, of three and of two.
+    # Of the queries, which look at those before them, the one at 45 m sees the one at 3 m; of the
+    # database, which looks by fours, each image sees its neighbours up to 45 m away.
     wider = dataclasses.replace(benchmark, radius=45.0)
     assert shares(wider) == (1 / 4, pytest.approx((1 + 2 + 2 + 1) / 3 / 7 + (1 + 1 + 2) / 2 / 7))
 
