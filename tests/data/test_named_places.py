@@ -1,7 +1,6 @@
 """Places that folders and tables name, and places by position or order, against ones by hand."""
 
 import itertools
-import math
 
 import numpy as np
 import pytest

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import read_places
 from crisalad_jax.synthetic import (
     VARIATIONS,
@@ -154,22 +154,19 @@ def test_the_city_reads_as_gsv_cities(city):
 
 def test_the_city_s_evaluation_reads_as_utm_layout(city):
     folder = city / "test" / "images" / "test"
-    sides = [sorted((folder / side).iterdir()) for side in ("database", "queries")]
     seasons, hours = [], []
-    for side in sides:
-        fields = [path.name.split("@") for path in side]
+    for side in ("database", "queries"):
+        fields = [path.name.split("@") for path in (folder / side).iterdir()]
         # An empty field before the first @, 14 fields of the format, and the suffix.
         assert {(len(each), each[0], each[-1]) for each in fields} == {(16, "", ".jpg")}
         assert all(0 <= float(each[9]) < 360 for each in fields)
         seasons.append({each[14].split("_")[0] for each in fields})
         hours.append({each[14].split("_")[1] for each in fields})
-        for path in side:
-            with Image.open(path) as picture:
-                assert (picture.size, picture.mode) == ((56, 42), "RGB")
     # Queries and database never share a season, and queries come at all hours.
     assert not seasons[0] & seasons[1]
     assert hours[0] == {"noon"}
     assert len(hours[1]) > 1
+    assert {read_image(path).shape for path in city.rglob("*.jpg")} == {(42, 56, 3)}
 
 
 @pytest.mark.parametrize(
