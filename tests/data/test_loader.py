@@ -334,5 +334,5 @@ class Cutting(NoAugmentation):
 
 
 def test_an_augmentation_that_returns_another_shape_is_named(places):
-    with pytest.raises(InputError, match="^augmentation cutting: found to return uint8 of shape "):
+    with pytest.raises(InputError, match=r"^augmentation cutting: found to return uint8 of shape "):
         train(places, augmentation=Cutting())
