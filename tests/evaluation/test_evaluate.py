@@ -50,9 +50,8 @@ def folder(benchmark: Benchmark, params) -> np.ndarray:
     return tokens_of(params, benchmark.database).rows
 
 
-def grouped(params, rows: np.ndarray, grouping: str, config=MODEL, **changes) -> np.ndarray:
-    batches = batches_of(len(rows), grouping, **({"batch_size": BATCH} | changes))
-    return group(describer_of(Model(params, config)), rows, batches)
+def grouped(params, rows: np.ndarray, grouping: str, config=MODEL) -> np.ndarray:
+    return group(describer_of(Model(params, config)), rows, batches_of(len(rows), grouping, BATCH))
 
 
 def alike(found: np.ndarray, expected: np.ndarray) -> None:
