@@ -45,6 +45,14 @@ def test_points_by_hand():
     assert all_of_them.min_similarity == 0.612
 
 
+def test_rounding_down_never_reaches_the_next_similarity():
+    """0.7504 would round to 0.750, which is that of a wrong answer."""
+    similarities = np.array([[0.7504], [0.75]], np.float32)
+    point = operating_point(INDICES[:2], similarities, [np.array([0]), np.array([1])], 1.0)
+    assert (point.right, point.answered) == (1, 1)
+    assert 0.75 < point.min_similarity <= similarities[0, 0]
+
+
 def test_a_precision_that_nothing_reaches_is_said():
     """Of the queries from the third on the best is 2 of 4, with all of them."""
     point = point_at(0.9, slice(2, None))
