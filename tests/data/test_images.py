@@ -1,7 +1,6 @@
 """Reading and listing images, against Pillow."""
 
 import io
-import pathlib
 import struct
 import zlib
 
@@ -17,8 +16,6 @@ from crisalad_jax.data.sources import open_source
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.data.benchmarks.trees import refused, touch_all
-
-PHOTOGRAPHS = pathlib.Path(__file__).parents[2].parent / "shared" / "data" / "toy_streets"
 
 FORMATS = {
     "jpeg": ("JPEG", {}),
@@ -64,14 +61,6 @@ def largest_difference(a, b):
     return np.abs(a.astype(int) - b.astype(int)).max()
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_formats(tmp_path, name):
-    file_format, options = FORMATS[name]
-    data = encode(Image.fromarray(smooth_picture()), file_format, **options)
-    # Both decode with the same libraries; 2 leaves room for another inverse DCT.
-    assert largest_difference(read_bytes(tmp_path, data), pillow_rgb(data)) <= 2
-
-
 @pytest.mark.parametrize(
     "suffix",
     [
@@ -100,7 +89,7 @@ def test_a_suffix_is_found_everywhere_and_read_as_by_pillow(tmp_path, suffix):
     [
         *((mode, (60, 80), "PNG", 0) for mode in ("1", "L", "LA", "P", "RGBA")),
         *(("RGB", size, "PNG", 0) for size in ((1, 1), (8, 20_000))),
-        # OpenCV 5.0 gives blue first where an AVIF has alpha. Most as in test_formats.
+        # OpenCV 5.0 gives blue first where an AVIF has alpha. Most as for a whole file below.
         ("RGBA", (60, 80), "AVIF", 2),
     ],
 )
@@ -115,28 +104,13 @@ def test_modes_and_sizes(tmp_path, mode, size, file_format, most):
     assert largest_difference(found, pillow_rgb(data)) <= most
 
 
-@pytest.mark.parametrize("file_format", ["PNG", "TIFF"])
-def test_sixteen_bits_keep_the_high_byte(tmp_path, file_format):
-    values = (np.arange(256)[:, None] * 256 + np.arange(0, 256, 5)).astype(np.uint16)
-    image = read_bytes(tmp_path, encode(Image.fromarray(values), file_format))
-    high_byte = np.repeat(np.arange(256), values.shape[1]).reshape(values.shape)
-    np.testing.assert_array_equal(image, np.stack([high_byte] * 3, axis=-1))
-
-
-@pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_sixteen_bit_colour(tmp_path, suffix):
-    """OpenCV 5.0 confuses the channels of a TIFF that it is asked for as RGB."""
-    red = np.arange(0, 65536, 32, dtype=np.uint16).reshape(32, 64)
-    rgb = np.stack([red, red // 2, red // 3], axis=-1)
-    data = cv2.imencode(suffix, rgb[..., ::-1])[1].tobytes()
-    np.testing.assert_array_equal(read_bytes(tmp_path, data), rgb >> 8)
-
-
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".ppm"])
 def test_sixteen_bits_stay_for_the_model_to_reduce(tmp_path, suffix):
+    """OpenCV 5.0 confuses the channels of a TIFF that it is asked for as RGB."""
     rgb = (7 + 3000 * np.arange(18, dtype=np.uint16)).reshape(2, 3, 3)
     cv2.imwrite(str(tmp_path / f"a{suffix}"), rgb[..., ::-1])
     np.testing.assert_array_equal(read_pixels(tmp_path / f"a{suffix}"), rgb)
+    np.testing.assert_array_equal(read_image(tmp_path / f"a{suffix}"), rgb >> 8)
 
 
 @pytest.mark.parametrize(
@@ -147,10 +121,8 @@ def test_a_tiff_of_floats_is_stretched_on_request(tmp_path, dtype, unit):
     values = (np.arange(101).reshape(1, 101) + 7200) * unit
     data = cv2.imencode(".tif", values.astype(dtype))[1].tobytes()
     (tmp_path / "t.tif").write_bytes(data)
-    with pytest.raises(InputError, match=r"t\.tif: found .*, expected uint8") as caught:
+    with refused(rf"t\.tif: found {np.dtype(dtype)} of shape .*contrast-stretch"):
         read_image(tmp_path / "t.tif")
-    assert f"{np.dtype(dtype)} of shape" in str(caught.value)
-    assert "contrast-stretch" in str(caught.value)
     grey = np.clip(255 * (np.arange(101) - 1) / 98, 0, 255)[:: int(np.sign(unit))]
     found = read_image(tmp_path / "t.tif", bit_depth="contrast-stretch")
     # A half more or less where rounding of the values decides.
@@ -205,17 +177,19 @@ def test_exif_orientation(tmp_path, file_format, orientation):
     exif = Image.Exif()
     exif[0x0112] = orientation
     data = encode(Image.fromarray(smooth_picture()), file_format, exif=exif)
-    # As in test_formats; a wrong orientation differs by tens of levels.
+    # As above; a wrong orientation differs by tens of levels.
     assert largest_difference(read_bytes(tmp_path, data), pillow_rgb(data)) <= 2
 
 
 @pytest.mark.parametrize("name", FORMATS)
-@pytest.mark.parametrize("share", [0.01, 0.3, 0.6, 0.9, 0.9999])
-def test_a_cut_file_is_an_error(tmp_path, capfd, name, share):
+def test_a_whole_file_is_read_as_by_pillow_and_a_cut_one_is_an_error(tmp_path, capfd, name):
     file_format, options = FORMATS[name]
     data = encode(Image.fromarray(smooth_picture(240, 320)), file_format, **options)
-    with pytest.raises(InputError, match=r"picture\.jpg: found"):
-        read_bytes(tmp_path, data[: int(len(data) * share)])
+    # Both decode with the same libraries; 2 leaves room for another inverse DCT.
+    assert largest_difference(read_bytes(tmp_path, data), pillow_rgb(data)) <= 2
+    for share in (0.01, 0.3, 0.6, 0.9, 0.9999):
+        with pytest.raises(InputError, match=r"picture\.jpg: found"):
+            read_bytes(tmp_path, data[: int(len(data) * share)])
     assert capfd.readouterr() == ("", "")
 
 
@@ -280,16 +254,6 @@ def test_no_file(tmp_path):
         read_image(tmp_path / "nothing.jpg")
     with pytest.raises(InputError, match=f"{tmp_path.name}: found a folder, expected an image"):
         read_image(tmp_path)
-
-
-def test_photographs_read_and_resize_as_by_pillow():
-    if not PHOTOGRAPHS.is_dir():
-        pytest.skip("no photographs beside the checkout")
-    for path in list_images(PHOTOGRAPHS)[::8]:
-        expected = Image.open(path).convert("RGB").resize((224, 224), Image.Resampling.BILINEAR)
-        resized = resize_image(read_image(path), (224, 224))
-        # One level from the resize, two from the JPEG decoder, as above.
-        assert largest_difference(resized, np.asarray(expected)) <= 3
 
 
 def test_list_images(tmp_path):

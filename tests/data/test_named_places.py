@@ -1,7 +1,6 @@
 """Places that folders and tables name, and places by position or order, against ones by hand."""
 
 import itertools
-import math
 
 import numpy as np
 import pytest
@@ -61,8 +60,6 @@ def test_a_radius_makes_places_as_by_hand(tmp_path):
     assert places.root == root
     # Centres at 0, 11, 30 and 5000: up to 40 m apart they are near.
     assert _near(places) == [[1, 2], [0, 2], [0, 1], []]
-    back = _street(tmp_path / "back", (11, 9))
-    assert _by_radius(back, 1).image_counts.tolist() == [2]
 
 
 def test_places_with_few_images_are_left_out_and_counted(tmp_path):
@@ -107,13 +104,6 @@ def test_places_across_zones_and_across_the_world(tmp_path):
     places = read_places(tmp_path, place_radius=20, min_images=1)
     assert places.names == (names[1], far)
     assert places.files == (*names[::-1], far)
-
-
-def test_names_say_where(tmp_path):
-    names = [f"@{x}.00@5000000.00@10@T@@@@@@@@@@@.jpg" for x in (500_000, 500_003, 500_500)]
-    touch_all(tmp_path, names)
-    places = read_places(tmp_path, place_radius=5, min_images=1)
-    assert places.image_counts.tolist() == [2, 1]
 
 
 def test_exif_data_says_where(tmp_path):
@@ -204,13 +194,9 @@ UNFIT = "^.*walk: found arguments that do not fit each other, expected --cities 
     ("given", "words"),
     [
         ({"place_radius": 0}, r"^--place-radius: found 0, expected metres above 0$"),
-        ({"place_radius": math.nan}, r"^--place-radius: found nan"),
         ({"place_frames": 1}, r"^--place-frames: found 1, expected at least 2$"),
         ({"place_radius": 5, "place_frames": 4}, UNFIT),
         ({"positions": "gps.csv"}, UNFIT),
-        ({"place_frames": 2, "positions": "gps.csv"}, UNFIT),
-        ({"fps": 2.0}, UNFIT),
-        ({"cities": ["a"]}, UNFIT),
         ({"place_frames": 4, "cities": ["a"]}, UNFIT),
         ({"place_frames": 4, "fps": 2.0}, r"^--fps: found 2 without a video"),
         ({"place_radius": 5}, r"walk: found no position of 7 images, expected --positions TA"),
@@ -222,19 +208,15 @@ def test_arguments_that_do_not_fit_are_told(tmp_path, given, words):
         read_places(_street(tmp_path / "walk", XS), **given)
 
 
-def test_a_source_that_has_no_places_says_which_flags_make_them(tmp_path, shared):
+def test_a_source_that_has_no_places_says_which_flags_make_them(tmp_path):
     root = _street(tmp_path / "walk", XS)
     video = write_video(tmp_path / "walk.avi", 3)
     for source in (root / "gps.csv", video):
         with pytest.raises(InputError, match=r"; --place-radius METRES makes places by positions"):
             read_places(source)
-    with pytest.raises(InputError, match=r"found no position of 1 images"):
-        read_places(video, place_radius=5)
     (tmp_path / "other.csv").write_text("name,x,y\nz.jpg,1,2\n")
     with pytest.raises(InputError, match=r"found none of the 7 images of .*, expected names such"):
         read_places(root, place_radius=5, positions=tmp_path / "other.csv")
-    with pytest.raises(InputError, match="found arguments that do not fit each other"):
-        read_places(shared / "city", place_radius=5)
 
 
 def test_classes_of_a_group_are_not_near(tmp_path):
@@ -310,36 +292,13 @@ def test_a_table_with_positions_makes_classes(folders):
 
 
 @pytest.mark.parametrize(
-    "table",
-    ["name,place\nbridge/1.JPG,a\n", "name,place,lat,lon\nbridge/1.JPG,a,1,2\n", None],
-)
-def test_classes_by_position_say_what_they_lack(folders, table):
-    if table:
-        (folders / "places.csv").write_text(table)
-    places = read_places(folders, min_images=1)
-    message = r"^.*mine: found no headings, or no positions, .*'cells'; --loss[^\n]*$"
-    with pytest.raises(InputError, match=message):
-        class_groups(places, ClassesConfig(kind="cells"), min_images=1, places_per_batch=1)
-    # Classes that are the places need none.
-    one = ClassesConfig(groups=1)
-    (group,) = class_groups(places, one, min_images=1, places_per_batch=1)
-    assert len(group.files) == len(places.files)
-    if table and "lat" in table:
-        assert math.isnan(places.views[0, 2])
-
-
-@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", r"places\.csv: found columns none; missing name$"),
         ("name;place\n", "found no place with at least 4 images"),
-        ("name;place;lat;lon\nlone/1.jpg;a;91,5;0\n", "lat: found '91,5', expected a number"),
-        ("name,place,lat\n", "found columns name, place, lat, expected"),
         ("name,place,heading\n", "found columns name, place, heading, expected"),
         ("name,place\nlone/1.jpg,\n", "line 2: found no place, expected"),
         ("name,place\nlone/1.jpg,a\nlone/1.jpg,b\n", "found 'lone/1.jpg' twice, on line 2 too"),
-        ("name,place\nlone/9.jpg,a\n", "found 1 of 1 images missing"),
-        ("name,place,lat,lon\nlone/1.jpg,a,1,\n", "line 2: lon: found '', expected a number"),
     ],
 )
 def test_bad_tables(folders, text, message):

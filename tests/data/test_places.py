@@ -14,7 +14,6 @@ from crisalad_jax.utils.output import Note
 from tests.data.benchmarks.trees import touch_all
 
 COLUMNS = ["place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid"]
-REAL = Path(__file__).parents[2].parent / "shared" / "data"
 
 
 def make_rows(city_id: str, place: int, images: int) -> list[list[str]]:
@@ -132,16 +131,9 @@ def test_no_dataframes(tmp_path):
         read_places(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("header", "words"),
-    [
-        ("place_id,year,month,city_id,lat,panoid\n", "place_id, year, .*; missing northdeg, lon$"),
-        ("", "none; missing place_id, "),
-    ],
-)
-def test_missing_columns_are_listed(two_cities, header, words):
-    (two_cities / "Dataframes" / "A.csv").write_text(header)
-    with pytest.raises(InputError, match=f"A.csv: found columns {words}"):
+def test_missing_columns_are_listed(two_cities):
+    (two_cities / "Dataframes" / "A.csv").write_text("place_id,year,month,city_id,lat,panoid\n")
+    with pytest.raises(InputError, match=r"A.csv: found columns .*; missing northdeg, lon$"):
         read_places(two_cities)
 
 
@@ -165,7 +157,6 @@ def test_a_missing_image_is_named_with_its_line_or_left_out_with_a_note(two_citi
         ({"min_images": 6}, "at least 6 images; the largest has 5"),
         ({"cities": ["A", "Paris"]}, r"\(--cities\): found A, Paris, expected some of .*: A, B"),
         ({"cities": ["A", "A"]}, "found A, A, expected .*, each once"),
-        ({"cities": []}, "found none, expected some"),
     ],
 )
 def test_too_few_images_and_bad_cities(two_cities, given, message):
@@ -175,7 +166,7 @@ def test_too_few_images_and_bad_cities(two_cities, given, message):
 
 @pytest.mark.parametrize(
     ("column", "text"),
-    [("place_id", "x1"), ("year", "2013.5"), ("month", ""), ("lat", "n/a")],
+    [("place_id", "x1"), ("month", ""), ("lat", "n/a")],
 )
 def test_a_field_that_is_no_number(two_cities, column, text):
     row = make_rows("A", 1, 1)[0]
@@ -259,7 +250,6 @@ def test_within_city_shuffles_places_and_cities():
         ({"images_per_place": 5}, "place 0 of city0 has 4 images, expected at least .* 5"),
         ({"places_per_batch": 7}, "found 6 places, expected places_per_batch 7 "),
         ({"places_per_batch": 0}, "found places_per_batch=0, .* expected numbers from 1"),
-        ({"seed": -1}, "found .*seed=-1"),
         ({"steps": 0}, "found .*steps=0, expected numbers from 1"),
         ({"order": "random"}, "order: found 'random', expected one of shuffled, within-city"),
     ],
@@ -267,12 +257,3 @@ def test_within_city_shuffles_places_and_cities():
 def test_bad_epoch_arguments(changes, message):
     with pytest.raises(InputError, match=message):
         draw(uneven(2, 3), **({"places_per_batch": 2} | changes))
-
-
-@pytest.mark.skipif(not (REAL / "sped_train").is_dir(), reason="needs the real photographs")
-def test_real_training_set():
-    places = read_places(REAL / "sped_train", min_images=2)
-    assert places.cities == ("SPED",)
-    assert places.image_counts.tolist() == [2] * 400
-    with pytest.raises(InputError, match="at least 4 images; the largest has 2"):
-        read_places(REAL / "sped_train")

@@ -7,6 +7,8 @@ import pytest
 from crisalad_jax.data.query_set import read_query_set
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import write_picture
+from tests.data.benchmarks.test_msls import Image, write_msls
+from tests.data.benchmarks.trees import write_sides
 
 
 def write_street(root: pathlib.Path) -> pathlib.Path:
@@ -43,32 +45,20 @@ def test_query_sets_are_read_by_positions(street):
 
 def test_images_of_other_cities_are_no_positives(tmp_path):
     """Two cities of MSLS whose positions are alike, in other zones of UTM."""
-    for city in ("boston", "paris"):
-        for side, norths in (("query", (0, 500)), ("database", (3, 503, 900))):
-            folder = tmp_path / "train_val" / city / side
-            keys = [f"{city}{side}{number}" for number in range(len(norths))]
-            for number, key in enumerate(keys):
-                write_picture(folder / "images" / f"{key}.jpg", number)
-            raw = [f"{n},{key},0,0,0,2020-01-01,False" for n, key in enumerate(keys)]
-            (folder / "raw.csv").write_text(
-                "\n".join([",key,lon,lat,ca,captured_at,pano", *raw]) + "\n"
-            )
-            rows = [
-                f"{n},{key},500000,{4e6 + north}"
-                for n, (key, north) in enumerate(zip(keys, norths, strict=True))
-            ]
-            (folder / "postprocessed.csv").write_text(
-                "\n".join([",key,easting,northing", *rows]) + "\n"
-            )
+    norths = {"query": (0, 500), "database": (3, 503, 900)}
+    sides = {
+        side: [Image(f"{side}{north}", 500_000, 4e6 + north, 0) for north in of_side]
+        for side, of_side in norths.items()
+    }
+    write_msls(tmp_path, {"goa": sides, "tokyo": sides})
     found = read_query_set(tmp_path)
     assert [each.tolist() for each in found.positives] == [[0], [1], [3], [4]]
     assert [each.tolist() for each in found.near] == [[0], [1], [3], [4]]
 
 
 def test_a_set_without_positions_goes_by_its_ground_truth(tmp_path):
-    for side in ("database", "queries"):
-        for number in range(3):
-            write_picture(tmp_path / side / f"{number}.jpg", number)
+    names = [f"{number}.jpg" for number in range(3)]
+    write_sides(tmp_path, names, names)
     with pytest.raises(InputError, match="no ground truth, nothing to score"):
         read_query_set(tmp_path)
     table = "query,database\n0.jpg,1.jpg\n0.jpg,2.jpg\n1.jpg,\n2.jpg,0.jpg\n"

@@ -83,24 +83,11 @@ def test_a_city_with_an_accent(tmp_path):
     assert places.path(0).is_file()
 
 
-@pytest.mark.parametrize("form", ["NFC", "NFD"])
-def test_a_file_is_found_by_the_name_that_it_has(tmp_path, form):
-    file = touch(tmp_path / f"{unicodedata.normalize(form, 'é')}.jpg")
-    for written in ("NFC", "NFD"):
-        name = f"{unicodedata.normalize(written, 'é')}.jpg"
-        assert Disk().find(tmp_path, name) == file
-        (tmp_path / "list.txt").write_text(f"{name}\n", encoding="utf-8")
-        assert open_source(tmp_path / "list.txt").paths == [file]
-
-
 def test_one_image_twice_is_told(tmp_path):
     touch(tmp_path / "a" / "é.jpg")
     (tmp_path / "list.csv").write_text("name\na/é.jpg\na\\é.jpg\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"line 3: found 'a\\\\é.jpg' twice, on line 2 too"):
         open_source(tmp_path / "list.csv")
-    (tmp_path / "list.txt").write_text("a/é.jpg\na\\é.jpg\n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"found 'a/é.jpg' twice, expected it once"):
-        open_source(tmp_path / "list.txt")
 
 
 def test_a_name_means_itself_first(tmp_path):

@@ -12,8 +12,6 @@ from crisalad_jax.data.images import read_image
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.evaluation.evaluate import evaluate, same_place_rule
-from crisalad_jax.evaluation.leakage import near, same_place_share
-from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.nn.model import Model, describe
 from crisalad_jax.retrieval.describe import TokenSet, group
 from crisalad_jax.retrieval.describer import describer_of
@@ -52,9 +50,8 @@ def folder(benchmark: Benchmark, params) -> np.ndarray:
     return tokens_of(params, benchmark.database).rows
 
 
-def grouped(params, rows: np.ndarray, grouping: str, config=MODEL, **changes) -> np.ndarray:
-    batches = batches_of(len(rows), grouping, **({"batch_size": BATCH} | changes))
-    return group(describer_of(Model(params, config)), rows, batches)
+def grouped(params, rows: np.ndarray, grouping: str, config=MODEL) -> np.ndarray:
+    return group(describer_of(Model(params, config)), rows, batches_of(len(rows), grouping, BATCH))
 
 
 def alike(found: np.ndarray, expected: np.ndarray) -> None:
@@ -68,35 +65,6 @@ def in_batches(params, images: np.ndarray, order: np.ndarray) -> np.ndarray:
         chosen = order[start : start + BATCH]
         descriptors[chosen] = describe(params, images[chosen], MODEL)
     return descriptors
-
-
-def test_single_is_every_image_in_a_batch_of_one(params, folder, images):
-    expected = np.concatenate([describe(params, image[None], MODEL) for image in images])
-    alike(grouped(params, folder, "single"), expected)
-
-
-def test_sequential_is_consecutive_batches_whose_padding_is_unseen(params, folder, images):
-    assert len(images) % BATCH  # or nothing is padded
-    expected = in_batches(params, images, np.arange(len(images)))
-    found = grouped(params, folder, "sequential")
-    alike(found, expected)
-    assert np.abs(found - grouped(params, folder, "single")).max() > VISIBLE
-
-
-def test_shuffled_gives_each_image_its_own_descriptor_in_the_seeds_order(params, folder, images):
-    found = grouped(params, folder, "shuffled", seed=3)
-    order = np.random.default_rng(3).permutation(len(images))
-    assert not np.array_equal(order, np.arange(len(images)))
-    alike(found, in_batches(params, images, order))
-    np.testing.assert_array_equal(grouped(params, folder, "shuffled", seed=3), found)
-    assert np.abs(grouped(params, folder, "shuffled", seed=4) - found).max() > VISIBLE
-
-
-def test_window_is_each_image_with_those_just_before_it(params, folder, images):
-    found = grouped(params, folder, "window")
-    windows = [images[max(0, i - BATCH + 1) : i + 1] for i in range(len(images))]
-    assert [len(window) for window in windows] == [1, 2, 3, 4, 4, 4, 4]
-    alike(found, np.stack([describe(params, window, MODEL)[-1] for window in windows]))
 
 
 @pytest.mark.parametrize("changed", range(7))
@@ -113,12 +81,6 @@ def test_a_window_owes_nothing_to_older_frames_nor_to_later_ones(params, folder,
     assert (moved[(sees >= 0) & (sees < BATCH)] > VISIBLE).all()
 
 
-@pytest.mark.parametrize("grouping", GROUPINGS)
-def test_descriptors_are_unit_vectors(params, folder, grouping):
-    norms = np.linalg.norm(grouped(params, folder, grouping), axis=1)
-    np.testing.assert_allclose(norms, 1, atol=1e-6)  # float32, some roundings
-
-
 def test_an_unreadable_image_is_seen_by_none(params, benchmark, images, folder, tmp_path):
     bad = tmp_path / "bad.jpg"
     bad.write_bytes(b"")
@@ -130,8 +92,16 @@ def test_an_unreadable_image_is_seen_by_none(params, benchmark, images, folder, 
         tokens_of(params, paths)
 
 
-def test_recalls_equal_brute_force(params, benchmark):
-    results = evaluate(Model(params, MODEL), benchmark, seed=7, seeds=1, reading=READING)
+def test_descriptors_and_recalls_equal_brute_force(params, benchmark):
+    seen = {}
+
+    def observe(grouping: str, database: np.ndarray, queries: np.ndarray) -> None:
+        assert grouping not in seen  # of several shuffles the first alone
+        seen[grouping] = database, queries
+
+    results = evaluate(
+        Model(params, MODEL), benchmark, seed=7, seeds=1, observe=observe, reading=READING
+    )
     assert [result.grouping for result in results] == [
         *("single", "shuffled", "sequential", "window/single")
     ]
@@ -161,6 +131,8 @@ def test_recalls_equal_brute_force(params, benchmark):
     expected["window/single"] = [expected["single"][0], last]
     for result in results:
         a, b = expected[result.grouping]
+        for found, side in zip(seen[result.grouping], (a, b), strict=True):
+            alike(found, side)
         similarities = b @ a.T
         ranking = np.argsort(-similarities, axis=1, kind="stable")
         # Two of the town's pictures are the same: their order is rounding's. All others are further
@@ -177,13 +149,6 @@ def test_recalls_equal_brute_force(params, benchmark):
             # 4/5 at most: a query without positives is a miss.
             assert result.recalls[k] == hits[:, :k].any(axis=1).mean()
     assert results[0].recalls[20] == 0.8
-
-
-def test_only_the_groupings_asked_for_in_their_order(params, benchmark):
-    results = evaluate(
-        Model(params, MODEL), benchmark, groupings=("sequential", "single"), reading=READING
-    )
-    assert [result.grouping for result in results] == ["sequential", "single"]
 
 
 def test_without_an_encoder_no_descriptor_depends_on_its_batch(benchmark):
@@ -206,65 +171,37 @@ def test_a_set_without_ground_truth_is_refused_before_anything_is_read(params, t
         evaluate(Model(params, MODEL), benchmark, reading=READING)
 
 
-# A shuffle's seeds
-
-
-@pytest.fixture(scope="module")
-def shuffles(params, benchmark: Benchmark) -> tuple[GroupingResult, list[GroupingResult]]:
-    """Three seeds in one call, and each alone by the seed that the first says."""
+def test_each_seed_of_a_shuffle_is_as_alone_and_what_is_not_random_is_of_one(params, benchmark):
     # The last query is far from all, and what it retrieves changes with the shuffle.
     positives = (*benchmark.positives[:4], np.array([1]))
     benchmark = dataclasses.replace(benchmark, positives=positives)
+    seen = []
 
-    def shuffled(seed: int, seeds: int) -> GroupingResult:
-        (result,) = evaluate(
+    def evaluated(**options):
+        return evaluate(
             Model(params, MODEL),
             benchmark,
-            groupings=("shuffled/single",),
-            seed=seed,
-            seeds=seeds,
+            groupings=("shuffled/single", "window/single"),
+            observe=lambda grouping, *_: seen.append(grouping),
             reading=READING,
+            **options,
         )
-        return result
 
-    together = shuffled(3, 3)
-    return together, [shuffled(seed, 1) for seed in together.by_seed]
-
-
-def test_mean_and_spread_are_those_of_the_seeds_alone(shuffles):
-    together, alone = shuffles
+    together, window = evaluated(seed=3, seeds=3)
+    assert seen == [together.grouping, window.grouping] == ["shuffled/single", "window/single"]
+    assert (window.spread, dict(window.by_seed)) == (None, {})
     assert list(together.by_seed) == [3, 5, 7]
+    alone = [evaluated(seed=seed, seeds=1)[0] for seed in together.by_seed]
     assert len({one.recalls[1] for one in alone}) > 1  # or there is no spread
-    for k in (1, 5, 10, 20):
-        found = [one.recalls[k] for one in alone]
-        assert [scores.recalls[k] for scores in together.by_seed.values()] == found
-        assert together.recalls[k] == pytest.approx(np.mean(found), rel=1e-15)
-        assert together.spread.recalls[k] == pytest.approx(np.std(found, ddof=1), abs=1e-15)
-    for name in ("average_precision", "recall_at_full_precision"):
-        found = [getattr(one, name) for one in alone]
-        assert getattr(together, name) == pytest.approx(np.mean(found), rel=1e-14)
-        assert getattr(together.spread, name) == pytest.approx(np.std(found, ddof=1), abs=1e-14)
+    assert [dict(each.recalls) for each in together.by_seed.values()] == [
+        dict(one.recalls) for one in alone
+    ]
     assert together.query_share == pytest.approx(np.mean([one.query_share for one in alone]))
     assert (together.database_share, alone[0].spread) == (None, None)
 
 
-def test_what_is_not_random_is_of_one_seed(params, benchmark):
-    (result,) = evaluate(
-        Model(params, MODEL), benchmark, groupings=("window/single",), seeds=3, reading=READING
-    )
-    assert (result.spread, dict(result.by_seed)) == (None, {})
-    assert result.precision_recall.average_precision == result.average_precision
-
-
-# Same-place shares
-
-
 def test_shares_are_told_by_positions_or_else_by_the_truth(params, benchmark):
     """Seven database images 40 m apart but for the last two, 10 m; five queries far apart."""
-    positions = [
-        np.array([[float(path.name.split("@")[1]), 5e6] for path in paths])
-        for paths in (benchmark.queries, benchmark.database)
-    ]
     unplaced = dataclasses.replace(benchmark, query_positions=None, database_positions=None)
 
     def shares(benchmark: Benchmark) -> tuple[float | None, ...]:
@@ -279,17 +216,10 @@ def test_shares_are_told_by_positions_or_else_by_the_truth(params, benchmark):
     assert shares(benchmark) == (0, (0.5 + 0.5) / 7)
     # The query at 205 has both of them as positives.
     assert shares(unplaced) == (0, (0.5 + 0.5) / 7)
-    for radius in (45.0, 90.0):
-        expected = [
-            same_place_share(batches_of(len(where), kind, BATCH), near(where, radius))
-            for where, kind in zip(positions, ("window", "sequential"), strict=True)
-        ]
-        wider = dataclasses.replace(benchmark, radius=radius)
-        assert shares(wider) == tuple(expected)
-        assert min(expected) > 0
-
-
-# FAISS
+    # Of the queries, which look at those before them, the one at 45 m sees the one at 3 m; of the
+    # database, which looks by fours, each image sees its neighbours up to 45 m away.
+    wider = dataclasses.replace(benchmark, radius=45.0)
+    assert shares(wider) == (1 / 4, pytest.approx((1 + 2 + 2 + 1) / 3 / 7 + (1 + 1 + 2) / 2 / 7))
 
 
 def test_recalls_are_those_of_a_flat_faiss_index_on_the_same_descriptors(params, town):
@@ -321,27 +251,3 @@ def test_recalls_are_those_of_a_flat_faiss_index_on_the_same_descriptors(params,
             for row, wanted in zip(ranking, benchmark.positives, strict=True)
         ]
         assert recall == np.mean(right)
-
-
-def test_an_observer_sees_the_descriptors_of_each_grouping(benchmark, params, images):
-    seen = {}
-
-    def observe(grouping: str, database: np.ndarray, queries: np.ndarray) -> None:
-        assert grouping not in seen  # of several shuffles the first alone
-        seen[grouping] = database, queries
-
-    results = evaluate(
-        Model(params, MODEL),
-        benchmark,
-        groupings=("single", "sequential", "shuffled"),
-        seeds=2,
-        observe=observe,
-        reading=READING,
-    )
-    assert list(seen) == ["single", "sequential", "shuffled"]
-    first = describe(params, images[:BATCH], MODEL)
-    np.testing.assert_allclose(seen["sequential"][0][:BATCH], first, rtol=0, atol=TOLERANCE)
-    for result in results:
-        database, queries = seen[result.grouping]
-        best = (queries @ database.T).max(axis=1)
-        np.testing.assert_allclose(result.neighbours.similarities[:, 0], best, atol=TOLERANCE)

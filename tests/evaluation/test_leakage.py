@@ -34,12 +34,6 @@ def test_the_truth_tells_by_what_is_shared(monkeypatch, chunk):
     np.testing.assert_array_equal(pairs(database, 9), expected)
 
 
-def test_no_truth_at_all_is_no_shared_place():
-    queries, database = by_truth([np.empty(0, np.int64)] * 3, 2)
-    assert not pairs(queries, 3).any()
-    assert not pairs(database, 2).any()
-
-
 def test_the_share_by_hand():
     # Places a a b a b: in file order by threes, (a a b) and (a b).
     same = near(np.array([[0.0, 0], [0, 0], [9, 0], [0, 0], [9, 0]]), 1.0)

