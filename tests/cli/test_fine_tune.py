@@ -126,7 +126,6 @@ def test_fields_that_nothing_uses_are_not_compared(found, expected, count):
 
 
 def test_fields_that_nothing_uses_are_not_checked():
-    MiningConfig(negatives=5, candidates=1)
     dataclasses.replace(LOCAL, deviation=(0.0, 0.0, 0.0))
 
 
