@@ -261,6 +261,8 @@ class Map:
             raise InputError(f"{path}: not a whole record of images: {error!r}") from error
         self._numbers |= {image.name: i for i, image in enumerate(images, len(self))}
         self.images += images
+        if len(self._numbers) < len(self.images):
+            raise InputError(f"{path}: not a whole record of images: a name stands twice")
         self.axes, self.zone = self.axes or axes, self.zone or zone
         self.additions = with_addition(self.additions, added, root, len(images))
 
