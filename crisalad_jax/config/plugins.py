@@ -23,6 +23,8 @@ ENTRY_POINTS = "crisalad_jax.plugins"
 _PACKAGE = __name__.partition(".")[0]
 _FROM_FILE = "crisalad_plugin_"
 """Beginning of the names of modules that are loaded from plug-in files."""
+_LARGEST = 2**24
+"""Most bytes of a plug-in's file: Python reads and copies it whole."""
 _LOADED: dict[str, str] = {}
 """What `load_plugin` loaded, in that order, of a file its whole path; and its module's name."""
 
@@ -89,6 +91,10 @@ def _spec_of(plugin: str) -> ModuleSpec | None:
     path = real_path(plugin)
     if not path.is_file():
         return None
+    if (size := path.stat().st_size) > _LARGEST:
+        raise InputError(
+            f"plugin {plugin}: found {size} bytes, expected a file of Python, of at most {_LARGEST}"
+        )
     # Files of the same name are different modules.
     name = f"{_FROM_FILE}{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     return importlib.util.spec_from_file_location(name, path)

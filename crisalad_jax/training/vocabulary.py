@@ -87,9 +87,15 @@ def with_vocabulary(
         check_count("images", images)
         if images < len(paths):
             paths = [paths[i] for i in sample(len(paths), images, seed)]
+    clusters = aggregator.count_centroids(config.backbone.dim)
+    most = len(paths) * min(PATCHES, config.grid[0] * config.grid[1])
+    require(
+        most >= clusters,
+        f"images: found {len(paths)}, which is {most} features, expected at least {clusters}, one "
+        "for each cluster",
+    )
     reading = Reading(batch_size=batch_size, on_bad_image=on_bad_image).fitted(len(paths))
     features = _read_features(model, paths, reading, seed, quiet=quiet)
-    clusters = aggregator.count_centroids(config.backbone.dim)
     require(
         len(features) >= clusters and bool(np.isfinite(features).all()),
         f"images: found {len(features)} features in those that can be read, expected at least "

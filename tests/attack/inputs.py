@@ -401,7 +401,7 @@ VALUES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("compare", "--epochs", ("0", "-1", HUGE)),
     ("compare", "--methods", ("x", "gem,gem", ",", "../gem")),
     ("compare", "--rerank", ("0", "-1")),
-    ("compare", "--weights", ("x", "x=y", "gem=", "=x", "gem=/dev/zero")),
+    ("compare", "--weights", ("x", "gem=", "=x", "gem=/dev/zero")),
     ("compare", "--grouping", ("x",)),
     ("compare", "--preset", ("x",)),
     ("compare", "--jobs", ("0", "-1", "x")),
@@ -462,7 +462,7 @@ def wrong_flags() -> Iterator[Case]:
             named = ("argument", "option", "one", "--", "no such", "plugin")
             make = with_more(verb, *more)
             yield of(verb, "flags", f"{verb}: {words}", make, *named, fine=fine)
-    for given in (["x"], ["--frobnicate"], [""], ["train"], ["\x1b[31m"], ["\udce9"], ["help"]):
+    for given in (["x"], ["--frobnicate"], [""], ["train"], ["\x1b[31m"], ["\udce9"]):
         yield Case("flags", f"{given}", lambda world, bad, given=given: list(given))
     # A flag given twice: the last one counts, or it is refused.
     for verb, flag, first, last in (("extract", "--seed", "1", "-1"), ("pca", "--dim", "3", "0")):
@@ -961,7 +961,7 @@ def pictures() -> Iterator[Case]:
         return None if "heic" in done.err else "no word of the images that are not read"
 
     make = with_file("extract", "--images", "pictures", others)
-    yield Case("pictures", "none but .heic", make, ("found no image",), check=told)
+    yield Case("pictures", "none but .heic", make, ("c.gif: found 5 bytes",), check=told)
 
 
 POSITIONS: Mapping[str, bytes] = {
@@ -1113,9 +1113,13 @@ def maps() -> Iterator[Case]:
             # What a map says of its images, or of where it was made, may be anything of its type.
             fine = kind in ("names with escapes", "a grouping of words", "a collection outside")
             fine |= kind in ("names of numbers", "a digest of nothing", "positions of NaN")
+            # Its file says what the model is, and a name may be of any bytes.
+            fine |= kind in ("an absurd model", "names that are no UTF-8")
             # Of wrong names or roots, the picture that is not there is told.
             make = _with_map(_sealed_in(name, change))
-            yield Case(f"maps: {name}", kind, make, ("map", "images/", ".jpg"), fine, ("index",))
+            yield Case(
+                f"maps: {name}", kind, make, ("map", "images/", "/dev/zero"), fine, ("index",)
+            )
     for kind, data in NPY.items():
         make = _with_map(_written_in("segments/0000000000.npy", data))
         yield Case("maps: descriptors", kind, make, ("0000000000",), needs=("index",))

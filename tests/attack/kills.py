@@ -42,11 +42,9 @@ from tests.attack.world import (
     import_everything,
     keep_programs,
     make_world,
+    without_times,
     write_rows,
 )
-
-TIMES = ("images_per_second", "waited_for_images", "seconds", "step_seconds")
-"""What a log or a result tells of the clock; all else is equal in two runs."""
 
 
 class Marks:
@@ -202,13 +200,6 @@ class Bench:
             stderr=subprocess.PIPE,
             **options,
         )
-
-
-def without_times(value: Any) -> Any:
-    """Leave out of JSON values what depends on the clock."""
-    if isinstance(value, dict):
-        return {k: without_times(v) for k, v in value.items() if k not in (*TIMES, "checksum")}
-    return [without_times(each) for each in value] if isinstance(value, list) else value
 
 
 def differences(found: pathlib.Path, expected: pathlib.Path) -> list[str]:
@@ -400,8 +391,7 @@ def map_files(folder: pathlib.Path) -> dict[str, bytes]:
     found = {p.name: p.read_bytes() for p in sorted((folder / "segments").iterdir())}
     for name in found:
         if name.endswith(".json"):
-            record = without_times(json.loads(found[name]))
-            found[name] = json.dumps(record | {"added": None}).encode()
+            found[name] = json.dumps(without_times(json.loads(found[name]))).encode()
     description = without_times(json.loads((folder / "map.json").read_text()))
     del description["created"], description["collection"]
     return found | {"map.json": json.dumps(description).encode()}

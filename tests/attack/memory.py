@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.nn.model import Model
 from tests.attack.kills import Bench, carry_out, part_of, recipe_of_chains
 from tests.attack.world import VERBS, Row, files_in, forked, make_products
 
@@ -124,19 +123,13 @@ def attack_queries(bench: Bench, scale: float) -> list[Row]:
             sizes = {}
             image = next(path for path in bench.world.images.rglob("*.jpg"))
             with Map.open(bench.world.path("map")) as places:
-                params = places.load_model()
+                model = places.load_model()
                 rows = np.concatenate(list(places.descriptors))
                 for number in range(1, last + 1):
                     if kind == "searches":
                         places.search(rows[:1], 3)
                     else:
-                        query(
-                            places,
-                            [image],
-                            model=Model(params, places.config),
-                            k=3,
-                            reading=Reading(quiet=True),
-                        )
+                        query(places, [image], model=model, k=3, reading=Reading(quiet=True))
                     if number % max(last // 10, 1) == 0:
                         gc.collect()
                         sizes[number] = resident()

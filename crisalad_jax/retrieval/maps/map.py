@@ -518,7 +518,8 @@ class Map:
             found = read_weights(file)
             assert found.digest is not None  # a file of this package says it
             check_model(self.metadata, self.folder, found.digest, file)
-            model = Model(found.params, self.config)
+            config = with_non_semantic_fields_of(self.config, found.config)
+            model = Model(found.params, config)
         else:
             model = open_runtime(
                 file,
