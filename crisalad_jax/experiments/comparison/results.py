@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark
@@ -285,7 +286,7 @@ def summarise(prepared: Prepared, runs: Sequence[Run], speed: Mapping[str, Any])
         The summary.
 
     Raises:
-        InputError: a result was changed since it was written.
+        InputError: a result was changed or removed since it was written.
     """
     config = prepared.config
     sets = dict(zip(short_names(prepared.benchmarks), prepared.benchmarks, strict=True))
@@ -293,6 +294,8 @@ def summarise(prepared: Prepared, runs: Sequence[Run], speed: Mapping[str, Any])
     reference = variants.get(config.reference or "crisalad", prepared.variants[0])
     results: dict[str, list[tuple[Run, RunResult]]] = {}
     for run in runs:
+        path = run.folder / "result.json"
+        require(run.is_done, f"{path}: found none of this run's, expected it until the end")
         results.setdefault(run.variant.run, []).append((run, run.read()))
     rows = [_rows(variant, reference, sets, results, speed) for variant in prepared.variants]
     adapters = adapter_costs(speed["adapters"]) if config.is_papers else []
