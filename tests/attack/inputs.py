@@ -435,7 +435,11 @@ def wrong_values() -> Iterator[Case]:
         for value in values:
             word = flag.strip("-").split(".")[-1]
             names = (word, word.replace("-", " "), word.replace("-", "_"), value, "aggregator")
-            more = {"--split": ("train", "val"), "--layout": ("layout", ".mat", "town")}
+            more = {
+                "--split": ("train", "val"),
+                "--layout": ("layout", ".mat", "town"),
+                "--format": ("public.pth: found suffix",),
+            }
             named = (*names, *more.get(flag, ()), flag)
             # The one that does no work of its own accepts any number of images.
             fine = (verb, flag, value) in (
