@@ -117,20 +117,6 @@ def test_on_a_narrow_page_what_a_row_changes_stands_below_its_name(tmp_path):
     shown = "model.<wbr>aggregator=gem, &lt;b&gt;"
     assert f'base<small class="under">{shown}</small></th>' in page
     assert f'<td class="label">{shown}</td>' in page
-    narrow = page.partition("@media (max-width: 40rem) {")[2].partition("\n}")[0]
-    assert "td.label { display: none; }" in narrow
-    assert ".under { display: block; }" in narrow
-
-
-def test_json_is_json():
-    found = json.loads(json.dumps(tables.as_json(SUMMARY)))
-    assert found["rows"][0]["recalls"]["town"]["R@5"] == {
-        "mean": 0.625,
-        "spread": 0.125,
-        "interval": {"low": 0.4, "high": 0.8},
-        "by_seed": [0.75, 0.5],
-        "difference": None,
-    }
 
 
 @pytest.mark.parametrize(
@@ -165,20 +151,12 @@ def test_a_table_in_a_page(tmp_path):
 BETTER = Difference(0.0449, Interval(0.004, 0.0861), "better")
 UNTOLD = Difference(-0.0001, Interval(-0.1, 0.1), "not told apart")
 WORSE = Difference(-0.25, Interval(-0.5, -0.01), "worse")
+DIFFERENCES = {1: BETTER, 5: UNTOLD, 10: WORSE}
+DIFFERENT = {k: LONE._replace(difference=each) for k, each in DIFFERENCES.items()}
 COMPARED = SUMMARY._replace(
     rows=[
         row("first", "single", ONE),
-        row(
-            "other",
-            "single",
-            LONE,
-            recalls={
-                "town": {
-                    k: LONE._replace(difference=each)
-                    for k, each in ((1, BETTER), (5, UNTOLD), (10, WORSE))
-                }
-            },
-        ),
+        row("other", "single", LONE, recalls={"town": DIFFERENT}),
     ],
 )
 
@@ -194,14 +172,18 @@ def test_differences_in_markdown():
 
 def test_differences_in_csv_and_json(tmp_path):
     lines = written(COMPARED, tmp_path)
-    assert [line["verdict"] for line in lines] == [
-        *("", "", ""),
-        *("better", "not told apart", "worse"),
-    ]
-    assert (lines[3]["difference"], lines[3]["difference_low"]) == ("0.0449", "0.004")
-    assert lines[3]["difference_high"] == "0.0861"
+    verdicts = ["", "", "", "better", "not told apart", "worse"]
+    assert [line["verdict"] for line in lines] == verdicts
+    names = ("difference", "difference_low", "difference_high")
+    assert [lines[3][name] for name in names] == ["0.0449", "0.004", "0.0861"]
     first, second = json.loads(json.dumps(tables.as_json(COMPARED)))["rows"]
-    assert first["recalls"]["town"]["R@10"]["difference"] is None
+    assert first["recalls"]["town"]["R@10"] == {
+        "mean": 0.625,
+        "spread": 0.125,
+        "interval": {"low": 0.4, "high": 0.8},
+        "by_seed": [0.75, 0.5],
+        "difference": None,
+    }
     assert second["recalls"]["town"]["R@10"]["difference"] == {
         "mean": -0.25,
         "interval": {"low": -0.5, "high": -0.01},
@@ -212,4 +194,3 @@ def test_differences_in_csv_and_json(tmp_path):
 def test_no_differences_of_a_single_row():
     alone = SUMMARY._replace(rows=SUMMARY.rows[:1])
     assert list(tables.tables_of(alone)) == ["recall", "costs"]
-    assert "less" not in tables.markdown(alone)
