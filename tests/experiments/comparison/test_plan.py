@@ -4,10 +4,9 @@ import dataclasses
 
 import pytest
 
-from crisalad_jax.cli import main
-from crisalad_jax.experiments.comparison import METHODS, ComparisonConfig, prepare
+from crisalad_jax.experiments.comparison import ComparisonConfig, prepare
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.recipes import RECIPES, from_scratch, recipe
+from crisalad_jax.training.recipes import RECIPES, recipe
 from tests.cli.test_cli import fails
 
 

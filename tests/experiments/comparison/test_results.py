@@ -1,7 +1,5 @@
 """Recalls and their paired differences, against scipy and a bootstrap written out."""
 
-import itertools
-
 import numpy as np
 import pytest
 import scipy.stats
