@@ -75,6 +75,5 @@ def test_frames_of_a_camera_are_followed(folder, tmp_path, capfd, queries):
         # Over all images of the map, each rounded to six digits.
         total = sum(answer["probability"] for answer in line["neighbours"])
         assert total == pytest.approx(1, abs=7 * 5e-7)
-    assert "probability" in succeeds(capfd, *query(folder, queries, "--sequence", "bayes"))
     words = ("--sequence-reach: found without --sequence bayes",)
     fails(capfd, *query(folder, queries, "--sequence-reach", 1), words=words)

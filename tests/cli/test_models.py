@@ -109,18 +109,12 @@ def test_weights_by_name(capfd, tmp_path):
     assert "a.png" in out
 
 
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
-def test_a_run_starts_from_weights_by_name():
-    start = read_start(dataclasses.replace(RECIPE, model=CONFIG), weights="tiny-model")
-    assert start is not None
-    assert_equal(start, load_weights(cached_weights(PUBLISHED["tiny-model"]))[0])
-
-
 @pytest.mark.slow  # draws the rest of the model
 @pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
-def test_a_run_starts_from_a_backbone_by_name():
-    model = dataclasses.replace(RECIPE.model, backbone=CONFIG.backbone)
+def test_a_run_starts_from_weights_or_a_backbone_by_name():
+    expected, config = load_weights(cached_weights(PUBLISHED["tiny-model"]))
+    whole = read_start(dataclasses.replace(RECIPE, model=config), weights="tiny-model")
+    assert_equal(whole, expected)
+    model = dataclasses.replace(RECIPE.model, backbone=config.backbone)
     start = read_start(dataclasses.replace(RECIPE, model=model), backbone="tiny-model")
-    assert start is not None
-    expected = load_weights(cached_weights(PUBLISHED["tiny-model"]))[0]
     assert_equal(start.backbone, expected.backbone)

@@ -93,11 +93,7 @@ def test_a_video_is_extracted_and_described_as_its_frames(tmp_path, capfd, weigh
     succeeds(capfd, "extract", "--images", video, "--fps", 2, "--out", out, *common)
     names, descriptors = read_descriptors(out)
     assert names == [f"walk.avi#t={time:.3f}" for time in (0, 0.5, 1, 1.5, 2)]
-    (record,) = (
-        value
-        for path in tmp_path.glob("d.npy*json")
-        if "fps" in (value := json.loads(path.read_text()))
-    )
+    record = json.loads((tmp_path / "d.npy.json").read_text())
     assert (record["images"], record["fps"]) == (str(video), 2)
     # The same frames by name, in another order.
     (tmp_path / "list.txt").write_text("\n".join(reversed(names)))
@@ -155,13 +151,10 @@ def test_a_camera_of_a_video(town_map, tmp_path, capfd):
     given = query(town_map, "--camera", video, "--k", 1, "--window", 3)
     out, error = runs(capfd, *given)
     lines = [json.loads(line) for line in out.splitlines()]
-    assert lines[-1]["query"] == "walk.avi#t=0.400"
-    assert lines[-1]["time"] == 0.4
-    assert set(lines[-1]) == {"query", "time", "latency_ms", "zone", "neighbours"}
+    assert (lines[-1]["query"], lines[-1]["time"]) == ("walk.avi#t=0.400", 0.4)
     ready, summary = error.splitlines()
     assert ready == f"crisalad: ready, taking frames from {video}"
     assert summary.startswith(f"crisalad: {len(lines)} answers, latency median ")
-    assert " ms, 95th percentile " in summary
 
 
 @pytest.mark.parametrize(

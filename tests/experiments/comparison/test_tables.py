@@ -48,6 +48,7 @@ SUMMARY = Summary(
 
 def test_markdown():
     recalls = "| 62.5 ± 12.5 (40.0-80.0) " * 3
+    assert list(tables.tables_of(SUMMARY._replace(rows=SUMMARY.rows[:1]))) == ["recall", "costs"]
     costs = "| 8,448 | 1.25 x | 1,000,000 | 10,000 | 0.50 x (0.40 to 0.75) |"
     assert tables.markdown(SUMMARY).splitlines() == [
         "| method | town R@1 | town R@5 | town R@10 |",
@@ -161,16 +162,13 @@ COMPARED = SUMMARY._replace(
 )
 
 
-def test_differences_in_markdown():
+def test_differences_in_markdown_csv_and_json(tmp_path):
     assert tables.markdown(COMPARED).splitlines()[5:8] == [
         "| method, less First | town Δ R@1 | town Δ R@5 | town Δ R@10 |",
         "| --- | ---: | ---: | ---: |",
         "| Other | +4.5 (+0.4 to +8.6) better | +0.0 (-10.0 to +10.0) not told apart "
         "| -25.0 (-50.0 to -1.0) worse |",
     ]
-
-
-def test_differences_in_csv_and_json(tmp_path):
     lines = written(COMPARED, tmp_path)
     verdicts = ["", "", "", "better", "not told apart", "worse"]
     assert [line["verdict"] for line in lines] == verdicts
@@ -189,8 +187,3 @@ def test_differences_in_csv_and_json(tmp_path):
         "interval": {"low": -0.5, "high": -0.01},
         "verdict": "worse",
     }
-
-
-def test_no_differences_of_a_single_row():
-    alone = SUMMARY._replace(rows=SUMMARY.rows[:1])
-    assert list(tables.tables_of(alone)) == ["recall", "costs"]

@@ -114,8 +114,7 @@ def test_transport_shows_picture_dustbin_and_clusters(params, benchmark, tmp_pat
     first, dustbin, *_ = figure.axes
     assert first.get_title(loc="left") == "70 x 50 pixels, 3 x 4 patches"
     np.testing.assert_array_equal(first.images[0].get_array(), image)
-    # Twelve patches for four clusters leave two thirds in the dustbin, within what three
-    # iterations leave.
+    # Two thirds, within what three iterations leave.
     assert dustbin.get_title(loc="left") in ("dustbin: 66 %", "dustbin: 67 %")
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert len(legend) == len({label.split(":")[0] for label in legend}) <= 4
