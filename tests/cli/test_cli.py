@@ -42,6 +42,7 @@ from tests.conftest import (
     MODEL,
     RECIPE,
     STEPS,
+    assert_equal,
     random_params,
     write_picture,
 )

@@ -30,7 +30,7 @@ def test_flags_become_the_manifest(tmp_path, capfd, weights):
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (("--platforms", "cpu,metal"), "platforms: found ('cpu', 'metal'), expected some of"),
+        (("--platforms", "cpu,metal"), "platforms: found ('cpu', 'metal'), expected a tuple"),
         (("--platforms", "cpu", "--format", "onnx"), "--platforms: found with --format onnx, exp"),
         (("--image-size", "28", "28"), "4 patches for 4 clusters"),
         (("--batch-size", "0"), "batch size: found 0"),
