@@ -32,7 +32,7 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import Crisalad, Model, describe
+from crisalad_jax.nn.model import Model, describe
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.pytree import named_leaves
@@ -526,15 +526,6 @@ def extract(shared: pathlib.Path, images: pathlib.Path, out: pathlib.Path, *more
     )
 
 
-def described(params: Crisalad, paths: list[pathlib.Path]) -> np.ndarray:
-    """Each alone, in a batch of one."""
-    rows = []
-    for path in paths:
-        image = resize_image(read_image(path), MODEL.image_size)
-        rows.append(describe(params, image[None], MODEL)[0])
-    return np.stack(rows)
-
-
 @pytest.mark.parametrize("name", ["d.npy", "d.names.txt", "d.npy.json"])
 def test_extract_knows_at_once_that_one_of_its_files_cannot_be(capfd, tmp_path, shared, name):
     (tmp_path / name).mkdir()
@@ -567,9 +558,10 @@ def test_extract_writes_descriptors_names_and_configuration(
     assert files_in(tmp_path / "new") == {"d.npy", "d.names.txt", "d.npy.json"}
     names = (tmp_path / "new" / "d.names.txt").read_text().splitlines()
     assert names == sorted(path.relative_to(town).as_posix() for path in town.rglob("*.jpg"))
-    found = np.load(tmp_path / "new" / "d.npy")
+    images = (resize_image(read_image(town / name), MODEL.image_size) for name in names)
+    expected = np.concatenate([describe(params, image[None], MODEL) for image in images])
     np.testing.assert_allclose(
-        found, described(params, [town / name for name in names]), atol=TOLERANCE, rtol=0
+        np.load(tmp_path / "new" / "d.npy"), expected, atol=TOLERANCE, rtol=0
     )
     config = json.loads((tmp_path / "new" / "d.npy.json").read_text())
     files = {"descriptors": tmp_path / "new" / "d.npy", "names": tmp_path / "new" / "d.names.txt"}
@@ -598,19 +590,13 @@ def test_extract_stops_at_a_bad_image_and_leaves_nothing(capfd, tmp_path, shared
     assert not (tmp_path / "out").exists()
 
 
-def test_extract_skips_bad_images_and_says_so(capfd, tmp_path, shared, town, params):
+def test_extract_skips_bad_images_and_says_so(capfd, tmp_path, shared, town):
     paths = list_images(town)
     for index in (0, 6, 11):
         spoil(paths[index])
-    kept = [path for index, path in enumerate(paths) if index not in (0, 6, 11)]
     out = succeeds(capfd, *extract(shared, town, tmp_path / "d.npy", "--on-bad-image", "skip"))
     assert "9 descriptors" in out
     assert "3 unreadable images left out" in out
-    names = (tmp_path / "d.names.txt").read_text().splitlines()
-    assert [town / name for name in names] == kept
-    np.testing.assert_allclose(
-        np.load(tmp_path / "d.npy"), described(params, kept), atol=TOLERANCE, rtol=0
-    )
     skipped = json.loads((tmp_path / "d.npy.json").read_text())["skipped"]
     assert [town / name for name in skipped] == [paths[0], paths[6], paths[11]]
 
