@@ -39,6 +39,12 @@ def draw(tmp_path, *outcomes, first=(0, 0)):
     return drawn(figure, tmp_path)
 
 
+def reddish(picture):
+    """Where crosses are, and the lines, which are thin and pale."""
+    lower = picture[:-LEGEND].astype(int)
+    return np.argwhere(lower[..., 0] - lower[..., 1] > 30)
+
+
 def test_a_right_query_is_green_and_a_wrong_one_red_with_a_line_to_its_retrieval(tmp_path):
     picture = draw(tmp_path, "right", "wrong")
     lower = picture[:-LEGEND]
@@ -47,10 +53,9 @@ def test_a_right_query_is_green_and_a_wrong_one_red_with_a_line_to_its_retrieval
     south_west, north_east = green.mean(axis=0), red.mean(axis=0)
     assert south_west[0] > north_east[0] + 300
     assert south_west[1] < north_east[1] - 300
-    # Thin and pale, the line passes half-way to the retrieval, five metres west of the green dot.
-    reddish = np.argwhere(lower[..., 0].astype(int) - lower[..., 1] > 30)
+    # The line passes half-way to the retrieval, five metres west of the green dot.
     middle = (south_west + north_east) / 2
-    assert np.abs(reddish - middle).sum(axis=1).min() < 40
+    assert np.abs(reddish(picture) - middle).sum(axis=1).min() < 40
     assert not near_colour(draw(tmp_path, "right", "right"), RED).any()
 
 
@@ -115,8 +120,8 @@ def test_what_is_out_of_place_is_not_drawn(tmp_path):
     # The map of all spans 5 km; without them it is the square of 100 m, whose red cross is alone:
     # no line leads to (0, 0).
     some, every = (
-        np.ptp(np.argwhere(near_colour(drawn(figure, tmp_path)[:-LEGEND], RED)), axis=0).max()
-        for figure in (position_map(each, first, outcomes) for each in (placed, everything))
+        np.ptp(reddish(drawn(position_map(each, first, outcomes), tmp_path)), axis=0).max()
+        for each in (placed, everything)
     )
     assert some < 40
     assert every > 200
