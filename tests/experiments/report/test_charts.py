@@ -112,7 +112,7 @@ def test_places_that_all_share_positions_are_in_place(count):
 
 def test_what_is_out_of_place_is_not_drawn(tmp_path):
     database = np.array([[1000.0, 5000], [1100, 5000], [1100, 5100], [1000, 5100], [0, 0]] * 5)
-    queries = np.array([[1005.0, 5000], [0, 0]])
+    queries = np.array([[1095.0, 5095], [0, 0]])
     placed = find_placed(database, queries)
     assert out_of(database, queries) == ([4, 9, 14, 19, 24], [1])
     everything = Positions(database, queries, np.ones(25, bool), np.ones(2, bool), np.inf)
