@@ -22,8 +22,6 @@ def test_a_map_is_calibrated_and_says_unknown(folder, shared, tmp_path, capfd, q
     value = json.loads((folder / "calibration.json").read_text())
     least = value["min_similarity"]
     assert f"calibration.json: answers below similarity {least:.9g} are unknown from now on" in said
-    assert "rests on few queries" in said
-    assert f"{value['right']} of {value['answered']}" in said
     assert (value["precision"], value["database"], value["unknown"]) == (0.4, 7, 1)
     assert value["right"] / value["answered"] >= 0.4
 
@@ -40,8 +38,6 @@ def test_a_map_is_calibrated_and_says_unknown(folder, shared, tmp_path, capfd, q
         f"{answers}: 5 queries in a map of 7 images; {unknown} of 5 unknown, below similarity "
         f"{least:.9g} (rests on {value['answered']} answers)"
     )
-    table = succeeds(capfd, *query(folder, queries))
-    assert table.count("unknown") == unknown + 1  # their rows and the title
     # What a flag says stands before what the map remembers.
     table = succeeds(capfd, *query(folder, queries, "--min-similarity", -1))
     assert "unknown" not in table
@@ -66,8 +62,6 @@ def test_a_damaged_calibration_is_left_out_with_a_similarity(folder, shared, cap
         said = succeeds(capfd, *query(folder, queries, "--min-similarity", least))
         assert ("unknown, below similarity 0.5" in said) == (least == 0.5)
         assert "rests on" not in said
-    watched = ("query", "--map", folder, "--watch", folder / "none", "--min-similarity", -1)
-    fails(capfd, *watched, words=("none",))
     # It is replaced, not read.
     succeeds(capfd, *calibrate(folder, shared / "town", "--precision", 0.4))
     assert "rests on" in succeeds(capfd, *query(folder, queries))
@@ -81,8 +75,5 @@ def test_frames_of_a_camera_are_followed(folder, tmp_path, capfd, queries):
         # Over all images of the map, each rounded to six digits.
         total = sum(answer["probability"] for answer in line["neighbours"])
         assert total == pytest.approx(1, abs=7 * 5e-7)
-    assert "probability" in succeeds(capfd, *query(folder, queries, "--sequence", "bayes"))
     words = ("--sequence-reach: found without --sequence bayes",)
     fails(capfd, *query(folder, queries, "--sequence-reach", 1), words=words)
-    words = ("BayesFilter.reach: found 0.0, expected at least 1",)
-    fails(capfd, *query(folder, queries, "--sequence", "bayes", "--sequence-reach", 0), words=words)

@@ -32,7 +32,7 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import Crisalad, Model, describe
+from crisalad_jax.nn.model import Model, describe
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.pytree import named_leaves
@@ -42,16 +42,15 @@ from tests.conftest import (
     MODEL,
     RECIPE,
     STEPS,
+    assert_equal,
     random_params,
     write_picture,
 )
 from tests.random_checkpoints import random_state, save
 
 Capture = pytest.CaptureFixture[str]
+ROOT = pathlib.Path(crisalad_jax.cli.__file__).parents[2]
 
-WITHOUT_ENCODER = dataclasses.replace(
-    MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=0)
-)
 # See test_evaluation: rounding of float32 sums.
 TOLERANCE = 2e-6
 
@@ -98,9 +97,10 @@ def train(shared: pathlib.Path, data: pathlib.Path, out: pathlib.Path, *more: ob
     )
 
 
-def spoil(path: pathlib.Path, how: str) -> None:
+def spoil(path: pathlib.Path) -> None:
+    """Cut a picture short."""
     data = path.read_bytes()
-    path.write_bytes({"empty": b"", "cut": data[: len(data) // 2], "text": b"no image"}[how])
+    path.write_bytes(data[: len(data) // 2])
 
 
 LONG = "/".join(["folder"] * 20)
@@ -112,14 +112,12 @@ POSITIONAL = {
     ("models", "name"): "NAME",
     ("query", "images"): "IMAGE",
 }
-SPOILT = pytest.mark.parametrize("how", ["empty", "cut", "text"])
-
-
 # Arguments
 
 
 def test_help_lists_every_command_and_flag(capfd):
     out = succeeds(capfd, "--help")
+    assert succeeds(capfd, "help") == out
     for command, summary in crisalad_jax.cli._COMMANDS.items():
         assert f"{command} {summary}" in out
         help_text = succeeds(capfd, command, "--help-all")
@@ -133,11 +131,6 @@ def test_help_lists_every_command_and_flag(capfd):
         assert flag in succeeds(capfd, "train", "--help-all")
 
 
-def test_help_is_a_command_too(capfd):
-    assert succeeds(capfd, "help") == succeeds(capfd, "--help")
-    assert succeeds(capfd, "help", "train") == succeeds(capfd, "train", "--help")
-
-
 def test_no_command_prints_the_usage(capfd):
     assert main([]) == 2
     assert capfd.readouterr().err.startswith("usage: crisalad COMMAND")
@@ -147,47 +140,42 @@ def test_no_command_prints_the_usage(capfd):
     ("arguments", "words"),
     [
         ("tran --data d --out o", r"found no command 'tran'; did you mean train\? \(see"),
-        ("querry a.jpg --map m", r"found no command 'querry'; did you mean query\? \("),
         ("help querry", r"found no command 'querry'; did you mean query\? \("),
         ("xyz", "found no command 'xyz'; expected demo, render, train, .*, completion"),
         ("info --preset b16", "preset: found 'b16', expected one of b14, g14, l14, s14, tiny"),
-        ("train --data d --out o --preset b16", "preset: found 'b16'"),
         ("train --data d --out o --recipe dbow", "recipe: found 'dbow', expected one of anyloc"),
         ("train --data d --out o --recipe salad --config c", "--recipe: found with --config"),
-        ("info --colour red", "--colour"),
         ("train --data d --out o --epoch 3", "--epochs"),  # perhaps you meant
-        ("train --data d", "--out"),
+        ("info --plugin --quiet", "--plugin: found no value, expected FILE.py or MODULE"),
+        ("info --max-pixels 0", "--max-pixels: found '0', expected a number of pixels"),
+        (
+            "query a --map m --k 9999999999999",
+            r"--k: found 9+, expected a number of at most 2\*\*40",
+        ),
         ("extract", "missing --images PATH --out PATH"),
         ("train --data d --out o --seed one", "--seed: found 'one', expected a whole number"),
-        ("query a --map m --k five", "--k: found 'five', expected a whole number"),
         ("query a --map m --fps slow", "--fps: found 'slow', expected a number"),
         (f"query a --map m --k {LONG}", f"--k: found '{LONG}', expected a whole number"),
         ("train --data d --out o --preset", "--preset: found none, expected a value"),
         ("evaluate --data d --image-size 1 x", "--image-size: found '1 x', expected 2 whole numb"),
-        ("train --data d --out o --model.image-size 9", "--model.image-size: found '9', expected"),
         ("train --data d --out o --model.image-size 9 9 9", "found '9 9 9', expected 2 values"),
         ("query a --map m --runtime tvm", "--runtime: found 'tvm', expected one of jax, onnxrunt"),
-        ("index --images a --out m --dtype int8", "--dtype: found 'int8', expected one of float"),
-        ("evaluate --data d --image-size 9 9 --image-size 200", "--image-size: found '200', exp"),
         ("index --images a b --out m", r"--images: found 'a b', expected one value \(quote"),
         ("extract --images a --out m --quiet no", "--quiet: found 'no', expected no value"),
         ("index --image a --out m", "--image: found no such flag; missing --images PATH"),
         ("query a --map m --kk 3", r"--kk: found no such flag; did you mean --k INT\?"),
         ("evaluate d", "found 'd' without a flag before it; missing --data PATH"),
-        ("serve city.map", "found 'city.map' without a flag before it; missing --map PATH"),
         ("train --data d --out o --seed -1", "TrainConfig.seed: found -1"),
         ("train --data d --out o --model.image-size 100 98", "found 100 x 98, .*nearest: 98 x 98"),
         ("train --data d --out o --model.backbone.ffn relu", "relu.*mlp.*swiglu"),
-        ("train --data d --out o --on-bad-image ignore", "ignore.*stop.*skip"),
         ("evaluate --data d --grouping single,sorted", "grouping: found 'sorted', expected one of"),
         ("evaluate --data d --grouping a/b/c", "grouping: found 'a/b/c', .*QUERIES/DATABASE"),
         ("evaluate --data d --seeds 0", "seeds: found 0, expected at least 1"),
         ("evaluate --data d --batch-size 0", "batch.size: found 0"),
         ("evaluate --data d --seed -1", "seed: found -1"),
         ("extract --weights w --images d --out f.txt", r"f\.txt: suffix.*\.h5, \.npy"),
-        ("extract --weights w --images d --out f.npy --grouping all", "grouping: found 'all'"),
+        ("info --verify", "--verify: found without --map"),
         ("info --image-size 112 98", "56 patches for 64 clusters"),
-        ("info --image-size 112", "--image-size"),
         ("info --trainable last-13-blocks+head", "last 13 blocks, expected at most 12"),
         ("demo --seed -1 --out o", "seed: found -1"),
     ],
@@ -201,29 +189,14 @@ def test_bad_arguments(capfd, tmp_path, monkeypatch, arguments, words):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_refusal_leaves_no_width_behind(capfd, monkeypatch):
-    monkeypatch.delenv("COLUMNS", raising=False)
-    fails(capfd, "query", "a", "--map", "m", "--k", "five", words=("--k",))
-    assert "COLUMNS" not in os.environ
-
-
 @pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (None, "found no such file, expected a configuration"),
-        ("{", "found no JSON"),
-        ('{"epochs": 3, "colour": "red"}', "colour"),
-    ],
+    ("content", "words"), [("{", "found no JSON"), ('{"epochs": 3, "colour": "red"}', "colour")]
 )
 def test_a_bad_config_file(capfd, tmp_path, content, words):
     path = tmp_path / "mine.json"
-    if content is not None:
-        path.write_text(content)
-    fails(
-        capfd,
-        *("train", "--data", "d", "--out", tmp_path / "run", "--config", path),
-        words=(f"crisalad: {path}: ", words),
-    )
+    path.write_text(content)
+    given = ("train", "--data", "d", "--out", tmp_path / "run", "--config", path)
+    fails(capfd, *given, words=(f"crisalad: {path}: ", words))
     assert not (tmp_path / "run").exists()
 
 
@@ -239,18 +212,12 @@ def test_an_interrupt_is_no_traceback(capfd, monkeypatch):
 def test_the_console_script_and_the_module_are_the_same_thing(tmp_path):
     """One process for real: nothing else may write to stderr, and the code must come through."""
     write_picture(tmp_path / "photos" / "a.jpg", 0)
-    spoil(tmp_path / "photos" / "a.jpg", "cut")
+    spoil(tmp_path / "photos" / "a.jpg")
     save_weights(tmp_path / "w.safetensors", Model(random_params(MODEL), MODEL))
     command = [sys.executable, "-m", "crisalad_jax", "extract", "--quiet"]
     command += ["--weights", "w.safetensors", "--images", "photos", "--out", "d.npy"]
-    root = pathlib.Path(crisalad_jax.cli.__file__).parents[2]
-    done = subprocess.run(
-        command,
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(root), "JAX_PLATFORMS": "cpu"},
-        capture_output=True,
-        text=True,
-    )
+    environment = {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr.startswith("crisalad: photos/a.jpg: found an image cut short")
     assert done.stderr.count("\n") == 1
@@ -278,7 +245,6 @@ def test_a_full_disk_at_standard_output_is_one_line(more):
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1] == "crisalad: standard output: No space left on device"
     assert "Traceback" not in done.stderr
-    assert "Errno" not in done.stderr
 
 
 def test_a_closed_standard_output_is_no_error():
@@ -304,9 +270,8 @@ def test_a_run_from_the_command_line_and_the_same_command_again(
     found, expected = (
         load_weights(folder / "last.safetensors") for folder in (tmp_path / "run", run)
     )
-    assert found[1] == MODEL
-    for name, leaf in named_leaves(found[0]).items():
-        np.testing.assert_array_equal(leaf, named_leaves(expected[0])[name])
+    assert found.config == MODEL
+    assert_equal(found.params, expected.params)
     resolved = tmp_path / "run" / "config.json"
     assert read_config(TrainConfig, resolved) == dataclasses.replace(RECIPE, patience=None)
 
@@ -350,24 +315,17 @@ def test_missing_and_empty_folders(capfd, tmp_path, shared):
         fails(capfd, *train(shared, data, out), words=(f"crisalad: {data}: ",))
         fails(capfd, *train(shared, shared / "city", out, "--val", data), words=(f"{data}: ",))
         fails(capfd, "evaluate", "--weights", weights, "--data", data, words=(f"{data}: found ",))
-        fails(
-            capfd,
-            *("extract", "--weights", weights, "--images", data, "--out", tmp_path / "d.npy"),
-            words=(f"crisalad: {data}: found ", "expected"),
-        )
+        fails(capfd, *extract(shared, data, tmp_path / "d.npy"), words=(f"{data}: found ",))
     assert files_in(tmp_path) == set()
     assert not out.exists()
 
 
-@SPOILT
-def test_a_bad_training_image_stops_the_run_until_it_is_repaired(
-    capfd, tmp_path, shared, city, how
-):
+def test_a_bad_training_image_stops_the_run_until_it_is_repaired(capfd, tmp_path, shared, city):
     """Half of the places are spoilt, and every batch holds three of four: one is met."""
     whole = {}
     for path in sorted((city / "Images").rglob("*_000000[01]_*.jpg")):
         whole[path] = path.read_bytes()
-        spoil(path, how)
+        spoil(path)
     arguments = train(shared, city, tmp_path / "run")
     error = fails(capfd, *arguments, words=(f"crisalad: {city}/Images/",))
     assert pathlib.Path(error.split(": ")[1]) in whole
@@ -384,14 +342,11 @@ def test_a_loss_that_is_not_finite_names_the_step_and_saves_the_state(
     """Finite weights so large that the first loss overflows."""
     huge = jax.tree.map(lambda leaf: leaf * 1e30, params)
     save_weights(tmp_path / "huge.safetensors", Model(huge, MODEL))
-    arguments = train(shared, shared / "city", tmp_path / "run")
-    position = arguments.index("--weights") + 1
-    arguments = (*arguments[:position], tmp_path / "huge.safetensors", *arguments[position + 1 :])
+    arguments = list(train(shared, shared / "city", tmp_path / "run"))
+    arguments[arguments.index("--weights") + 1] = tmp_path / "huge.safetensors"
     words = ("nan", "at step 1, expected finite", "the state after step 0 is saved")
     fails(capfd, *arguments, words=words)
-    kept, _ = load_weights(tmp_path / "run" / "last.safetensors")
-    for name, leaf in named_leaves(kept).items():
-        np.testing.assert_array_equal(leaf, named_leaves(huge)[name])
+    assert_equal(load_weights(tmp_path / "run" / "last.safetensors").params, huge)
     assert (tmp_path / "run" / "metrics.jsonl").read_text() == ""
 
 
@@ -421,16 +376,14 @@ def test_bad_weights_are_named_by_every_command(capfd, tmp_path, shared, kind):
         arrays = safetensors.numpy.load_file(whole)
         safetensors.numpy.save_file(arrays, weights, metadata={"format": "pt"})
     before = files_in(tmp_path)
-    start = ("--weights", weights)
     town = shared / "town"
-    recipe, city = shared / "recipe.json", shared / "city"
     for arguments in (
-        ("train", "--config", recipe, "--data", city, "--out", tmp_path / "r"),
+        ("train", "--data", shared / "city", "--out", tmp_path / "r"),
         ("evaluate", "--data", town, "--json", tmp_path / "table.json"),
         ("extract", "--images", town, "--out", tmp_path / "d.npy"),
         ("info",),
     ):
-        fails(capfd, *arguments, *start, words=(f"crisalad: {weights}: ",))
+        fails(capfd, *arguments, "--weights", weights, words=(f"crisalad: {weights}: ",))
     assert files_in(tmp_path) == before
 
 
@@ -488,20 +441,14 @@ def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public):
     write_json(tmp_path / "recipe.json", to_plain(recipe))
     arguments = (
         *("train", "--config", tmp_path / "recipe.json", "--backbone", public),
-        *("--data", shared / "city", "--quiet"),
+        *("--data", shared / "city", "--out", tmp_path / "run", "--quiet"),
     )
-    fails(
-        capfd,
-        *(*arguments, "--out", tmp_path / "r", "--weights", public),
-        words=("--backbone: found with --weights",),
-    )
-    fails(
-        capfd,
-        *(*arguments, "--out", tmp_path / "r", "--model.backbone.depth", 3),
-        words=(f"{public}: this backbone is another", "backbone.depth: found 2, expected 3"),
-    )
-    assert not (tmp_path / "r").exists()
-    succeeds(capfd, *arguments, "--out", tmp_path / "run")
+    words = ("--backbone: found with --weights",)
+    fails(capfd, *arguments, "--weights", public, words=words)
+    words = (f"{public}: this backbone is another", "backbone.depth: found 2, expected 3")
+    fails(capfd, *arguments, "--model.backbone.depth", 3, words=words)
+    assert not (tmp_path / "run").exists()
+    succeeds(capfd, *arguments)
     trained, _ = load_weights(tmp_path / "run" / "last.safetensors")
     found = named_leaves(trained.backbone)
     # The frozen part is the file's to the bit; the adapters have moved from their start at 0.
@@ -521,10 +468,8 @@ def test_evaluate_prints_and_writes_the_table(capfd, tmp_path, shared, params, b
         *("--seeds", "2", "--out", tmp_path / "pictures"),
     )
     assert "town/test (@UTM, 25 m): 5 queries, 7 database images; positive: UTM distance" in out
-    # The customer is told that a descriptor depends on its batch, and how each row grouped.
+    # The customer is told that a descriptor depends on its batch.
     assert f"depends on the images in its batch of {BATCH}: single = every image alone" in out
-    assert "window = every image with those just before it in file order" in out
-    assert "Shuffled: mean of 2 seeds ± their standard deviation" in out
     table = json.loads((tmp_path / "table.json").read_text())
     reading = Reading(batch_size=BATCH, quiet=True)
     expected = evaluate(Model(params, MODEL), benchmark, seed=3, seeds=2, reading=reading)
@@ -538,23 +483,18 @@ def test_evaluate_prints_and_writes_the_table(capfd, tmp_path, shared, params, b
         }
         assert f"{100 * result.recalls[1]:.1f}" in out
     assert table["model"] == to_plain(MODEL)
-    assert (table["batch_size"], table["seed"], table["seeds"]) == (BATCH, 3, 2)
-    assert table["rule"] == benchmark.rule
-    assert f"the image's own place, told by {table['same_place']}" in out
     assert files_in(tmp_path / "pictures") == {
         "config.json",
         *(f"gallery_{name.replace('/', '-')}.png" for name in groupings),
     }
     written = json.loads((tmp_path / "pictures" / "config.json").read_text())
-    assert len(written.pop("checksum")) == len(table.pop("checksum")) == 64
-    assert table.pop("skipped") == {"queries": [], "database": []}
-    assert written == {key: value for key, value in table.items() if key != "results"}
+    assert len(written.pop("checksum")) == 64
+    assert table.items() >= written.items()
 
 
-@SPOILT
-def test_a_bad_image_stops_an_evaluation(capfd, tmp_path, town, how, weights):
+def test_a_bad_image_stops_an_evaluation(capfd, tmp_path, town, weights):
     bad = sorted((town / "images" / "test" / "database").iterdir())[5]
-    spoil(bad, how)
+    spoil(bad)
     fails(
         capfd,
         *("evaluate", "--weights", weights, "--data", town, "--quiet"),
@@ -589,15 +529,6 @@ def extract(shared: pathlib.Path, images: pathlib.Path, out: pathlib.Path, *more
     )
 
 
-def described(params: Crisalad, paths: list[pathlib.Path]) -> np.ndarray:
-    """Each alone, in a batch of one."""
-    rows = []
-    for path in paths:
-        image = resize_image(read_image(path), MODEL.image_size)
-        rows.append(describe(params, image[None], MODEL)[0])
-    return np.stack(rows)
-
-
 @pytest.mark.parametrize("name", ["d.npy", "d.names.txt", "d.npy.json"])
 def test_extract_knows_at_once_that_one_of_its_files_cannot_be(capfd, tmp_path, shared, name):
     (tmp_path / name).mkdir()
@@ -630,14 +561,15 @@ def test_extract_writes_descriptors_names_and_configuration(
     assert files_in(tmp_path / "new") == {"d.npy", "d.names.txt", "d.npy.json"}
     names = (tmp_path / "new" / "d.names.txt").read_text().splitlines()
     assert names == sorted(path.relative_to(town).as_posix() for path in town.rglob("*.jpg"))
-    found = np.load(tmp_path / "new" / "d.npy")
+    images = (resize_image(read_image(town / name), MODEL.image_size) for name in names)
+    expected = np.concatenate([describe(params, image[None], MODEL) for image in images])
     np.testing.assert_allclose(
-        found, described(params, [town / name for name in names]), atol=TOLERANCE, rtol=0
+        np.load(tmp_path / "new" / "d.npy"), expected, atol=TOLERANCE, rtol=0
     )
     config = json.loads((tmp_path / "new" / "d.npy.json").read_text())
+    files = {"descriptors": tmp_path / "new" / "d.npy", "names": tmp_path / "new" / "d.names.txt"}
     assert config.pop("files") == {
-        "descriptors": hashlib.sha256((tmp_path / "new" / "d.npy").read_bytes()).hexdigest(),
-        "names": hashlib.sha256((tmp_path / "new" / "d.names.txt").read_bytes()).hexdigest(),
+        name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()
     }
     assert len(config.pop("checksum")) == 64
     assert config == {
@@ -653,32 +585,22 @@ def test_extract_writes_descriptors_names_and_configuration(
     }
 
 
-@SPOILT
-def test_extract_stops_at_a_bad_image_and_leaves_nothing(capfd, tmp_path, shared, town, how):
+def test_extract_stops_at_a_bad_image_and_leaves_nothing(capfd, tmp_path, shared, town):
     bad = list_images(town)[6]
-    spoil(bad, how)
+    spoil(bad)
     for name in ("d.npy", "d.h5"):
-        fails(
-            capfd,
-            *extract(shared, town, tmp_path / "out" / name),
-            words=(f"crisalad: {bad}: found",),
-        )
+        given = extract(shared, town, tmp_path / "out" / name)
+        fails(capfd, *given, words=(f"crisalad: {bad}: found",))
     assert not (tmp_path / "out").exists()
 
 
-def test_extract_skips_bad_images_and_says_so(capfd, tmp_path, shared, town, params):
+def test_extract_skips_bad_images_and_says_so(capfd, tmp_path, shared, town):
     paths = list_images(town)
-    for index, how in ((0, "empty"), (6, "cut"), (11, "text")):
-        spoil(paths[index], how)
-    kept = [path for index, path in enumerate(paths) if index not in (0, 6, 11)]
+    for index in (0, 6, 11):
+        spoil(paths[index])
     out = succeeds(capfd, *extract(shared, town, tmp_path / "d.npy", "--on-bad-image", "skip"))
     assert "9 descriptors" in out
     assert "3 unreadable images left out" in out
-    names = (tmp_path / "d.names.txt").read_text().splitlines()
-    assert [town / name for name in names] == kept
-    np.testing.assert_allclose(
-        np.load(tmp_path / "d.npy"), described(params, kept), atol=TOLERANCE, rtol=0
-    )
     skipped = json.loads((tmp_path / "d.npy.json").read_text())["skipped"]
     assert [town / name for name in skipped] == [paths[0], paths[6], paths[11]]
 
@@ -696,24 +618,6 @@ def test_info_gives_the_papers_numbers(capfd, tmp_path):
     assert summary["one_adapter"]["macs"] == 257 * 589_824 + 256 * 150_912
     # DINOv2 ViT-B/14: 86.58 M parameters, of which its mask token (768) is not part of our model.
     assert summary["frozen_parameters"] == 86_580_480 - 768
-
-
-def test_info_of_a_file_and_of_other_choices(capfd, tmp_path, params, weights):
-    succeeds(
-        capfd,
-        *("info", "--weights", weights, "--image-size", "56", "70"),
-        *("--trainable", "all", "--json", tmp_path / "info.json"),
-    )
-    summary = json.loads((tmp_path / "info.json").read_text())
-    count = sum(leaf.size for leaf in jax.tree.leaves(params))
-    assert (summary["trainable_parameters"], summary["frozen_parameters"]) == (count, 0)
-    assert summary["image_size"] == [56, 70]
-    assert summary["descriptor"] == 48
-
-
-def test_a_plug_in_without_a_name_is_refused(capfd):
-    for more in ((), ("--quiet",)):
-        fails(capfd, "info", "--plugin", *more, words=("--plugin: found no value, expected FIL",))
 
 
 def test_the_version_is_that_of_the_package(capfd):

@@ -1,7 +1,6 @@
 """`crisalad train --weights`: flags come before the file, and the file before recipes."""
 
 import dataclasses
-import json
 import pathlib
 
 import pytest
@@ -15,9 +14,8 @@ from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model
 from crisalad_jax.training.config import MiningConfig
-from crisalad_jax.training.start import read_start
 from crisalad_jax.utils.output import Note
-from tests.cli.test_cli import fails, runs
+from tests.cli.test_cli import fails
 from tests.conftest import MODEL, RECIPE
 
 STARTER = cj.load("starter").config
@@ -35,7 +33,6 @@ def _settings(*flags):
         (("--recipe", "starter"), "all", 7e-4),
         (("--preset", "tiny"), "all", 1e-3),
         (("--recipe", "salad"), "last-4-blocks+head", 6e-5),
-        (("--recipe", "salad", "--trainable", "head"), "head", 6e-5),
     ],
 )
 def test_the_model_is_the_files_and_the_training_the_recipes(flags, trainable, learning_rate):
@@ -65,20 +62,6 @@ def test_a_part_that_the_recipe_puts_in_place_is_told_not_ignored(shared, tmp_pa
     fails(capfd, "train", "--data", shared / "city", *flags, words=words)
 
 
-def test_what_is_saved_has_the_files_images(shared, tmp_path, capfd, weights):
-    model = dataclasses.replace(MODEL, image_size=(28, 42))
-    params, _ = load_weights(weights)
-    save_weights(tmp_path / "w.safetensors", Model(params, model))
-    flags = ["--preset", "tiny", "--epochs", "1", "--places-per-batch", "3", "--quiet"]
-    files = ("--data", shared / "city", "--out", tmp_path / "run")
-    arguments = ["train", "--weights", tmp_path / "w.safetensors", *files, *flags]
-    out, err = runs(capfd, *arguments)
-    assert load_weights(tmp_path / "run" / "last.safetensors")[1] == model
-    saved = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert saved["model"]["image_size"] == [28, 42]
-    assert "weights for images" not in out + err
-
-
 def test_python_tells_of_weights_for_other_images(shared, tmp_path, weights):
     params, _ = load_weights(weights)
     file, city = tmp_path / "w.safetensors", shared / "city"
@@ -87,12 +70,6 @@ def test_python_tells_of_weights_for_other_images(shared, tmp_path, weights):
     words = r"found weights for images at 28 x 42, .* this run trains and is saved with 42 x 56,"
     with pytest.warns(Note, match=words):
         cj.train(config, city, tmp_path / "a", weights=file, quiet=True)
-    area = dataclasses.replace(MODEL.preprocessing, filter="area")
-    save_weights(
-        tmp_path / "area.safetensors", Model(params, dataclasses.replace(MODEL, preprocessing=area))
-    )
-    with pytest.warns(Note, match=r"images at 42 x 56, area.* saved with 42 x 56, b"):
-        read_start(config, weights=tmp_path / "area.safetensors", backbone=None)
     own = dataclasses.replace(config, model=cj.load(file).config)
     cj.train(own, city, tmp_path / "b", weights=file, quiet=True)
     assert cj.load(tmp_path / "b" / "last.safetensors").config.image_size == (28, 42)
@@ -112,8 +89,6 @@ LOCAL = cj.PRESETS["tiny"].preprocessing
 @pytest.mark.parametrize(
     ("found", "expected", "count"),
     [
-        (NO_ENCODER, CrossImageConfig(layers=0, heads=4, feedforward=128, global_token=False), 0),
-        (CrossImageConfig(layers=1, heads=4), CrossImageConfig(layers=1), 1),
         (CrossImageConfig(heads=4), NO_ENCODER, 1),  # the layers alone
         (AdapterConfig(kind="none"), AdapterConfig(kind="none", alpha=0.5, bottleneck=0.1), 0),
         (AdapterConfig(kind="mlp", alpha=0.5), AdapterConfig(kind="mlp"), 1),

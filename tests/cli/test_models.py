@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.cache import cached_weights
-from crisalad_jax.checkpoints.formats import FORMATS
 from crisalad_jax.checkpoints.published import PUBLISHED, Licence, Published
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.retrieval.maps.map import Map
@@ -59,22 +58,9 @@ def test_the_table_has_every_model_and_marks_those_in_the_cache(capfd, tmp_path)
 def test_one_model_is_told_with_all_that_is_known(capfd):
     out, _ = runs(capfd, "models", "tiny-model")
     facts = dict(line.split(maxsplit=1) for line in out.splitlines())
-    assert facts == {
-        "name": "tiny-model",
-        "format": "huggingface",
-        "descriptor": "64",
-        "parameters": "88,640",
-        "images": "56 x 56",
-        "repository": "https://github.com/nobody/tiny",
-        "file": FILE,
-        "url": "not said",
-        "paper": "Nobody, 2026",
-        "backbone": "-",
-        "note": "in an archive",
-        "licence": "no licence file",
-        "commercial": "not said",
-        "cached": "no",
-    }
+    known = {"parameters": "88,640", "images": "56 x 56", "file": FILE, "url": "not said"}
+    known |= {"backbone": "-", "licence": "no licence file", "cached": "no"}
+    assert facts.items() >= known.items()
 
 
 def test_both_are_written_as_json(capfd, tmp_path):
@@ -108,10 +94,7 @@ def test_an_unknown_name_is_one_line(capfd, name, nearest):
 def test_weights_by_name(capfd, tmp_path):
     out, notes = runs(capfd, "info", "--weights", "tiny-model")
     assert "88,640" in out
-    assert notes.splitlines()[0] == (
-        "crisalad: note: tiny-model: no licence file: its authors have not said who may use it "
-        "(https://github.com/nobody/tiny)"
-    )
+    assert notes.startswith("crisalad: note: tiny-model: no licence file: ")
     weights = tmp_path / "cache" / "models" / "tiny-model" / "tiny-model.safetensors"
     assert load_weights(weights)[1] == CONFIG
     write_picture(tmp_path / "images" / "a.png", 0)
@@ -126,26 +109,12 @@ def test_weights_by_name(capfd, tmp_path):
     assert "a.png" in out
 
 
-@pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
-def test_a_run_starts_from_weights_by_name():
-    start = read_start(dataclasses.replace(RECIPE, model=CONFIG), weights="tiny-model")
-    assert start is not None
-    assert_equal(start, load_weights(cached_weights(PUBLISHED["tiny-model"]))[0])
-
-
 @pytest.mark.slow  # draws the rest of the model
 @pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
-def test_a_run_starts_from_a_backbone_by_name():
-    model = dataclasses.replace(RECIPE.model, backbone=CONFIG.backbone)
+def test_a_run_starts_from_weights_or_a_backbone_by_name():
+    expected, config = load_weights(cached_weights(PUBLISHED["tiny-model"]))
+    whole = read_start(dataclasses.replace(RECIPE, model=config), weights="tiny-model")
+    assert_equal(whole, expected)
+    model = dataclasses.replace(RECIPE.model, backbone=config.backbone)
     start = read_start(dataclasses.replace(RECIPE, model=model), backbone="tiny-model")
-    assert start is not None
-    expected = load_weights(cached_weights(PUBLISHED["tiny-model"]))[0]
     assert_equal(start.backbone, expected.backbone)
-
-
-def test_the_help_of_convert_names_every_format(capfd):
-    out, _ = runs(capfd, "convert", "--help-all")
-    words = " ".join(out.replace("│", " ").split())
-    for name, each in FORMATS.items():
-        assert f"{name}," in words
-        assert f"{each.holds}," in words

@@ -10,18 +10,16 @@ import pytest
 from tests.cli.test_cli import extract, fails, files_in, succeeds
 
 
-@pytest.mark.parametrize("folder", ["x[/b]", "fo[red]x", "a:smile:b"])
-def test_brackets_and_colons_in_names_are_printed_as_they_are(capfd, tmp_path, shared, folder):
-    out = tmp_path / folder / "d.npy"
+def test_brackets_and_colons_in_names_are_printed_as_they_are(capfd, tmp_path, shared):
+    out = tmp_path / "fo[red]x[/b]:smile:" / "d.npy"
     said = succeeds(capfd, *extract(shared, shared / "town", out))
-    assert f"{folder}/d.npy: 12 descriptors" in said
+    assert f"{out}: 12 descriptors" in said
 
 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
         (b"b\nc.jpg", "found a line break in the name 'images/test/queries/b\\nc.jpg'"),
-        ("b\u2028c.jpg".encode(), "found a line break in the name"),
         (b"caf\xe9.jpg", "found the name 'images/test/queries/caf\\udce9.jpg', expected UTF-8"),
     ],
 )
@@ -59,10 +57,6 @@ def test_every_output_is_checked_before_any_work(capfd, tmp_path, monkeypatch, o
     given = [*example[:-1], target] if flag == "DST" else [*example, flag, target]
     fails(capfd, *given, words=(f"crisalad: {target}: cannot be made: found {folder[:5]}, exp",))
     assert files_in(tmp_path) == {"file"}
-
-
-def test_verify_needs_a_map(capfd):
-    fails(capfd, "info", "--verify", words=("--verify: found without --map",))
 
 
 def test_an_export_does_not_take_the_place_of_the_working_folder(

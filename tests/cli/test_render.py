@@ -38,7 +38,6 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capfd):
     for flag, value, words in (
         ("--scenes", "0", "WorldConfig.scenes: found 0, expected at least 1"),
         ("--repaint", "-1", "WorldConfig.repaint: found -1.0, expected 0 to 3"),
-        ("--repaint", "inf", "WorldConfig.repaint: found inf, expected 0 to 3"),
         ("--sceneries", "sea", "sea"),
         ("--varied", "sun", "sun"),
         ("--seed", "-1", "WorldConfig.seed: found -1"),
@@ -46,12 +45,6 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capfd):
         fails(capfd, "render", "--out", out, *SMALL, flag, value, words=(words,))
     assert not list(tmp_path.iterdir())
     (tmp_path / "file").write_text("mine")
-    fails(
-        capfd,
-        "render",
-        "--out",
-        tmp_path / "file",
-        *SMALL,
-        words=("found a file, expected a folder",),
-    )
+    words = ("found a file, expected a folder",)
+    fails(capfd, "render", "--out", tmp_path / "file", *SMALL, words=words)
     assert (tmp_path / "file").read_text() == "mine"

@@ -33,10 +33,8 @@ def test_words_change_what_is_extracted_and_are_told(shared, tmp_path, capfd, da
 def test_info_tells_how_images_are_resized(shared, tmp_path, capfd):
     weights, out = shared / "weights.safetensors", tmp_path / "info.json"
     words = "longer side at most 56, area, on bytes, rounded to multiples of 14"
-    said = succeeds(
-        capfd, "info", "--weights", weights, "--json", out, "--resize", "longer-side", "area"
-    )
-    assert words in said
+    flags = ("--json", out, "--resize", "longer-side", "area")
+    assert words in succeeds(capfd, "info", "--weights", weights, *flags)
     told = json.loads(out.read_text())
     assert told["images"] == words
     assert told["preprocessing"]["size_rule"] == "longer-side"
@@ -45,4 +43,3 @@ def test_info_tells_how_images_are_resized(shared, tmp_path, capfd):
 def test_wrong_words_are_one_line(capfd, weights):
     info = ("info", "--weights", weights, "--resize")
     fails(capfd, *info, "cubic", words=("--resize: found 'cubic', expected some of fixed",))
-    fails(capfd, *info, "bytes", "floats", words=("expected one of bytes, floats",))

@@ -33,17 +33,26 @@ def succeeds(capfd: Capture, *arguments: object) -> str:
     return " ".join(runs(capfd, *arguments)[0].split())
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("grouping", ["single", "sequential", "window"])
-def test_extract_gives_the_descriptors_of_jax(engine, grouping, shared, tmp_path, capfd):
+@pytest.mark.parametrize(
+    ("engine", "grouping", "source"),
+    [
+        ("onnxruntime", "sequential", "weights"),
+        ("openvino", "window", "weights"),
+        ("openvino", "single", "exported"),
+    ],
+)
+def test_extract_gives_the_descriptors_of_jax(
+    engine, grouping, source, shared, exported, weights, tmp_path, capfd
+):
     flags = ("--images", shared / "town", "--grouping", grouping, "--batch-size", "4", "--quiet")
-    weights = ("--weights", shared / "weights.safetensors")
-    found = {}
-    for runtime in ("jax", engine):
+    model = {"weights": weights, "exported": exported}[source]
+    found = []
+    for runtime, file in (("jax", weights), (engine, model)):
         out = tmp_path / f"{runtime}.npy"
-        succeeds(capfd, "extract", *weights, *flags, "--runtime", runtime, "--out", out)
-        found[runtime] = np.load(out)
-    np.testing.assert_allclose(found[engine], found["jax"], rtol=0, atol=TOLERANCE)
+        given = ("extract", "--weights", file, "--runtime", runtime, "--out", out)
+        succeeds(capfd, *given, *flags)
+        found.append(np.load(out))
+    np.testing.assert_allclose(*found, rtol=0, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -52,18 +61,16 @@ def test_evaluate_recalls_as_jax_does(engine, shared, tmp_path, capfd, weights):
         *("evaluate", "--data", shared / "town", "--weights", weights),
         *("--batch-size", "4", "--seeds", "1", "--quiet"),
     )
-    tables = {}
-    for runtime in ("jax", engine):
+
+    def recalls(runtime):
         file = tmp_path / f"{runtime}.json"
         succeeds(capfd, *command, "--runtime", runtime, "--json", file)
-        tables[runtime] = json.loads(file.read_text())["results"]
-    # Not its similarities, which differ by rounding.
-    found, expected = (
-        [(each["grouping"], each["recalls"], each["by_seed"]) for each in tables[name]]
-        for name in (engine, "jax")
-    )
-    assert len(found) == 4
-    assert found == expected
+        # Not its similarities, which differ by rounding.
+        results = json.loads(file.read_text())["results"]
+        return [(each["grouping"], each["recalls"], each["by_seed"]) for each in results]
+
+    assert len(recalls(engine)) == 4
+    assert recalls(engine) == recalls("jax")
 
 
 def test_a_map_of_one_runtime_answers_another(shared, tmp_path, capfd, weights):
@@ -74,15 +81,11 @@ def test_a_map_of_one_runtime_answers_another(shared, tmp_path, capfd, weights):
     answers = []
     for runtime in ("jax", *ENGINES):
         said = tmp_path / f"{runtime}.jsonl"
-        succeeds(
-            capfd,
-            *("query", queries, "--map", tmp_path / "map", "--k", "3", "--runtime", runtime),
-            *("--quiet", "--json", said),
-        )
+        asked = ("query", queries, "--map", tmp_path / "map", "--k", "3", "--quiet")
+        succeeds(capfd, *asked, "--runtime", runtime, "--json", said)
         lines = map(json.loads, said.read_text().splitlines())
         answers.append([[each["name"] for each in line["neighbours"]] for line in lines])
-    assert len(answers[0]) == 5
-    assert answers[0] == answers[1] == answers[2]
+    assert answers[0] == answers[1] == answers[2] != []
 
 
 def printed_by(program: str) -> str:
@@ -128,17 +131,6 @@ def test_a_query_by_an_exported_folder_starts_without_jax(exported, shared, tmp_
     assert printed_by(program).endswith("\nset()\n")
 
 
-def test_an_exported_folder_is_a_model(exported, shared, tmp_path, capfd):
-    flags = ("--images", town(shared) / "queries", "--quiet")
-    out = tmp_path / "d.npy"
-    extract = ("extract", "--weights", exported, *flags, "--out", out)
-    succeeds(capfd, *extract, "--runtime", "openvino")
-    own = tmp_path / "jax.npy"
-    weights = ("--weights", shared / "weights.safetensors")
-    succeeds(capfd, "extract", *weights, *flags, "--out", own)
-    np.testing.assert_allclose(np.load(out), np.load(own), rtol=0, atol=TOLERANCE)
-
-
 def test_bad_input_is_one_line(exported, shared, tmp_path, capfd, monkeypatch):
     flags = ("--images", town(shared) / "queries", "--out", tmp_path / "d.npy", "--quiet")
     extract = ("extract", "--weights", exported, *flags, "--runtime", "onnxruntime")
@@ -159,10 +151,9 @@ def test_bad_input_is_one_line(exported, shared, tmp_path, capfd, monkeypatch):
 def test_a_program_of_other_weights_is_not_a_maps(exported, shared, tmp_path, capfd):
     other = tmp_path / "other.safetensors"
     save_weights(other, Model(init_crisalad(jax.random.key(0), MODEL), MODEL))
-    images = town(shared) / "queries"
-    index = ("index", "--images", images, "--out", tmp_path / "map", "--quiet")
-    succeeds(capfd, *index, "--weights", other)
-    query = ("query", images, "--map", tmp_path / "map", "--weights", exported, "--quiet")
+    images, places = town(shared) / "queries", tmp_path / "map"
+    succeeds(capfd, "index", "--images", images, "--out", places, "--weights", other, "--quiet")
+    query = ("query", images, "--map", places, "--weights", exported, "--quiet")
     fails(capfd, *query, "--runtime", "onnxruntime", words=(exported, "map"))
 
 

@@ -16,7 +16,7 @@ from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.descriptor_files import read_descriptors
 from crisalad_jax.retrieval.maps.map import Map
-from tests.cli.test_cli import fails, runs, succeeds
+from tests.cli.test_cli import extract, fails, runs, succeeds
 from tests.cli.test_index import index, query
 from tests.conftest import BATCH, random_params, write_video
 from tests.data.test_sources import write_jpeg
@@ -73,26 +73,17 @@ def test_a_rate_without_a_video_is_refused(shared, images, town_map, tmp_path, c
     words = ("--fps: found 2 without a video among the images, expected both",)
     out = ("--out", tmp_path / "out.npy")
     common = ("--weights", weights, "--images", images, "--quiet")
-    before = sorted(tmp_path.iterdir())
     fails(capfd, "extract", *common, *out, "--fps", 2, words=words)
     fails(capfd, *index(shared, images, tmp_path / "map", "--fps", 2), words=words)
     fails(capfd, *query(town_map, images, "--fps", 2), words=words)
     target = ("--out", tmp_path / "v.safetensors")
     fails(capfd, "vocabulary", "--images", images, *target, "--fps", 2, words=words)
-    assert sorted(tmp_path.iterdir()) == before
+    assert not list(tmp_path.iterdir())
     # One video among several sources is enough.
     video = write_video(tmp_path / "walk.avi", 21)
     assert "walk.avi#t=0.500" in succeeds(
         capfd, *query(town_map, images, video, "--fps", 2, "--json", "-")
     )
-
-
-def test_one_image_is_one(shared, images, tmp_path, capfd):
-    said = succeeds(capfd, *index(shared, images / "a.jpg", tmp_path / "map"))
-    assert "map: 1 image added, 1 with positions; 1 descriptor of" in said
-    answers = tmp_path / "answers.jsonl"
-    said = succeeds(capfd, *query(tmp_path / "map", images / "a.jpg", "--json", answers))
-    assert said == f"{answers}: 1 query in a map of 1 image"
 
 
 def test_a_video_is_extracted_and_described_as_its_frames(tmp_path, capfd, weights):
@@ -102,11 +93,7 @@ def test_a_video_is_extracted_and_described_as_its_frames(tmp_path, capfd, weigh
     succeeds(capfd, "extract", "--images", video, "--fps", 2, "--out", out, *common)
     names, descriptors = read_descriptors(out)
     assert names == [f"walk.avi#t={time:.3f}" for time in (0, 0.5, 1, 1.5, 2)]
-    (record,) = (
-        value
-        for path in tmp_path.glob("d.npy*json")
-        if "fps" in (value := json.loads(path.read_text()))
-    )
+    record = json.loads((tmp_path / "d.npy.json").read_text())
     assert (record["images"], record["fps"]) == (str(video), 2)
     # The same frames by name, in another order.
     (tmp_path / "list.txt").write_text("\n".join(reversed(names)))
@@ -127,34 +114,25 @@ def test_a_pattern_and_a_window_of_queries(town_map, tmp_path, capfd, queries):
         return [json.loads(line) for line in out.read_text().splitlines()]
 
     lines, together = answers(), answers("--window", 3)
-    assert [line["query"] for line in lines] == [path.name for path in list_images(queries)]
+    assert len(lines) == len(list_images(queries))
     alone, similar = (
         [line["neighbours"][0]["similarity"] for line in each] for each in (lines, together)
     )
     assert similar[0] == pytest.approx(alone[0], abs=ROUNDING + 1e-6)  # nothing is before it
     assert np.abs(np.subtract(similar, alone))[1:].max() > 1000 * ROUNDING
-    # As a shell writes out a pattern: one file after the other.
-    out = tmp_path / "answers.jsonl"
-    files = list_images(queries)
-    succeeds(capfd, *query(town_map, *files, "--k", 1, "--json", out, "--window", 3))
-    assert [json.loads(line) for line in out.read_text().splitlines()] == together
 
 
 def test_the_default_rate_of_a_video_is_said(shared, town_map, tmp_path, capfd):
     """Of 21 frames in 2.1 seconds three are taken: at 0, 1 and 2 s."""
     video = write_video(tmp_path / "walk.avi", 21)
     said = f"crisalad: note: {video}: 3 of 21 frames, 1 per second: --fps\n"
-    weights = ("--weights", shared / "weights.safetensors")
-    save_weights(tmp_path / "start.safetensors", Model(random_params(ANYLOC), ANYLOC))
-    out = ("--out", tmp_path / "d.npy")
+    start, out = tmp_path / "start.safetensors", tmp_path / "v.safetensors"
+    save_weights(start, Model(random_params(ANYLOC), ANYLOC))
     verbs = (
-        ("extract", *weights, "--images", video, *out, "--quiet"),
+        extract(shared, video, tmp_path / "d.npy"),
         index(shared, video, tmp_path / "map"),
         query(town_map, video),
-        (
-            *("vocabulary", "--images", video, "--weights", tmp_path / "start.safetensors"),
-            *("--out", tmp_path / "v.safetensors", "--quiet"),
-        ),
+        ("vocabulary", "--images", video, "--weights", start, "--out", out, "--quiet"),
     )
     for verb in verbs:
         assert runs(capfd, *verb)[1] == said
@@ -173,13 +151,10 @@ def test_a_camera_of_a_video(town_map, tmp_path, capfd):
     given = query(town_map, "--camera", video, "--k", 1, "--window", 3)
     out, error = runs(capfd, *given)
     lines = [json.loads(line) for line in out.splitlines()]
-    assert lines[-1]["query"] == "walk.avi#t=0.400"
-    assert lines[-1]["time"] == 0.4
-    assert set(lines[-1]) == {"query", "time", "latency_ms", "zone", "neighbours"}
+    assert (lines[-1]["query"], lines[-1]["time"]) == ("walk.avi#t=0.400", 0.4)
     ready, summary = error.splitlines()
     assert ready == f"crisalad: ready, taking frames from {video}"
     assert summary.startswith(f"crisalad: {len(lines)} answers, latency median ")
-    assert " ms, 95th percentile " in summary
 
 
 @pytest.mark.parametrize(
@@ -214,7 +189,6 @@ def test_a_watch_ends_by_a_signal_with_its_summary(shared, town_map, tmp_path, n
     said = (tmp_path / "errors").read_text()
     assert line["query"] == "new.jpg"
     assert line["neighbours"][0]["name"] == image.name
-    assert f"ready, watching {tmp_path / 'in'} (1 image is there, and left out)" in said
     assert "crisalad: 1 answer, latency median " in said
     assert said.endswith(f"crisalad: {words}\n")
 
@@ -224,7 +198,6 @@ def test_a_watch_ends_by_a_signal_with_its_summary(shared, town_map, tmp_path, n
     [
         (("--watch", "{map}", "a.jpg"), "IMAGE: found with --watch, expected only one of the two"),
         (("--watch", "{map}", "--camera", "0"), "--camera: found with --watch, expected only one"),
-        (("--watch", "{map}", "--fps", "2"), "--fps: found with --watch, expected only one of"),
         (("--camera", "0", "--gallery", "a.png"), "--gallery: found with --camera, expected only"),
         (("--camera", "0", "--json", "a"), "--json: found a with --camera, expected -: answers go"),
         (("--camera", "x.avi"), "camera: found no frame from x.avi, expected a number from 0"),

@@ -15,7 +15,7 @@ from crisalad_jax.experiments.comparison import (
 )
 from crisalad_jax.experiments.comparison.costs import Spread, adapter_calls, race, ratios
 from crisalad_jax.training.recipes import from_scratch, recipe
-from tests.cli.test_cli import fails, succeeds
+from tests.cli.test_cli import succeeds
 from tests.conftest import BATCH
 
 
@@ -30,10 +30,6 @@ def test_table_3_to_the_unit():
     assert costs["depthwise"].paper_macs == linears + 256 * depthwise == 39_223_296
     assert costs["multi-resolution"].paper_macs == linears + 256 * branches == 44_236_800
     assert costs["mlp"].paper_macs == 2 * linears + 384 + 768 == 1_180_800
-    printed = {"mlp": "1.181", "multi-resolution": "44.236", "depthwise": "39.223"}
-    for name, words in printed.items():
-        # 44.2368: the paper cuts where it does not round.
-        assert f"{int(costs[name].paper_macs / 1e3 + (name == 'mlp')) / 1e3:.3f}" == words
     # Convolution biases, and of batch norms weight, bias and the two statistics, on 432 channels.
     assert costs["multi-resolution"].parameters == 761_472 + 432 + 4 * 432
     assert costs["mlp"].parameters == linears + 384 + 768
@@ -61,15 +57,6 @@ def test_rows_change_one_thing_each():
     assert rows["no-encoder"].model.cross_image.layers == 0
     assert rows["no-encoder"].optimiser == base.optimiser
     assert rows["no-encoder-step"].optimiser == rows["step"].optimiser
-    for name, words in (
-        (
-            "crisalad",
-            "adapter depthwise, cross-image encoder yes, learning rate 6e-05, scheduler l",
-        ),
-        ("lr-1e-4", "learning rate 0.0001"),
-        ("no-encoder-step", "cross-image encoder no, scheduler step"),
-    ):
-        assert ABLATIONS[name].words(rows[name]).startswith(words)
 
 
 def test_from_nothing_rates_are_in_the_papers_proportion():
@@ -98,12 +85,6 @@ def test_ablate(flags, capfd, tmp_path, monkeypatch):
     # Measured once: what is on the disk is what is shown again.
     monkeypatch.delattr(runner, "race")
     assert "741,504" in succeeds(capfd, *given, "--preset", "tiny", "--out", out)
-
-
-def test_an_unknown_row(flags, capfd, tmp_path):
-    given = ("ablate", "--rows", "half", *flags[flags.index("--epochs") :])
-    words = ("--rows: found 'half', expected one of anyloc, boq",)
-    fails(capfd, *given, "--preset", "tiny", "--out", tmp_path / "out", words=words)
 
 
 def test_every_row_can_be_made(shared):

@@ -16,7 +16,6 @@ from crisalad_jax.experiments.comparison import (
     prepare,
 )
 from crisalad_jax.experiments.comparison.methods import method_of, method_training
-from crisalad_jax.experiments.comparison.plan import file_name
 from crisalad_jax.training.recipes import from_scratch, recipe
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
@@ -41,9 +40,6 @@ def test_what_names_stand_for():
     ):
         method = method_of(name, "tiny")
         assert (method.title, method.recipe, method.rerank) == (whole, whole, None)
-    assert file_name("step:newton") == "step-newton"
-    assert file_name("a/b c:d") == "a-b-c-d"
-    assert {file_name(name) for name in METHODS} == set(METHODS)
 
 
 def test_a_method_is_trained_as_its_recipe_says():
@@ -61,8 +57,6 @@ def test_a_row_swaps_one_part():
     aggregator = dataclasses.replace(newton.model.aggregator, sinkhorn=sinkhorn)
     model = dataclasses.replace(newton.model, aggregator=aggregator)
     assert dataclasses.replace(newton, model=model) == base
-    stop = row_training("gradient:stop")
-    assert stop.model.aggregator.sinkhorn.gradient.part_name == "stop"
 
 
 @pytest.mark.parametrize("name", ["light", "rand-augment", "none"])
@@ -78,10 +72,9 @@ def test_an_augmentation_that_is_compared_stays(name):
 def test_variants_of_parts(settings):
     names = ("crisalad", "step:newton", "anyloc")
     prepared = prepare(ComparisonConfig(**settings | {"names": names}))
-    assert [variant.labels[0] for variant in prepared.variants] == [
-        *("CriSALAD", "crisalad+step:newton", "AnyLoc")
+    assert [(variant.labels, variant.trains) for variant in prepared.variants] == [
+        *((("CriSALAD",), True), (("crisalad+step:newton",), True), (("AnyLoc",), False))
     ]
-    assert [variant.trains for variant in prepared.variants] == [True, True, False]
     ablation = prepare(ComparisonConfig(**settings | {"kind": "ablate", "names": names[:2]}))
     assert ablation.variants[1].labels == ("step:newton", "crisalad+step:newton")
 
@@ -177,11 +170,9 @@ REFUSED = [
     *(
         (text, f"--row: found '{text}', {SHAPE}")
         for text in (
-            *("epochs=2", "a b", "x: ,", "x: epochs", "x: recipe=", "x: epochs=2, epochs=3"),
-            *("x: cities=a', b", "x=: epochs=2", "x: epochs=2 lr='"),
+            *("epochs=2", "x: ,", "x: epochs", "x: epochs=2, epochs=3", "x: cities=a', b"),
         )
     ),
-    ("x: epochs=two", "--row x: .*--epochs.*'two'"),
     ("x: epoch=2", r"--row x: --epoch: found no such flag; did you mean .*--epochs INT"),
     ("x: help=1", "--row x: --help: found no such flag"),
     ("x: epochs=0", "--row x: TrainConfig.epochs: found 0, expected more than 0"),
@@ -252,22 +243,6 @@ def test_a_table_says_what_a_row_changes(ablation):
     ]
 
 
-@pytest.mark.usefixtures("registries")
-def test_a_plug_ins_loss_and_its_settings():
-    source = """
-import dataclasses, crisalad_jax as cj
-@cj.register_loss("mine")
-@dataclasses.dataclass(frozen=True)
-class Mine(cj.Loss):
-    scale: float = 1.0
-    def apply(self, params, batch):
-        return cj.LossValue(self.scale * batch.distances.sum())
-"""
-    exec(compile(source, "mine.py", "exec"), {"__name__": "mine"})
-    row = parse_row("mine: loss.kind=mine, loss.kind.scale=2")
-    assert row.training("tiny", from_nothing=True).loss.kind.scale == 2
-
-
 def test_the_command_line_takes_several(flags, monkeypatch, tmp_path):
     """With --row the paper's rows are left out but for the first, unless --rows names them."""
     seen = []
@@ -278,11 +253,8 @@ def test_the_command_line_takes_several(flags, monkeypatch, tmp_path):
     monkeypatch.setattr(ablate, "run_comparison", run_comparison)
     given = ["ablate", *map(str, flags[flags.index("--epochs") :]), "--preset", "tiny"]
     given += ["--out", str(tmp_path / "out")]
-    rows = ["--row", "a: epochs=2", "--row", "b: loss.miner=none", "--reference", "a"]
-    assert main([*given, *rows]) == 0
-    assert main([*given, *rows, "--rows", "crisalad,step"]) == 0
     texts = ("a: epochs=2", "b: loss.miner=none")
-    assert seen == [
-        ("ablate", ("crisalad",), texts, "a"),
-        ("ablate", ("crisalad", "step"), texts, "a"),
-    ]
+    rows = ["--row", texts[0], "--row", texts[1], "--reference", "a"]
+    for more, names in (([], ("crisalad",)), (["--rows", "crisalad,step"], ("crisalad", "step"))):
+        assert main([*given, *rows, *more]) == 0
+        assert seen.pop() == ("ablate", names, texts, "a")

@@ -36,36 +36,23 @@ def plugin(tmp_path, monkeypatch):
     return path
 
 
-@pytest.mark.parametrize(
-    ("count", "jobs", "visible", "devices", "memory", "beside"),
-    [
-        (5, 2, None, ["0,2,4", "1,3"], [None, None], [False, False]),
-        (
-            *(2, 3, "GPU-a, GPU-b", ["GPU-a", "GPU-b", "GPU-a"]),
-            *(["0.450", "0.900", "0.450"], [True, False, True]),
-        ),
-    ],
-)
-def test_gpus_are_dealt_out_or_shared_with_their_memory(
-    count, jobs, visible, devices, memory, beside
-):
-    shares = shares_of("gpu", count, jobs, visible)
-    assert [share.environment["CUDA_VISIBLE_DEVICES"] for share in shares] == devices
-    parts = [share.environment.get("XLA_PYTHON_CLIENT_MEM_FRACTION") for share in shares]
-    assert parts == memory
-    assert [share.beside for share in shares] == beside
+def test_gpus_are_dealt_out_or_shared_with_their_memory():
+    def devices(*names):
+        return [{"CUDA_VISIBLE_DEVICES": name} for name in names]
+
+    def memory(share):
+        return {"XLA_PYTHON_CLIENT_MEM_FRACTION": share}
+
+    assert shares_of("gpu", 5, 2, None) == [(each, False) for each in devices("0,2,4", "1,3")]
+    a, b = devices("GPU-a", "GPU-b")
+    half, whole = (a | memory("0.450"), True), (b | memory("0.900"), False)
+    assert shares_of("gpu", 2, 3, "GPU-a, GPU-b") == [half, whole, half]
 
 
 def test_processes_share_a_cpu_and_no_tpu():
     assert shares_of("cpu", 1, 2, None) == [({}, True)] * 2
     with pytest.raises(InputError, match="--jobs: found 2 on tpu, expected 1"):
         shares_of("tpu", 4, 2, None)
-
-
-def test_no_jobs(flags, capfd, tmp_path):
-    words = ("--jobs: found 0, expected at least 1",)
-    fails(capfd, *flags, "--jobs", 0, "--out", tmp_path / "out", words=words)
-    assert not list(tmp_path.iterdir())
 
 
 def test_two_processes_share_the_runs(shared, settings, tmp_path, plugin):

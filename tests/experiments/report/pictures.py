@@ -30,6 +30,12 @@ def near_colour(picture, colour):
     return (np.abs(picture.astype(int) - colour) < 40).all(axis=-1)
 
 
+def assert_clear_edges(picture):
+    """Nothing touches them."""
+    for edge in (picture[:4], picture[-4:], picture[:, :4], picture[:, -4:]):
+        assert (edge == 255).all()
+
+
 def boxes_of(picture, colour):
     """(left, top, width, height) of every frame of a colour; letters are narrower."""
     _, _, stats, _ = cv2.connectedComponentsWithStats(is_colour(picture, colour).astype(np.uint8))
