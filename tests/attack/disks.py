@@ -22,9 +22,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-import unittest.mock
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple
 
 from tests.attack.world import (
     COMMANDS,
@@ -80,38 +78,6 @@ TARGETS: Mapping[str, tuple[str, ...]] = {
 """Files that a verb replaces where they are there."""
 
 
-class Whole(NamedTuple):
-    """A verb, and what it does undisturbed."""
-
-    verb: str
-    world: World
-    sizes: dict[str, int]
-    """Of its files."""
-    digests: dict[str, str]
-    """Of those that hold no times."""
-    seconds: float
-
-    def start(self, out: pathlib.Path, **options: Any) -> Done:
-        """Run it in a process of its own."""
-        return start(arguments(self.verb, self.world, out), cwd=out.parent, **options)
-
-
-def start(given: list[str], *, file_limit: int | None = None, **options: Any) -> Done:
-    """Run a command in a process of its own; the demo in a smaller size."""
-
-    def work() -> int:
-        from crisalad_jax.experiments import demo
-
-        if file_limit is not None:
-            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-            resource.setrlimit(resource.RLIMIT_FSIZE, (file_limit, file_limit))
-        small = demo.DemoConfig(train_places=24, test_places=12, epochs=1)
-        with unittest.mock.patch.object(demo, "DemoConfig", return_value=small):
-            return command(given)
-
-    return forked(work, limit=400, **options)
-
-
 def _digest(path: pathlib.Path) -> str:
     """Return the digest of what is to be the same in two runs."""
     data = path.read_bytes()
@@ -126,13 +92,35 @@ def digests(folder: pathlib.Path) -> dict[str, str]:
     return {name: _digest(folder / name) for name in names if (folder / name).is_file()}
 
 
-def undisturbed(verb: str, world: World, out: pathlib.Path) -> Whole:
-    """Run a verb with all the room it needs."""
-    out.mkdir(parents=True)
-    done = start(arguments(verb, world, out), cwd=out)
-    assert done.code == 0, (verb, done.err)
-    sizes = {n: (out / n).stat().st_size for n in files_in(out) if (out / n).is_file()}
-    return Whole(verb, world, sizes, digests(out), done.seconds)
+class Verb:
+    """A command, and what it does undisturbed."""
+
+    def __init__(self, name: str, world: World, out: pathlib.Path) -> None:
+        """Run it with all the room it needs."""
+        self.name, self._world = name, world
+        out.mkdir(parents=True)
+        done = self.start(out)
+        assert done.code == 0, (name, done.err)
+        self.seconds, self.digests = done.seconds, digests(out)
+        files = [out / name for name in files_in(out)]
+        self.sizes = [path.stat().st_size for path in files if path.is_file()]
+
+    def start(
+        self,
+        out: pathlib.Path,
+        *,
+        file_limit: int | None = None,
+        during: Callable[[int], None] | None = None,
+    ) -> Done:
+        """Run it in a process of its own, which may write no files larger than the limit."""
+
+        def work() -> int:
+            if file_limit is not None:
+                signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+                resource.setrlimit(resource.RLIMIT_FSIZE, (file_limit, file_limit))
+            return command(arguments(self.name, self._world, out))
+
+        return forked(work, cwd=out.parent, limit=400, during=during)
 
 
 @functools.cache
@@ -176,7 +164,7 @@ def small_disk(folder: pathlib.Path, size: int) -> Iterator[None]:
 
 
 def judge(
-    row: Row, words: str, whole: Whole, out: pathlib.Path, done: Done, old: tuple[str, ...] = ()
+    row: Row, words: str, verb: Verb, out: pathlib.Path, done: Done, old: tuple[str, ...] = ()
 ) -> None:
     """Note what a disturbed command did wrong; `old` are files that hold OLD."""
     wrong = []
@@ -185,7 +173,7 @@ def judge(
     if out.exists():
         wrong += [f"left {name}" for name in has_temporaries(out)]
         left = files_in(out) - {*old}
-        kept = RESUMABLE.get(whole.verb, "nothing")
+        kept = RESUMABLE.get(verb.name, "nothing")
         wrong += [f"left {n}" for n in sorted(left) if not n.startswith(f"{kept}/")]
         if left and kept not in done.err:
             wrong.append(f"does not name {kept}, which it left")
@@ -198,25 +186,25 @@ def judge(
 OLD = b"before"
 
 
-def finish(row: Row, words: str, whole: Whole, out: pathlib.Path) -> None:
+def finish(row: Row, words: str, verb: Verb, out: pathlib.Path) -> None:
     """Run the same command with room, and compare its files with the undisturbed ones."""
-    done = whole.start(out)
-    differ = differences(digests(out), whole.digests)
+    done = verb.start(out)
+    differ = differences(digests(out), verb.digests)
     right = done.code == 0 and not differ and not has_temporaries(out)
     row.note(right, f"{words}, again: code {done.code}, differ: {differ}: {done.err[-300:]!r}")
 
 
-def fill(way: str, whole: Whole, folder: pathlib.Path, sizes: int, row: Row) -> None:
+def fill(way: str, verb: Verb, folder: pathlib.Path, sizes: int, row: Row) -> None:
     """Give a verb less room than it needs, every second time over earlier files."""
     for number, fraction in enumerate(FRACTIONS[:sizes]):
-        old = TARGETS.get(whole.verb, ()) if number % 2 else ()
+        old = TARGETS.get(verb.name, ()) if number % 2 else ()
         words = f"room for {100 * fraction:.0f} %" + (" over earlier files" if old else "")
         disk, limit = folder / str(number), None
         if way == "limit":
-            limit = int(fraction * max(whole.sizes.values()))
+            limit = int(fraction * max(verb.sizes))
             words, small = f"{words} of the largest file", contextlib.nullcontext()
         else:
-            pages = sum(-(-size // PAGE) for size in whole.sizes.values())
+            pages = sum(-(-size // PAGE) for size in verb.sizes)
             room = int(fraction * (pages - 1)) + len(old)
             words, small = f"{words} ({room} pages)", small_disk(disk, room * PAGE)
         with small:
@@ -225,23 +213,23 @@ def fill(way: str, whole: Whole, folder: pathlib.Path, sizes: int, row: Row) -> 
             for name in old:
                 (out / name).parent.mkdir(exist_ok=True)
                 (out / name).write_bytes(OLD)
-            judge(row, words, whole, out, whole.start(out, file_limit=limit), old)
+            judge(row, words, verb, out, verb.start(out, file_limit=limit), old)
             if way != "limit":
                 _remount(disk, "size=1g")
-            finish(row, words, whole, out)
+            finish(row, words, verb, out)
         shutil.rmtree(disk)
 
 
-def forbid(whole: Whole, folder: pathlib.Path, _: int, row: Row) -> None:
+def forbid(verb: Verb, folder: pathlib.Path, _: int, row: Row) -> None:
     """Let a verb write where it may not: to a disk to read, or as a user into a folder to read."""
     out = folder / "out"
 
     def try_it(forbid: Callable[[], object], allow: Callable[[], object]) -> None:
         out.mkdir(parents=True)
         forbid()
-        judge(row, "nothing can be written", whole, out, whole.start(out))
+        judge(row, "nothing can be written", verb, out, verb.start(out))
         allow()
-        finish(row, "nothing can be written", whole, out)
+        finish(row, "nothing can be written", verb, out)
 
     if can_mount():
         with small_disk(folder, 2**30):
@@ -250,15 +238,15 @@ def forbid(whole: Whole, folder: pathlib.Path, _: int, row: Row) -> None:
         try_it(lambda: out.chmod(0o555), lambda: out.chmod(0o755))
 
 
-def remove(whole: Whole, folder: pathlib.Path, sizes: int, row: Row) -> None:
+def remove(verb: Verb, folder: pathlib.Path, sizes: int, row: Row) -> None:
     """Remove the folder of the results once, at moments spread over the work."""
     for number in range(sizes):
         moment = (number + 0.7) / sizes
         out = folder / str(number) / "out"
         out.mkdir(parents=True)
         removal = functools.partial(shutil.rmtree, out, ignore_errors=True)
-        timer = threading.Timer(moment * whole.seconds, removal)
-        done = whole.start(out, during=lambda process, timer=timer: timer.start())
+        timer = threading.Timer(moment * verb.seconds, removal)
+        done = verb.start(out, during=lambda process, timer=timer: timer.start())
         left = has_temporaries(out.parent)
         right = not left and (done.code == 0 or done.told_in_one_line())
         words = f"after {100 * moment:.0f} % of the time: code {done.code}, left {left}"
@@ -266,7 +254,7 @@ def remove(whole: Whole, folder: pathlib.Path, sizes: int, row: Row) -> None:
         shutil.rmtree(out.parent, ignore_errors=True)
 
 
-Way = Callable[[Whole, pathlib.Path, int, Row], None]
+Way = Callable[[Verb, pathlib.Path, int, Row], None]
 DISK: tuple[str, Way] = (
     "full disk (a small file system in memory)",
     functools.partial(fill, "disk"),
@@ -279,19 +267,19 @@ READ_ONLY: tuple[str, Way] = ("read-only folder", forbid)
 REMOVED: tuple[str, Way] = ("folder removed during the work", remove)
 
 
-def attack(verb: str, limited: bool, bench: Bench, scale: float) -> list[Row]:
+def attack(name: str, limited: bool, bench: Bench, scale: float) -> list[Row]:
     """Attack one verb, in all ways that there are here or by a limit alone."""
     ways = [LIMIT]
     if not limited:
         # Who is root writes into any folder: only a disk to read stops them.
         refuses = can_mount() or os.getuid()
         ways = [DISK if can_mount() else LIMIT, *[READ_ONLY] * bool(refuses), REMOVED]
-    folder = bench.folder / "tried" / f"{verb}, limited: {limited}"
-    whole = undisturbed(verb, bench.world, folder / "whole" / "out")
+    folder = bench.folder / "tried" / f"{name}, limited: {limited}"
+    verb = Verb(name, bench.world, folder / "whole" / "out")
     rows = []
     for title, way in ways:
-        row = Row(f"{title}: {verb}", PROMISE)
-        way(whole, folder / title, part_of(len(FRACTIONS), scale), row)
+        row = Row(f"{title}: {name}", PROMISE)
+        way(verb, folder / title, part_of(len(FRACTIONS), scale), row)
         rows.append(row)
     return rows
 

@@ -7,12 +7,10 @@ signalled while they import. No program can handle a signal before the interpret
 line: such tries are counted apart, and that time is measured.
 """
 
-import functools
 import hashlib
 import os
 import pathlib
 import signal
-import statistics
 import subprocess
 import sys
 import time
@@ -26,6 +24,7 @@ from tests.attack.kills import (
     contents,
     marked,
     recipe_of_chains,
+    runs,
     train_arguments,
 )
 from tests.attack.world import (
@@ -91,32 +90,17 @@ class Verb:
         self,
         out: pathlib.Path,
         during: Callable[[int], None] | None = None,
-        *,
-        before: Callable[[], object] = lambda: None,
         settings: Sequence[tuple[Any, str, Any]] = (),
     ) -> Done:
         """Run it in a fork, with smaller settings where the command has none."""
-        import crisalad_jax.experiments.demo
         import crisalad_jax.retrieval.extract
         import crisalad_jax.retrieval.maps.build
 
-        of_demo = crisalad_jax.experiments.demo.DemoConfig
-        small = functools.partial(of_demo, train_places=48, test_places=12, epochs=2)
-        all_settings = [
-            *settings,
-            (crisalad_jax.experiments.demo, "DemoConfig", small),
+        small = [
             (crisalad_jax.retrieval.maps.build, "SEGMENT", 4),
             (crisalad_jax.retrieval.extract, "SEGMENT", 4),
         ]
-        out.mkdir(parents=True, exist_ok=True)
-        CALLS.clear()
-        work = marked(self.arguments(out), CALLS, *all_settings)
-
-        def whole_work() -> int:
-            before()
-            return work()
-
-        return forked(whole_work, cwd=self._bench.folder, during=during, limit=600)
+        return runs(self._bench, CALLS, self.arguments, *settings, *small)(out, during)
 
     def _files(self, out: pathlib.Path) -> dict[str, Any]:
         found: dict[str, Any] = {
@@ -246,16 +230,13 @@ def attack_programs(bench: Bench, scale: float) -> list[Row]:
         "counted apart: the interpreter's own start, which no program can handle",
     )
     verbs = [Verb(bench, name) for name in ("info", "train", "index", "query", "extract .h5")]
-    windows, startups = [], []
-    for _ in range(3):
-        begun = time.monotonic()
-        program = bench.program(["info", "--preset", "tiny"])
-        while not handles(program.pid):
-            time.sleep(0.0005)
-        windows.append(time.monotonic() - begun)
-        program.communicate()
-        startups.append(time.monotonic() - begun)
-    window, startup = statistics.median(windows), statistics.median(startups)
+    begun = time.monotonic()
+    program = bench.program(["info", "--preset", "tiny"])
+    while not handles(program.pid):
+        time.sleep(0.0005)
+    window = time.monotonic() - begun
+    program.communicate()
+    startup = time.monotonic() - begun
     early.promise += f" (here {1000 * window:.0f} ms of {1000 * startup:.0f} ms of a start)"
     for turn in range(part_of(30, scale)):
         verb, number = verbs[turn % len(verbs)], SIGNALS[turn % len(SIGNALS)]
@@ -355,8 +336,9 @@ def attack_training(bench: Bench, scale: float) -> list[Row]:
     for turn in range(part_of(3, scale)):
         out = bench.folder / "nohup" / f"{turn}"
         moment = _moment(bench, verb, signal.SIGHUP)
-        done = verb.go(out, moment, before=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN))
-        wrong = verb.wrong_with(out, done)
+        before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as a child takes over
+        wrong = verb.wrong_with(out, verb.go(out, moment))
+        signal.signal(signal.SIGHUP, before)
         ignored.note(not wrong, f"seed {bench.seed}, {moment}: {wrong}")
     return [twice, waiting, ignored]
 

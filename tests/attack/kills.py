@@ -22,7 +22,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -168,18 +168,28 @@ def marked(given: Sequence[str], marks: Marks, *settings: tuple[Any, str, Any]) 
 
 Go = Callable[..., Done]
 """Runs a command in a folder, as go(folder) or go(folder, during)."""
+Files = Callable[[pathlib.Path], dict[str, Any]]
+"""Returns what is in a folder, without what differs in two runs."""
 
 
-def undisturbed(
-    go: Go, folder: pathlib.Path, contents: Callable[[pathlib.Path], dict[str, Any]]
-) -> tuple[float, dict[str, Any]]:
-    """Run a command twice; return the seconds of the second run, and what both have written."""
+class Whole(NamedTuple):
+    """A command, and what it does undisturbed."""
+
+    go: Go
+    files: Files
+    expected: dict[str, Any]
+    """What `files` returns after a whole run."""
+    seconds: float
+
+
+def undisturbed(go: Go, folder: pathlib.Path, files: Files) -> Whole:
+    """Run a command twice, and check that both write the same."""
     folders = [folder / f"whole{number}" for number in range(2)]
     done = [go(each) for each in folders]
     assert not any(each.code for each in done), done
-    first, second = map(contents, folders)
+    first, second = map(files, folders)
     assert first == second, differences(first, second)
-    return done[1].seconds, first
+    return Whole(go, files, first, done[1].seconds)
 
 
 def a_moment(
@@ -208,54 +218,18 @@ def a_moment(
     return Moment(marks, signal.SIGKILL, after=after, work=work, nth=nth)
 
 
-def kill_chains(
-    bench: Bench,
-    folder: pathlib.Path,
-    kills: int,
-    go: Go,
-    kill: Callable[[pathlib.Path], tuple[str, int]],
-    wrong_at_end: Callable[[pathlib.Path], list[str]],
-    row: Row,
-    *,
-    most: int | None = None,
-    prepare: Callable[[pathlib.Path, int], None] = lambda chain, number: None,
-) -> list[tuple[list[str], str]]:
-    """Kill a command in one folder after another, in each until it has finished.
+def runs(
+    bench: Bench, marks: Marks, given: Callable[[pathlib.Path], list[str]], *settings: Any
+) -> Go:
+    """Return what runs a command that writes into a folder, as `marked` does, in a fork."""
 
-    Args:
-        bench: says how it goes on.
-        folder: of the chains.
-        kills: number of all.
-        go: runs the command in a chain's folder.
-        kill: runs it and kills it; returns what it met, and the exit code.
-        wrong_at_end: returns what is wrong with a chain's folder after the command.
-        row: of the chains.
-        most: kills in a chain; None leaves it to them.
-        prepare: makes a chain's folder, of this number.
+    def go(out: pathlib.Path, during: Callable[[int], None] | None = None) -> Done:
+        marks.clear()
+        out.mkdir(parents=True, exist_ok=True)
+        work = marked(given(out), marks, *settings)
+        return forked(work, cwd=bench.folder, during=during, limit=600)
 
-    Returns:
-        For each chain what its kills met, and what was wrong at its end.
-    """
-    ends, killed = [], 0
-    while killed < kills:
-        chain, met, wrong = folder / f"chain{len(ends)}", [], []
-        prepare(chain, len(ends))
-        while killed < kills and len(met) != most:
-            name, code = kill(chain)
-            if code == 0:
-                break  # it had finished
-            killed += 1
-            met.append(name)
-            wrong += [f"exit code {code} at {name}"] if code != -signal.SIGKILL else []
-        done = go(chain)
-        wrong += [done.err[-300:]] if done.code else wrong_at_end(chain)
-        words = f"seed {bench.seed}, chain {len(ends)}, {met}: {wrong}"
-        row.note(not wrong, words)
-        ends.append((met, words if wrong else ""))
-        if not wrong:
-            shutil.rmtree(chain)
-        bench.say(f"{row.attack}: {killed} of {kills} kills, {row.tries} chains")
-    return ends
+    return go
 
 
 def kill_at(
@@ -277,6 +251,59 @@ def kill_at(
     return kill
 
 
+def kill_chains(
+    bench: Bench,
+    folder: pathlib.Path,
+    whole: Whole,
+    kills: int,
+    kill: Callable[[pathlib.Path], tuple[str, int]],
+    row: Row,
+    *,
+    most: int | None = None,
+    prepare: Callable[[pathlib.Path, int], None] = lambda chain, number: None,
+) -> list[tuple[list[str], str]]:
+    """Kill a command in one folder after another, in each until it has finished.
+
+    Args:
+        bench: says how it goes on.
+        folder: of the chains.
+        whole: the command.
+        kills: number of all.
+        kill: runs the command in a chain's folder and kills it; returns what the command was doing,
+            and its exit code.
+        row: of the chains.
+        most: kills in a chain; None leaves it to them.
+        prepare: makes a chain's folder, of this number.
+
+    Returns:
+        For each chain what its kills met, and what was wrong at its end.
+    """
+    ends, killed = [], 0
+    while killed < kills:
+        chain, met, wrong = folder / f"chain{len(ends)}", [], []
+        prepare(chain, len(ends))
+        while killed < kills and len(met) != most:
+            name, code = kill(chain)
+            if code == 0:
+                break  # it had finished
+            killed += 1
+            met.append(name)
+            if code != -signal.SIGKILL:
+                wrong.append(f"exit code {code} at {name}")
+        done = whole.go(chain)
+        if done.code:
+            wrong.append(done.err[-300:])
+        else:
+            wrong += differences(whole.files(chain), whole.expected)
+        words = f"seed {bench.seed}, chain {len(ends)}, {met}: {wrong}"
+        row.note(not wrong, words)
+        ends.append((met, words if wrong else ""))
+        if not wrong:
+            shutil.rmtree(chain)
+        bench.say(f"{row.attack}: {killed} of {kills} kills, {row.tries} chains")
+    return ends
+
+
 def contents(folder: pathlib.Path) -> dict[str, Any]:
     """Return what two runs of training write alike: names, weights, results and log."""
     found: dict[str, Any] = {}
@@ -287,7 +314,7 @@ def contents(folder: pathlib.Path) -> dict[str, Any]:
         elif path.name in ("metrics.jsonl", "result.json"):
             lines = path.read_text().splitlines() if path.suffix == ".jsonl" else [path.read_text()]
             found[name] = [without_times(json.loads(line)) for line in lines]
-        elif not any(part in f"/{name}" for part in OF_ONE_RUN):
+        elif ".crisalad-" in name or not any(part in f"/{name}" for part in OF_ONE_RUN):
             found[name] = None
     return found
 
@@ -338,34 +365,34 @@ def attack_training(bench: Bench, scale: float) -> list[Row]:
     folder = bench.folder / "training"
     folder.mkdir()
     recipe = recipe_of_chains(folder)
+
+    def train(out: pathlib.Path) -> list[str]:
+        return train_arguments(bench.world, recipe, out / "run")
+
     often = (crisalad_jax.training.run_files, "SAVE_SECONDS", -1.0)
-
-    def go(out: pathlib.Path, during: Callable[[int], None] | None = None) -> Done:
-        TRAINING.clear()
-        work = marked(train_arguments(bench.world, recipe, out), TRAINING, often)
-        return forked(work, cwd=folder, during=during)
-
-    seconds, expected = undisturbed(go, folder, contents)
+    go = runs(bench, TRAINING, train, often)
+    whole = undisturbed(go, folder, contents)
     startup = 0.0
     if programs:
         begun = time.monotonic()
-        bench.program(train_arguments(bench.world, recipe, folder / "program")).communicate()
+        bench.program(train(folder / "program")).communicate()
         startup = time.monotonic() - begun
-        assert contents(folder / "program") == expected
+        assert contents(folder / "program") == whole.expected
     starting: set[pathlib.Path] = set()
 
     def prepare(chain: pathlib.Path, number: int) -> None:
         if programs and number % max(chains // programs, 1) == 0:
             starting.add(chain)
 
-    def moment() -> Moment:
-        times, weights = (1, 4, 4, 4, 4, 4, 1), (1, 1, 4, 5, 2, 2, 1)
-        return a_moment(bench, TRAINING, seconds, times, (0.002, 0.02, 0.2), weights)
+    times, weights = (1, 4, 4, 4, 4, 4, 1), (1, 1, 4, 5, 2, 2, 1)
+    moment = functools.partial(
+        a_moment, bench, TRAINING, whole.seconds, times, (0.002, 0.02, 0.2), weights
+    )
 
     def kill(chain: pathlib.Path) -> tuple[str, int]:
         if chain in starting:
             starting.discard(chain)
-            program = bench.program(train_arguments(bench.world, recipe, chain))
+            program = bench.program(train(chain))
             try:
                 program.wait(bench.random.uniform(0, startup))
             except subprocess.TimeoutExpired:
@@ -373,11 +400,8 @@ def attack_training(bench: Bench, scale: float) -> list[Row]:
             program.communicate()
             return "a program as it starts", program.returncode
         name, code = kill_at(go, moment)(chain)
-        writing = any("tmp" in path.name for path in (chain / "state").glob("*"))
+        writing = any("tmp" in path.name for path in (chain / "run" / "state").glob("*"))
         return "a state is written" if writing else name, code
-
-    def wrong_at_end(out: pathlib.Path) -> list[str]:
-        return differences(contents(out), expected) + has_temporaries(out)
 
     of_chains = Row(
         "kills of training, chains", "killed runs end with the bits of an uninterrupted run"
@@ -388,7 +412,7 @@ def attack_training(bench: Bench, scale: float) -> list[Row]:
     }
     most = -(-kills // chains)
     for met, bad in kill_chains(
-        bench, folder, kills, go, kill, wrong_at_end, of_chains, most=most, prepare=prepare
+        bench, folder, whole, kills, kill, of_chains, most=most, prepare=prepare
     ):
         for name in met:
             of_kills[name].note(not bad, bad)
@@ -412,17 +436,13 @@ def describes(bench: Bench, verb: str, name: str, marks: Marks, module: Any) -> 
     for number in range(IMAGES):
         write_picture(images / "sub" / f"@{100 + number}@500@10@S@{number:03d}@.jpg", number)
 
-    def go(out: pathlib.Path, during: Callable[[int], None] | None = None) -> Done:
-        marks.clear()
-        out.mkdir(parents=True, exist_ok=True)
-        given = [
+    def given(out: pathlib.Path) -> list[str]:
+        return [
             *(verb, "--weights", str(bench.world.path("weights.safetensors")), "--quiet"),
             *("--images", str(images), "--out", str(out / name), "--batch-size", str(TOGETHER)),
         ]
-        work = marked(given, marks, (module, "SEGMENT", TOGETHER))
-        return forked(work, cwd=bench.folder, during=during)
 
-    return go
+    return runs(bench, marks, given, (module, "SEGMENT", TOGETHER))
 
 
 INDEXING = Marks(
@@ -444,7 +464,7 @@ def map_files(out: pathlib.Path) -> dict[str, Any]:
         if name.endswith(".json"):
             found[name] = without_times(json.loads(found[name]))
     del found["map.json"]["created"], found["map.json"]["collection"]
-    return found
+    return found | dict.fromkeys(has_temporaries(out))
 
 
 def attack_maps(bench: Bench, scale: float) -> list[Row]:
@@ -455,7 +475,7 @@ def attack_maps(bench: Bench, scale: float) -> list[Row]:
 
     folder = bench.folder / "maps"
     go = describes(bench, "index", "map", INDEXING, crisalad_jax.retrieval.maps.build)
-    seconds, expected = undisturbed(go, folder, map_files)
+    whole = undisturbed(go, folder, map_files)
     with Map.open(folder / "whole0" / "map") as opened:
         names = [image.name for image in opened.images]
         rows = np.concatenate(list(opened.descriptors))
@@ -476,16 +496,14 @@ def attack_maps(bench: Bench, scale: float) -> list[Row]:
             prefix = found == names[:count] and same and count % TOGETHER == 0
         return "" if prefix else f"{count} images, not the first ones"
 
-    def wrong_at_end(out: pathlib.Path) -> list[str]:
-        return differences(map_files(out), expected) + has_temporaries(out)
-
-    def moment() -> Moment:
-        return a_moment(bench, INDEXING, seconds, (1, 3, 3, 3), (0.0005, 0.005, 0.05))
-
+    moment = functools.partial(
+        a_moment, bench, INDEXING, whole.seconds, (1, 3, 3, 3), (0.0005, 0.005, 0.05)
+    )
     at_each = Row("kills of index: each moment", "the map opens with the first images, or has none")
     of_chains = Row("kills of index: chains", "the map ends with the bits of an uninterrupted one")
     kill = kill_at(go, moment, at_each, wrong_with)
-    kill_chains(bench, folder, part_of(50, scale, least=4), go, kill, wrong_at_end, of_chains)
+    kills = part_of(50, scale, least=4)
+    kill_chains(bench, folder, whole, kills, kill, of_chains)
     return [at_each, of_chains, *attack_readers(folder, go, rows, bench.say)]
 
 
@@ -577,7 +595,7 @@ def attack_extract(suffix: str, bench: Bench, scale: float) -> list[Row]:
             if not path.name.startswith(".crisalad-")
         }
 
-    seconds, expected = undisturbed(go, folder, set_files)
+    whole = undisturbed(go, folder, set_files)
     names, new = read(folder / "whole0")
     old = np.ascontiguousarray(new[::-1])
     had_old: set[pathlib.Path] = set()
@@ -599,12 +617,9 @@ def attack_extract(suffix: str, bench: Bench, scale: float) -> list[Row]:
         right = found == names and any(np.array_equal(descriptors, each) for each in sets)
         return "" if right else "read a mixture"
 
-    def wrong_at_end(chain: pathlib.Path) -> list[str]:
-        return differences(set_files(chain), expected)
-
-    def moment() -> Moment:
-        return a_moment(bench, EXTRACTING, seconds, (4, 1), (0.002, 0.005, 0.02))
-
+    moment = functools.partial(
+        a_moment, bench, EXTRACTING, whole.seconds, (4, 1), (0.002, 0.005, 0.02)
+    )
     at_each = Row(
         f"kills of extract {suffix}: each moment",
         "read_descriptors gives the old set, the new one, or refuses in one line",
@@ -614,7 +629,7 @@ def attack_extract(suffix: str, bench: Bench, scale: float) -> list[Row]:
     )
     kill = kill_at(go, moment, at_each, wrong_with)
     kills = part_of(20, scale, least=3)
-    kill_chains(bench, folder, kills, go, kill, wrong_at_end, of_chains, prepare=prepare)
+    kill_chains(bench, folder, whole, kills, kill, of_chains, prepare=prepare)
     return [at_each, of_chains]
 
 
@@ -630,24 +645,14 @@ COMPARING = Marks(
 def attack_compare(bench: Bench, scale: float) -> list[Row]:
     """Kill a small comparison."""
     folder = bench.folder / "comparing"
-    folder.mkdir()
-
-    def go(out: pathlib.Path, during: Callable[[int], None] | None = None) -> Done:
-        COMPARING.clear()
-        work = marked(arguments("compare", bench.world, out), COMPARING)
-        return forked(work, cwd=folder, during=during, limit=600)
-
-    seconds, expected = undisturbed(go, folder, contents)
-
-    def wrong_at_end(out: pathlib.Path) -> list[str]:
-        return differences(contents(out), expected) + has_temporaries(out)
-
-    def moment() -> Moment:
-        return a_moment(bench, COMPARING, seconds, (1, 1, 1), (0.3 * seconds,))
-
+    given = functools.partial(arguments, "compare", bench.world)
+    go = runs(bench, COMPARING, given)
+    whole = undisturbed(go, folder, contents)
+    spread = 0.3 * whole.seconds
+    moment = functools.partial(a_moment, bench, COMPARING, whole.seconds, (1, 1, 1), [spread])
     row = Row("kills of compare", "the comparison ends with the weights and ranks of a whole one")
     kills = part_of(5, scale)
-    kill_chains(bench, folder, kills, go, kill_at(go, moment), wrong_at_end, row)
+    kill_chains(bench, folder, whole, kills, kill_at(go, moment), row)
     return [row]
 
 

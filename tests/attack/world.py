@@ -8,6 +8,7 @@ import argparse
 import contextlib
 import dataclasses
 import fcntl
+import functools
 import importlib
 import json
 import os
@@ -164,9 +165,9 @@ def import_everything() -> None:
         importlib.import_module(f"crisalad_jax.cli.{name.replace('-', '_')}")
     for name in (
         *("faiss", "h5py", "matplotlib.pyplot", "optax", "orbax.checkpoint", "tyro"),
-        *("crisalad_jax.checkpoints.export", "crisalad_jax.experiments.comparison"),
+        *("crisalad_jax.checkpoints.export", "crisalad_jax.experiments.demo"),
         *("crisalad_jax.experiments.report", "crisalad_jax.experiments.train"),
-        "crisalad_jax.retrieval.extract",
+        *("crisalad_jax.experiments.comparison", "crisalad_jax.retrieval.extract"),
     ):
         importlib.import_module(name)
 
@@ -179,14 +180,19 @@ def run(given: Sequence[str], *, cwd: pathlib.Path, **options: Any) -> Done:
 def command(given: Sequence[str], ready: Callable[[], None] = lambda: None) -> int:
     """Run a command in this process, as the program `crisalad` does; return its exit code.
 
+    The demo, which has no flags for that, is a smaller one.
+
     Args:
         given: its arguments.
         ready: called as soon as signals are handled.
     """
     from crisalad_jax.__main__ import keep_on_without_reader
     from crisalad_jax.cli import main
+    from crisalad_jax.experiments import demo
     from crisalad_jax.utils.signals import end_at_signals
 
+    small = {"train_places": 24, "test_places": 12, "epochs": 2}
+    demo.DemoConfig = functools.partial(demo.DemoConfig, **small)
     end_at_signals()
     keep_on_without_reader()
     ready()
@@ -418,7 +424,7 @@ def carry_out(
     )
     parser.add_argument("--seed", type=int, default=0)
     usual = [name for name in attacks if name not in optional]
-    parser.add_argument("--only", nargs="+", choices=attacks, default=usual, metavar="NAME")
+    parser.add_argument("--only", nargs="+", choices=attacks, default=usual)
     given = parser.parse_args()
     for number in (signal.SIGINT, signal.SIGHUP):  # ignored under nohup and in the background
         if signal.getsignal(number) is signal.SIG_IGN:
