@@ -888,7 +888,8 @@ def tables() -> Iterator[Case]:
         "NaN": b"0,2020,5,0,Aston,nan,2.5,pano\n",
     }
     makers = {kind: containing(head + data) for kind, data in rows.items()}
-    makers["UTF-16"] = containing((head + rows["below zero"]).decode().encode("utf-16"))
+    whole = head + b"0,2020,5,0,Aston,1.5,2.5,pano\n"
+    makers["UTF-16"] = containing(whole.decode().encode("utf-16"))
     makers["a folder"] = lambda path: path.mkdir(parents=True)
     for kind, write in makers.items():
         make = with_file("train", "--data", "places/Dataframes/Bad.csv", write, "places")
