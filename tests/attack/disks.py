@@ -1,16 +1,15 @@
 """Fill the disk, forbid writing and take folders away while each verb works.
 
-    python -m tests.attack.disks --out rows.json [--verbs NAME,...] [--ways WAY,...] [--sizes N]
+    python -m tests.attack.disks --out rows.json [--scale 1] [--only VERB ...]
 
-Ways: `disk` is a small file system in memory, which needs root, in a mount namespace of this
-process. `limit` is a limit on the size of a file, which needs nothing. Without --ways the first is
-taken where it can be, else the second. `read-only` and `removed` are folders; root cannot be
-refused a folder where nothing can be mounted.
+A full disk is a small file system in memory, which needs root, in a mount namespace of this
+process; where that cannot be, and for `VERB limited`, it is a limit on the size of a file. Root
+cannot be refused a folder where nothing can be mounted.
 """
 
-import argparse
 import contextlib
 import ctypes
+import functools
 import hashlib
 import json
 import os
@@ -23,26 +22,24 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
-import unittest.mock
 from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple
 
 from tests.attack.world import (
-    ALL,
-    NEEDS,
+    COMMANDS,
+    Attack,
+    Bench,
     Done,
     Row,
     World,
+    arguments,
+    carry_out,
     command,
+    differences,
     files_in,
     forked,
     has_temporaries,
-    import_everything,
-    make_products,
-    make_world,
+    part_of,
     without_times,
-    write_rows,
 )
 
 PROMISE = (
@@ -52,25 +49,22 @@ PROMISE = (
 PAGE = 4096
 FRACTIONS = (0.3, 0.02, 0.97, 0.6, 0.85)
 """How full the disk may get, of what the results take: those that come first in short runs."""
-
-# What may stay behind of each verb: work that the same command goes on with.
 RESUMABLE: Mapping[str, str] = {
-    "train": r"run/.*",
-    "compare": r"comparison/.*",
-    "ablate": r"ablation/.*",
-    "demo": r"demo/.*",
-    "index": r"map/.*",
-    "extract .npy": r"d\.npy\.partial/.*",
-    "extract .h5": r"d\.h5\.partial/.*",
+    "train": "run",
+    "compare": "comparison",
+    "ablate": "ablation",
+    "demo": "demo",
+    "index": "map",
+    "extract .npy": "d.npy.partial",
+    "extract .h5": "d.h5.partial",
 }
+"""Folders that may stay behind: work that the same command goes on with."""
 # Files that hold times, or are drawn from them.
 _TIMED = re.compile(
     r"metrics\.jsonl|/tensorboard/|/state/|curves\.png|training\.(json|png)|speed\.json|index\.html|"
     r"table\.(md|csv|json)|results\.json|summary\.json|sittings\.json|test-\d\.json|map\.json|"
     r"config\.json|adapters\.json|\.names\.txt\.lock"
 )
-
-
 TARGETS: Mapping[str, tuple[str, ...]] = {
     "evaluate": ("table.json", "pictures/config.json", "report/index.html"),
     "extract .npy": ("d.npy", "d.names.txt", "d.npy.json", "pairs.txt"),
@@ -84,62 +78,56 @@ TARGETS: Mapping[str, tuple[str, ...]] = {
 """Files that a verb replaces where they are there."""
 
 
-def start(arguments: list[str], **options: object) -> Done:
-    """Run a command in a process of its own; the demo in a smaller size."""
-    limit = options.pop("file_limit", None)
-
-    def work() -> int:
-        from crisalad_jax.experiments import demo
-
-        if limit is not None:
-            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))  # pyright: ignore
-        small = demo.DemoConfig(train_places=24, test_places=12, epochs=1)
-        with unittest.mock.patch.object(demo, "DemoConfig", return_value=small):
-            return command(arguments)
-
-    return forked(work, limit=400, **options)  # pyright: ignore
-
-
-class Whole(NamedTuple):
-    """What a verb does undisturbed."""
-
-    files: dict[str, int]
-    """Sizes of its files."""
-    digests: dict[str, str]
-    """Of those that hold no times."""
-    seconds: float
-
-
-def _contents(path: pathlib.Path) -> bytes:
-    """Return what is to be the same in two runs."""
-    if path.suffix != ".json":
-        return path.read_bytes()
-    return json.dumps(without_times(json.loads(path.read_text()))).encode()
+def _digest(path: pathlib.Path) -> str:
+    """Return the digest of what is to be the same in two runs."""
+    data = path.read_bytes()
+    if path.suffix == ".json":
+        data = json.dumps(without_times(json.loads(data))).encode()
+    return hashlib.sha256(data).hexdigest()
 
 
 def digests(folder: pathlib.Path) -> dict[str, str]:
     """Return the digests of all files but those that are made of times."""
-    return {
-        name: hashlib.sha256(_contents(folder / name)).hexdigest()
-        for name in sorted(files_in(folder))
-        if (folder / name).is_file() and not _TIMED.search(f"/{name}")
-    }
+    names = [name for name in files_in(folder) if not _TIMED.search(f"/{name}")]
+    return {name: _digest(folder / name) for name in names if (folder / name).is_file()}
 
 
-def undisturbed(verb: str, world: World, out: pathlib.Path) -> Whole:
-    """Run a verb with all the room it needs."""
-    out.mkdir(parents=True)
-    done = start(ALL[verb](world, out), cwd=out)
-    assert done.code == 0, (verb, done.err)
-    sizes = {n: (out / n).stat().st_size for n in files_in(out) if (out / n).is_file()}
-    return Whole(sizes, digests(out), done.seconds)
+class Verb:
+    """A command, and what it does undisturbed."""
+
+    def __init__(self, name: str, world: World, out: pathlib.Path) -> None:
+        """Run it with all the room it needs."""
+        self.name, self._world = name, world
+        out.mkdir(parents=True)
+        done = self.start(out)
+        assert done.code == 0, (name, done.err)
+        self.seconds, self.digests = done.seconds, digests(out)
+        files = [out / name for name in files_in(out)]
+        self.sizes = [path.stat().st_size for path in files if path.is_file()]
+
+    def start(
+        self,
+        out: pathlib.Path,
+        *,
+        file_limit: int | None = None,
+        during: Callable[[int], None] | None = None,
+    ) -> Done:
+        """Run it in a process of its own, which may write no files larger than the limit."""
+
+        def work() -> int:
+            if file_limit is not None:
+                signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+                resource.setrlimit(resource.RLIMIT_FSIZE, (file_limit, file_limit))
+            return command(arguments(self.name, self._world, out))
+
+        return forked(work, cwd=out.parent, limit=400, during=during)
 
 
+@functools.cache
 def can_mount() -> bool:
     """Take a mount namespace for this process; return whether that and a small disk work."""
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.unshare(0x00020000):  # CLONE_NEWNS
+    if os.getuid() or libc.unshare(0x00020000):  # CLONE_NEWNS
         return False
     private = subprocess.run(["mount", "--make-rprivate", "/"], capture_output=True)
     with tempfile.TemporaryDirectory() as folder:
@@ -163,192 +151,144 @@ def _unmount(folder: pathlib.Path) -> None:
 
 
 @contextlib.contextmanager
-def small_disk(folder: pathlib.Path, size: int) -> Iterator[Callable[[], None]]:
-    """Yield what gives more room; `folder` is a small disk in the block."""
+def small_disk(folder: pathlib.Path, size: int) -> Iterator[None]:
+    """Let `folder` be a small disk in the block."""
     folder.mkdir(parents=True)
     # The smallest has one page: that one is full.
     assert _mount(folder, size + PAGE) == 0
     (folder / "full").write_bytes(b"0" * PAGE)
     try:
-        yield lambda: _remount(folder, "size=1g")
+        yield
     finally:
         _unmount(folder)
 
 
 def judge(
-    row: Row, words: str, verb: str, out: pathlib.Path, done: Done, before: dict[str, bytes]
+    row: Row, words: str, verb: Verb, out: pathlib.Path, done: Done, old: tuple[str, ...] = ()
 ) -> None:
-    """Note what a disturbed command did wrong."""
+    """Note what a disturbed command did wrong; `old` are files that hold OLD."""
     wrong = []
     if not done.told_in_one_line():
         wrong.append(f"code {done.code}, said {len(done.err.splitlines())} lines: {done.err!r}")
     if out.exists():
         wrong += [f"left {name}" for name in has_temporaries(out)]
-        left = files_in(out) - before.keys()
-        kept = re.compile(RESUMABLE.get(verb, "$^"))
-        wrong += [f"left {n}" for n in sorted(left) if not kept.fullmatch(n)]
-        named = next(iter(RESUMABLE.get(verb, "").replace("\\", "").split("/")), "")
-        if left and named not in done.err:
-            wrong.append(f"does not name {named}, which it left")
-        wrong += [f"changed {n}" for n, data in before.items() if _read(out / n) != data]
+        left = files_in(out) - {*old}
+        kept = RESUMABLE.get(verb.name, "nothing")
+        wrong += [f"left {n}" for n in sorted(left) if not n.startswith(f"{kept}/")]
+        if left and kept not in done.err:
+            wrong.append(f"does not name {kept}, which it left")
+        for name in old:
+            if not (out / name).is_file() or (out / name).read_bytes() != OLD:
+                wrong.append(f"changed {name}")
     row.note(not wrong, f"{words}: {'; '.join(wrong)[:600]}")
 
 
-def _read(path: pathlib.Path) -> bytes | None:
-    return path.read_bytes() if path.is_file() else None
+OLD = b"before"
 
 
-def _old(out: pathlib.Path, names: tuple[str, ...]) -> dict[str, bytes]:
-    """Write earlier results, which a failure must leave."""
-    for name in names:
-        (out / name).parent.mkdir(parents=True, exist_ok=True)
-        (out / name).write_bytes(b"before")
-    return dict.fromkeys(names, b"before")
-
-
-def finish(row: Row, words: str, verb: str, world: World, out: pathlib.Path, whole: Whole) -> None:
+def finish(row: Row, words: str, verb: Verb, out: pathlib.Path) -> None:
     """Run the same command with room, and compare its files with the undisturbed ones."""
-    done = start(ALL[verb](world, out), cwd=out.parent)
-    found = digests(out)
-    differ = sorted(
-        n for n in found.keys() | whole.digests.keys() if found.get(n) != whole.digests.get(n)
-    )
-    differ = [name for name in differ if name != "before.txt"]
+    done = verb.start(out)
+    differ = differences(digests(out), verb.digests)
     right = done.code == 0 and not differ and not has_temporaries(out)
     row.note(right, f"{words}, again: code {done.code}, differ: {differ}: {done.err[-300:]!r}")
 
 
-def attack(
-    verb: str, way: str, world: World, folder: pathlib.Path, whole: Whole, sizes: int
-) -> Row:
-    """Attack one verb in one way."""
-    row = Row(f"{TITLES[way]}: {verb}", PROMISE)
-    if way in ("disk", "limit"):
-        for number, fraction in enumerate(FRACTIONS[:sizes]):
-            old = TARGETS.get(verb, ()) if number % 2 else ()
-            _full(row, verb, way, world, folder / f"{way}-{number}", whole, fraction, old)
-    elif way == "read-only":
-        _read_only(row, verb, world, folder / way, whole)
-    else:
-        for number in range(sizes):
-            _removed(row, verb, world, folder / f"{way}-{number}", whole, (number + 0.7) / sizes)
-    print(f"{row.attack}: {row.tries} tries, {len(row.failures)} failures", file=sys.stderr)
-    for line in row.failures:
-        print(f"    {line}", file=sys.stderr)
-    return row
+def fill(way: str, verb: Verb, folder: pathlib.Path, sizes: int, row: Row) -> None:
+    """Give a verb less room than it needs, every second time over earlier files."""
+    for number, fraction in enumerate(FRACTIONS[:sizes]):
+        old = TARGETS.get(verb.name, ()) if number % 2 else ()
+        words = f"room for {100 * fraction:.0f} %" + (" over earlier files" if old else "")
+        disk, limit = folder / str(number), None
+        if way == "limit":
+            limit = int(fraction * max(verb.sizes))
+            words, small = f"{words} of the largest file", contextlib.nullcontext()
+        else:
+            pages = sum(-(-size // PAGE) for size in verb.sizes)
+            room = int(fraction * (pages - 1)) + len(old)
+            words, small = f"{words} ({room} pages)", small_disk(disk, room * PAGE)
+        with small:
+            out = disk / "out"
+            out.mkdir(parents=True)
+            for name in old:
+                (out / name).parent.mkdir(exist_ok=True)
+                (out / name).write_bytes(OLD)
+            judge(row, words, verb, out, verb.start(out, file_limit=limit), old)
+            if way != "limit":
+                _remount(disk, "size=1g")
+            finish(row, words, verb, out)
+        shutil.rmtree(disk)
 
 
-def _full(
-    row: Row,
-    verb: str,
-    way: str,
-    world: World,
-    folder: pathlib.Path,
-    whole: Whole,
-    fraction: float,
-    old: tuple[str, ...],
-) -> None:
-    words = f"room for {100 * fraction:.0f} %" + (" over earlier files" if old else "")
-    out, limit = folder / "out", None
-    if way == "limit":
-        limit = int(fraction * max(whole.files.values()))
-        disk, words = contextlib.nullcontext(lambda: None), f"{words} of the largest file"
-    else:
-        pages = sum(-(-size // PAGE) for size in whole.files.values())
-        room = int(fraction * (pages - 1)) + len(old)
-        disk, words = small_disk(folder, room * PAGE), f"{words} ({room} pages)"
-    with disk as more:
-        out.mkdir(parents=True)
-        before = _old(out, old)
-        done = start(ALL[verb](world, out), cwd=folder, file_limit=limit)
-        judge(row, words, verb, out, done, before)
-        more()
-        finish(row, words, verb, world, out, whole)
-    shutil.rmtree(folder, ignore_errors=True)
-
-
-def _read_only(row: Row, verb: str, world: World, folder: pathlib.Path, whole: Whole) -> None:
-    if os.getuid():
-        out = folder / "out"
-        out.mkdir(parents=True)
-        out.chmod(0o555)
-        judge(row, "a folder mode 555", verb, out, start(ALL[verb](world, out), cwd=folder), {})
-        out.chmod(0o755)
-    elif MOUNTS:
-        with small_disk(folder, 2**30):
-            out = folder / "out"
-            out.mkdir()
-            _remount(folder, "ro")
-            judge(row, "a disk to read", verb, out, start(ALL[verb](world, out), cwd=folder), {})
-            _remount(folder, "rw")
-            finish(row, "a disk to read", verb, world, out, whole)
-
-
-def _removed(
-    row: Row, verb: str, world: World, folder: pathlib.Path, whole: Whole, moment: float
-) -> None:
-    """Remove the folder of the results, again and again from a moment on, for half a second."""
+def forbid(verb: Verb, folder: pathlib.Path, _: int, row: Row) -> None:
+    """Let a verb write where it may not: to a disk to read, or as a user into a folder to read."""
     out = folder / "out"
-    out.mkdir(parents=True)
 
-    def remove(process: int) -> None:
-        def work() -> None:
-            time.sleep(moment * whole.seconds)
-            shutil.rmtree(out, ignore_errors=True)
+    def try_it(forbid: Callable[[], object], allow: Callable[[], object]) -> None:
+        out.mkdir(parents=True)
+        forbid()
+        judge(row, "nothing can be written", verb, out, verb.start(out))
+        allow()
+        finish(row, "nothing can be written", verb, out)
 
-        thread = threading.Thread(target=work, daemon=True)
-        thread.start()
-
-    done = start(ALL[verb](world, out), cwd=folder, during=remove)
-    left = has_temporaries(folder)
-    right = not left and (done.code == 0 or done.told_in_one_line())
-    words = f"after {100 * moment:.0f} % of the time: code {done.code}, left {left}: {done.err!r}"
-    row.note(right, words[:800])
-    shutil.rmtree(folder, ignore_errors=True)
+    if can_mount():
+        with small_disk(folder, 2**30):
+            try_it(lambda: _remount(folder, "ro"), lambda: _remount(folder, "rw"))
+    else:
+        try_it(lambda: out.chmod(0o555), lambda: out.chmod(0o755))
 
 
-TITLES = {
-    "disk": "full disk (a small file system in memory)",
-    "limit": "full disk (a limit on the size of a file)",
-    "read-only": "read-only folder",
-    "removed": "folder removed during the work",
+def remove(verb: Verb, folder: pathlib.Path, sizes: int, row: Row) -> None:
+    """Remove the folder of the results once, at moments spread over the work."""
+    for number in range(sizes):
+        moment = (number + 0.7) / sizes
+        out = folder / str(number) / "out"
+        out.mkdir(parents=True)
+        removal = functools.partial(shutil.rmtree, out, ignore_errors=True)
+        timer = threading.Timer(moment * verb.seconds, removal)
+        done = verb.start(out, during=lambda process, timer=timer: timer.start())
+        left = has_temporaries(out.parent)
+        right = not left and (done.code == 0 or done.told_in_one_line())
+        words = f"after {100 * moment:.0f} % of the time: code {done.code}, left {left}"
+        row.note(right, f"{words}: {done.err!r}"[:800])
+        shutil.rmtree(out.parent, ignore_errors=True)
+
+
+Way = Callable[[Verb, pathlib.Path, int, Row], None]
+DISK: tuple[str, Way] = (
+    "full disk (a small file system in memory)",
+    functools.partial(fill, "disk"),
+)
+LIMIT: tuple[str, Way] = (
+    "full disk (a limit on the size of a file)",
+    functools.partial(fill, "limit"),
+)
+READ_ONLY: tuple[str, Way] = ("read-only folder", forbid)
+REMOVED: tuple[str, Way] = ("folder removed during the work", remove)
+
+
+def attack(name: str, limited: bool, bench: Bench, scale: float) -> list[Row]:
+    """Attack one verb, in all ways that there are here or by a limit alone."""
+    ways = [LIMIT]
+    if not limited:
+        # Who is root writes into any folder: only a disk to read stops them.
+        refuses = can_mount() or os.getuid()
+        ways = [DISK if can_mount() else LIMIT, *[READ_ONLY] * bool(refuses), REMOVED]
+    folder = bench.folder / "tried" / f"{name}, limited: {limited}"
+    verb = Verb(name, bench.world, folder / "whole" / "out")
+    rows = []
+    for title, way in ways:
+        row = Row(f"{title}: {name}", PROMISE)
+        way(verb, folder / title, part_of(len(FRACTIONS), scale), row)
+        rows.append(row)
+    return rows
+
+
+LIMITED = {f"{verb} limited": functools.partial(attack, verb, True) for verb in COMMANDS}
+ATTACKS: Mapping[str, Attack] = {
+    **{verb: functools.partial(attack, verb, False) for verb in COMMANDS},
+    **LIMITED,
 }
-MOUNTS = False
-
-
-def main() -> int:
-    """Attack, and write the rows."""
-    global MOUNTS
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=pathlib.Path, required=True)
-    parser.add_argument("--verbs", default=",".join(ALL))
-    parser.add_argument("--ways", default=None)
-    parser.add_argument("--sizes", type=int, default=len(FRACTIONS))
-    given = parser.parse_args()
-    MOUNTS = os.getuid() == 0 and can_mount()
-    # Who is root writes into any folder: only a disk to read stops them.
-    usual = ["disk" if MOUNTS else "limit", *["read-only"] * (MOUNTS or os.getuid() > 0), "removed"]
-    ways = given.ways.split(",") if given.ways else usual
-    if not MOUNTS and "disk" in ways:
-        parser.error("--ways: found disk, expected limit: no file system can be mounted here")
-    import_everything()
-    with contextlib.ExitStack() as stack:
-        folder = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        world = make_world(folder / "world")
-        verbs = given.verbs.split(",")
-        needed = dict.fromkeys(need for verb in verbs for need in NEEDS.get(verb, ()))
-        make_products(world, tuple(needed))
-        failed = False
-        for verb in verbs:
-            whole = undisturbed(verb, world, folder / "whole" / verb / "out")
-            rows = [
-                attack(verb, way, world, folder / "tried" / verb, whole, given.sizes)
-                for way in ways
-            ]
-            write_rows(given.out, rows)
-            failed = failed or any(row.failures for row in rows)
-    return 1 if failed else 0
-
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(carry_out(ATTACKS, __doc__, optional=list(LIMITED), keep=False))

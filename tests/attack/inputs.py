@@ -1,50 +1,51 @@
 """Give every verb bad inputs: files, folders, numbers, names and settings, a process for each.
 
-    python -m tests.attack.inputs --out rows.json [--seed 0] [--most N] [--quick] [--only WORDS]
+    python -m tests.attack.inputs --out rows.json [--seed 0] [--only GROUP ...]
 
-A table says for each verb and argument what is bad about it; `--most` takes a sample of that many,
-`--quick` only those that need no products of other verbs, `--only` those with these words.
+A table says for each verb and argument what is bad about it. A group is what stands before the
+colon of its rows; `a sample` is some of the quick ones.
 """
 
-import argparse
-import contextlib
+import csv
+import functools
 import io
+import itertools
 import json
 import math
 import os
 import pathlib
 import pickle
 import random
-import resource
+import re
 import shutil
 import socket
 import struct
 import sys
-import tempfile
-import time
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import h5py
 import numpy as np
 
+from crisalad_jax.utils.checksums import checksummed_json
 from tests.attack.world import (
-    ALL,
     HUNG,
-    NEEDS,
-    PRODUCTS,
+    Attack,
+    Bench,
     Done,
     Row,
     World,
+    arguments,
+    carry_out,
     files_in,
-    import_everything,
-    make_products,
-    make_world,
+    part_of,
     picture_bytes,
     run,
-    write_rows,
+    with_flag,
 )
+from tests.data.benchmarks import test_msls, test_netvlad
 
 PROMISE = (
     "exit code 2 and one line that names the file or argument, without a traceback, within the "
@@ -74,55 +75,47 @@ class Case(NamedTuple):
     """The line names one of these; all pass where there is none."""
     fine: bool = False
     """Whether success is right too."""
-    needs: tuple[str, ...] = ()
-    """Verbs whose products it takes."""
     memory: int | None = None
     """Limit of the address space beyond the start."""
     check: Callable[[Done, pathlib.Path], str | None] = lambda done, folder: None
     """Returns what else is wrong."""
 
 
-def of(verb: str, attack: str, words: str, make: Make, *named: str, **more: Any) -> Case:
-    """Return a bad input of a verb, with the products that this reads."""
-    return Case(attack, words, make, named, needs=NEEDS.get(verb, ()), **more)
-
-
-def with_flag(arguments: Sequence[str], flag: str, *values: str) -> list[str]:
-    """Give a flag other values, in place of those it has."""
-    given = list(arguments)
-    if flag in given:
-        start = given.index(flag)
-        end = start + 1
-        while end < len(given) and not given[end].startswith("--"):
-            end += 1
-        del given[start:end]
-    return [*given, flag, *values]
-
-
 def base(verb: str, world: World, folder: pathlib.Path) -> list[str]:
     """Return a verb's good arguments, which write into `folder`/out."""
-    return ALL["extract .npy" if verb == "extract" else verb](world, folder / "out")
+    return arguments("extract .npy" if verb == "extract" else verb, world, folder / "out")
 
 
-def put(verb: str, flag: str, given: list[str], *values: str) -> list[str]:
+def put(given: list[str], flag: str, *values: str) -> list[str]:
     """Give an argument other values, by its flag or its place."""
+    verb = given[0]
     if flag in ("IMAGE", "SRC"):
-        return [given[0], *values, *given[2:]]
+        return [verb, *values, *given[2:]]
     if flag == "DST":
         return [*given[:2], *values, *given[3:]]
     if (verb, flag) == ("info", "--map"):
         return ["info", "--map", *values, "--json", given[-1]]
     if flag in ("--recipe", "--preset") and "--weights" in given:
-        where = given.index("--weights")
-        given = [*given[:where], *given[where + 2 :], "--preset", "tiny"]
+        given = [*without(given, "--weights"), "--preset", "tiny"]
     if (verb, flag) == ("compare", "--rerank"):
         given = with_flag(given, "--methods", "patch-netvlad")
     return with_flag(given, flag, *values)
 
 
+def without(given: list[str], flag: str) -> list[str]:
+    """Leave out a flag and its value."""
+    where = given.index(flag)
+    return given[:where] + given[where + 2 :]
+
+
 def with_values(verb: str, flag: str, *values: str) -> Make:
     """Give a verb's argument other values."""
-    return lambda world, bad: put(verb, flag, base(verb, world, bad), *values)
+    return lambda world, bad: put(base(verb, world, bad), flag, *values)
+
+
+def with_more(verb: str, *more: str) -> Make:
+    """Give a verb more arguments than its good ones."""
+    return lambda world, bad: [*base(verb, world, bad), *more]
 
 
 Write = Callable[[pathlib.Path], Any]
@@ -133,18 +126,20 @@ def containing(data: bytes | str | Callable[[], bytes]) -> Write:
     """Write a file of these bytes, or of this text; a function makes them when they are needed."""
 
     def write(path: pathlib.Path) -> None:
-        path.parent.mkdir(exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         made = data() if callable(data) else data
         path.write_bytes(made.encode() if isinstance(made, str) else made)
 
     return write
 
 
-def with_file(verb: str, flag: str, name: str, write: Write, value: str | None = None) -> Make:
-    """Make something bad, and give it to a verb's flag.
+def with_file(
+    start: str | Make, flag: str, name: str, write: Write, value: str | None = None
+) -> Make:
+    """Make something bad, and give it to a flag.
 
     Args:
-        verb: a command.
+        start: a verb, or what makes its arguments.
         flag: a flag of it, or IMAGE, SRC or DST.
         name: of what `write` makes.
         write: makes it.
@@ -152,15 +147,23 @@ def with_file(verb: str, flag: str, name: str, write: Write, value: str | None =
     """
 
     def make(world: World, bad: pathlib.Path) -> list[str]:
+        given = base(start, world, bad) if isinstance(start, str) else start(world, bad)
         write(bad / name)
-        return put(verb, flag, base(verb, world, bad), str(bad / (value or name)))
+        return put(given, flag, str(bad / (value or name)))
 
     return make
 
 
-def with_more(verb: str, *more: str) -> Make:
-    """Give a verb more arguments than its good ones."""
-    return lambda world, bad: [*base(verb, world, bad), *more]
+def with_changed(verb: str, flag: str, name: str, change: Write) -> Make:
+    """Change a copy of a file or folder of the world, and give it to a verb's flag."""
+
+    def make(world: World, bad: pathlib.Path) -> list[str]:
+        whole = world.path(name)
+        (shutil.copytree if whole.is_dir() else shutil.copy)(whole, bad / name)
+        change(bad / name)
+        return put(base(verb, world, bad), flag, str(bad / name))
+
+    return make
 
 
 # ---- Something else in place of a file or a folder ----
@@ -183,13 +186,15 @@ def _socket(path: pathlib.Path) -> None:
     os.chdir(here)
 
 
-def _bomb(path: pathlib.Path) -> None:
-    with (
-        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
-        archive.open("archive/data.pkl", "w", force_zip64=True) as file,
-    ):
-        for _ in range(2048):
+def _write_zeros(archive: zipfile.ZipFile, name: str, megabytes: int) -> None:
+    with archive.open(name, "w", force_zip64=True) as file:
+        for _ in range(megabytes):
             file.write(bytes(2**20))
+
+
+def _bomb(path: pathlib.Path) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        _write_zeros(archive, "archive/data.pkl", 2048)
 
 
 def _torch_bomb(path: pathlib.Path) -> None:
@@ -201,12 +206,9 @@ def _torch_bomb(path: pathlib.Path) -> None:
     with zipfile.ZipFile(plain) as old, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as new:
         for name in old.namelist():
             if name.endswith("/data/0"):
-                with new.open(name, "w", force_zip64=True) as file:
-                    for _ in range(4096):
-                        file.write(bytes(2**20))
+                _write_zeros(new, name, 4096)
             else:
-                data = old.read(name)
-                new.writestr(name, data)
+                new.writestr(name, old.read(name))
     plain.unlink()
 
 
@@ -217,7 +219,7 @@ def _huge_storage(path: pathlib.Path) -> None:
     torch.save({"state_dict": {"cls_token": meta}}, path)
 
 
-FILES: Mapping[str, Callable[[pathlib.Path], Any]] = {
+FILES: Mapping[str, Write] = {
     "no file": lambda path: None,
     "a folder": lambda path: path.mkdir(),
     "a pipe": os.mkfifo,
@@ -259,18 +261,18 @@ RIGHT |= {("IMAGE", "a folder"), ("IMAGE", "a picture")}
 
 def wrong_files() -> Iterator[Case]:
     """Put something else in place of each file and folder."""
-    for verb, arguments in FILE_ARGUMENTS.items():
-        for flag, name in (argument.split() for argument in arguments.split(", ")):
+    for verb, listed in FILE_ARGUMENTS.items():
+        for flag, name in (argument.split() for argument in listed.split(", ")):
             words, is_folder = f"{verb} {flag} {name}", name.endswith("/")
             for kind in FOLDERS if is_folder else FILES:
                 if (flag, kind) not in RIGHT:
                     make = with_file(verb, flag, name.rstrip("/"), FILES[kind])
-                    yield of(verb, f"files: {kind}", words, make, name.rstrip("/"), flag)
+                    yield Case(f"files: {kind}", words, make, (name.rstrip("/"), flag))
             for value in ("", "-", "x" * 300, "no\x1b[31mred\nline", "caf\udce9", "/dev/zero"):
                 # Empty values are refused before flags are told apart.
                 named = (flag, "argument", value[:20], "red", "caf", flag.lower())
                 make = with_values(verb, flag, value)
-                yield of(verb, f"names: {value[:12]!r}", f"{verb} {flag}", make, *named)
+                yield Case(f"names: {value[:12]!r}", f"{verb} {flag}", make, named)
 
 
 # ---- Targets ----
@@ -290,149 +292,106 @@ SUFFIX = {
 }
 
 
-def _below_file(path: pathlib.Path) -> pathlib.Path:
-    path.write_text("a file")
-    return path / f"x{path.suffix}"
-
-
-def _below_loop(path: pathlib.Path) -> pathlib.Path:
-    (path.parent / "loop").symlink_to("loop")
-    return path.parent / "loop" / path.name
-
-
-def _made(make: Callable[[pathlib.Path], Any]) -> Callable[[pathlib.Path], pathlib.Path]:
-    def made(path: pathlib.Path) -> pathlib.Path:
-        make(path)
-        return path
-
-    return made
-
-
-def _full_folder(path: pathlib.Path) -> pathlib.Path:
-    path.mkdir()
-    (path / "mine.txt").write_text("mine")
-    return path
-
-
-BAD_TARGETS: Mapping[str, Callable[[pathlib.Path], pathlib.Path]] = {
-    "below a file": _below_file,
-    "below a loop of links": _below_loop,
-    "a pipe": _made(os.mkfifo),
-    "a socket": _made(_socket),
-    "a link to a device": _made(lambda path: path.symlink_to("/dev/zero")),
-    "a folder with files": _full_folder,
-    "a name of 300 letters": lambda path: path.with_name("x" * 300 + path.suffix),
-    "in /proc": lambda path: pathlib.Path("/proc/none") / path.name,
-}
-
-
 def wrong_targets() -> Iterator[Case]:
     """Let each verb write to where nothing can be written, or must not be."""
     targets = [(verb, flag) for verb, flags in TARGETS.items() for flag in flags.split()]
     for verb, flag in targets:
-        for kind, prepare in BAD_TARGETS.items():
+        suffix = SUFFIX.get((verb, flag), "")
+        name = f"target{suffix}"
+        ways: Mapping[str, tuple[str, str, Write]] = {
+            "below a file": (f"{name}/x{suffix}", name, containing("a file")),
+            "below a loop of links": (f"loop/{name}", "loop", FILES["a link to itself"]),
+            "a pipe": (name, name, FILES["a pipe"]),
+            "a socket": (name, name, FILES["a socket"]),
+            "a link to a device": (name, name, FILES["/dev/zero"]),
+            "a folder with files": (name, f"{name}/mine.txt", containing("mine")),
+            "a name of 300 letters": ("x" * 300 + suffix, name, FILES["no file"]),
+            "in /proc": (f"/proc/none/{name}", name, FILES["no file"]),
+        }
+        for kind, (value, made, write) in ways.items():
             # A folder of pictures or pages may hold others.
             if kind != "a folder with files" or verb != "evaluate" or flag == "--json":
-                make, words = _with_target(verb, flag, prepare), f"{verb} {flag}"
+                make = with_file(verb, flag, made, write, value)
                 named = ("target", "xxx", "loop", "/proc", "mine")
-                yield of(verb, f"targets: {kind}", words, make, *named)
-
-
-def _with_target(verb: str, flag: str, prepare: Callable[[pathlib.Path], pathlib.Path]) -> Make:
-    def make(world: World, bad: pathlib.Path) -> list[str]:
-        target = prepare(bad / f"target{SUFFIX.get((verb, flag), '')}")
-        return put(verb, flag, base(verb, world, bad), str(target))
-
-    return make
+                yield Case(f"targets: {kind}", f"{verb} {flag}", make, named)
 
 
 # ---- Numbers and words ----
 
 HUGE = "99999999999999999999"
-VALUES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
-    *(
-        (verb, "--seed", ("-1", HUGE, str(2**32), "1.5", "nan", "x", "0x10"))
-        for verb in ("evaluate", "extract", "pca", "vocabulary", "demo", "render", "train")
+VALUES: Mapping[str, tuple[str, ...]] = {
+    "evaluate|extract|pca|vocabulary|demo|render|train --seed": (
+        *("-1", HUGE, str(2**32), "1.5", "nan", "x", "0x10"),
     ),
-    *(
-        (verb, "--image-size", ("1400000014 1400000014", "0 0", "-14 -14", "13 14", "x 14", "14"))
-        for verb in ("train", "evaluate", "extract", "index", "info", "export", "vocabulary")
+    "train|evaluate|extract|index|info|export|vocabulary --image-size": (
+        *("1400000014 1400000014", "0 0", "-14 -14", "13 14", "x 14", "14"),
     ),
-    *((verb, "--image-size", ("1400000014 1400000014", "0 0")) for verb in ("compare", "ablate")),
-    *(
-        (verb, "--batch-size", ("0", "-1", HUGE, "1e9", "x"))
-        for verb in ("evaluate", "extract", "index", "query", "info", "vocabulary", "compare")
+    "compare|ablate --image-size": ("1400000014 1400000014", "0 0"),
+    "evaluate|extract|index|query|info|vocabulary|compare --batch-size": (
+        *("0", "-1", HUGE, "1e9", "x"),
     ),
-    *(
-        (verb, "--max-pixels", ("0", "-1", HUGE, "x", "1e3"))
-        for verb in ("evaluate", "extract", "index", "query", "train", "compare")
-    ),
-    ("extract", "--k", ("0", "-1", HUGE)),
-    ("query", "--k", ("0", "-1")),
-    ("evaluate", "--seeds", ("0", "-1", "1e9", HUGE)),
-    ("compare", "--seeds", ("0", "-1", "1e9")),
-    ("evaluate", "--radius", ("-1", "nan", "inf", "x", "1e400")),
-    ("evaluate", "--frames", ("-1", "3", HUGE)),
-    ("evaluate", "--max-heading-difference", ("-1", "nan", "400", "x")),
-    ("evaluate", "--grouping", (",", "foo", "single/", "/", "single/foo/bar", "single,,")),
-    ("evaluate", "--rerank", ("x", ":", "patch-netvlad:0", "transvpr:-1", f"transvpr:{HUGE}")),
-    ("evaluate", "--split", ("x", "../test", "train")),
-    ("evaluate", "--layout", ("x", "netvlad", "salad", "msls")),
-    ("evaluate", "--queries", ("../../..", "/etc", "x")),
-    ("evaluate", "--preset", ("x",)),
-    ("evaluate", "--compute-dtype", ("float8",)),
-    ("train", "--epochs", ("0", "-1", HUGE, "1e9", "x")),
-    ("train", "--places-per-batch", ("0", "-1", HUGE)),
-    ("train", "--images-per-place", ("0", "-1", HUGE)),
-    ("train", "--min-images", ("0", "-1", HUGE)),
-    ("train", "--patience", ("-1", "x")),
-    ("train", "--save-top-k", ("-1",)),
-    ("train", "--num-threads", ("-1", "x")),
-    ("train", "--optimiser.learning-rate", ("-1", "nan", "inf", "x")),
-    ("train", "--model.aggregator", ("x",)),
-    ("train", "--model.backbone.heads", ("0", "3", "-1", HUGE)),
-    ("train", "--model.backbone.dim", ("0", "-1", HUGE)),
-    ("train", "--model.backbone.depth", ("0", "-1")),
-    ("train", "--trainable", ("x", "last-0-blocks+head", "last-99-blocks+head")),
-    ("train", "--augmentation", ("x",)),
-    ("train", "--cities", ("x", "../Aston")),
-    ("train", "--num-processes", ("2", "-1")),
-    ("train", "--recipe", ("x", "salad")),
-    ("compare", "--epochs", ("0", "-1", HUGE)),
-    ("compare", "--methods", ("x", "gem,gem", ",", "../gem")),
-    ("compare", "--rerank", ("0", "-1")),
-    ("compare", "--weights", ("x", "gem=", "=x", "gem=/dev/zero")),
-    ("compare", "--grouping", ("x",)),
-    ("compare", "--preset", ("x",)),
-    ("compare", "--jobs", ("0", "-1", "x")),
-    ("compare", "--reference", ("x",)),
-    ("ablate", "--rows", ("x", "step:x", ",")),
-    ("ablate", "--row", ("x", ":", "x: epochs", "x: epochs=0", f"x: epochs={HUGE}", "x: x=1")),
-    ("pca", "--dim", ("0", "-1", HUGE, "7.5")),
-    ("pca", "--samples", ("0", "-1", "1")),
-    ("export", "--platforms", (",", "x", "cpu,x")),
-    ("export", "--batch-size", ("0", "-1", "x")),
-    ("export", "--grouping", ("x",)),
-    ("info", "--preset", ("x",)),
-    ("info", "--trainable", ("x", "last-99-blocks+head")),
-    ("convert", "--format", ("x", "huggingface", "cricavpr")),
-    ("vocabulary", "--clusters", ("0", "-1", HUGE, "1000000000")),
-    ("vocabulary", "--max-images", ("0", "-1")),
-    ("vocabulary", "--aggregator", ("x", "gem")),
-    ("vocabulary", "--layer", ("3",)),
-    ("index", "--store", ("x", "milvus", "milvus:", "../files")),
-    ("index", "--dtype", ("int8",)),
-    ("render", "--scenes", ("0", "-1", "x")),
-    ("render", "--sceneries", ("x",)),
-    ("render", "--repaint", ("-1", "nan", "inf", "1e6")),
-    ("render", "--varied", ("sun",)),
-)
+    "evaluate|extract|index|query|train|compare --max-pixels": ("0", "-1", HUGE, "x", "1e3"),
+    "extract --k": ("0", "-1", HUGE),
+    "query --k": ("0", "-1"),
+    "evaluate --seeds": ("0", "-1", "1e9", HUGE),
+    "compare --seeds": ("0", "-1", "1e9"),
+    "evaluate --radius": ("-1", "nan", "inf", "x", "1e400"),
+    "evaluate --frames": ("-1", "3", HUGE),
+    "evaluate --max-heading-difference": ("-1", "nan", "400", "x"),
+    "evaluate --grouping": (",", "foo", "single/", "/", "single/foo/bar", "single,,"),
+    "evaluate --rerank": ("x", ":", "patch-netvlad:0", "transvpr:-1", f"transvpr:{HUGE}"),
+    "evaluate --split": ("x", "../test", "train"),
+    "evaluate --layout": ("x", "netvlad", "salad", "msls"),
+    "evaluate --queries": ("../../..", "/etc", "x"),
+    "evaluate|info|compare --preset": ("x",),
+    "evaluate --compute-dtype": ("float8",),
+    "train --epochs": ("0", "-1", HUGE, "1e9", "x"),
+    "train --places-per-batch|--images-per-place|--min-images": ("0", "-1", HUGE),
+    "train --patience|--num-threads": ("-1", "x"),
+    "train --save-top-k": ("-1",),
+    "train --optimiser.learning-rate": ("-1", "nan", "inf", "x"),
+    "train --model.aggregator|--augmentation": ("x",),
+    "train --model.backbone.heads": ("0", "3", "-1", HUGE),
+    "train --model.backbone.dim": ("0", "-1", HUGE),
+    "train --model.backbone.depth": ("0", "-1"),
+    "train --trainable": ("x", "last-0-blocks+head", "last-99-blocks+head"),
+    "train --cities": ("x", "../Aston"),
+    "train --num-processes": ("2", "-1"),
+    "train --recipe": ("x", "salad"),
+    "compare --epochs": ("0", "-1", HUGE),
+    "compare --methods": ("x", "gem,gem", ",", "../gem"),
+    "compare --rerank": ("0", "-1"),
+    "compare --weights": ("x", "gem=", "=x", "gem=/dev/zero"),
+    "compare --grouping|--reference": ("x",),
+    "compare --jobs": ("0", "-1", "x"),
+    "ablate --rows": ("x", "step:x", ","),
+    "ablate --row": ("x", ":", "x: epochs", "x: epochs=0", f"x: epochs={HUGE}", "x: x=1"),
+    "pca --dim": ("0", "-1", HUGE, "7.5"),
+    "pca --samples": ("0", "-1", "1"),
+    "export --platforms": (",", "x", "cpu,x"),
+    "export --batch-size": ("0", "-1", "x"),
+    "export --grouping": ("x",),
+    "info --trainable": ("x", "last-99-blocks+head"),
+    "convert --format": ("x", "huggingface", "cricavpr"),
+    "vocabulary --clusters": ("0", "-1", HUGE, "1000000000"),
+    "vocabulary --max-images": ("0", "-1"),
+    "vocabulary --aggregator": ("x", "gem"),
+    "vocabulary --layer": ("3",),
+    "index --store": ("x", "milvus", "milvus:", "../files"),
+    "index --dtype": ("int8",),
+    "render --scenes": ("0", "-1", "x"),
+    "render --sceneries": ("x",),
+    "render --repaint": ("-1", "nan", "inf", "1e6"),
+    "render --varied": ("sun",),
+}
+"""Bad values, by the verbs and the flags to which each is given."""
 
 
 def wrong_values() -> Iterator[Case]:
     """Give flags values that are out of range, or nothing of their kind."""
-    for verb, flag, values in VALUES:
-        for value in values:
+    for key, values in VALUES.items():
+        verbs, flags = (part.split("|") for part in key.split())
+        for verb, flag, value in itertools.product(verbs, flags, values):
             word = flag.strip("-").split(".")[-1]
             names = (word, word.replace("-", " "), word.replace("-", "_"), value, "aggregator")
             more = {
@@ -448,7 +407,7 @@ def wrong_values() -> Iterator[Case]:
                 ("evaluate", "--queries", "../../.."),
             )
             make = with_values(verb, flag, *value.split())
-            yield of(verb, f"values: {flag}", f"{verb} {value}", make, *named, fine=fine)
+            yield Case(f"values: {flag}", f"{verb} {value}", make, named, fine)
 
 
 def wrong_flags() -> Iterator[Case]:
@@ -465,13 +424,13 @@ def wrong_flags() -> Iterator[Case]:
             fine = (verb, words) == ("query", "a word too many")
             named = ("argument", "option", "one", "--", "no such", "plugin")
             make = with_more(verb, *more)
-            yield of(verb, "flags", f"{verb}: {words}", make, *named, fine=fine)
+            yield Case("flags", f"{verb}: {words}", make, named, fine)
     for given in (["x"], ["--frobnicate"], [""], ["train"], ["\x1b[31m"], ["\udce9"]):
         yield Case("flags", f"{given}", lambda world, bad, given=given: list(given))
     # A flag given twice: the last one counts, or it is refused.
     for verb, flag, first, last in (("extract", "--seed", "1", "-1"), ("pca", "--dim", "3", "0")):
         words, make = f"{verb} {flag} twice", with_more(verb, flag, first, flag, last)
-        yield of(verb, "flags", words, make, flag, flag.strip("-"))
+        yield Case("flags", words, make, (flag, flag.strip("-")))
 
 
 # ---- What is in files ----
@@ -525,10 +484,9 @@ def _descriptors(data: bytes, names: bytes | None) -> Write:
 
 def arrays() -> Iterator[Case]:
     """Damage .npy files."""
-    needs = ("extract .npy",)
     for kind, data in NPY.items():
         make = with_file("pca", "--descriptors", "bad.npy", containing(data))
-        yield Case("arrays: pca", kind, make, ("bad.npy", "dim"), needs=needs)
+        yield Case("arrays: pca", kind, make, ("bad.npy", "dim"))
         write = _descriptors(data, b"".join(b"%d.jpg\n" % number for number in range(8)))
         make = with_file("extract", "--database", "bad.npy", write)
         yield Case("arrays: extract --database", kind, make, ("bad.npy",))
@@ -549,8 +507,6 @@ def arrays() -> Iterator[Case]:
 
 
 def _virtual(file: Any) -> None:
-    import h5py
-
     layout = h5py.VirtualLayout((96,), "f4")
     layout[:] = h5py.VirtualSource("/etc/passwd", "x", (96,))
     file.create_virtual_dataset(DATASET, layout)
@@ -559,102 +515,68 @@ def _virtual(file: Any) -> None:
 def _deep_groups(file: Any) -> None:
     for _ in range(1000):
         file = file.create_group("g")
-    file.create_dataset("global_descriptor", data=np.ones(96, "f4"))
+    file["global_descriptor"] = ONES
 
 
-def _links(file: Any) -> None:
-    import h5py
-
-    file["a"], file["b"] = h5py.SoftLink("/b"), h5py.SoftLink("/a")
+def _dataset(*shape: Any, **options: Any) -> Callable[[Any], Any]:
+    return lambda file: file.create_dataset(DATASET, *shape, **options)
 
 
-def _external_link(file: Any) -> None:
-    import h5py
-
-    file["a"] = h5py.ExternalLink("/etc/passwd", "/x")
-
-
-def _empty(file: Any) -> None:
-    import h5py
-
-    file.create_dataset(DATASET, data=h5py.Empty("f4"))
-
-
-def _lengths(file: Any) -> None:
-    file.create_dataset(DATASET, data=np.ones(96, "f4"))
-    file.create_dataset("b/global_descriptor", data=np.ones(95, "f4"))
-
-
-def _dataset(name: str, *shape: Any, **options: Any) -> Callable[[Any], Any]:
-    return lambda file: file.create_dataset(name, *shape, **options)
-
-
-DATASET = "a/global_descriptor"
-H5: Mapping[str, Callable[[Any], Any]] = {
-    "a TB": _dataset(DATASET, (2**38,), "f4", chunks=(2**20,), compression=1),
-    "external": _dataset(DATASET, (96,), "f4", external=[("/etc/passwd", 0, 384)]),
+DATASET, ONES = "a/global_descriptor", np.ones(96, "f4")
+H5: Mapping[str, Callable[[Any], Any] | Mapping[str, Any]] = {
+    "a TB": _dataset((2**38,), "f4", chunks=(2**20,), compression=1),
+    "external": _dataset((96,), "f4", external=[("/etc/passwd", 0, 384)]),
     "virtual": _virtual,
-    "an external link": _external_link,
-    "links in a circle": _links,
+    "an external link": {"a": h5py.ExternalLink("/etc/passwd", "/x")},
+    "links in a circle": {"a": h5py.SoftLink("/b"), "b": h5py.SoftLink("/a")},
     "a group in itself": lambda file: file.create_group("a").__setitem__("b", file["/"]),
     "groups 1,000 deep": _deep_groups,
-    "a number": _dataset(DATASET, data=1.0),
-    "text": _dataset(DATASET, data="text"),
-    "fields": _dataset(DATASET, data=np.zeros(4, [("x", "f4")])),
-    "a name with a line break": _dataset("a\nb\x1b[31m/global_descriptor", data=np.ones(96, "f4")),
-    "a name that is no UTF-8": _dataset("cafe/global_descriptor", data=np.ones(96, "f4")),
-    "lengths that differ": _lengths,
-    "empty": _empty,
-    "integers": _dataset(DATASET, data=np.ones(96, "i4")),
-    "nothing": lambda file: None,
+    "a number": {DATASET: 1.0},
+    "text": {DATASET: "text"},
+    "fields": {DATASET: np.zeros(4, [("x", "f4")])},
+    "a name with a line break": {"a\nb\x1b[31m/global_descriptor": ONES},
+    "a name that is no UTF-8": {"cafe/global_descriptor": ONES},
+    "lengths that differ": {DATASET: ONES, "b/global_descriptor": ONES[1:]},
+    "empty": {DATASET: h5py.Empty("f4")},
+    "integers": {DATASET: np.ones(96, "i4")},
+    "nothing": {},
 }
+"""What is in a file, or what writes it."""
 
 
-def _with_h5(write: Callable[[World, pathlib.Path], Any]) -> Make:
-    """Give `extract` a database, and a picture at which it ends at the latest."""
-
-    def make(world: World, bad: pathlib.Path) -> list[str]:
-        write(world, bad / "bad.h5")
-        containing(b"\xff\xd8 no picture")(bad / "pictures" / "broken.jpg")
-        given = with_flag(base("extract", world, bad), "--images", str(bad / "pictures"))
-        return with_flag(given, "--database", str(bad / "bad.h5"))
-
-    return make
-
-
-def _h5(kind: str) -> Callable[[World, pathlib.Path], Any]:
-    def write(_: World, path: pathlib.Path) -> None:
-        import h5py
-
-        with h5py.File(path, "w") as file:
-            H5[kind](file)
-        if kind == "a name that is no UTF-8":
-            path.write_bytes(path.read_bytes().replace(b"cafe", b"caf\xe9"))
-
-    return write
-
-
-def _damaged_h5(place: float, change: bytes, cut: bool) -> Callable[[World, pathlib.Path], Any]:
-    def write(world: World, path: pathlib.Path) -> None:
-        data = bytearray(world.path("d.h5").read_bytes())
-        start = int(place * len(data))
-        data[start : None if cut else start + 8] = b"" if cut else change
-        path.write_bytes(data)
-
-    return write
+def _h5(kind: str, path: pathlib.Path) -> None:
+    held = H5[kind]
+    with h5py.File(path, "w") as file:
+        held(file) if callable(held) else file.update(held)
+    if kind == "a name that is no UTF-8":
+        path.write_bytes(path.read_bytes().replace(b"cafe", b"caf\xe9"))
 
 
 def hdf5(seed: int) -> Iterator[Case]:
     """Damage .h5 files, and let them claim what they do not hold."""
-    for kind in H5:
-        yield Case("HDF5", kind, _with_h5(_h5(kind)), ("bad.h5",))
     generator = random.Random(seed)
+
+    def case(attack: str, words: str, make: Make, *named: str) -> Case:
+        """Return a case with a picture at which `extract` ends at the latest."""
+        write = containing(b"\xff\xd8 no picture")
+        make = with_file(make, "--images", "pictures/broken.jpg", write, "pictures")
+        return Case(attack, words, make, named)
+
+    def damage(place: float, change: bytes, cut: bool, path: pathlib.Path) -> None:
+        data = bytearray(path.read_bytes())
+        start = int(place * len(data))
+        data[start : None if cut else start + 8] = b"" if cut else change
+        path.write_bytes(data)
+
+    for kind in H5:
+        make = with_file("extract", "--database", "bad.h5", functools.partial(_h5, kind))
+        yield case("HDF5", kind, make, "bad.h5")
     for number in range(48):
         place, change, cut = generator.random(), generator.randbytes(8), number % 6 == 0
         words = f"{'cut at' if cut else change.hex() + ' at'} {place:.4f}"
-        named, needs = ("bad.h5", "broken.jpg"), ("extract .h5",)
-        make = _with_h5(_damaged_h5(place, change, cut))
-        yield Case("HDF5: damaged", words, make, named, needs=needs)
+        write = functools.partial(damage, place, change, cut)
+        make = with_changed("extract", "--database", "d.h5", write)
+        yield case("HDF5: damaged", words, make, "d.h5", "broken.jpg")
 
 
 def _leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
@@ -703,21 +625,22 @@ def configurations(seed: int) -> Iterator[Case]:
         make = with_file("train", "--config", "bad.json", containing(text))
         yield Case("configurations", kind, make, ("bad.json", "weights.safetensors"))
     generator = random.Random(seed)
-    plain = to_plain(RECIPE)
-    places = list(_leaves(plain))
-    for _ in range(60):
-        place, new = generator.choice(places), generator.choice(STRANGE)
-        words = f"{'.'.join(map(str, place))} = {new!r}"
-        make = _without_places(containing(json.dumps(_changed(plain, place, new))))
+
+    def strange(plain: Any, count: int) -> Iterator[tuple[str, Any]]:
+        places = list(_leaves(plain))
+        for _ in range(count):
+            place, new = generator.choice(places), generator.choice(STRANGE)
+            yield f"{'.'.join(map(str, place))} = {new!r}", _changed(plain, place, new)
+
+    for words, changed in strange(to_plain(RECIPE), 60):
+        make = with_file("train", "--config", "bad.json", containing(json.dumps(changed)))
+        # A folder at which it ends at the latest.
+        make = with_file(make, "--data", "no-places", FILES["a folder"])
         yield Case("configurations: strange values", words, make)
     model = to_plain(MODEL)
-    places = list(_leaves(model))
-    for _ in range(40):
-        place, new = generator.choice(places), generator.choice(STRANGE)
-        words = f"{'.'.join(map(str, place))} = {new!r}"
-        made_of = _weights_of(_changed(model, place, new))
-        attack = "weights: strange configurations"
-        yield Case(attack, words, made_of, ("bad.safetensors",), fine=True)
+    attack, named = "weights: strange configurations", ("weights.safetensors",)
+    for words, changed in strange(model, 40):
+        yield Case(attack, words, _weights_of(changed), named, fine=True)
     for words, place, new in (
         ("a depth of 10**9", ("backbone", "depth"), 10**9),
         ("a dim of 10**9", ("backbone", "dim"), 10**9),
@@ -725,38 +648,29 @@ def configurations(seed: int) -> Iterator[Case]:
         ("10**9 clusters", ("aggregator", "clusters"), 10**9),
         ("a feedforward of 10**12", ("cross_image", "feedforward"), 10**12),
     ):
-        changed = _changed(model, place, new)
-        yield Case("weights: strange configurations", words, _weights_of(changed), ("bad.safe",))
-
-
-def _without_places(write: Write) -> Make:
-    """Give `train` a configuration, and a folder at which it ends at the latest."""
-    with_config = with_file("train", "--config", "bad.json", write)
-
-    def make(world: World, bad: pathlib.Path) -> list[str]:
-        (bad / "no-places").mkdir()
-        return with_flag(with_config(world, bad), "--data", str(bad / "no-places"))
-
-    return make
+        yield Case(attack, words, _weights_of(_changed(model, place, new)), named)
 
 
 def _weights_of(config: Any) -> Make:
     """Make weights whose checksum is right and whose configuration is not."""
 
-    def make(world: World, bad: pathlib.Path) -> list[str]:
+    def change(path: pathlib.Path) -> None:
         from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
         from crisalad_jax.checkpoints.weights import FORMAT
 
-        value, arrays = read_sealed(world.weights, FORMAT, "weights")
-        path = bad / "bad.safetensors"
+        value, arrays = read_sealed(path, FORMAT, "weights")
         write_sealed(path, arrays, FORMAT, value | {"config": config})
-        return with_flag(base("info", world, bad), "--weights", str(path))
 
-    return make
+    return with_changed("info", "--weights", "weights.safetensors", change)
 
 
 def _safetensors(header: bytes, body: bytes = bytes(64), length: int | None = None) -> bytes:
     return (len(header) if length is None else length).to_bytes(8, "little") + header + body
+
+
+def _tensor(dtype: str = "F32", shape: tuple = (16,), ends: tuple = (0, 64), name="a") -> bytes:
+    entry = {"dtype": dtype, "shape": shape, "data_offsets": ends}
+    return _safetensors(json.dumps({name: entry}).encode())
 
 
 SAFETENSORS: Mapping[str, bytes] = {
@@ -765,19 +679,13 @@ SAFETENSORS: Mapping[str, bytes] = {
     "a deep header": _safetensors(b'{"__metadata__":' + b"[" * 10**5),
     "metadata of numbers": _safetensors(b'{"__metadata__": {"crisalad": 3}}'),
     "no arrays": _safetensors(b"{}", b""),
-    "offsets beyond": _safetensors(b'{"a":{"dtype":"F32","shape":[4],"data_offsets":[0,999]}}'),
-    "offsets below zero": _safetensors(b'{"a":{"dtype":"F32","shape":[4],"data_offsets":[-4,12]}}'),
-    "a shape of 2**62": _safetensors(
-        b'{"a":{"dtype":"F32","shape":[4611686018427387904,4],"data_offsets":[0,64]}}'
-    ),
-    "an unknown type": _safetensors(b'{"a":{"dtype":"F3","shape":[16],"data_offsets":[0,64]}}'),
-    "a type of 8 bits": _safetensors(
-        b'{"a":{"dtype":"F8_E4M3","shape":[64],"data_offsets":[0,64]}}'
-    ),
+    "offsets beyond": _tensor(shape=(4,), ends=(0, 999)),
+    "offsets below zero": _tensor(shape=(4,), ends=(-4, 12)),
+    "a shape of 2**62": _tensor(shape=(2**62, 4)),
+    "an unknown type": _tensor("F3"),
+    "a type of 8 bits": _tensor("F8_E4M3", shape=(64,)),
     "bytes that are no UTF-8": _safetensors(b'{"caf\xe9":{}}'),
-    "a name with escapes": _safetensors(
-        b'{"\\u001b[31m\\n":{"dtype":"F32","shape":[16],"data_offsets":[0,64]}}'
-    ),
+    "a name with escapes": _tensor(name="\x1b[31m\n"),
     "metadata nested deep": _safetensors(
         json.dumps({"__metadata__": {"crisalad-jax 3": "[" * 10**5}}).encode(), b""
     ),
@@ -789,29 +697,26 @@ class _Call:
         return os.system, ("touch /tmp/crisalad-pwned",)
 
 
-def _deep_pickle() -> bytes:
-    return b"\x80\x02" + b"]" * 100_000 + b"a" * 99_999 + b"."
-
-
-def _without_weights(make: Make) -> Make:
-    def made(world: World, bad: pathlib.Path) -> list[str]:
-        given = make(world, bad)
-        where = given.index("--weights")
-        return given[:where] + given[where + 2 :]
-
-    return made
-
-
 def weights() -> Iterator[Case]:
     """Damage weights and checkpoints."""
+
+    def without_weights(world: World, bad: pathlib.Path) -> list[str]:
+        return without(base("train", world, bad), "--weights")
+
+    def convert(world: World, bad: pathlib.Path) -> list[str]:
+        return ["convert", "SRC", str(bad / "out" / "x.safetensors")]
+
     for kind, data in SAFETENSORS.items():
-        for verb, flag in (("info", "--weights"), ("convert", "SRC"), ("train", "--backbone")):
-            make = with_file(verb, flag, "bad.safetensors", containing(data))
-            make = _without_weights(make) if verb == "train" else make
+        for start, verb, flag in (
+            ("info", "info", "--weights"),
+            ("convert", "convert", "SRC"),
+            (without_weights, "train", "--backbone"),
+        ):
+            make = with_file(start, flag, "bad.safetensors", containing(data))
             yield Case("weights: safetensors", f"{verb}: {kind}", make, ("bad.safetensors",))
     makers: Mapping[str, Write] = {
         "a call": containing(pickle.dumps(_Call())),
-        "nested deep": containing(_deep_pickle()),
+        "nested deep": containing(b"\x80\x02" + b"]" * 100_000 + b"a" * 99_999 + b"."),
         "a bomb of 4 GB": _torch_bomb,
         "a tensor that claims 2**38 numbers": _huge_storage,
         "a list": containing(pickle.dumps([1, 2])),
@@ -821,15 +726,8 @@ def weights() -> Iterator[Case]:
         "numbers by text": containing(b"\x80\x02L" + b"9" * 10**6 + b"L\n."),
     }
     for kind, maker in makers.items():
-        yield Case("weights: torch", kind, _converted(maker), ("bad.pth",), check=_not_run)
-
-
-def _converted(write: Write) -> Make:
-    def make(world: World, bad: pathlib.Path) -> list[str]:
-        write(bad / "bad.pth")
-        return ["convert", str(bad / "bad.pth"), str(bad / "out" / "x.safetensors")]
-
-    return make
+        make = with_file(convert, "SRC", "bad.pth", maker)
+        yield Case("weights: torch", kind, make, ("bad.pth",), check=_not_run)
 
 
 def _not_run(done: Done, folder: pathlib.Path) -> str | None:
@@ -855,15 +753,16 @@ def _png(width: int, height: int, rows: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", body) + chunk(b"IEND", b"")
 
 
-def _jpeg(height: int, width: int) -> bytes:
-    import cv2
+def _claiming(suffix: str, start: bytes, offset: int, claim: bytes) -> Callable[[], bytes]:
+    """Write a small picture with other bytes in its header, at an offset from some of its own."""
 
-    done, data = cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))
-    assert done
-    whole = bytearray(data.tobytes())
-    at = whole.index(b"\xff\xc0") + 5
-    whole[at : at + 4] = struct.pack(">HH", height, width)
-    return bytes(whole)
+    def picture() -> bytes:
+        data = bytearray(picture_bytes(suffix))
+        at = data.index(start) + offset
+        data[at : at + len(claim)] = claim
+        return bytes(data)
+
+    return picture
 
 
 def _tiff(width: int, height: int) -> bytes:
@@ -875,56 +774,38 @@ def _tiff(width: int, height: int) -> bytes:
     )
 
 
-def _webp(width: int, height: int) -> bytes:
-    bits = (width - 1) | (height - 1) << 14
-    body = b"VP8L" + struct.pack("<I", 6) + b"\x2f" + struct.pack("<I", bits) + b"\0"
-    return b"RIFF" + struct.pack("<I", len(body) + 4) + b"WEBP" + body
-
-
-def _bmp(width: int, height: int) -> bytes:
-    head = struct.pack("<IiiHHIIiiII", 40, width, height, 1, 24, 0, 0, 1, 1, 0, 0)
-    return b"BM" + struct.pack("<III", 200, 0, 54) + head + bytes(99)
-
-
 PICTURES: Mapping[str, Callable[[], bytes]] = {
     "a PNG of 40,000 x 40,000": lambda: _png(40_000, 40_000, 40_000),
     "a PNG of 2**31 - 1 squared": lambda: _png(2**31 - 1, 2**31 - 1, 0),
     "a PNG of no size": lambda: _png(0, 0, 0),
     "a PNG cut short": lambda: picture_bytes()[:-20],
     "a PNG without pixels": lambda: _png(100, 100, 0),
-    "a JPEG of 65,535 x 65,535": lambda: _jpeg(65_535, 65_535),
-    "a JPEG of no height": lambda: _jpeg(0, 16),
+    "a JPEG of 65,535 x 65,535": _claiming(".jpg", b"\xff\xc0", 5, b"\xff" * 4),
+    "a JPEG of no height": _claiming(".jpg", b"\xff\xc0", 5, bytes(2)),
     "a TIFF of 2**31": lambda: _tiff(2**31, 2**31),
     "a TIFF of 60,000 x 60,000": lambda: _tiff(60_000, 60_000),
     "a TIFF that points at itself": lambda: b"II*\0\x08\0\0\0" + b"\xff" * 64,
-    "a WebP of 16,384 x 16,384": lambda: _webp(16_384, 16_384),
-    "a BMP of 2**31": lambda: _bmp(2**31 - 1, 2**31 - 1),
-    "a BMP of -2**31": lambda: _bmp(9, -(2**31)),
+    # Fourteen bits of each side, less one, behind a byte.
+    "a WebP of 16,384 x 16,384": _claiming(".webp", b"VP8L", 9, b"\xff\xff\xff\x0f"),
+    "a BMP of 2**31": _claiming(".bmp", b"BM", 18, struct.pack("<ii", 2**31 - 1, 2**31 - 1)),
+    "a BMP of -2**31": _claiming(".bmp", b"BM", 18, struct.pack("<ii", 9, -(2**31))),
     "text": lambda: b"<svg/>",
     "a GIF": lambda: b"GIF89a" + bytes(40),
 }
 
 
-def _linked(made: Sequence[tuple[str, str]]) -> Write:
+def _linked(made: Mapping[str, str], folder: pathlib.Path) -> None:
     """Make a folder of pictures with links, and one picture at which it ends at the latest."""
-
-    def write(folder: pathlib.Path) -> None:
-        for name, target in made:
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).symlink_to(target)
-        (folder / "broken.jpg").write_bytes(b"broken")
-
-    return write
+    for name, target in made.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).symlink_to(target)
+    (folder / "broken.jpg").write_bytes(b"broken")
 
 
-def _printed(make: Make, more: Sequence[str]) -> Make:
+def _printing(more: Sequence[str], world: World, bad: pathlib.Path) -> list[str]:
     """Let a query print its answers, or draw them."""
-
-    def made(world: World, bad: pathlib.Path) -> list[str]:
-        given = [*make(world, bad)[:2], "--map", str(world.path("map")), "--quiet"]
-        return [*given, *(each.replace("OUT", str(bad / "out")) for each in more)]
-
-    return made
+    more = [each.replace("OUT", str(bad / "out")) for each in more]
+    return ["query", "IMAGE", "--map", str(world.path("map")), "--quiet", *more]
 
 
 def pictures() -> Iterator[Case]:
@@ -932,30 +813,30 @@ def pictures() -> Iterator[Case]:
     for kind, data in PICTURES.items():
         for verb, flag in (("extract", "--images"), ("index", "--images"), ("query", "IMAGE")):
             make = with_file(verb, flag, "pictures/bad.png", containing(data), "pictures")
-            yield of(verb, "pictures", f"{verb}: {kind}", make, "bad.png")
+            yield Case("pictures", f"{verb}: {kind}", make, ("bad.png",))
     # A link to the root would find pictures of all kinds.
     for kind, made in {
-        "a folder that links to itself": (("a/b", "../a"),),
-        "two folders that link to each other": (("a/x", "../b"), ("b/y", "../a")),
+        "a folder that links to itself": {"a/b": "../a"},
+        "two folders that link to each other": {"a/x": "../b", "b/y": "../a"},
     }.items():
-        make = with_file("extract", "--images", "pictures", _linked(made))
+        make = with_file("extract", "--images", "pictures", functools.partial(_linked, made))
         yield Case("pictures: links", kind, make, ("broken.jpg", "pictures"))
     names = {
         "escapes": "a\x1b[31mb.jpg", "a line break": "a\nb.jpg", "no UTF-8": "caf\udce9.jpg",
         "a bell and a carriage return": "a\x07\rb.jpg", "right to left": "a\u202eb.jpg",
     }  # fmt: skip
-    attack, needs = "pictures: names", ("index",)
+    attack = "pictures: names"
     for kind, name in names.items():
+        path = f"pictures/{name}"
         for words, data in (("broken", b"broken"), ("whole", picture_bytes())):
-            path = f"pictures/{name}"
             make = with_file("extract", "--images", path, containing(data), "pictures")
             yield Case(attack, f"extract: {kind}, {words}", make, fine=True)
             make = with_file("query", "IMAGE", path, containing(data))
-            yield Case(attack, f"query: {kind}, {words}", make, fine=True, needs=needs)
-            for more in (["--json", "-"], ["--gallery", "OUT/g.png"], []):
-                if words == "whole":
-                    made = _printed(make, more)
-                    yield Case(attack, f"query {more}: {kind}", made, fine=True, needs=needs)
+            yield Case(attack, f"query: {kind}, {words}", make, fine=True)
+        for more in (["--json", "-"], ["--gallery", "OUT/g.png"], []):
+            start = functools.partial(_printing, more)
+            make = with_file(start, "IMAGE", path, containing(picture_bytes()))
+            yield Case(attack, f"query {more}: {kind}", make, fine=True)
 
     def others(folder: pathlib.Path) -> None:
         for name in ("a.heic", "b.HEIC", "c.gif"):
@@ -999,7 +880,6 @@ def tables() -> Iterator[Case]:
     head = b"place_id,year,month,northdeg,city_id,lat,lon,panoid\n"
     rows = {
         "a NUL": b"0,2020,5,0,Aston,1.5\x00,2.5,pano\n",
-        "UTF-16": (head + b"0,2020,5,0,Aston,1.5,2.5,pano\n").decode().encode("utf-16"),
         "a place of 5,000 digits": b"9" * 5000 + b",2020,5,0,Aston,1.5,2.5,pano\n",
         "a place of 30 digits": b"9" * 30 + b",2020,5,0,Aston,1.5,2.5,pano\n",
         "a city outside": b"0,2020,5,0,../../../../etc,1.5,2.5,pano\n",
@@ -1010,62 +890,43 @@ def tables() -> Iterator[Case]:
         "below zero": b"-1,2020,5,0,Aston,1.5,2.5,pano\n",
         "words": b"a,b,c,d,e,f,g,h\n",
         "NaN": b"0,2020,5,0,Aston,nan,2.5,pano\n",
-        "a folder": b"",
     }
-    for kind, data in rows.items():
-        write = _table(None if kind == "a folder" else data if kind == "UTF-16" else head + data)
-        make = with_file("train", "--data", "places", write)
+    makers = {kind: containing(head + data) for kind, data in rows.items()}
+    whole = head + b"0,2020,5,0,Aston,1.5,2.5,pano\n"
+    makers["UTF-16"] = containing(whole.decode().encode("utf-16"))
+    makers["a folder"] = lambda path: path.mkdir(parents=True)
+    for kind, write in makers.items():
+        make = with_file("train", "--data", "places/Dataframes/Bad.csv", write, "places")
         yield Case("tables: places", kind, make, ("Bad.csv",))
-
-
-def _table(data: bytes | None) -> Write:
-    """Write a training set with this table; None is a folder of its name."""
-
-    def write(folder: pathlib.Path) -> None:
-        table = folder / "Dataframes" / "Bad.csv"
-        table.parent.mkdir(parents=True)
-        table.mkdir() if data is None else table.write_bytes(data)
-
-    return write
 
 
 # ---- Maps ----
 
 
-def _sealed(path: pathlib.Path, change: Callable[[Any], Any]) -> None:
-    """Change a JSON file, and give it the checksum of what it then is."""
-    from crisalad_jax.utils.checksums import checksummed_json
+def _sealed_in(name: str, change: Callable[[Any], Any]) -> Write:
+    """Change a JSON file in a folder, and give it the checksum of what it then is."""
 
-    value = json.loads(path.read_text())
-    value.pop("checksum", None)
-    changed = change(value)
-    if isinstance(changed, dict):
-        path.write_bytes(checksummed_json(changed))
-    else:
-        path.write_text(json.dumps(changed))
+    def write(folder: pathlib.Path) -> None:
+        value = json.loads((folder / name).read_text())
+        value.pop("checksum", None)
+        changed = change(value)
+        sealed = isinstance(changed, dict)
+        data = checksummed_json(changed) if sealed else json.dumps(changed).encode()
+        (folder / name).write_bytes(data)
+
+    return write
 
 
 def _setting(key: str, new: Any) -> Callable[[Any], Any]:
     return lambda value: value | {key: new}
 
 
-def _with_map(change: Callable[[pathlib.Path], Any]) -> Make:
-    """Change a copy of the map, and ask it."""
-
-    def make(world: World, bad: pathlib.Path) -> list[str]:
-        shutil.copytree(world.path("map"), bad / "map")
-        change(bad / "map")
-        return with_flag(base("query", world, bad), "--map", str(bad / "map"))
-
-    return make
+def _map_with(change: Write) -> Make:
+    return with_changed("query", "--map", "map", change)
 
 
-def _sealed_in(name: str, change: Callable[[Any], Any]) -> Write:
-    return lambda folder: _sealed(folder / name, change)
-
-
-def _written_in(name: str, data: bytes | str) -> Write:
-    return lambda folder: containing(data)(folder / name)
+def _written_in(name: str, data: bytes | str) -> Make:
+    return _map_with(lambda folder: containing(data)(folder / name))
 
 
 def maps() -> Iterator[Case]:
@@ -1120,65 +981,53 @@ def maps() -> Iterator[Case]:
             # Its file says what the model is, and a name may be of any bytes.
             fine |= kind in ("an absurd model", "names that are no UTF-8")
             # Of wrong names or roots, the picture that is not there is told.
-            make = _with_map(_sealed_in(name, change))
-            yield Case(
-                f"maps: {name}", kind, make, ("map", "images/", "/dev/zero"), fine, ("index",)
-            )
+            make = _map_with(_sealed_in(name, change))
+            yield Case(f"maps: {name}", kind, make, ("map", "images/", "/dev/zero"), fine)
     for kind, data in NPY.items():
-        make = _with_map(_written_in("segments/0000000000.npy", data))
-        yield Case("maps: descriptors", kind, make, ("0000000000",), needs=("index",))
+        make = _written_in("segments/0000000000.npy", data)
+        yield Case("maps: descriptors", kind, make, ("0000000000",))
     texts = {"deep": "[" * 200_000, "NaN": "NaN", "nothing": "", "a key twice": '{"a":1,"a":2}'}
     for name in ("segments/0000000000.json", "map.json"):
         for kind, text in texts.items():
-            make = _with_map(_written_in(name, text))
-            yield Case(f"maps: {name}", f"text: {kind}", make, ("map",), needs=("index",))
+            yield Case(f"maps: {name}", f"text: {kind}", _written_in(name, text), ("map",))
 
 
 # ---- Layouts of evaluation sets ----
 
 
-def _layout(bad: pathlib.Path, kind: str, names: Sequence[str]) -> pathlib.Path:
-    """Make an evaluation set whose files name these images."""
-    folder = bad / "set"
-    folder.mkdir()
-    (folder / "inside.png").write_bytes(picture_bytes())
-    (bad / "outside.png").write_bytes(picture_bytes())
-    if kind == "netvlad":
-        import scipy.io
+def _netvlad(names: Sequence[str], folder: pathlib.Path) -> None:
+    cells, points = test_netvlad.cells([*names]), np.zeros((2, len(names)))
+    sides = {"dbImage": cells, "utmDb": points, "numDb": float(len(names))}
+    sides |= {"qImage": cells, "utmQ": points, "numQ": float(len(names))}
+    test_netvlad.write(folder / "set.mat", **sides)
 
-        cells = np.empty((len(names), 1), object)
-        cells[:, 0] = names
-        points = np.zeros((2, len(names)))
-        value = {
-            "dbStruct": {
-                "whichSet": "test", "dataset": "x", "dbImageFns": cells, "utmDb": points,
-                "qImageFns": cells, "utmQ": points, "numImages": len(names),
-                "numQueries": len(names), "posDistThr": 25.0, "posDistSqThr": 625.0,
-                "nonTrivPosDistSqThr": 100.0,
-            }
-        }  # fmt: skip
-        scipy.io.savemat(folder / "set.mat", value)
-        return folder / "set.mat"
-    if kind == "salad":
-        array = np.array(names)
-        for name in ("dbImages", "qImages"):
-            np.save(folder / f"x_{name}.npy", array)
-        positives = np.empty(len(names), object)
-        positives[:] = [[0]] * len(names)
-        np.save(folder / "x_gt.npy", positives)
-        return folder
+
+def _salad(names: Sequence[str], folder: pathlib.Path) -> None:
+    folder.mkdir()
+    for kind in ("dbImages", "qImages"):
+        np.save(folder / f"x_{kind}.npy", np.array(names))
+    positives = np.empty(len(names), object)
+    positives[:] = [[0]] * len(names)
+    np.save(folder / "x_gt.npy", positives)
+
+
+def _msls(names: Sequence[str], folder: pathlib.Path) -> None:
     for part in ("query", "database"):
         city = folder / "train_val" / "cph" / part
         (city / "images").mkdir(parents=True)
-        keys = "\n".join(f"{n},{name},0,0" for n, name in enumerate(names))
-        (city / "postprocessed.csv").write_text(
-            ",key,easting,northing,unique_cluster,night,control_panel,view_direction\n"
-            + "\n".join(f"{n},{name},0,0,{n},False,False,Forward" for n, name in enumerate(names))
-        )
-        (city / "raw.csv").write_text(",key,lon,lat,ca,pano\n" + keys)
-        (city / "seq_info.csv").write_text(",key,sequence_key,frame_number\n" + keys)
-        (city / "subtask_index.csv").write_text(",all\n0,True\n")
-    return folder
+        for table, columns, values in (
+            ("raw", ["key", "lon", "lat", "pano"], [0, 0, False]),
+            ("postprocessed", ["key", "easting", "northing"], [0, 0]),
+        ):
+            rows = [[name, *values] for name in names]
+            test_msls.write_table(city / f"{table}.csv", columns, rows)
+
+
+LAYOUTS: Mapping[str, Callable[[Sequence[str], pathlib.Path], None]] = {
+    "netvlad": _netvlad,
+    "salad": _salad,
+    "msls": _msls,
+}
 
 
 def layouts() -> Iterator[Case]:
@@ -1192,18 +1041,18 @@ def layouts() -> Iterator[Case]:
         "empty": ["", ""],
         "with a NUL": ["a\0b.png", "c.png"],
     }
-    for kind in ("netvlad", "salad", "msls"):
+
+    def write(layout: str, names: Sequence[str], folder: pathlib.Path) -> None:
+        LAYOUTS[layout](names, folder)
+        (folder.parent / "outside.png").write_bytes(picture_bytes())
+
+    for layout in LAYOUTS:
+        value = "set/set.mat" if layout == "netvlad" else "set"
         for words, names in strange.items():
+            change = functools.partial(write, layout, names)
+            make = with_file("evaluate", "--data", "set", change, value)
             named = ("set", "outside.png", "/etc", "/dev", "png", "xxx")
-            fine = words == "outside"
-            yield Case("layouts: names", f"{kind}: {words}", _listed(kind, names), named, fine)
-
-
-def _listed(kind: str, names: Sequence[str]) -> Make:
-    def make(world: World, bad: pathlib.Path) -> list[str]:
-        return with_flag(base("evaluate", world, bad), "--data", str(_layout(bad, kind, names)))
-
-    return make
+            yield Case("layouts: names", f"{layout}: {words}", make, named, words == "outside")
 
 
 # ---- Comparisons ----
@@ -1216,32 +1065,21 @@ def comparisons() -> Iterator[Case]:
         "no settings": {},
         "other settings": {"training": {"epochs": 99}},
     }.items():
-        make = _with_comparison(_sealed_in(name, _setting("settings", settings)))
-        named = ("result.json", "comparison")
-        yield Case(f"comparisons: {name}", kind, make, named, needs=("compare",))
-
-
-def _with_comparison(change: Write) -> Make:
-    def make(world: World, bad: pathlib.Path) -> list[str]:
-        shutil.copytree(world.path("comparison"), bad / "comparison")
-        change(bad / "comparison")
-        return with_flag(base("compare", world, bad), "--out", str(bad / "comparison"))
-
-    return make
+        change = _sealed_in(name, _setting("settings", settings))
+        make = with_changed("compare", "--out", "comparison", change)
+        yield Case(f"comparisons: {name}", kind, make, ("result.json", "comparison"))
 
 
 # ---- The rest ----
 
 
+TAKEN = socket.create_server(("", 0))
+
+
 def processes() -> Iterator[Case]:
     """Give addresses of coordinators that cannot be met."""
-    taken = socket.socket()
-    taken.bind(("", 0))
-    taken.listen()
-    port = taken.getsockname()[1]
-    held.append(taken)
     addresses = {
-        "a port in use": f"127.0.0.1:{port}",
+        "a port in use": f"127.0.0.1:{TAKEN.getsockname()[1]}",
         "a port of 99999": "127.0.0.1:99999",
         "a port of 0": "127.0.0.1:0",
         "a port of 5,000 digits": "127.0.0.1:" + "9" * 5000,
@@ -1258,16 +1096,13 @@ def processes() -> Iterator[Case]:
             yield Case("processes", f"{kind}, index {index}", with_more("train", *more), words)
 
 
-held: list[socket.socket] = []
-
-
 def memory() -> Iterator[Case]:
     """Limit the address space."""
     verbs = ("train", "evaluate", "extract", "index", "query", "pca", "convert", "info", "export")
     for verb in verbs:
         for megabytes in (16, 64, 256, 1024):
             words, most = f"{verb}: {megabytes} MB", megabytes * 2**20
-            yield of(verb, "memory", words, with_more(verb), fine=True, memory=most)
+            yield Case("memory", words, with_more(verb), fine=True, memory=most)
 
 
 MARKUP = "<script>alert(1)</script>"
@@ -1283,40 +1118,31 @@ def _no_markup(done: Done, folder: pathlib.Path) -> str | None:
 
 
 def _no_formula(done: Done, folder: pathlib.Path) -> str | None:
-    import csv
-
-    for path in (folder / "out").rglob("*.csv"):
-        for row in csv.reader(path.open(newline="")):
-            for cell in row:
-                if cell[:1] in ("=", "+", "-", "@", "\t", "\r") and not _is_number(cell):
-                    return f"a spreadsheet runs {cell!r}"
-    return None if list((folder / "out").rglob("*.csv")) else "no table was written"
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    tables = list((folder / "out").rglob("*.csv"))
+    for path in tables:
+        for cell in itertools.chain.from_iterable(csv.reader(path.open(newline=""))):
+            if re.match(r"[=@\t\r]|[+-](?![\d.]|nan|inf)", cell):
+                return f"a spreadsheet runs {cell!r}"
+    return None if tables else "no table was written"
 
 
 def injections() -> Iterator[Case]:
     """Give data sets and weights names that spreadsheets and browsers run."""
 
     def page(world: World, bad: pathlib.Path) -> list[str]:
-        name = MARKUP.replace("/", "\u2215")
-        (bad / name).symlink_to(world.town)
-        shutil.copy(world.weights, bad / '"><script>alert(2)<b>.safetensors')
-        given = with_flag(base("evaluate", world, bad), "--data", str(bad / name))
-        return with_flag(given, "--weights", str(bad / '"><script>alert(2)<b>.safetensors'))
+        name = bad / MARKUP.replace("/", "\u2215")
+        name.symlink_to(world.path("town"))
+        weights = bad / '"><script>alert(2)<b>.safetensors'
+        shutil.copy(world.path("weights.safetensors"), weights)
+        given = with_flag(base("evaluate", world, bad), "--data", str(name))
+        return with_flag(given, "--weights", str(weights))
 
     def table(world: World, bad: pathlib.Path) -> list[str]:
-        (bad / "=cmd()").symlink_to(world.town)
+        (bad / "=cmd()").symlink_to(world.path("town"))
         return with_flag(base("compare", world, bad), "--test", str(bad / "=cmd()"))
 
     yield Case("injections", "a page", page, fine=True, check=_no_markup)
-    yield Case("injections", "a table", table, fine=True, check=_no_formula, needs=("compare",))
+    yield Case("injections", "a table", table, fine=True, check=_no_formula)
 
 
 def cases(seed: int) -> list[Case]:
@@ -1365,68 +1191,64 @@ def judge(case: Case, done: Done, before: set[str], folder: pathlib.Path) -> str
     return f"{'; '.join(wrong)}: {done.err[-700:]!r}" if wrong else None
 
 
-def attack(case: Case, world: World, folder: pathlib.Path) -> str | None:
+def attempt(case: Case, world: World, folder: pathlib.Path) -> str | None:
     """Try a case in a new folder; return what is wrong."""
     (folder / "out").mkdir(parents=True)
     around = files_in(folder.parent)
     try:
-        arguments = case.make(world, folder)
+        given = case.make(world, folder)
         before = files_in(folder / "out")
         made = files_in(folder.parent)
-        slow = 4 if case.needs == ("compare",) or case.fine or case.memory else 1
-        done = run(arguments, cwd=folder, limit=slow * HANGS, memory=case.memory)
+        slow = 4 if case.attack.startswith("comparisons") or case.fine or case.memory else 1
+        done = run(given, cwd=folder, limit=slow * HANGS, memory=case.memory)
         wrong = judge(case, done, before, folder)
         outside = {name for name in files_in(folder.parent) - made - around if "/out" not in name}
-        if outside and wrong is None and case.attack != "comparisons":
+        if outside and wrong is None:
             wrong = f"wrote outside: {sorted(outside)[:4]}"
         return wrong
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def main() -> int:
-    """Attack, and write the rows."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=pathlib.Path, required=True)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--most", type=int, default=None)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--only", default="")
-    given = parser.parse_args()
-    import_everything()
-    chosen = [case for case in cases(given.seed) if given.only in f"{case.attack}: {case.words}"]
-    if given.quick:
-        slow = ("memory", "injections", "layouts: names")
-        chosen = [case for case in chosen if not case.needs and case.attack not in slow]
-    random.Random(given.seed).shuffle(chosen)
-    chosen = chosen[: given.most]
+def try_all(bench: Bench, chosen: Sequence[Case]) -> list[Row]:
+    """Try cases, and return their rows."""
     if any("torch" in case.attack or ".pth" in case.words for case in chosen):
         import torch  # noqa: F401  (once, before the forks)
     rows = {case.attack: Row(case.attack, PROMISE) for case in chosen}
-    with contextlib.ExitStack() as stack:
-        folder = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        world = make_world(folder / "world")
-        needed = {need for case in chosen for need in case.needs}
-        make_products(world, [verb for verb in (*PRODUCTS, "compare") if verb in needed])
-        started = time.monotonic()
-        for number, case in enumerate(chosen, start=1):
-            wrong = attack(case, world, folder / "tried" / f"{number}")
-            aborted = wrong is not None and wrong.startswith(ABORTED)
-            row = rows.setdefault("memory: aborts", Row("memory: aborts", UNCAUGHT))
-            row = row if aborted else rows[case.attack]
-            row.note(wrong is None or aborted, f"{case.words}: {wrong}")
-            if wrong is not None:
-                print(f"{case.attack}: {case.words}: {wrong}", file=sys.stderr)
-            if number % 20 == 0 or number == len(chosen):
-                seconds = time.monotonic() - started
-                failed = sum(len(row.failures) for row in rows.values())
-                line = f"{number} of {len(chosen)} inputs, {failed} failures, {seconds:.0f} s"
-                print(line, file=sys.stderr)
-                write_rows(given.out, [row for row in rows.values() if row.tries])
-    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
-    print(f"largest process: {peak:.2f} GB", file=sys.stderr)
-    return 1 if any(row.failures for row in rows.values()) else 0
+    aborts = Row("memory: aborts", UNCAUGHT)
+    for number, case in enumerate(chosen):
+        wrong = attempt(case, bench.world, bench.folder / "tried" / f"{number}")
+        aborted = wrong is not None and wrong.startswith(ABORTED)
+        row = aborts if aborted else rows[case.attack]
+        row.note(wrong is None or aborted, f"{case.words}: {wrong}")
+    return [row for row in (*rows.values(), aborts) if row.tries]
+
+
+def group_of(case: Case) -> str:
+    """Return what stands before the colon of its row."""
+    return case.attack.partition(":")[0]
+
+
+def attack(group: str, bench: Bench, _: float) -> list[Row]:
+    """Try all cases of a group."""
+    return try_all(bench, [case for case in cases(bench.seed) if group_of(case) == group])
+
+
+SAMPLED = ("files", "names", "targets", "values", "flags", "configurations", "weights", "tables")
+SAMPLE = "a sample"
+
+
+def attack_sample(bench: Bench, scale: float) -> list[Row]:
+    """Try some of those that fail early."""
+    quick = [case for case in cases(bench.seed) if group_of(case) in SAMPLED]
+    return try_all(bench, bench.random.sample(quick, part_of(200, scale, least=16)))
+
+
+def attacks() -> dict[str, Attack]:
+    """Return an attack for each group of cases, and a sample."""
+    groups = dict.fromkeys(map(group_of, cases(0)))
+    return {SAMPLE: attack_sample, **{g: functools.partial(attack, g) for g in groups}}
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(carry_out(attacks(), __doc__, optional=[SAMPLE], keep=False))

@@ -7,30 +7,41 @@ signalled while they import. No program can handle a signal before the interpret
 line: such tries are counted apart, and that time is measured.
 """
 
-import functools
 import hashlib
 import os
 import pathlib
 import signal
-import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from tests.attack.kills import (
-    Bench,
+    OF_ONE_RUN,
     Marks,
     Moment,
-    carry_out,
-    command,
-    differences,
-    part_of,
+    contents,
+    marked,
     recipe_of_chains,
+    runs,
     train_arguments,
 )
-from tests.attack.world import VERBS, Done, Row, files_in, forked, has_temporaries, make_products
+from tests.attack.world import (
+    VERBS,
+    Attack,
+    Bench,
+    Done,
+    Row,
+    arguments,
+    carry_out,
+    differences,
+    files_in,
+    forked,
+    has_temporaries,
+    one_line,
+    part_of,
+)
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 LONGEST = 10.0
@@ -49,8 +60,6 @@ CALLS = Marks(
     }
 )
 TRAINING_CALLS = ("the loop of training", "saving", "validating", "keeping the best")
-_OF_ONE_RUN = ("/state/", "/tensorboard/")
-"""What other programs name by time, and what is not the end of a run."""
 
 
 class Verb:
@@ -65,71 +74,52 @@ class Verb:
             done = self.go(folder)
             assert done.code == 0, (name, done.err)
             self.seconds = done.seconds
-        first, second = map(_files, folders)
+        first, second = map(self._files, folders)
         assert first.keys() == second.keys(), (name, first.keys() ^ second.keys())
-        self.names = first.keys()
-        self.stable = {path: data for path, data in first.items() if second[path] == data}
-        assert self.stable, name
+        self._unstable = differences(first, second)
+        self._expected = second
+        assert len(self._unstable) < len(second), name
 
     def arguments(self, out: pathlib.Path) -> list[str]:
         """Return the command that writes into a folder."""
         if self._recipe is not None:
             return train_arguments(self._bench.world, self._recipe, out / "run")
-        return VERBS[self.name](self._bench.world, out)
+        return arguments(self.name, self._bench.world, out)
 
     def go(
         self,
         out: pathlib.Path,
         during: Callable[[int], None] | None = None,
-        *,
-        before: Callable[[], None] = lambda: None,
         settings: Sequence[tuple[Any, str, Any]] = (),
     ) -> Done:
         """Run it in a fork, with smaller settings where the command has none."""
-        import crisalad_jax.experiments.demo
         import crisalad_jax.retrieval.extract
         import crisalad_jax.retrieval.maps.build
-        import crisalad_jax.training.trainer
 
-        of_demo = crisalad_jax.experiments.demo.DemoConfig
-        small = functools.partial(of_demo, train_places=48, test_places=12, epochs=2)
-        all_settings = [
-            *settings,
-            (crisalad_jax.experiments.demo, "DemoConfig", small),
+        small = [
             (crisalad_jax.retrieval.maps.build, "SEGMENT", 4),
             (crisalad_jax.retrieval.extract, "SEGMENT", 4),
         ]
-        out.mkdir(parents=True, exist_ok=True)
-        CALLS.clear()
-        work = command(self.arguments(out), CALLS, *all_settings)
+        return runs(self._bench, CALLS, self.arguments, *settings, *small)(out, during)
 
-        def whole_work() -> int:
-            before()
-            return work()
+    def _files(self, out: pathlib.Path) -> dict[str, Any]:
+        found: dict[str, Any] = {
+            name: (out / name).read_bytes()
+            for name in files_in(out)
+            if (out / name).is_file() and not any(part in f"/{name}" for part in OF_ONE_RUN)
+        }
+        if self.name == "train":
+            found |= {name: value for name, value in contents(out).items() if value is not None}
+        return found
 
-        return forked(whole_work, cwd=self._bench.folder, during=during, limit=600)
-
-    def wrong_with(self, out: pathlib.Path) -> list[str]:
-        """List what a finished command did not write as an uninterrupted one."""
-        found = _files(out)
-        wrong = [f"{name}: in one only" for name in sorted(found.keys() ^ self.names)]
-        wrong += [
-            f"{name}: other bytes"
-            for name, data in self.stable.items()
-            if name in found and found[name] != data
-        ]
-        if self.name == "train" and not wrong:
-            whole = self._bench.folder / "whole" / "train 0" / "run"
-            wrong += differences(out / "run", whole)
-        return wrong + left_in(out)
-
-
-def _files(folder: pathlib.Path) -> dict[str, bytes]:
-    return {
-        name: (folder / name).read_bytes()
-        for name in files_in(folder)
-        if not any(part in f"/{name}" for part in _OF_ONE_RUN) and (folder / name).is_file()
-    }
+    def wrong_with(self, out: pathlib.Path, done: Done) -> list[str]:
+        """List what a command that should have finished did not do as an uninterrupted one."""
+        if done.code:
+            return [done.err[-300:]]
+        found = self._files(out)
+        differ = differences(found, self._expected)
+        both = found.keys() & self._expected.keys()
+        return [name for name in differ if name not in both & {*self._unstable}] + left_in(out)
 
 
 def left_in(folder: pathlib.Path) -> list[str]:
@@ -138,48 +128,54 @@ def left_in(folder: pathlib.Path) -> list[str]:
     return sorted({*has_temporaries(folder), *empty})
 
 
-def wrong_end(number: int, code: int, err: str, seconds: float) -> list[str]:
-    """List what is wrong with the end of a program at a signal."""
-    notes = "crisalad: note: "
-    lines = [line for line in err.splitlines() if not line.startswith(notes)]
+def wrong_end(number: int, code: int, err: str, sent: float) -> list[str]:
+    """List what is wrong with the end, which was just now, of a program at a signal."""
+    seconds = time.monotonic() - sent
     wrong = []
     if code != 128 + number:
         wrong.append(f"exit code {code}")
-    if len(lines) != 1 or not lines[0].startswith("crisalad: "):
-        wrong.append(f"{len(lines)} lines: {err[-300:]!r}")
+    if not one_line(err):
+        wrong.append(f"not one line: {err[-300:]!r}")
     if seconds > LONGEST:
         wrong.append(f"{seconds:.1f} s after the signal")
     return wrong
 
 
-class Tries(NamedTuple):
+class Tries:
     """The rows of an attack by signals."""
 
-    ends: Row
-    nothing_left: Row
-    resumed: Row
+    def __init__(self, what: str) -> None:
+        """Make empty rows."""
+        self.ends = Row(f"signals, {what}: the end", "one line, code 130, 143 or 129, within 10 s")
+        self.left = Row(
+            f"signals, {what}: what is left", "no temporary file, no lock, no empty folder"
+        )
+        self.resumed = Row(
+            f"signals, {what}: the same command", "it finishes with the bits of a whole one"
+        )
+        self.rows = [self.ends, self.left, self.resumed]
+
+    def resume(self, verb: Verb, out: pathlib.Path, words: str) -> None:
+        """Note what a signal has left, and whether the same command finishes."""
+        left = left_in(out)
+        self.left.note(not left, f"{words}: {left}")
+        done = verb.go(out)
+        if verb.name == "export" and "expected a new or empty one" in done.err:
+            # An export whose last act was done refuses to write into its own folder.
+            done = done._replace(code=0)
+        wrong = verb.wrong_with(out, done)
+        self.resumed.note(not wrong, f"{words}: {wrong}")
 
 
-def tries_of(what: str) -> Tries:
-    """Make empty rows."""
-    return Tries(
-        Row(f"signals, {what}: the end", "one line, code 130, 143 or 129, within 10 s"),
-        Row(f"signals, {what}: what is left", "no temporary file, no lock, no empty folder"),
-        Row(f"signals, {what}: the same command", "it finishes with the bits of a whole one"),
-    )
-
-
-def attack_forks(bench: Bench, tries: int, verbs: Sequence[str]) -> list[Row]:
+def attack_forks(what: str, verbs: Sequence[str], tries: int, bench: Bench) -> list[Row]:
     """Signal forks at moments spread over their work, or just after a call that changes files."""
-    rows = tries_of(", ".join(verbs) if len(verbs) < len(QUICK) else "all verbs but the long ones")
+    rows = Tries(what)
     for position, name in enumerate(verbs):
         verb = Verb(bench, name)
-        share = tries // len(verbs) + (position < tries % len(verbs))
-        for turn in range(share):
+        for turn in range(tries // len(verbs) + (position < tries % len(verbs))):
             _one_fork(bench, verb, position + turn, rows)
-        failures = sum(len(row.failures) for row in rows)
-        bench.say(f"signals: {name}, {verb.seconds:.1f} s a run, {failures} failures so far")
-    return list(rows)
+        bench.say(f"signals: {name}, {verb.seconds:.1f} s a run")
+    return rows.rows
 
 
 def _one_fork(bench: Bench, verb: Verb, turn: int, rows: Tries) -> None:
@@ -195,18 +191,12 @@ def _one_fork(bench: Bench, verb: Verb, turn: int, rows: Tries) -> None:
         words = f"seed {bench.seed}, {verb.name}, {moment}, at its end: {done.err[-300:]}"
         rows.resumed.note(done.code in (0, 128 + number) and not left_in(out), words)
     words = f"seed {bench.seed}, {verb.name}, signal {number}, {moment} ({moment.during})"
-    wrong = wrong_end(number, done.code, done.err, time.monotonic() - moment.sent)
+    wrong = wrong_end(number, done.code, done.err, moment.sent)
     at_work = moment.during in TRAINING_CALLS and moment.before["logging"]
     if verb.name == "train" and at_work and "goes on" not in done.err:
         wrong.append(f"no word of the saved state: {done.err}")
     rows.ends.note(not wrong, f"{words}: {wrong}")
-    left = left_in(out)
-    rows.nothing_left.note(not left, f"{words}: {left}")
-    done = verb.go(out)
-    # An export whose last act was done refuses to write into its own folder.
-    refused = verb.name == "export" and "expected a new or empty one" in done.err
-    wrong = verb.wrong_with(out) if refused or not done.code else [done.err[-300:]]
-    rows.resumed.note(not wrong, f"{words}: {wrong}")
+    rows.resume(verb, out, words)
 
 
 def _moment(bench: Bench, verb: Verb, number: int) -> Moment:
@@ -232,26 +222,23 @@ def handles(process: int) -> bool:
     return bool(int(caught, 16) & 1 << (signal.SIGHUP - 1))
 
 
-def attack_programs(bench: Bench, tries: int) -> list[Row]:
+def attack_programs(bench: Bench, scale: float) -> list[Row]:
     """Signal programs of their own, from their first moment to the end of their imports."""
-    rows = tries_of("programs that start")
+    rows = Tries("programs that start")
     early = Row(
         "signals before the first line of Python",
         "counted apart: the interpreter's own start, which no program can handle",
     )
     verbs = [Verb(bench, name) for name in ("info", "train", "index", "query", "extract .h5")]
-    windows, startups = [], []
-    for _ in range(3):
-        begun = time.monotonic()
-        program = bench.program(["info", "--preset", "tiny"])
-        while not handles(program.pid):
-            time.sleep(0.0005)
-        windows.append(time.monotonic() - begun)
-        program.communicate()
-        startups.append(time.monotonic() - begun)
-    window, startup = statistics.median(windows), statistics.median(startups)
+    begun = time.monotonic()
+    program = bench.program(["info", "--preset", "tiny"])
+    while not handles(program.pid):
+        time.sleep(0.0005)
+    window = time.monotonic() - begun
+    program.communicate()
+    startup = time.monotonic() - begun
     early.promise += f" (here {1000 * window:.0f} ms of {1000 * startup:.0f} ms of a start)"
-    for turn in range(tries):
+    for turn in range(part_of(30, scale)):
         verb, number = verbs[turn % len(verbs)], SIGNALS[turn % len(SIGNALS)]
         out = bench.folder / "programs started" / f"{turn}"
         out.mkdir(parents=True)
@@ -260,49 +247,43 @@ def attack_programs(bench: Bench, tries: int) -> list[Row]:
         time.sleep(after)
         handled, sent = handles(program.pid), time.monotonic()
         program.send_signal(number)
-        _, err = program.communicate()
-        seconds, code = time.monotonic() - sent, program.returncode
+        err = program.communicate()[1].decode(errors="replace")
         words = f"seed {bench.seed}, {verb.name}, signal {number}, {after:.3f} s after its start"
         if handled:
-            wrong = wrong_end(number, code, err.decode(errors="replace"), seconds)
+            wrong = wrong_end(number, program.returncode, err, sent)
             rows.ends.note(not wrong, f"{words}: {wrong}")
         else:
-            early.note(code != 0, f"{words}: it went on")
-        left = left_in(out)
-        rows.nothing_left.note(not left, f"{words}: {left}")
-        done = verb.go(out)
-        wrong = [done.err[-300:]] if done.code else verb.wrong_with(out)
-        rows.resumed.note(not wrong, f"{words}: {wrong}")
-        bench.say(f"programs: {turn + 1} of {tries}, {early.tries} before Python")
-    return [*rows, early]
+            early.note(program.returncode != 0, f"{words}: it went on")
+        rows.resume(verb, out, words)
+    return [*rows.rows, early]
 
 
 def attack_closed_output(bench: Bench, _: float) -> list[Row]:
     """Close standard output after one line, as `| head -1`, for each verb."""
     row = Row("standard output closed (| head -1)", "exit code 0, nothing on standard error")
-    verbs = {name: make(bench.world, bench.folder / "piped" / name) for name, make in VERBS.items()}
-    del verbs["compare"], verbs["demo"]  # they print as the others, after minutes
+    folder = bench.folder / "piped"
+    # compare and demo print as the others, after minutes.
+    verbs = {name: arguments(name, bench.world, folder / name) for name in QUICK}
     verbs["query --json -"] = [
-        *("query", f"{bench.world.images}", "--map", f"{bench.world.path('map')}", "--quiet"),
-        *("--json", "-"),
+        *("query", str(bench.world.path("images")), "--map", str(bench.world.path("map"))),
+        *("--quiet", "--json", "-"),
     ]
     verbs["info --json -"] = ["info", "--preset", "tiny", "--json", "-"]
-    for name, arguments in verbs.items():
-        (bench.folder / "piped" / name).mkdir(parents=True)
+    for name, given in verbs.items():
+        (folder / name).mkdir(parents=True)
 
-        def work(arguments: Sequence[str] = arguments) -> int:
+        def work(given: Sequence[str] = given) -> int:
             head = subprocess.Popen(["head", "-1"], stdin=subprocess.PIPE)
             assert head.stdin is not None
             os.dup2(head.stdin.fileno(), 1)
             head.stdin.close()
-            return command(arguments, CALLS)()
+            return marked(given, CALLS)()
 
         CALLS.clear()
         done = forked(work, cwd=bench.folder)
         beside = name.endswith("--json -")  # all but the JSON is told on standard error
         right = done.code == 0 and (not done.err or beside) and "Traceback" not in done.err
         row.note(right, f"{name}: {done.code} {done.err[-300:]}")
-        bench.say(f"closed output: {name}")
     return [row]
 
 
@@ -315,17 +296,10 @@ def attack_training(bench: Bench, scale: float) -> list[Row]:
         "the second is refused in one line, the first saves, the same command finishes alike",
     )
     ignored = Row("SIGHUP under nohup", "it goes on, and finishes alike")
-
-    def finish(out: pathlib.Path, wrong: list[str]) -> str:
-        done = verb.go(out)
-        wrong += [done.err[-300:]] if done.code else verb.wrong_with(out)
-        return f"seed {bench.seed}, {out.name}: {wrong}" if wrong else ""
-
     for turn in range(part_of(5, scale)):
         out = bench.folder / "twice" / f"{turn}"
         pause = bench.random.choice([0.0, 0.001, 0.01, 0.1])
         first = _moment(bench, verb, signal.SIGINT)
-        sent = time.monotonic()
 
         def both(process: int, first: Moment = first, pause: float = pause) -> None:
             first(process)
@@ -333,13 +307,11 @@ def attack_training(bench: Bench, scale: float) -> list[Row]:
             if first.during:
                 os.kill(process, signal.SIGINT)  # not waited for yet, so the number is its own
 
-        done = verb.go(out, both)
-        wrong = []
+        done, wrong = verb.go(out, both), []
         if CALLS.times("the end") == 0:
-            wrong = wrong_end(signal.SIGINT, done.code, done.err, time.monotonic() - first.sent)
-        words = finish(out, wrong)
-        twice.note(not words, f"{first}, {pause} s between: {words}")
-        bench.say(f"Ctrl-C twice: {turn + 1}, {time.monotonic() - sent:.1f} s")
+            wrong = wrong_end(signal.SIGINT, done.code, done.err, first.sent)
+        wrong += verb.wrong_with(out, verb.go(out))
+        twice.note(not wrong, f"seed {bench.seed}, {first}, {pause} s between: {wrong}")
     for turn in range(part_of(3, scale)):
         out = bench.folder / "waiting" / f"{turn}"
         second: list[Done] = []
@@ -351,28 +323,24 @@ def attack_training(bench: Bench, scale: float) -> list[Row]:
                 time.sleep(0.001)
             os.kill(process, signal.SIGSTOP)
             marks = Marks({})
-            second.append(forked(command(verb.arguments(out), marks), cwd=bench.folder))
+            second.append(forked(marked(verb.arguments(out), marks), cwd=bench.folder))
             os.kill(process, number)
             os.kill(process, signal.SIGCONT)
 
         done = verb.go(out, ask)
-        wrong = wrong_end(number, done.code, done.err, 0)
+        wrong = wrong_end(number, done.code, done.err, time.monotonic()) + left_in(out)
         if not second[0].told_in_one_line() or "another process" not in second[0].err:
             wrong.append(f"the second: {second[0].code} {second[0].err[-300:]}")
-        words = finish(out, [*wrong, *left_in(out)])
-        waiting.note(not words, words)
-        bench.say(f"a second process: {turn + 1}")
+        wrong += verb.wrong_with(out, verb.go(out))
+        waiting.note(not wrong, f"seed {bench.seed}, turn {turn}: {wrong}")
     for turn in range(part_of(3, scale)):
         out = bench.folder / "nohup" / f"{turn}"
         moment = _moment(bench, verb, signal.SIGHUP)
-        done = verb.go(out, moment, before=lambda: _ignore(signal.SIGHUP))
-        wrong = [f"code {done.code}: {done.err[-300:]}"] if done.code else verb.wrong_with(out)
+        before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as a child takes over
+        wrong = verb.wrong_with(out, verb.go(out, moment))
+        signal.signal(signal.SIGHUP, before)
         ignored.note(not wrong, f"seed {bench.seed}, {moment}: {wrong}")
     return [twice, waiting, ignored]
-
-
-def _ignore(number: int) -> None:
-    signal.signal(number, signal.SIG_IGN)
 
 
 def attack_busy(bench: Bench, _: float) -> list[Row]:
@@ -386,13 +354,17 @@ def attack_busy(bench: Bench, _: float) -> list[Row]:
     )
     step, busy_from = crisalad_jax.training.trainer.train_step, [0]
 
-    def busy(*arguments: Any, **options: Any) -> Any:
+    def busy(*given: Any, **options: Any) -> Any:
         busy_from[0] -= 1
         if busy_from[0] < 0:
             CALLS.say("busy")
             hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)
-        return step(*arguments, **options)
+        return step(*given, **options)
 
+    places = {
+        "extract .npy": (crisalad_jax.retrieval.extract, "group", busy),
+        "train": (crisalad_jax.training.trainer, "train_step", busy),
+    }
     for name, steps, signals in (
         ("extract .npy", 0, [signal.SIGINT]),
         ("train", 0, [signal.SIGTERM]),
@@ -410,49 +382,31 @@ def attack_busy(bench: Bench, _: float) -> list[Row]:
                 os.kill(process, number)
 
         busy_from[0] = steps
-        holder = (
-            crisalad_jax.training.trainer if name == "train" else crisalad_jax.retrieval.extract
-        )
-        function = "train_step" if name == "train" else "group"
-        done = verb.go(out, send, settings=[(holder, function, busy)])
-        wrong = wrong_end(signals[-1], done.code, done.err, time.monotonic() - last.sent)
-        wrong += left_in(out)
-        done = verb.go(out)
-        wrong += [done.err[-300:]] if done.code else verb.wrong_with(out)
+        done = verb.go(out, send, settings=[places[name]])
+        wrong = wrong_end(signals[-1], done.code, done.err, last.sent) + left_in(out)
+        wrong += verb.wrong_with(out, verb.go(out))
         row.note(not wrong, f"{name}, {signals}: {wrong}")
-        bench.say(f"busy: {name}, {len(signals)} signals")
     return [row]
 
 
-def attack_some(bench: Bench, _: float) -> list[Row]:
-    """Signal two quick verbs, which need none of the products."""
-    return attack_forks(bench, 6, ["extract .npy", "convert"])
-
-
-def prepared(attack: Callable[[Bench, float], list[Row]]) -> Callable[[Bench, float], list[Row]]:
-    """Return an attack whose world has the products that commands read."""
-
-    def run(bench: Bench, scale: float) -> list[Row]:
-        if not (bench.world.root / "products").exists():
-            make_products(bench.world)
-        return attack(bench, scale)
-
-    return run
-
-
 QUICK = [name for name in VERBS if name not in ("compare", "demo")]
-ATTACKS: Mapping[str, Callable[[Bench, float], list[Row]]] = {
-    "some": attack_some,
-    "forks": prepared(lambda bench, scale: attack_forks(bench, part_of(64, scale), QUICK)),
-    "programs": prepared(lambda bench, scale: attack_programs(bench, part_of(30, scale))),
-    "training": prepared(attack_training),
+ATTACKS: Mapping[str, Attack] = {
+    # Two quick verbs, which need none of the products.
+    "some": lambda bench, _: attack_forks(
+        "extract .npy, convert", ["extract .npy", "convert"], 6, bench
+    ),
+    "forks": lambda bench, scale: attack_forks(
+        "all verbs but the long ones", QUICK, part_of(64, scale), bench
+    ),
+    "programs": attack_programs,
+    "training": attack_training,
     "busy": attack_busy,
-    "closed output": prepared(attack_closed_output),
-    "long": prepared(
-        lambda bench, scale: attack_forks(bench, part_of(8, scale), ["compare", "demo"])
+    "closed output": attack_closed_output,
+    "long": lambda bench, scale: attack_forks(
+        "compare, demo", ["compare", "demo"], part_of(8, scale), bench
     ),
 }
 
 
 if __name__ == "__main__":
-    sys.exit(carry_out(ATTACKS, (__doc__ or "").splitlines()[0]))
+    sys.exit(carry_out(ATTACKS, __doc__))

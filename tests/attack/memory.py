@@ -4,19 +4,19 @@ python -m tests.attack.memory --out rows.json [--scale 1] [--seed 0] [--only tra
 """
 
 import dataclasses
+import functools
 import gc
 import json
 import pathlib
 import resource
-import shutil
 import sys
 from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from crisalad_jax.data.reading import Reading
-from tests.attack.kills import Bench, carry_out, part_of, recipe_of_chains
-from tests.attack.world import VERBS, Row, files_in, forked, make_products
+from tests.attack.kills import recipe_of_chains
+from tests.attack.world import Attack, Bench, Row, arguments, carry_out, files_in, forked, part_of
 
 MOST = 20
 """Growth of resident memory in megabytes that passes as none."""
@@ -31,115 +31,122 @@ def resident() -> float:
     return pages * resource.getpagesize() / 2**20
 
 
-def _row_of_growth(attack: str, first: int, last: int, most: float = MOST) -> Row:
-    words = f"resident memory after {first:,} and after {last:,} differs by less than {most:g} MB"
-    return Row(attack, words)
+def growth(
+    bench: Bench,
+    attack: str,
+    work: Callable[[dict[int, float]], None],
+    first: int,
+    last: int,
+    most: float = MOST,
+) -> Row:
+    """Judge what a function, in a fork, measures at numbers of steps or queries.
+
+    Args:
+        bench: says what was measured.
+        attack: the row.
+        work: does the steps, and puts the memory after some of them into a dictionary.
+        first: number from which on memory is not to grow.
+        last: number of the last one.
+        most: megabytes that pass as no growth.
+    """
+
+    def measure() -> int:
+        sizes: dict[int, float] = {}
+        work(sizes)
+        print(json.dumps(sizes))
+        return 0
+
+    promise = f"resident memory after {first:,} and after {last:,} differs by less than {most:g} MB"
+    row = Row(attack, promise)
+    done = forked(measure, cwd=bench.folder, limit=3600)
+    if done.code:
+        row.note(False, f"exit code {done.code}: {done.err[-300:]}")
+        return row
+    sizes = {int(number): size for number, size in json.loads(done.out).items()}
+    early = min(number for number in sizes if number >= first)
+    grown = sizes[max(sizes)] - sizes[early]
+    told = ", ".join(f"{number}: {size:.1f} MB" for number, size in sorted(sizes.items()))
+    row.promise += f" (here {grown:+.1f} MB)"
+    row.note(grown < most, f"{grown:+.1f} MB ({told})")
+    bench.say(f"{row.attack}: {told}")
+    return row
 
 
 def attack_training(bench: Bench, scale: float) -> list[Row]:
     """Take many steps in one process; then save and validate after each epoch."""
     recipe = recipe_of_chains(bench.folder)
+
+    def train(sizes: dict[int, float], last: int, often: bool) -> None:
+        import crisalad_jax.training.run_files
+        from crisalad_jax.config.io import read_config
+        from crisalad_jax.data.benchmarks import open_benchmark
+        from crisalad_jax.data.places import read_places
+        from crisalad_jax.training.config import TrainConfig
+        from crisalad_jax.training.loop import fit
+        from crisalad_jax.training.run_files import RunFiles
+
+        if often:
+            crisalad_jax.training.run_files.SAVE_SECONDS = -1.0
+        config = dataclasses.replace(
+            read_config(TrainConfig, recipe), epochs=-(-last // 2), save_top_k=1
+        )
+        real = RunFiles.log
+
+        def log(self: RunFiles, values: Mapping[str, int | float], **more: str) -> None:
+            real(self, values, **more)
+            step = int(values["step"])
+            if step % max(last // 12, 1) == 0:
+                sizes[step] = resident()
+
+        RunFiles.log = log
+        fit(
+            config,
+            read_places(bench.world.path("city"), min_images=2),
+            bench.folder / f"run of {last} steps, often: {often}",
+            validation=open_benchmark(bench.world.path("town")) if often else None,
+            quiet=True,
+        )
+
     rows = []
-    for kind, steps in (("steps", 3000), ("steps with saves and validations", 600)):
-        often = kind != "steps"
+    for kind, first, last, often in (
+        ("steps", 500, 3000, False),
         # Until some hundred saves, memory that compiling took is given back.
-        first = part_of(steps // 2 if often else steps // 6, scale)
-        last = part_of(steps, scale)
+        ("steps with saves and validations", 300, 600, True),
+    ):
+        first, last = part_of(first, scale), part_of(last, scale)
         most = OF_A_SAVE * (last - first) if often else MOST
-
-        def work(last: int = last, often: bool = often, kind: str = kind) -> int:
-            import crisalad_jax.training.run_files
-            from crisalad_jax.config.io import read_config
-            from crisalad_jax.data.benchmarks import open_benchmark
-            from crisalad_jax.data.places import read_places
-            from crisalad_jax.training.config import TrainConfig
-            from crisalad_jax.training.loop import fit
-            from crisalad_jax.training.run_files import RunFiles
-
-            if often:
-                crisalad_jax.training.run_files.SAVE_SECONDS = -1.0
-            config = dataclasses.replace(
-                read_config(TrainConfig, recipe), epochs=-(-last // 2), save_top_k=1
-            )
-            sizes: dict[int, float] = {}
-            real = RunFiles.log
-
-            def log(self: RunFiles, values: Mapping[str, int | float], **more: str) -> None:
-                real(self, values, **more)
-                step = int(values["step"])
-                if step % max(last // 12, 1) == 0:
-                    sizes[step] = resident()
-
-            RunFiles.log = log
-            fit(
-                config,
-                read_places(bench.world.city, min_images=2),
-                bench.folder / f"run of {kind}",
-                validation=open_benchmark(bench.world.town) if often else None,
-                quiet=True,
-            )
-            print(json.dumps(sizes))
-            return 0
-
-        row = _row_of_growth(f"memory of training: {kind}", first, last, most)
-        done = forked(work, cwd=bench.folder, limit=3600)
-        _note(bench, row, done.code, done.out, done.err, first, most)
-        rows.append(row)
+        work = functools.partial(train, last=last, often=often)
+        rows.append(growth(bench, f"memory of training: {kind}", work, first, last, most))
     return rows
-
-
-def _note(
-    bench: Bench, row: Row, code: int, out: str, err: str, first: int, most: float = MOST
-) -> None:
-    """Judge sizes by number of steps or queries: the first late enough, and the last."""
-    if code:
-        row.note(False, f"exit code {code}: {err[-300:]}")
-        return
-    sizes = {int(number): size for number, size in json.loads(out).items()}
-    early = min(number for number in sizes if number >= first)
-    growth = sizes[max(sizes)] - sizes[early]
-    told = ", ".join(f"{number}: {size:.1f} MB" for number, size in sorted(sizes.items()))
-    row.promise += f" (here {growth:+.1f} MB)"
-    row.note(growth < most, f"{growth:+.1f} MB ({told})")
-    bench.say(f"{row.attack}: {told}")
-
-
-def _make_products(bench: Bench) -> None:
-    if not (bench.world.root / "products").exists():
-        make_products(bench.world)
 
 
 def attack_queries(bench: Bench, scale: float) -> list[Row]:
     """Search an open map, and describe and search images, many times."""
-    _make_products(bench)
+    folder = bench.world.path("map")
+
+    def ask(sizes: dict[int, float], last: int, with_images: bool) -> None:
+        from crisalad_jax.retrieval.maps.map import Map
+        from crisalad_jax.retrieval.maps.query import query
+
+        image = next(path for path in bench.world.path("images").rglob("*.jpg"))
+        with Map.open(folder) as places:
+            model = places.load_model()
+            rows = np.concatenate(list(places.descriptors))
+            for number in range(1, last + 1):
+                if with_images:
+                    query(places, [image], model=model, k=3, reading=Reading(quiet=True))
+                else:
+                    places.search(rows[:1], 3)
+                if number % max(last // 10, 1) == 0:
+                    gc.collect()
+                    sizes[number] = resident()
+
     rows = []
-    for kind, count in (("searches", 10_000), ("queries by images", 2_000)):
+    for kind, count, images in (("searches", 10_000, False), ("queries by images", 2_000, True)):
         first, last = part_of(count // 10, scale), part_of(count, scale)
-
-        def work(last: int = last, kind: str = kind) -> int:
-            from crisalad_jax.retrieval.maps.map import Map
-            from crisalad_jax.retrieval.maps.query import query
-
-            sizes = {}
-            image = next(path for path in bench.world.images.rglob("*.jpg"))
-            with Map.open(bench.world.path("map")) as places:
-                model = places.load_model()
-                rows = np.concatenate(list(places.descriptors))
-                for number in range(1, last + 1):
-                    if kind == "searches":
-                        places.search(rows[:1], 3)
-                    else:
-                        query(places, [image], model=model, k=3, reading=Reading(quiet=True))
-                    if number % max(last // 10, 1) == 0:
-                        gc.collect()
-                        sizes[number] = resident()
-            print(json.dumps(sizes))
-            return 0
-
-        row = _row_of_growth(f"memory of an open map: {kind}", first, last)
-        done = forked(work, cwd=bench.folder, limit=3600)
-        _note(bench, row, done.code, done.out, done.err, first)
-        rows.append(row)
+        attack = f"memory of an open map: {kind}"
+        work = functools.partial(ask, last=last, with_images=images)
+        rows.append(growth(bench, attack, work, first, last))
     return rows
 
 
@@ -148,35 +155,29 @@ def attack_cache(bench: Bench, _: float) -> list[Row]:
 
     By default it keeps those that took half a second to compile, which differs with the load.
     """
-    _make_products(bench)
     row = Row("growth of the compile cache", "the second run of a command adds no file to it")
     cache = bench.folder / "cache"
     environment = {**bench.environment, "JAX_COMPILATION_CACHE_DIR": str(cache)}
-    quick = dataclasses.replace(bench, environment=environment)
+    apart = dataclasses.replace(bench, environment=environment)
     for name in ("info", "query", "train"):
         listed = []
         for turn in range(2):
             out = bench.folder / "cached" / f"{name} {turn}"
             out.mkdir(parents=True)
-            program = quick.program(VERBS[name](bench.world, out))
+            program = apart.program(arguments(name, bench.world, out))
             _, err = program.communicate()
             assert program.returncode == 0, err
-            listed.append(files_in(cache) if cache.exists() else set())
-        new = listed[1] - listed[0]
-        size = sum(path.stat().st_size for path in cache.rglob("*") if path.is_file())
-        row.note(
-            not new, f"{name}: {len(new)} of {len(listed[1])} files are new, {sorted(new)[:3]}"
-        )
-        bench.say(f"compile cache after {name}: {len(listed[1])} files, {size / 2**20:.1f} MB")
-    shutil.rmtree(cache, ignore_errors=True)
+            listed.append(files_in(cache))
+        new = sorted(listed[1] - listed[0])
+        row.note(not new, f"{name}: {len(new)} of {len(listed[1])} files are new, {new[:3]}")
     return [row]
 
 
-ATTACKS: Mapping[str, Callable[[Bench, float], list[Row]]] = {
+ATTACKS: Mapping[str, Attack] = {
     "training": attack_training,
     "queries": attack_queries,
     "cache": attack_cache,
 }
 
 if __name__ == "__main__":
-    sys.exit(carry_out(ATTACKS, (__doc__ or "").splitlines()[0]))
+    sys.exit(carry_out(ATTACKS, __doc__))
