@@ -71,26 +71,6 @@ def test_the_descriptor_is_torchs() -> None:
     np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
-def test_mixers_of_no_effect_leave_chosen_numbers_by_channel() -> None:
-    """Channels 2, 4, ... of patches 1, 3 and 5: all rows of a channel, then the next channel."""
-    mixer = FeatureMixer(
-        LayerNorm(jnp.ones(6), jnp.zeros(6)),
-        Linear(jnp.ones((6, 6)), jnp.ones(6)),
-        Linear(jnp.zeros((6, 6)), jnp.zeros(6)),
-    )
-    channels, rows = np.zeros((12, 5), np.float32), np.zeros((6, 3), np.float32)
-    channels[[2, 4, 6, 8, 10], range(5)] = 1
-    rows[[1, 3, 5], range(3)] = 1
-    params = MixVpr(
-        (mixer, mixer),
-        Linear(jnp.asarray(channels), jnp.zeros(5)),
-        Linear(jnp.asarray(rows), jnp.zeros(3)),
-    )
-    chosen = np.array([[PATCHES[0, n, c] for n in (1, 3, 5)] for c in (2, 4, 6, 8, 10)]).ravel()
-    found = descriptors(params, PATCHES)[0]
-    np.testing.assert_allclose(found, chosen / np.linalg.norm(chosen), atol=1e-6)
-
-
 def test_it_starts_as_published() -> None:
     config = ModelConfig(aggregator="mixvpr", cross_image=CrossImageConfig(layers=0))
     assert config.descriptor_dim == 4096

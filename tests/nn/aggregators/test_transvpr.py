@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.nn.aggregators.base import to_descriptor
-from crisalad_jax.nn.aggregators.transvpr import TransVpr, TransVprConfig, attentions, key_features
+from crisalad_jax.nn.aggregators.transvpr import TransVpr, TransVprConfig, key_features
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -86,14 +86,6 @@ def test_the_descriptor_by_hand() -> None:
     np.testing.assert_allclose(
         to_descriptor(tokens, CONFIG.aggregator), by_hand(params, patches, 3), atol=1e-6
     )
-
-
-def test_attentions_are_shares_of_the_patches() -> None:
-    params = start()
-    patches = jax.random.normal(jax.random.key(2), (2, 12, 48)).astype(jnp.bfloat16)
-    weights = attentions(params, patches)
-    assert (weights.shape, weights.dtype) == ((2, 12, 3), jnp.float32)
-    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
 
 
 def test_key_patches_by_hand() -> None:

@@ -28,8 +28,6 @@ from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.layers import Linear, init_linear, l2_normalise
-from crisalad_jax.nn.model import attend_across_images, self_mask
-from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import random_params
 
@@ -212,18 +210,6 @@ def test_a_facet_looks_at_no_block_after_its_own() -> None:
         np.testing.assert_array_equal(found.class_token, expected.class_token)
 
 
-def test_netvlads_tokens_fit_the_encoder() -> None:
-    """It has no global token, which the encoder's switch leaves on."""
-    config = dataclasses.replace(MODEL, cross_image=CrossImageConfig(heads=4, feedforward=8))
-    params = random_params(config)
-    local = jax.random.normal(jax.random.key(1), (2, 3, 32))
-    found = attend_across_images(
-        params, Tokens(jnp.zeros((2, 0)), local), config, mask=self_mask(2)
-    )
-    assert found.shape == (2, config.descriptor_dim) == (2, 96)
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-6)
-
-
 def test_a_vocabulary_knows_its_backbone() -> None:
     config = AnyLocConfig(clusters=2, layer=1)
     backbone = random_params(MODEL).backbone
@@ -244,22 +230,6 @@ def test_a_vocabulary_knows_its_backbone() -> None:
     assert len(digests) == 4
     with pytest.raises(InputError, match=r"^some.safetensors: found a vocabulary of another back"):
         config.check_backbone(bound, backbone, "some.safetensors")
-
-
-def test_a_files_metadata_keep_whose_vocabulary_it_is() -> None:
-    """Beside the arrays: no cast of these can spoil it."""
-    config, words = AnyLocConfig(clusters=2), AnyLoc(jnp.ones((2, 32)))
-    assert config.metadata(words) == {}
-    assert config.with_metadata(words, {}).backbone == words.backbone
-    bound = config.attach_backbone_hash(words, random_params(MODEL).backbone)
-    kept = config.metadata(bound)
-    assert kept == {"backbone": bound.backbone}
-    half = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), bound)
-    assert half.backbone == bound.backbone
-    assert config.with_metadata(words, kept).backbone == bound.backbone
-    # Of any other method there is nothing to keep.
-    assert MODEL.aggregator.metadata(None) == {}
-    assert MODEL.aggregator.attach_backbone_hash(words, None) is words
 
 
 def test_patches_that_are_alike_share_their_weight() -> None:
