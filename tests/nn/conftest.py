@@ -4,12 +4,9 @@ from collections.abc import Collection, Iterable
 from typing import Any
 
 import jax
-import numpy as np
 import pytest
-import torch
 
 from crisalad_jax.nn import attention_pallas
-from crisalad_jax.nn.attention import Attention
 
 
 @pytest.fixture
@@ -44,14 +41,3 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 def slow_unless(quick: Collection[str], names: Iterable[str]) -> list[Any]:
     """Parameters of a test: all names, of which the quick ones alone run everywhere."""
     return [pytest.param(x, marks=() if x in quick else pytest.mark.slow) for x in names]
-
-
-def copy_attention(theirs: torch.nn.MultiheadAttention, ours: Attention) -> None:
-    """Give torch's attention our parameters."""
-    state = {
-        "in_proj_weight": ours.qkv.weight.T,
-        "in_proj_bias": ours.qkv.bias,
-        "out_proj.weight": ours.proj.weight.T,
-        "out_proj.bias": ours.proj.bias,
-    }
-    theirs.load_state_dict({name: torch.tensor(np.asarray(x)) for name, x in state.items()})

@@ -1,4 +1,7 @@
-"""Attention against torch's scaled_dot_product_attention and nn.MultiheadAttention."""
+"""Attention's masks and gradients against torch's softmax, and its kernels against the CPU's.
+
+parity/ compares self- and cross-attention with torch's modules.
+"""
 
 from collections.abc import Iterator
 from typing import Any
@@ -20,7 +23,6 @@ from crisalad_jax.nn.attention import (
 from crisalad_jax.nn.attention_fused import padded_length
 from crisalad_jax.nn.layers import init_linear, linear
 from crisalad_jax.utils.target import CPU, GPU, TPU, Target, lowering_for
-from tests.nn.conftest import copy_attention
 
 TOKENS, DIM, HEADS = 7, 12, 3
 
@@ -30,11 +32,8 @@ def network(dim: int) -> Attention:
     return Attention(init_linear(qkv, dim, 3 * dim), init_linear(proj, dim, dim))
 
 
-def make() -> tuple[Attention, jax.Array, torch.nn.MultiheadAttention]:
-    params, data = network(DIM), jax.random.key(0)
-    theirs = torch.nn.MultiheadAttention(DIM, HEADS, batch_first=True)
-    copy_attention(theirs, params)
-    return params, jax.random.normal(data, (TOKENS, DIM)), theirs
+def make() -> tuple[Attention, jax.Array]:
+    return network(DIM), jax.random.normal(jax.random.key(0), (TOKENS, DIM))
 
 
 def masked_attention(params: Attention, x: jax.Array, mask: Any, dropped: Any = None) -> jax.Array:
@@ -44,55 +43,8 @@ def masked_attention(params: Attention, x: jax.Array, mask: Any, dropped: Any = 
     return linear(params.proj, mixed.reshape(x.shape))
 
 
-def test_equals_torch_with_and_without_mask() -> None:
-    params, x, theirs = make()
-    x = jnp.stack([x, 1 - x])
-    mask = np.random.default_rng(0).random((TOKENS, TOKENS)) < 0.5
-    np.fill_diagonal(mask, True)
-    tx = torch.tensor(np.asarray(x))
-    everything = theirs(tx, tx, tx, need_weights=False)[0].detach()
-    seen = theirs(tx, tx, tx, attn_mask=torch.tensor(~mask), need_weights=False)[0].detach()
-    for ours, expected in (
-        (attention(params, x, HEADS), everything),
-        (attention(params, x[1], HEADS), everything[1]),
-        (masked_attention(params, x, jnp.asarray(mask)), seen),
-        (masked_attention(params, x[1], jnp.asarray(mask)), seen[1]),
-    ):
-        # Two products of 12 terms of order 1 in float32.
-        np.testing.assert_allclose(ours, expected, atol=2e-6)
-
-
-def test_queries_of_their_own_are_torchs_cross_attention() -> None:
-    params, x, theirs = make()
-    tokens, queries = jnp.stack([x, 1 - x, 2 * x]), x[:4] + 0.5
-
-    def found(params: Attention, queries: jax.Array, tokens: jax.Array) -> jax.Array:
-        return cross_attention(params, queries, tokens, HEADS)
-
-    asked = torch.tensor(np.asarray(queries), requires_grad=True)
-    seen = torch.tensor(np.asarray(tokens), requires_grad=True)
-    expected = theirs(asked.expand(3, -1, -1), seen, seen, need_weights=False)[0]
-    ours, back = jax.vjp(found, params, queries, tokens)
-    assert ours.shape == (3, 4, DIM)
-    np.testing.assert_allclose(ours, expected.detach(), atol=2e-6)
-    one = cross_attention(params, queries, tokens[2], HEADS)
-    np.testing.assert_allclose(one, expected[2].detach(), atol=2e-6)
-
-    slope = np.random.default_rng(0).normal(size=ours.shape).astype(np.float32)
-    expected.backward(torch.tensor(slope))
-    to_params, to_queries, to_tokens = back(jnp.asarray(slope))
-    for mine, other in (
-        (to_queries, asked.grad),
-        (to_tokens, seen.grad),
-        (to_params.qkv.weight.T, theirs.in_proj_weight.grad),
-        (to_params.qkv.bias, theirs.in_proj_bias.grad),
-    ):
-        # Sums of some hundred products of order 1.
-        np.testing.assert_allclose(mine, other, atol=2e-5)
-
-
 def test_a_masked_token_has_no_influence_and_no_gradient() -> None:
-    params, x, _ = make()
+    params, x = make()
     mask = jnp.ones((TOKENS, TOKENS), bool).at[:-1, -1].set(False)
 
     def seen(x: jax.Array) -> jax.Array:
@@ -136,7 +88,7 @@ def test_gradient_equals_that_of_torchs_softmax(masking: bool) -> None:
 
 
 def test_scores_of_bfloat16_are_float32() -> None:
-    params, x, _ = make()
+    params, x = make()
     ours = attention(params, x.astype(jnp.bfloat16), HEADS)
     assert ours.dtype == jnp.bfloat16
     # bfloat16 keeps 8 bits: inputs, weights and outputs of order 1 are each off by up to 2^-9.
@@ -289,7 +241,7 @@ def test_what_a_tpus_kernel_does_not_take_is_computed_all_the_same(
 
 def test_an_accelerators_products_are_the_cpus() -> None:
     """In float32 a GPU has no fused attention; the order of the axes is another."""
-    params, x, _ = make()
+    params, x = make()
     x, mask = jnp.stack([x, 1 - x]), jnp.tri(TOKENS, dtype=bool)
     dropped = 2.0 * jax.random.bernoulli(jax.random.key(5), 0.5, (HEADS, TOKENS, TOKENS))
 
@@ -306,7 +258,7 @@ def test_an_accelerators_products_are_the_cpus() -> None:
 
 
 def test_an_accelerators_cross_attention_is_the_cpus() -> None:
-    params, x, _ = make()
+    params, x = make()
     tokens = jnp.stack([x, 1 - x, 2 * x])
     expected = cross_attention(params, x[:4], tokens, HEADS)
     with lowering_for(TPU):

@@ -1,7 +1,6 @@
-"""NetVLAD and AnyLoc against loops over patches and clusters, and the block that a facet is of."""
+"""Hard VLAD by loops, the starts from centroids, bursts, and whose vocabulary it is."""
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
@@ -23,11 +22,11 @@ from crisalad_jax.nn.aggregators.vlad import (
     burst_weights,
     scores_from_centroids,
 )
-from crisalad_jax.nn.backbones.base import Features, FeatureSpec
+from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.layers import Linear, init_linear, l2_normalise
+from crisalad_jax.nn.layers import init_linear, l2_normalise
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import random_params
 
@@ -52,21 +51,6 @@ FEATURES = np.stack([unit(row) for row in PATCHES.reshape(-1, 6)])
 def sums_of(config: VladConfig, params: Any, patches: jax.Array) -> jax.Array:
     features = Features(patches[..., 0, :0], patches)
     return config.apply(params, features, (1, patches.shape[-2]), key=None).local
-
-
-def test_netvlad_is_the_papers_sum() -> None:
-    """Eq. 4, patch by patch and cluster by cluster, in float64."""
-    weight = np.random.default_rng(2).normal(size=(6, 4)).astype(np.float32)
-    params = NetVlad(Linear(jnp.asarray(weight), None), jnp.asarray(CENTROIDS))
-    found = sums_of(NetVladConfig(clusters=4), params, jnp.asarray(PATCHES))
-    for image, clusters in zip(PATCHES.astype(np.float64), found, strict=True):
-        sums = np.zeros((4, 6))
-        for patch in map(unit, image):
-            exponentials = [np.exp(weight[:, k] @ patch) for k in range(4)]
-            for k in range(4):
-                sums[k] += exponentials[k] / sum(exponentials) * (patch - CENTROIDS[k])
-        # Sums of nine numbers around 1 in float32, divided by their length.
-        np.testing.assert_allclose(clusters, [unit(row) for row in sums], atol=1e-6)
 
 
 def distance(patch: np.ndarray, word: np.ndarray) -> float:
@@ -186,28 +170,6 @@ def test_without_features_centroids_are_random_and_unit() -> None:
         centroids = params.centroids if isinstance(params, NetVlad) else params.words
         assert centroids.shape == (3, 32)
         np.testing.assert_allclose(np.linalg.norm(centroids, axis=1), 1, rtol=1e-6)
-
-
-def test_a_facet_looks_at_no_block_after_its_own() -> None:
-    """All of those after it NaN, and of its own what a facet does not need."""
-    params = random_params(MODEL).backbone
-    images = jax.random.normal(jax.random.key(1), (1, 42, 56, 3))
-    spoilt = jax.tree.map(lambda leaf: leaf.at[2:].set(jnp.nan), params.blocks)
-    beyond = dataclasses.replace(
-        spoilt, mlp=jax.tree.map(lambda x: x.at[1:].set(jnp.nan), spoilt.mlp)
-    )
-
-    @functools.partial(jax.jit, static_argnums=2)
-    def run(params: Any, images: jax.Array, name: Any) -> Features:
-        return VIT.apply(params, images, AnyLocConfig(layer=1, facet=name).features(VIT.depth))[0]
-
-    assert AnyLocConfig(layer=1).features(3) == FeatureSpec((2,), "value", norm=False)
-    for name, blocks in (("value", beyond), ("token", spoilt)):
-        found = run(dataclasses.replace(params, blocks=blocks), images, name)
-        expected = run(params, images, name)
-        assert np.isfinite(expected.patches).all()
-        np.testing.assert_array_equal(found.patches, expected.patches)
-        np.testing.assert_array_equal(found.class_token, expected.class_token)
 
 
 def test_a_vocabulary_knows_its_backbone() -> None:

@@ -47,22 +47,6 @@ def heads(seed: int, tokens: int, dim: int = 16) -> jax.Array:
     return jax.random.normal(jax.random.key(seed), (2, tokens, 3, dim))
 
 
-def test_pairs_turn_like_complex_numbers() -> None:
-    """Number i of a head + j times number i + 8, times exp(j angle), by loops over patches."""
-    x = np.asarray(heads(0, 12))
-    expected = np.empty_like(x)
-    for row in range(3):
-        for column in range(4):
-            place = (2 * row + 1) / 3 - 1, (2 * column + 1) / 4 - 1
-            angles = [2 * np.pi * at / 100 ** (i / 4) for at in place for i in range(4)]
-            patch = 4 * row + column
-            pairs = (x[:, patch, :, :8] + 1j * x[:, patch, :, 8:]) * np.exp(1j * np.array(angles))
-            expected[:, patch] = np.concatenate([pairs.real, pairs.imag], axis=-1)
-    found = rotate(heads(0, 12), CONFIG.rotation(GRID))
-    # Products of numbers of order 3 in float32.
-    np.testing.assert_allclose(found, expected, atol=2e-6)
-
-
 def test_tokens_in_front_are_not_rotated() -> None:
     x = heads(0, 15)
     turned = rotate(x, CONFIG.rotation(GRID))

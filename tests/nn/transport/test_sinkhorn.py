@@ -1,7 +1,7 @@
 """Transport plans against their defining properties, numpy and torch, in float32.
 
 Other libraries' plans and all exact gradients are in test_sinkhorn_float64.py, bad input in
-test_sinkhorn_input.py, the published outputs and gradients in parity/test_goldens.py.
+test_sinkhorn_input.py, the published iterations in parity/.
 """
 
 import dataclasses
@@ -28,7 +28,6 @@ from crisalad_jax.sinkhorn import (
     SinkhornConfig,
     SinkhornResult,
     SinkhornStep,
-    Step,
     append_dustbin,
     assign_with_dustbin,
     log_marginals,
@@ -45,50 +44,11 @@ def scores_of(seed: int, *shape: int, scale: float = 1.0) -> jax.Array:
     return scale * jax.random.normal(jax.random.key(seed), shape)
 
 
-def take(step: Step, problem: Problem, at: Potentials) -> Potentials:
-    """One iteration of a step that has no state."""
-    return step.step(problem, at, None, jnp.zeros((), int))[0]
-
-
 def plan_of(result: SinkhornResult) -> np.ndarray:
     return np.exp(np.asarray(result.log_plan, np.float64))
 
 
-# The published algorithm
-
-
-def published(scores: np.ndarray, dustbin: float, epsilon: float, count: int) -> np.ndarray:
-    """SALAD's log_otp_solver, written out in torch from the paper: (K, N), clusters first."""
-    kernel = torch.from_numpy(np.asarray(scores, np.float64)).T / epsilon
-    clusters, rows = kernel.shape
-    kernel = torch.cat([kernel, torch.full((1, rows), dustbin / epsilon)])
-    log_a = torch.zeros(clusters + 1)
-    log_a[-1] = np.log(rows - clusters)
-    u, v = torch.zeros(clusters + 1), torch.zeros(rows)
-    for _ in range(count):
-        u = log_a - torch.logsumexp(kernel + v, dim=1)
-        v = -torch.logsumexp(kernel + u[:, None], dim=0)
-    return torch.exp(kernel + u[:, None] + v).T.numpy()
-
-
-@pytest.mark.parametrize(
-    ("config", "count"),
-    [
-        (SinkhornConfig(), 3),  # by default
-        (SinkhornConfig(iterations=12), 12),
-        (SinkhornConfig(domain="log"), 3),
-    ],
-)
-def test_equals_the_published_iterations(config: SinkhornConfig, count: int) -> None:
-    scores = scores_of(1, 2, 9, 4, scale=3.0)
-    for dustbin, epsilon in ((1.3, 0.7), (-0.4, 1.0)):
-        result = assign_with_dustbin(scores, jnp.float32(dustbin), epsilon=epsilon, config=config)
-        for one, plan in zip(np.asarray(scores), plan_of(result), strict=True):
-            # Logarithms of order 10 in float32.
-            np.testing.assert_allclose(plan, published(one, dustbin, epsilon, count), rtol=1e-5)
-        np.testing.assert_array_equal(result.iterations, [count, count])
-        assert result.finite.all()
-        assert not result.converged.any()  # nothing was asked of them
+# Over-relaxation
 
 
 @pytest.mark.parametrize("fields", [{}, {"row_tau": 0.7}, {"column_tau": 0.7}], ids=str)
@@ -120,23 +80,13 @@ def test_over_relaxation_never_makes_the_dual_fall() -> None:
         plan = np.exp(scores + row[:, None] + column)
         return row.sum() + np.exp(log_nu) @ column - plan.sum()
 
-    def duals(step: Callable[[Problem, Potentials], Potentials]) -> np.ndarray:
-        problem = Problem.of(*(jnp.asarray(x, jnp.float32) for x in (scores, log_mu, log_nu)))
-        at, found = Potentials(jnp.zeros(30), jnp.zeros(5)), []
-        for _ in range(20):
-            at = step(problem, at)
-            found.append(dual(*(np.asarray(x, np.float64) for x in at)))
-        return np.array(found)
-
-    def unguarded(problem: Problem, at: Potentials) -> Potentials:
-        column = problem.log_nu - problem.lse_rows(at.row)
-        column = at.column + 1.9 * (column - at.column)
-        row = problem.log_mu - problem.lse_columns(column)
-        return Potentials(at.row + 1.9 * (row - at.row), column)
-
+    problem = Problem.of(*(jnp.asarray(x, jnp.float32) for x in (scores, log_mu, log_nu)))
+    at, step, duals = Potentials(jnp.zeros(30), jnp.zeros(5)), SinkhornStep(relaxation=1.9), []
+    for number in range(20):
+        at, _ = step.step(problem, at, None, jnp.asarray(number))
+        duals.append(dual(*(np.asarray(x, np.float64) for x in at)))
     # Rounding of float32 potentials of order 10, times masses of 30.
-    assert (np.diff(duals(functools.partial(take, SinkhornStep(relaxation=1.9)))) > -1e-4).all()
-    assert (np.diff(duals(unguarded)) < -1).any()
+    assert (np.diff(duals) > -1e-4).all()
 
 
 # Diagnostics
@@ -180,16 +130,6 @@ def test_iterations_are_counted_until_nothing_changes_more() -> None:
             assert result.iterations == expected
             assert result.converged
             assert result.column_error <= tolerance
-
-
-def test_the_tolerance_bounds_the_error_that_is_left() -> None:
-    scores = scores_of(0, 16, 40, 6, scale=5.0)
-    for tolerance in (0.1, 1e-3):
-        config = implicit(tolerance=tolerance, iterations=2000)
-        result = assign_with_dustbin(scores, 0.0, config=config)
-        assert result.converged.all()
-        # The change is of logarithms: exp(0.1) is 0.105 from 1. And rounding.
-        assert (result.column_error <= np.expm1(tolerance) + 1e-5).all()
 
 
 def test_a_change_of_the_rows_alone_goes_on_too() -> None:
@@ -514,22 +454,6 @@ def test_relaxed_masses_too_large_for_a_float_still_have_gradients() -> None:
     gradient = jax.grad(lambda x: jnp.tanh(0.01 * log_plan(x)).sum())(scores)
     assert jnp.isfinite(gradient).all()
     assert jnp.abs(gradient).max() > 1e-3
-
-
-@pytest.mark.parametrize("gradient", ["unrolled", "implicit", "optimistix", "stop"])
-def test_counts_and_flags_may_be_used_while_differentiating(gradient: Any) -> None:
-    config = SinkhornConfig() if gradient == "unrolled" else implicit(gradient=gradient)
-    scores = scores_of(6, 2, 12, 4)
-
-    def of(scores: jax.Array, use: bool) -> jax.Array:
-        result = assign_with_dustbin(scores, 1.0, config=config)
-        loss = jnp.exp(2 * result.log_plan).sum()
-        kept = jnp.where(result.finite.all(), loss, 0 * loss) * result.iterations.max()
-        return kept / result.iterations.max() if use else loss
-
-    used, plain = (jax.jit(jax.grad(of), static_argnums=1)(scores, use) for use in (True, False))
-    # A product and a quotient, rounded; entries are sums of terms of 0.02.
-    np.testing.assert_allclose(used, plain, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize("apart", [1.0, 100.0])
