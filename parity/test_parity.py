@@ -20,8 +20,6 @@ NAMES = [what.name for what in (*CASES, *RUNS)]
 SLOW = {
     "Sinkhorn: 100 iterations, epsilon 1.0",
     "DINO-SALAD",  # a part of CriSALAD
-    # tests/nn/aggregators compare smaller ones.
-    *("BoQ", "CosPlace's head", "MixVPR", "Conv-AP", "GeM", "SuperVLAD"),
     "NetVLAD's descriptor",  # the aggregators have rows of their own
     "AnyLoc's descriptor",
     "training CriSALAD's adapters and head",  # quick in float64

@@ -1,5 +1,6 @@
-"""Kernels of accelerators, computed by JAX's own operations on any machine."""
+"""Kernels of accelerators, computed by JAX on any machine, and what several tests share."""
 
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import jax
@@ -35,3 +36,8 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     original = jax.nn.dot_product_attention
     monkeypatch.setattr(jax.nn, "dot_product_attention", attend)
     return asked
+
+
+def slow_unless(quick: Collection[str], names: Iterable[str]) -> list[Any]:
+    """Parameters of a test: all names, of which the quick ones alone run everywhere."""
+    return [pytest.param(x, marks=() if x in quick else pytest.mark.slow) for x in names]

@@ -17,7 +17,6 @@ from crisalad_jax.nn.adapter import (
     init_adapter,
 )
 from crisalad_jax.nn.backbones.vit import ViTConfig
-from crisalad_jax.nn.layers import Linear
 from crisalad_jax.utils.pytree import named_leaves
 
 GRID = (3, 5)
@@ -102,19 +101,3 @@ def test_cricavprs_convolutions_start_at_1e_5() -> None:
     assert params.keys() - starts.keys() == {"down.weight", "down.bias"}
     for name, value in starts.items():
         np.testing.assert_array_equal(params[name], value, err_msg=name)
-
-
-def test_no_adapter_is_none() -> None:
-    config = ViTConfig(adapter=AdapterConfig(kind="none"))
-    assert init_adapter(jax.random.key(0), config.dim, config.adapter) is None
-
-
-def test_an_mlp_adapter_looks_at_no_neighbour() -> None:
-    config = ViTConfig(dim=32, heads=2, adapter=AdapterConfig(kind="mlp"))
-    params = init_adapter(jax.random.key(0), config.dim, config.adapter)
-    params = dataclasses.replace(params, up=Linear(jnp.ones((16, 32)), jnp.ones(32)))
-    tokens = jax.random.normal(jax.random.key(2), (16, 32))
-    hidden = np.maximum(tokens @ params.down.weight + params.down.bias, 0)
-    expected = np.broadcast_to(hidden.sum(axis=1, keepdims=True) + 1, (16, 32))
-    # A sum of 16 numbers of order 1.
-    np.testing.assert_allclose(adapter(params, tokens, GRID)[0], expected, atol=1e-5)

@@ -37,6 +37,10 @@ LINEARS = 257 * 768 * 384 * 2
 """An adapter's projections down and up, of 257 tokens."""
 
 
+def macs_of(config: ModelConfig, images: int = 1) -> dict[str, int]:
+    return {cost.part: cost.macs for cost in part_costs(config, images=images)}
+
+
 @pytest.mark.parametrize(
     ("kind", "macs", "paper"),
     [
@@ -118,10 +122,6 @@ def edtformer_by_hand() -> int:
 
 AGGREGATORS: dict[str, tuple[Any, int]] = {
     "salad": (SMALL.aggregator, salad_by_hand()),
-    "salad, 10 iterations": (
-        dataclasses.replace(SMALL.aggregator, sinkhorn=SinkhornConfig(iterations=10)),
-        salad_by_hand(10 * 2 * PATCHES * 8),
-    ),
     # Sums of exponentials are no products.
     "salad, log": (
         dataclasses.replace(SMALL.aggregator, sinkhorn=SinkhornConfig(domain="log")),
@@ -136,11 +136,6 @@ AGGREGATORS: dict[str, tuple[Any, int]] = {
     "salad, row and column": (
         dataclasses.replace(SMALL.aggregator, dustbin="row and column"),
         salad_by_hand(3 * 2 * (PATCHES + 1) * 8),
-    ),
-    # No column is a dustbin; the last is kept apart all the same.
-    "salad, none": (
-        dataclasses.replace(SMALL.aggregator, dustbin="none"),
-        salad_by_hand(3 * 2 * PATCHES * 7),
     ),
     "gem": (GemConfig(), 0),
     "gem-pyramid": (GemPyramidConfig(), 0),
@@ -170,10 +165,6 @@ AGGREGATORS: dict[str, tuple[Any, int]] = {
         VladBuffConfig(clusters=5, reduced=12),
         PATCHES * DIM * 12 + 2 * PATCHES * 12 * 5 + PATCHES**2 * 12,
     ),
-    "vlad-buff, whole": (
-        VladBuffConfig(clusters=5, reduced=0),
-        2 * PATCHES * DIM * 5 + PATCHES**2 * DIM,
-    ),
     # A descriptor needs no local features.
     "selavpr": (SelaVprConfig(hidden=8, local=4), 0),
     # SALAD's; the dustbin comes from the backbone.
@@ -188,16 +179,14 @@ AGGREGATORS: dict[str, tuple[Any, int]] = {
 def test_an_aggregator_by_hand(name: str) -> None:
     part, by_hand = AGGREGATORS[name]
     config = dataclasses.replace(PLAIN, aggregator=part)
-    costs = {cost.part: cost.macs for cost in part_costs(config)}
-    assert costs["aggregator"] == by_hand
+    assert macs_of(config)["aggregator"] == by_hand
 
 
-@pytest.mark.parametrize("ffn", ["mlp", "swiglu"])
-@pytest.mark.parametrize("registers", [0, 4])
+@pytest.mark.parametrize(("ffn", "registers"), [("mlp", 4), ("swiglu", 0)])
 def test_the_backbone_by_hand(ffn: Any, registers: int) -> None:
     """Three blocks of attention and network over all tokens; the embedding over the patches."""
     backbone = dataclasses.replace(SMALL.backbone, ffn=ffn, registers=registers)
-    costs = {x.part: x.macs for x in part_costs(dataclasses.replace(SMALL, backbone=backbone))}
+    costs = macs_of(dataclasses.replace(SMALL, backbone=backbone))
     tokens = 1 + registers + PATCHES
     # Two thirds of 128, up to a multiple of 8, are 88: gates and values, and one product back.
     network = {"mlp": 2 * 128, "swiglu": 3 * 88}[ffn]
@@ -209,22 +198,19 @@ def test_the_backbone_by_hand(ffn: Any, registers: int) -> None:
     assert costs["adapters"] == 3 * adapter
 
 
-@pytest.mark.parametrize("images", [1, 5])
-@pytest.mark.parametrize("global_token", [True, False])
+@pytest.mark.parametrize(("images", "global_token"), [(1, True), (5, False)])
 def test_the_encoder_by_hand(images: int, global_token: bool) -> None:
     """Each of an image's 8 tokens of 32 numbers, and 2 of the global one's 64, sees `images`."""
     across = dataclasses.replace(SMALL.cross_image, global_token=global_token)
     config = dataclasses.replace(SMALL, cross_image=across)
-    costs = {cost.part: cost.macs for cost in part_costs(config, images=images)}
     tokens = 8 + 2 * global_token
     by_hand = 2 * tokens * (4 * 32**2 + 2 * images * 32 + 2 * 32 * 24)
-    assert costs["cross-image encoder"] == by_hand
-    assert {x.part: x.macs for x in part_costs(PLAIN)}["cross-image encoder"] == 0
+    assert macs_of(config, images)["cross-image encoder"] == by_hand
 
 
 def test_b14_by_hand() -> None:
     """The paper's model: 256 patches, 64 clusters, and their 66 tokens in the encoder."""
-    costs = {cost.part: cost.macs for cost in part_costs(PRESETS["b14"])}
+    costs = macs_of(PRESETS["b14"])
     attention = 257 * 4 * 768**2 + 2 * 257**2 * 768
     assert costs["backbone blocks"] == 12 * (attention + 257 * 2 * 768 * 3072)
     assert costs["adapters"] == 12 * 190_218_240
@@ -242,15 +228,11 @@ def test_a_model_of_float64_costs_the_same() -> None:
 def test_parameters_are_counted_by_part() -> None:
     shapes = parameter_shapes(SMALL)
     total = sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(shapes))
-    assert sum(cost.parameters for cost in part_costs(SMALL)) == total
     counts = {cost.part: cost.parameters for cost in part_costs(SMALL)}
+    assert sum(counts.values()) == total
     # Without a bias, but the two convolutions'.
     assert counts["adapters"] == 3 * (2 * 32 * 16 + 9 * 16 + 16 + 16 * 16 + 16)
     assert counts["aggregator"] == sum(x.size for x in jax.tree.leaves(shapes.aggregator))
-    assert [cost.part for cost in part_costs(PLAIN)] == [
-        *("backbone embedding, norm", "backbone blocks", "adapters", "aggregator"),
-        "cross-image encoder",
-    ]
 
 
 def test_what_a_program_counts() -> None:
@@ -258,9 +240,6 @@ def test_what_a_program_counts() -> None:
     x, y = jnp.zeros((2, 3)), jnp.zeros((3, 4))
     assert count_macs(jnp.matmul, x, y).total() == 24
     assert count_macs(lambda x, y: (x @ y).sum() + x.sum(), x, y).total() == 24
-    assert (
-        count_macs(jax.jit(lambda x, y: jax.vmap(jnp.vdot, (None, 1))(x[0], y)), x, y).total() == 12
-    )
 
     def scanned(x: Any, y: Any) -> Any:
         return jax.lax.scan(lambda carry, _: (carry, carry @ y), x, length=5)[1]

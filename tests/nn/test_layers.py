@@ -31,8 +31,6 @@ from crisalad_jax.nn.layers import (
     l2_normalise,
     layer_norm,
     linear,
-    split_key,
-    split_statistics,
     train_batch_norm,
 )
 from crisalad_jax.utils.target import GPU, TPU, Target, lowering_for
@@ -42,16 +40,7 @@ def normal(seed: int, *shape: int) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal(shape).astype(np.float32)
 
 
-def test_linear_equals_torch() -> None:
-    x, weight, bias = normal(0, 5, 7), normal(1, 7, 3), normal(2, 3)
-    expected = torch.nn.functional.linear(*map(torch.tensor, (x, weight.T.copy(), bias)))
-    ours = linear(Linear(jnp.asarray(weight), jnp.asarray(bias)), jnp.asarray(x))
-    np.testing.assert_allclose(ours, expected, atol=2e-6)
-    without = linear(Linear(jnp.asarray(weight), None), jnp.asarray(x))
-    np.testing.assert_allclose(without, expected.numpy() - bias, atol=2e-6)
-
-
-STRIDED = [(3, 1, 1), (3, 2, 1), (1, 2, 0), (4, 4, 0), (7, 2, 3), (2, 3, 0)]
+STRIDED = [(3, 1, 1), (4, 4, 0), (7, 2, 3), (2, 3, 0)]
 """Kernel size, stride and padding; the windows of the last leave a row and a column out."""
 
 
@@ -162,17 +151,6 @@ def test_gelu_of_bfloat16_is_computed_in_float32() -> None:
     np.testing.assert_allclose(np.asarray(ours, np.float64), expected, rtol=5e-3)
 
 
-def test_layer_norm_equals_torch() -> None:
-    x, weight, bias = 3 + 2 * normal(0, 5, 16), normal(1, 16), normal(2, 16)
-    expected = torch.nn.functional.layer_norm(
-        torch.tensor(x), (16,), torch.tensor(weight), torch.tensor(bias), eps=1e-2
-    )
-    ours = layer_norm(
-        LayerNorm(jnp.asarray(weight), jnp.asarray(bias)), jnp.asarray(x), epsilon=1e-2
-    )
-    np.testing.assert_allclose(ours, expected, atol=5e-6)
-
-
 def test_derivatives_that_jax_is_told_are_torchs() -> None:
     """Of GELU and of layer norm; of their gradients too, for which nothing is told."""
     x, towards, again = (normal(seed, 5, 7) for seed in (3, 4, 5))
@@ -253,15 +231,6 @@ def test_dropout() -> None:
     assert abs((dropped == 0).mean() - 0.3) < 0.007
 
 
-def test_split_key() -> None:
-    assert split_key(None, 3) == [None, None, None]
-    keys = split_key(jax.random.key(0), 2)
-    assert len(keys) == 2
-    assert keys[0] is not None
-    assert keys[1] is not None
-    assert not jnp.array_equal(jax.random.key_data(keys[0]), jax.random.key_data(keys[1]))
-
-
 def test_starts_are_torch_defaults() -> None:
     """Uniform within 1 / sqrt(fan in): the largest of many draws comes within 1 % of the bound."""
     key = jax.random.key(0)
@@ -322,16 +291,6 @@ def test_batch_norm_of_no_image_keeps_its_statistics() -> None:
     assert np.isfinite(y).all()
     np.testing.assert_array_equal(updated.running_mean, params.running_mean)
     np.testing.assert_array_equal(updated.running_var, params.running_var)
-
-
-def test_statistics_are_found_wherever_they_are() -> None:
-    tree = {"first": (init_batch_norm(2), jnp.ones(3)), "running_mean": jnp.ones(1)}
-    statistics, rest = split_statistics(tree)
-    assert statistics["first"][0].weight is None
-    assert statistics["first"][1] is None
-    assert rest["first"][0].running_var is None
-    assert rest["running_mean"] is None
-    assert len(jax.tree.leaves(statistics)) == 3
 
 
 def test_batch_norm_starts_as_torchs() -> None:

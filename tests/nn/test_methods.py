@@ -36,6 +36,7 @@ from crisalad_jax.nn.model import (
 )
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL, random_params
+from tests.nn.conftest import slow_unless
 
 SMALL = dataclasses.replace(
     MODEL,
@@ -61,13 +62,6 @@ PARTS: dict[str, Aggregator] = {
     "selavpr": SelaVprConfig(hidden=8, local=4),
     "fol": FolConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16, local_hidden=8, local=4),
 }
-METHODS = [
-    # tests/test_model.py and others have enough of these.
-    pytest.param(name, marks=pytest.mark.slow)
-    if name in {"salad", "gem-pyramid", "class-token"}
-    else name
-    for name in PARTS
-]
 RELATED = CrossImageConfig(layers=1, heads=2, feedforward=16, dropout=0.0)
 # Float32 sums of one program, in another place of the batch.
 TOLERANCE = 2e-6
@@ -90,7 +84,7 @@ def test_every_method_is_here() -> None:
     assert all(PARTS[name].part_name == name for name in PARTS)
 
 
-@pytest.mark.parametrize("aggregator", METHODS)
+@pytest.mark.parametrize("aggregator", slow_unless(PARTS.keys() - {"gem-pyramid"}, PARTS))
 def test_descriptors_of_every_method(aggregator: str) -> None:
     """Unit vectors that owe nothing to the batch; near the same in bfloat16."""
     params, config = model(aggregator)
@@ -112,15 +106,8 @@ def test_descriptors_of_every_method(aggregator: str) -> None:
     assert np.abs(half - described).max() > 1e-5  # it did compute in bfloat16
 
 
-@pytest.mark.parametrize(
-    "aggregator",
-    [
-        # A method with a global token alone, and one without.
-        name if name in {"gem", "boq"} else pytest.param(name, marks=pytest.mark.slow)
-        for name in PARTS
-        if name != "anyloc"
-    ],
-)
+# A method with a global token alone, and one without.
+@pytest.mark.parametrize("aggregator", slow_unless({"gem", "boq"}, PARTS.keys() - {"anyloc"}))
 def test_with_the_encoder_images_look_at_each_other(aggregator: str) -> None:
     """Tokens of every method that trains fit it; under `self_mask` it leaves them to themselves."""
     params, config = model(aggregator)
@@ -147,13 +134,7 @@ def test_with_the_encoder_images_look_at_each_other(aggregator: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("part", "width"),
-    [
-        (ConvApConfig(channels=100), 100),
-        (CosPlaceConfig(dim=500), 500),
-        (MixVprConfig(channels=1000), 1000),
-        (BoqConfig(channels=72), 72),
-    ],
+    ("part", "width"), [(ConvApConfig(channels=100), 100), (BoqConfig(channels=72), 72)]
 )
 def test_tokens_that_do_not_fit_the_encoder(part: Aggregator, width: int) -> None:
     words = f"^CrossImageConfig.heads: found 16, expected a divisor of the {width} numbers"

@@ -10,13 +10,11 @@ import pytest
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.config import PRESETS
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import (
     attend_across_images,
     cast_params,
     describe,
     extract_tokens,
-    init_crisalad,
     parameter_shapes,
     self_mask,
     transport_masses,
@@ -24,7 +22,6 @@ from crisalad_jax.nn.model import (
 )
 from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import MODEL as CONFIG
 from tests.conftest import assert_equal, random_params
 
@@ -130,18 +127,6 @@ def test_alone_is_a_batch_of_one(params) -> None:
     assert np.abs(describe(params, images, CONFIG) - together).max() > 100 * TOLERANCE
 
 
-def test_without_encoder_no_image_matters_to_another() -> None:
-    config = dataclasses.replace(CONFIG, cross_image=CrossImageConfig(layers=0))
-    bare = init_crisalad(jax.random.key(0), config)
-    assert bare.cross_image is None
-    images = pictures(4)
-    np.testing.assert_allclose(
-        describe(bare, images, config),
-        describe(bare, images, config, mask=self_mask(4)),
-        atol=TOLERANCE,
-    )
-
-
 def test_describe_is_attention_across_images_after_their_tokens(params) -> None:
     images, mask = pictures(3), valid_mask(jnp.array([True, True, False]))
     tokens = extract_tokens(params, images, CONFIG)
@@ -160,16 +145,6 @@ def test_bytes_are_normalised_and_floats_are_taken_as_they_are(params) -> None:
     )
 
 
-def test_bfloat16_stays_close(params) -> None:
-    config = dataclasses.replace(CONFIG, compute_dtype="bfloat16")
-    half, full = (describe(params, pictures(4), c) for c in (config, CONFIG))
-    assert half.dtype == jnp.float32
-    cosine = (half * full).sum(axis=1)
-    # 8 bits of mantissa through 4 layers: each rounding turns a vector by at most 2^-9.
-    assert cosine.min() > 0.999
-    assert np.abs(half - full).max() > 1e-5  # it did compute in bfloat16
-
-
 def test_dropout_is_drawn_from_the_key(params) -> None:
     plain, first, again, other = (
         describe(params, pictures(3), CONFIG, key=key)
@@ -178,24 +153,6 @@ def test_dropout_is_drawn_from_the_key(params) -> None:
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-3
     assert np.abs(first - plain).max() > 1e-3
-
-
-def test_same_seed_same_parameters() -> None:
-    a, b, c = (named_leaves(init_crisalad(jax.random.key(seed), CONFIG)) for seed in (0, 0, 1))
-    assert all(jnp.array_equal(a[name], b[name]) for name in a)
-    weights = [
-        name for name in a if name.endswith(".weight") and "norm" not in name and ".up." not in name
-    ]
-    assert weights
-    assert all(not jnp.array_equal(a[name], c[name]) for name in weights)
-
-
-def test_names_read_like_torchs() -> None:
-    names = named_leaves(parameter_shapes(CONFIG))
-    assert names["backbone.blocks.attn.qkv.weight"].shape == (2, 32, 96)
-    assert names["backbone.blocks.mlp.fc1.bias"].shape == (2, 128)
-    assert names["aggregator.score.fc2.weight"].shape == (16, 4)
-    assert names["cross_image.layers.1.linear2.weight"].shape == (16, 8)
 
 
 @pytest.mark.usefixtures("_unchecked")

@@ -13,13 +13,6 @@ PIXELS = np.random.default_rng(0).integers(0, 256, (42, 56, 3), dtype=np.uint8)
 LOCAL = PreprocessingConfig(normalisation="local-contrast")
 
 
-def test_imagenet() -> None:
-    mean, deviation = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
-    expected = (PIXELS / 255 - mean) / deviation
-    found = normalise(jnp.asarray(PIXELS), PreprocessingConfig())
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-
-
 def test_bytes_less_a_mean_as_hlocs_netvlad_takes_them() -> None:
     """Mean 123.68, 116.779, 103.939 of 0 to 255, and no deviation."""
     mean = (123.68, 116.779, 103.939)

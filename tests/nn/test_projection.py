@@ -8,13 +8,12 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from crisalad_jax import describe, init_crisalad, load, save_weights
+from crisalad_jax import describe, init_crisalad
 from crisalad_jax.checkpoints.formats import check_holds
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.costs import part_costs
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.model import Model
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.training.trainable import split_params
 from crisalad_jax.utils.errors import InputError
@@ -57,13 +56,6 @@ def test_it_counts_and_trains_with_the_head() -> None:
     assert part_costs(CONFIG)[:-1] == part_costs(PLAIN)
     trainable, _ = split_params(PARAMS, CONFIG, "head")
     assert trainable.projection.weight is not None
-
-
-def test_a_file_keeps_it(tmp_path) -> None:
-    save_weights(tmp_path / "w.safetensors", Model(PARAMS, CONFIG))
-    loaded, config = load(tmp_path / "w.safetensors")
-    assert config == CONFIG
-    np.testing.assert_array_equal(loaded.projection.bias, PARAMS.projection.bias)
 
 
 def test_layouts_without_a_place_for_it_refuse_it() -> None:

@@ -1,6 +1,4 @@
-"""The aggregators beside SALAD, by hand and by torch's pooling; the order of a descriptor."""
-
-import itertools
+"""Generalised means at their floor, regions by torch's pooling, the order of a descriptor."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +9,14 @@ import torch
 from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.aggregators.base import Aggregator, to_descriptor
-from crisalad_jax.nn.aggregators.gem import Gem, GemPyramidConfig, gem_pyramid
+from crisalad_jax.nn.aggregators.conv_ap import adaptive_means
+from crisalad_jax.nn.aggregators.gem import (
+    CosPlace,
+    CosPlaceConfig,
+    GemConfig,
+    GemPyramidConfig,
+    gem,
+)
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -49,40 +54,45 @@ def test_descriptors_have_the_published_order(name: str) -> None:
     np.testing.assert_allclose(to_descriptor(tokens, aggregator)[:4], first / 506**0.5, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("grid", "cuts"),
-    [
-        # The published slices of the 16 x 16 grid: 8; 5, 11. And a wide grid, cut in proportion.
-        ((16, 16), {2: ([0, 8, 16], [0, 8, 16]), 3: ([0, 5, 11, 16], [0, 5, 11, 16])}),
-        ((6, 9), {2: ([0, 3, 6], [0, 4, 9]), 3: ([0, 2, 4, 6], [0, 3, 6, 9])}),
-    ],
-)
-@pytest.mark.parametrize("exponent", [3.0, 1.7])
-def test_the_pyramid_is_torchs_pooling_of_its_regions(grid, cuts, exponent: float) -> None:
-    patches = np.random.default_rng(0).normal(size=(grid[0] * grid[1], 20)).astype(np.float32)
-    found = gem_pyramid(jnp.asarray(patches), jnp.asarray(exponent), grid)
-    maps = torch.nn.functional.normalize(torch.tensor(patches).T.reshape(1, 20, *grid), dim=1)
-    regions = [
-        torch.nn.functional.lp_pool2d(
-            (region := maps[:, :, top:bottom, left:right].clamp(min=1e-6)),
-            exponent,
-            kernel_size=region.shape[2:],
-        )[0, :, 0, 0]
-        # A sum of powers where this is a mean.
-        / ((bottom - top) * (right - left)) ** (1 / exponent)
-        for rows, columns in cuts.values()
-        for top, bottom in itertools.pairwise(rows)
-        for left, right in itertools.pairwise(columns)
-    ]
-    assert len(regions) == 13
-    # Means of at most 81 numbers below 1, each the result of two powers of a few roundings.
-    np.testing.assert_allclose(found, torch.stack(regions), atol=2e-6)
+@pytest.mark.parametrize("config", [GemConfig(), GemPyramidConfig(), CosPlaceConfig(dim=7)])
+def test_means_start_at_the_published_exponent(config: Aggregator) -> None:
+    params = config.init(KEY, VIT, (16, 16))
+    assert (params.p.shape, float(params.p)) == ((), 3.0)
+    if isinstance(params, CosPlace):
+        bound = 768**-0.5  # torch's nn.Linear
+        assert 0.7 * bound < jnp.abs(params.fc.weight).max() <= bound
+        assert params.fc.bias is not None
+        assert params.fc.bias.any()  # EigenPlaces and CosPlace alike have a bias
 
 
-def test_the_pyramid_starts_at_the_published_exponent() -> None:
-    pyramid = GemPyramidConfig().init(KEY, VIT, (16, 16))
-    assert isinstance(pyramid, Gem)
-    assert (pyramid.p.shape, float(pyramid.p)) == ((), 3.0)  # CricaVPR's GeM(p=3)
+def test_negative_numbers_count_as_the_floor() -> None:
+    found = gem(jnp.array([[-3.0, 4.0]]), jnp.asarray(3.0))
+    # The floor's logarithm is 14, whose rounding is the exponential's relative error.
+    np.testing.assert_allclose(found, [1e-6, 0.8], rtol=2e-6)
+
+
+def test_channels_at_the_floor_have_gradients_under_high_exponents() -> None:
+    """Where (1e-6)^8 is 0 in float32; by hand the mean is the floor whatever the exponent."""
+
+    def total(patches: jax.Array, p: jax.Array) -> jax.Array:
+        return gem(patches, p).sum()
+
+    patches = -jnp.abs(jax.random.normal(KEY, (2, 9, 20)))
+    value, slopes = jax.jit(jax.value_and_grad(total, argnums=(0, 1)))(patches, jnp.asarray(8.0))
+    np.testing.assert_allclose(value, 40e-6, rtol=1e-5)
+    np.testing.assert_array_equal(slopes[0], 0)
+    # Equal numbers: the terms that cancel are of size log(1e-6) * 1e-6.
+    np.testing.assert_allclose(slopes[1], 0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("grid", "side"), [((5, 7), 2), ((4, 6), 2), ((5, 7), 3), ((2, 3), 1)])
+def test_regions_are_those_of_torchs_adaptive_pooling(grid: tuple[int, int], side: int) -> None:
+    patches = np.random.default_rng(0).normal(size=(grid[0] * grid[1], 6)).astype(np.float32)
+    pool = torch.nn.AdaptiveAvgPool2d((side, side))
+    expected = pool(torch.tensor(patches).T.unflatten(1, grid)).flatten(1).T
+    # Means of at most 35 numbers of order 1.
+    found = adaptive_means(jnp.asarray(patches), grid, side)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_a_class_token_is_all_there_is() -> None:

@@ -13,7 +13,6 @@ from crisalad_jax.nn.aggregators.salad import Salad, SaladConfig
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.tokens import Tokens
-from crisalad_jax.sinkhorn import SinkhornConfig
 
 CONFIG = SaladConfig(clusters=3, cluster_dim=4, token_dim=8, hidden=16, dropout=0.5)
 
@@ -40,19 +39,6 @@ def test_tokens_are_unit_vectors_and_do_not_depend_on_the_order_of_patches() -> 
         # float32 rounding of lengths and of sums taken in another order.
         np.testing.assert_allclose(jnp.linalg.norm(ours, axis=-1), 1, atol=1e-6)
         np.testing.assert_allclose(ours, other, atol=1e-6)
-
-
-def test_dropout_is_on_with_a_key_only() -> None:
-    params = init_salad(CONFIG)
-    plain = salad(params, features(10), CONFIG, key=None)
-    first, again, other = (
-        salad(params, features(10), CONFIG, key=jax.random.key(seed)) for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(first.local, again.local)
-    assert not np.allclose(first.local, other.local, atol=1e-3)
-    assert not np.allclose(first.local, plain.local, atol=1e-3)
-    # The public implementation has no dropout in the global token's network.
-    np.testing.assert_array_equal(first.global_token, plain.global_token)
 
 
 def test_dropout_stands_before_relu_of_the_two_local_networks(monkeypatch) -> None:
@@ -96,26 +82,6 @@ def test_a_batch_is_its_images_under_every_dustbin(dustbin: str) -> None:
             functools.partial(np.testing.assert_allclose, atol=1e-6), together[:2], others[:2]
         )
         jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-5), together, others)
-
-
-@pytest.mark.parametrize(
-    ("dustbin", "live"), [("column", False), ("row and column", True), ("mass", True)]
-)
-def test_the_published_dustbin_is_dead_and_others_live(dustbin: str, live: bool) -> None:
-    sinkhorn = SinkhornConfig(domain="log")
-    config = dataclasses.replace(CONFIG, dustbin=dustbin, sinkhorn=sinkhorn)
-    params = init_salad(config)
-    sharp = features(30)
-    sharp = sharp._replace(patches=20 * sharp.patches)
-
-    def lost(dust_bin: jax.Array) -> jax.Array:
-        replaced = dataclasses.replace(params, dust_bin=dust_bin)
-        log_plan = config.transport(replaced, sharp, key=None).log_plan
-        return jnp.sin(3 * jnp.exp(log_plan)).sum()
-
-    gradient = abs(float(jax.grad(lost)(jnp.float32(1))))
-    # Rounding noise of sums of a hundred terms of order 1, against what a live parameter has.
-    assert gradient > 1e-3 if live else gradient < 1e-4
 
 
 def test_a_dustbin_score_a_patch_is_the_networks_own_column() -> None:

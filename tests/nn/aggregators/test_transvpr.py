@@ -1,4 +1,4 @@
-"""TransVPR's descriptor and key patches by hand; its levels against the backbone's own layers."""
+"""TransVPR's key patches by hand; its levels against the backbone's own layers."""
 
 import dataclasses
 
@@ -7,9 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.nn.aggregators.base import to_descriptor
-from crisalad_jax.nn.aggregators.transvpr import TransVpr, TransVprConfig, attentions, key_features
-from crisalad_jax.nn.backbones.base import Features
+from crisalad_jax.nn.aggregators.transvpr import TransVpr, TransVprConfig, key_features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
@@ -55,45 +53,6 @@ def test_a_models_last_level_is_its_backbones_last_layer() -> None:
     descriptors = describe(params, images, CONFIG)
     assert descriptors.shape == (2, 8)
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, atol=1e-6)
-
-
-def by_hand(params: TransVpr, patches: np.ndarray, levels: int) -> np.ndarray:
-    """Patch by patch, in float64."""
-    attention, weight = (np.asarray(x.weight, float) for x in (params.attention, params.reduction))
-    dim = patches.shape[1] // levels
-    pooled = []
-    for level in range(levels):
-        scores = [np.exp(patch @ attention[:, level]) for patch in patches]
-        total = np.zeros(dim)
-        for patch, score in zip(patches, scores, strict=True):
-            total += score / sum(scores) * patch[level * dim : (level + 1) * dim]
-        pooled.append(total)
-    joined = np.concatenate(pooled)
-    bias = np.asarray(params.reduction.bias, float)
-    found = joined / np.linalg.norm(joined) @ weight + bias
-    return found / np.linalg.norm(found)
-
-
-def test_the_descriptor_by_hand() -> None:
-    params = start()
-    assert isinstance(params, TransVpr)
-    assert params.attention.bias is None
-    patches = np.random.default_rng(0).standard_normal((12, 48))
-    features = Features(jnp.zeros(16), jnp.asarray(patches, jnp.float32))
-    tokens = CONFIG.aggregator.apply(params, features, (3, 4), key=None)
-    assert tokens.local.shape == (0, 8)
-    # float32 sums of at most 48 numbers of order 1.
-    np.testing.assert_allclose(
-        to_descriptor(tokens, CONFIG.aggregator), by_hand(params, patches, 3), atol=1e-6
-    )
-
-
-def test_attentions_are_shares_of_the_patches() -> None:
-    params = start()
-    patches = jax.random.normal(jax.random.key(2), (2, 12, 48)).astype(jnp.bfloat16)
-    weights = attentions(params, patches)
-    assert (weights.shape, weights.dtype) == ((2, 12, 3), jnp.float32)
-    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
 
 
 def test_key_patches_by_hand() -> None:

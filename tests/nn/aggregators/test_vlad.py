@@ -1,7 +1,6 @@
-"""NetVLAD and AnyLoc against loops over patches and clusters, and the block that a facet is of."""
+"""Hard VLAD by loops, the starts from centroids, bursts, and whose vocabulary it is."""
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
@@ -23,13 +22,11 @@ from crisalad_jax.nn.aggregators.vlad import (
     burst_weights,
     scores_from_centroids,
 )
-from crisalad_jax.nn.backbones.base import Features, FeatureSpec
+from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.layers import Linear, init_linear, l2_normalise
-from crisalad_jax.nn.model import attend_across_images, self_mask
-from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.nn.layers import init_linear, l2_normalise
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import random_params
 
@@ -54,21 +51,6 @@ FEATURES = np.stack([unit(row) for row in PATCHES.reshape(-1, 6)])
 def sums_of(config: VladConfig, params: Any, patches: jax.Array) -> jax.Array:
     features = Features(patches[..., 0, :0], patches)
     return config.apply(params, features, (1, patches.shape[-2]), key=None).local
-
-
-def test_netvlad_is_the_papers_sum() -> None:
-    """Eq. 4, patch by patch and cluster by cluster, in float64."""
-    weight = np.random.default_rng(2).normal(size=(6, 4)).astype(np.float32)
-    params = NetVlad(Linear(jnp.asarray(weight), None), jnp.asarray(CENTROIDS))
-    found = sums_of(NetVladConfig(clusters=4), params, jnp.asarray(PATCHES))
-    for image, clusters in zip(PATCHES.astype(np.float64), found, strict=True):
-        sums = np.zeros((4, 6))
-        for patch in map(unit, image):
-            exponentials = [np.exp(weight[:, k] @ patch) for k in range(4)]
-            for k in range(4):
-                sums[k] += exponentials[k] / sum(exponentials) * (patch - CENTROIDS[k])
-        # Sums of nine numbers around 1 in float32, divided by their length.
-        np.testing.assert_allclose(clusters, [unit(row) for row in sums], atol=1e-6)
 
 
 def distance(patch: np.ndarray, word: np.ndarray) -> float:
@@ -190,40 +172,6 @@ def test_without_features_centroids_are_random_and_unit() -> None:
         np.testing.assert_allclose(np.linalg.norm(centroids, axis=1), 1, rtol=1e-6)
 
 
-def test_a_facet_looks_at_no_block_after_its_own() -> None:
-    """All of those after it NaN, and of its own what a facet does not need."""
-    params = random_params(MODEL).backbone
-    images = jax.random.normal(jax.random.key(1), (1, 42, 56, 3))
-    spoilt = jax.tree.map(lambda leaf: leaf.at[2:].set(jnp.nan), params.blocks)
-    beyond = dataclasses.replace(
-        spoilt, mlp=jax.tree.map(lambda x: x.at[1:].set(jnp.nan), spoilt.mlp)
-    )
-
-    @functools.partial(jax.jit, static_argnums=2)
-    def run(params: Any, images: jax.Array, name: Any) -> Features:
-        return VIT.apply(params, images, AnyLocConfig(layer=1, facet=name).features(VIT.depth))[0]
-
-    assert AnyLocConfig(layer=1).features(3) == FeatureSpec((2,), "value", norm=False)
-    for name, blocks in (("value", beyond), ("token", spoilt)):
-        found = run(dataclasses.replace(params, blocks=blocks), images, name)
-        expected = run(params, images, name)
-        assert np.isfinite(expected.patches).all()
-        np.testing.assert_array_equal(found.patches, expected.patches)
-        np.testing.assert_array_equal(found.class_token, expected.class_token)
-
-
-def test_netvlads_tokens_fit_the_encoder() -> None:
-    """It has no global token, which the encoder's switch leaves on."""
-    config = dataclasses.replace(MODEL, cross_image=CrossImageConfig(heads=4, feedforward=8))
-    params = random_params(config)
-    local = jax.random.normal(jax.random.key(1), (2, 3, 32))
-    found = attend_across_images(
-        params, Tokens(jnp.zeros((2, 0)), local), config, mask=self_mask(2)
-    )
-    assert found.shape == (2, config.descriptor_dim) == (2, 96)
-    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-6)
-
-
 def test_a_vocabulary_knows_its_backbone() -> None:
     config = AnyLocConfig(clusters=2, layer=1)
     backbone = random_params(MODEL).backbone
@@ -244,22 +192,6 @@ def test_a_vocabulary_knows_its_backbone() -> None:
     assert len(digests) == 4
     with pytest.raises(InputError, match=r"^some.safetensors: found a vocabulary of another back"):
         config.check_backbone(bound, backbone, "some.safetensors")
-
-
-def test_a_files_metadata_keep_whose_vocabulary_it_is() -> None:
-    """Beside the arrays: no cast of these can spoil it."""
-    config, words = AnyLocConfig(clusters=2), AnyLoc(jnp.ones((2, 32)))
-    assert config.metadata(words) == {}
-    assert config.with_metadata(words, {}).backbone == words.backbone
-    bound = config.attach_backbone_hash(words, random_params(MODEL).backbone)
-    kept = config.metadata(bound)
-    assert kept == {"backbone": bound.backbone}
-    half = jax.tree.map(lambda leaf: leaf.astype(jnp.bfloat16), bound)
-    assert half.backbone == bound.backbone
-    assert config.with_metadata(words, kept).backbone == bound.backbone
-    # Of any other method there is nothing to keep.
-    assert MODEL.aggregator.metadata(None) == {}
-    assert MODEL.aggregator.attach_backbone_hash(words, None) is words
 
 
 def test_patches_that_are_alike_share_their_weight() -> None:

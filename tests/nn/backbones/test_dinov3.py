@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.checkpoints.formats import check_holds, infer, public_shapes, to_params, to_state
+from crisalad_jax.checkpoints.formats import check_holds, infer, public_shapes, to_params
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.attention import rotate
 from crisalad_jax.nn.backbones import Features, FeatureSpec
-from crisalad_jax.nn.backbones.dinov3 import DinoV3Config, rotary_angles
+from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
 from crisalad_jax.nn.backbones.vit import ViT
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
@@ -47,35 +47,6 @@ def heads(seed: int, tokens: int, dim: int = 16) -> jax.Array:
     return jax.random.normal(jax.random.key(seed), (2, tokens, 3, dim))
 
 
-def test_pairs_turn_like_complex_numbers() -> None:
-    """Number i of a head + j times number i + 8, times exp(j angle), by loops over patches."""
-    x = np.asarray(heads(0, 12))
-    expected = np.empty_like(x)
-    for row in range(3):
-        for column in range(4):
-            place = (2 * row + 1) / 3 - 1, (2 * column + 1) / 4 - 1
-            angles = [2 * np.pi * at / 100 ** (i / 4) for at in place for i in range(4)]
-            patch = 4 * row + column
-            pairs = (x[:, patch, :, :8] + 1j * x[:, patch, :, 8:]) * np.exp(1j * np.array(angles))
-            expected[:, patch] = np.concatenate([pairs.real, pairs.imag], axis=-1)
-    found = rotate(heads(0, 12), CONFIG.rotation(GRID))
-    # Products of numbers of order 3 in float32.
-    np.testing.assert_allclose(found, expected, atol=2e-6)
-
-
-def test_scores_depend_on_where_patches_are_to_each_other() -> None:
-    """One query and one key at all patches: of the same step, the same score."""
-    rotation = CONFIG.rotation((4, 4))
-    query, key = (jnp.broadcast_to(heads(seed, 1)[:1], (1, 16, 3, 16)) for seed in (0, 1))
-    scores = jnp.einsum("bqhd,bkhd->hqk", rotate(query, rotation), rotate(key, rotation))
-    scores = np.asarray(scores).reshape(3, 4, 4, 4, 4)
-    # 16 products of order 3 in float32.
-    np.testing.assert_allclose(scores[:, 1:, :, 1:], scores[:, :-1, :, :-1], atol=1e-5)
-    np.testing.assert_allclose(scores[:, :, 1:, :, 1:], scores[:, :, :-1, :, :-1], atol=1e-5)
-    assert np.abs(scores[:, 1, 1, 1, 2] - scores[:, 1, 1, 2, 1]).max() > 0.1
-    assert np.abs(scores[:, 1, 1, 1, 2] - scores[:, 1, 2, 1, 1]).max() > 0.1
-
-
 def test_tokens_in_front_are_not_rotated() -> None:
     x = heads(0, 15)
     turned = rotate(x, CONFIG.rotation(GRID))
@@ -88,15 +59,6 @@ def test_half_precision_is_rounded_once() -> None:
     once = rotate(x.astype(jnp.float32), CONFIG.rotation(GRID)).astype(jnp.bfloat16)
     assert rotate(x, CONFIG.rotation(GRID)).dtype == jnp.bfloat16
     np.testing.assert_array_equal(rotate(x, CONFIG.rotation(GRID)), once)
-
-
-def test_a_resized_image_has_the_same_angles_at_its_edges() -> None:
-    """Of one row the centre is 0; patches are half a patch from the edges, at -1 and 1."""
-    for side in (2, 5, 40):
-        angles = rotary_angles((1, side), 8).reshape(side, 2, 2)
-        np.testing.assert_allclose(angles[:, 0], 0, atol=1e-12)  # float64
-        edge = 2 * np.pi * (1 - 1 / side)
-        np.testing.assert_allclose(angles[[0, -1], 1, 0], [-edge, edge], rtol=1e-12)
 
 
 def with_key_bias(params: ViT, value: jax.Array) -> ViT:
@@ -139,50 +101,28 @@ def test_sides_are_multiples_of_16() -> None:
         DinoV3Config(dim=12, depth=1, heads=2)
 
 
-LABELS = jnp.array([0, 0, 1, 1])
-
-
-def stepped(trainable: str, **changes: str) -> dict[str, np.ndarray]:
-    """By how much a step moves each parameter of the model, adapters beside its blocks."""
+def test_a_step_moves_the_last_block_and_no_bias_of_keys() -> None:
+    """In a model with adapters beside its blocks."""
     backbone = dataclasses.replace(CONFIG, adapter=AdapterConfig(kind="mlp"))
-    model = dataclasses.replace(MODEL, backbone=backbone, **changes)
-    params = random_params(model)
-    step = StepConfig(
-        model,
-        LossConfig(kind=MultiSimilarityConfig(base=0.5)),
-        OptimiserConfig(learning_rate=1e-3, weight_decay=0.0),
-        10,
-    )
-    state, frozen = init_train_state(params, trainable, step)
+    model = dataclasses.replace(MODEL, backbone=backbone, remat="full", compute_dtype="bfloat16")
+    optimiser = OptimiserConfig(learning_rate=1e-3, weight_decay=0.0)
+    step = StepConfig(model, LossConfig(kind=MultiSimilarityConfig(base=0.5)), optimiser, 10)
+    before = random_params(model)
+    state, frozen = init_train_state(before, "last-1-blocks+head", step)
     pictures = np.random.default_rng(0).integers(0, 256, (4, 48, 64, 3), np.uint8)
-    batch = pictures, LABELS, np.ones(4, bool)
+    batch = pictures, jnp.array([0, 0, 1, 1]), np.ones(4, bool)
     state, metrics = train_step(state, frozen, *batch, jax.random.key(0), step)
     assert metrics.updated
     after = named_leaves(merge_params(state.trainable, frozen, model))
-    return {name: np.asarray(after[name] - leaf) for name, leaf in named_leaves(params).items()}
-
-
-@pytest.mark.parametrize(
-    ("trainable", "remat", "dtype"),
-    [
-        ("adapters+head", "full", "bfloat16"),
-        pytest.param("last-1-blocks+head", "dots", "float32", marks=pytest.mark.slow),
-    ],
-)
-def test_a_step_moves_what_trains_alone(trainable: str, remat: str, dtype: str) -> None:
-    moved = stepped(trainable, remat=remat, compute_dtype=dtype)
+    moved = {name: np.asarray(after[name] - leaf) for name, leaf in named_leaves(before).items()}
     for name, change in moved.items():
-        if not name.startswith("backbone."):
-            assert change.any(), name
-        elif trainable == "adapters+head":
-            assert bool(change.any()) == (".adapter." in name), name
-        elif name.startswith("backbone.blocks."):
+        if name.startswith("backbone.blocks."):
             assert not change[:2].any(), name
             assert change[2].any(), name
         else:
-            assert bool(change.any()) == name.startswith("backbone.norm."), name
-    keys = moved["backbone.blocks.attn.qkv.bias"][:, 32:64]
-    assert not keys.any()
+            head = not name.startswith("backbone.") or name.startswith("backbone.norm.")
+            assert bool(change.any()) == head, name
+    assert not moved["backbone.blocks.attn.qkv.bias"][:, 32:64].any()
 
 
 BACKBONE = ModelConfig(
@@ -192,8 +132,8 @@ BACKBONE = ModelConfig(
 )
 
 
-def published_state(biases: bool) -> dict[str, np.ndarray]:
-    """A file of facebookresearch/dinov3's names; in the published ones every bias of qkv is 0."""
+def published_state() -> dict[str, np.ndarray]:
+    """A file of facebookresearch/dinov3's names, with biases of queries and of values."""
     rng = np.random.default_rng(0)
     state = {
         name: rng.standard_normal(shape).astype(np.float32)
@@ -202,28 +142,13 @@ def published_state(biases: bool) -> dict[str, np.ndarray]:
     periods = 100 ** (np.arange(16) / 16)
     state["rope_embed.periods"] = periods.astype(jnp.bfloat16).astype(np.float32)
     for i in range(2):
-        mask = np.repeat([1.0, 0.0, 1.0] if biases else [0.0, 0.0, 0.0], 64)
-        state[f"blocks.{i}.attn.qkv.bias_mask"] = mask.astype(np.float32)
-        state[f"blocks.{i}.attn.qkv.bias"] *= mask.astype(np.float32)
+        state[f"blocks.{i}.attn.qkv.bias_mask"] = np.repeat(np.float32([1, 0, 1]), 64)
     return state
-
-
-@pytest.mark.parametrize("biases", [False, True])
-def test_a_published_file_comes_back_bit_for_bit(biases: bool) -> None:
-    state = published_state(biases)
-    assert infer(state, source="file") == ("dinov3", BACKBONE)
-    params, extras = to_params(state, BACKBONE, "dinov3", source="file")
-    check_holds(BACKBONE, "dinov3")
-    back = to_state(params, BACKBONE, "dinov3", extras)
-    assert list(back) == list(state)
-    for name, array in state.items():
-        assert back[name].tobytes() == array.tobytes(), name
 
 
 def test_a_masked_bias_is_none() -> None:
     """The public code multiplies biases by the mask, whatever the file holds below it."""
-    state = published_state(biases=True)
-    state["blocks.0.attn.qkv.bias"] += 1
+    state = published_state()
     state["blocks.1.attn.qkv.bias_mask"][:] = 0
     params, _ = to_params(state, BACKBONE, "dinov3", source="file")
     found = params.backbone.blocks.attn.qkv.bias
@@ -232,7 +157,7 @@ def test_a_masked_bias_is_none() -> None:
 
 
 def test_other_periods_are_refused() -> None:
-    state = published_state(biases=False)
+    state = published_state()
     state["rope_embed.periods"] *= 1.01
     with pytest.raises(
         InputError, match=r"^file: rope_embed.periods found \[1.0\d+, .*about \[1.0"

@@ -1,7 +1,7 @@
 """Transport plans against their defining properties, numpy and torch, in float32.
 
 Other libraries' plans and all exact gradients are in test_sinkhorn_float64.py, bad input in
-test_sinkhorn_input.py, the published outputs and gradients in parity/test_goldens.py.
+test_sinkhorn_input.py, the published iterations in parity/.
 """
 
 import dataclasses
@@ -28,7 +28,6 @@ from crisalad_jax.sinkhorn import (
     SinkhornConfig,
     SinkhornResult,
     SinkhornStep,
-    Step,
     append_dustbin,
     assign_with_dustbin,
     log_marginals,
@@ -37,61 +36,19 @@ from crisalad_jax.sinkhorn import (
     solve,
 )
 from crisalad_jax.utils.errors import InputError
+from tests.nn.conftest import slow_unless
+from tests.nn.transport.problems import implicit
 
 
 def scores_of(seed: int, *shape: int, scale: float = 1.0) -> jax.Array:
     return scale * jax.random.normal(jax.random.key(seed), shape)
 
 
-def implicit(**fields: Any) -> SinkhornConfig:
-    standard: dict[str, Any] = {"gradient": "implicit", "tolerance": 1e-5, "iterations": 300}
-    return SinkhornConfig(**{**standard, **fields})
-
-
-def take(step: Step, problem: Problem, at: Potentials) -> Potentials:
-    """One iteration of a step that has no state."""
-    return step.step(problem, at, None, jnp.zeros((), int))[0]
-
-
 def plan_of(result: SinkhornResult) -> np.ndarray:
     return np.exp(np.asarray(result.log_plan, np.float64))
 
 
-# The published algorithm
-
-
-def published(scores: np.ndarray, dustbin: float, epsilon: float, count: int) -> np.ndarray:
-    """SALAD's log_otp_solver, written out in torch from the paper: (K, N), clusters first."""
-    kernel = torch.from_numpy(np.asarray(scores, np.float64)).T / epsilon
-    clusters, rows = kernel.shape
-    kernel = torch.cat([kernel, torch.full((1, rows), dustbin / epsilon)])
-    log_a = torch.zeros(clusters + 1)
-    log_a[-1] = np.log(rows - clusters)
-    u, v = torch.zeros(clusters + 1), torch.zeros(rows)
-    for _ in range(count):
-        u = log_a - torch.logsumexp(kernel + v, dim=1)
-        v = -torch.logsumexp(kernel + u[:, None], dim=0)
-    return torch.exp(kernel + u[:, None] + v).T.numpy()
-
-
-@pytest.mark.parametrize(
-    ("config", "count"),
-    [
-        (SinkhornConfig(), 3),  # by default
-        *((SinkhornConfig(iterations=n), n) for n in (1, 12)),
-        *((SinkhornConfig(iterations=n, domain="log"), n) for n in (1, 3, 12)),
-    ],
-)
-def test_equals_the_published_iterations(config: SinkhornConfig, count: int) -> None:
-    scores = scores_of(1, 2, 9, 4, scale=3.0)
-    for dustbin, epsilon in ((1.3, 0.7), (-0.4, 1.0)):
-        result = assign_with_dustbin(scores, jnp.float32(dustbin), epsilon=epsilon, config=config)
-        for one, plan in zip(np.asarray(scores), plan_of(result), strict=True):
-            # Logarithms of order 10 in float32.
-            np.testing.assert_allclose(plan, published(one, dustbin, epsilon, count), rtol=1e-5)
-        np.testing.assert_array_equal(result.iterations, [count, count])
-        assert result.finite.all()
-        assert not result.converged.any()  # nothing was asked of them
+# Over-relaxation
 
 
 @pytest.mark.parametrize("fields", [{}, {"row_tau": 0.7}, {"column_tau": 0.7}], ids=str)
@@ -123,23 +80,13 @@ def test_over_relaxation_never_makes_the_dual_fall() -> None:
         plan = np.exp(scores + row[:, None] + column)
         return row.sum() + np.exp(log_nu) @ column - plan.sum()
 
-    def duals(step: Callable[[Problem, Potentials], Potentials]) -> np.ndarray:
-        problem = Problem.of(*(jnp.asarray(x, jnp.float32) for x in (scores, log_mu, log_nu)))
-        at, found = Potentials(jnp.zeros(30), jnp.zeros(5)), []
-        for _ in range(20):
-            at = step(problem, at)
-            found.append(dual(*(np.asarray(x, np.float64) for x in at)))
-        return np.array(found)
-
-    def unguarded(problem: Problem, at: Potentials) -> Potentials:
-        column = problem.log_nu - problem.lse_rows(at.row)
-        column = at.column + 1.9 * (column - at.column)
-        row = problem.log_mu - problem.lse_columns(column)
-        return Potentials(at.row + 1.9 * (row - at.row), column)
-
+    problem = Problem.of(*(jnp.asarray(x, jnp.float32) for x in (scores, log_mu, log_nu)))
+    at, step, duals = Potentials(jnp.zeros(30), jnp.zeros(5)), SinkhornStep(relaxation=1.9), []
+    for number in range(20):
+        at, _ = step.step(problem, at, None, jnp.asarray(number))
+        duals.append(dual(*(np.asarray(x, np.float64) for x in at)))
     # Rounding of float32 potentials of order 10, times masses of 30.
-    assert (np.diff(duals(functools.partial(take, SinkhornStep(relaxation=1.9)))) > -1e-4).all()
-    assert (np.diff(duals(unguarded)) < -1).any()
+    assert (np.diff(duals) > -1e-4).all()
 
 
 # Diagnostics
@@ -160,8 +107,6 @@ def test_marginal_error_by_hand() -> None:
     # Rounding of logarithms.
     np.testing.assert_allclose(rows, 0.25, atol=1e-6)
     np.testing.assert_allclose(columns, 0.25, atol=1e-6)
-    rows, columns = marginal_error(plan, jnp.log(jnp.array([0.5, 1.5])), jnp.log(jnp.ones(2)))
-    np.testing.assert_allclose(rows, 0.5, atol=1e-6)
 
 
 def test_iterations_are_counted_until_nothing_changes_more() -> None:
@@ -187,18 +132,6 @@ def test_iterations_are_counted_until_nothing_changes_more() -> None:
             assert result.column_error <= tolerance
 
 
-def test_the_tolerance_bounds_the_error_that_is_left() -> None:
-    for seed in range(3):
-        for tolerance in (0.1, 1e-3):
-            scores = scores_of(seed, 16, 40, 6, scale=5.0)
-            result = assign_with_dustbin(
-                scores, 0.0, config=implicit(tolerance=tolerance, iterations=2000)
-            )
-            assert result.converged.all()
-            # The change is of logarithms: exp(0.1) is 0.105 from 1. And rounding.
-            assert (result.column_error <= np.expm1(tolerance) + 1e-5).all()
-
-
 def test_a_change_of_the_rows_alone_goes_on_too() -> None:
     """Flat scores and even columns: the first step moves rows only, and the second nothing."""
     mu = np.array([0.25, 0.5, 1.0, 2.25])
@@ -211,14 +144,7 @@ def test_a_change_of_the_rows_alone_goes_on_too() -> None:
 
 
 @pytest.mark.parametrize(
-    "config",
-    [
-        SinkhornConfig(),
-        SinkhornConfig(domain="log"),
-        implicit(tolerance=1e-3),
-        SinkhornConfig(step="softmax"),
-    ],
-    ids=["scaling", "log", "tolerance", "softmax"],
+    "config", [SinkhornConfig(), SinkhornConfig(domain="log"), implicit()], ids=["3", "log", "rest"]
 )
 def test_what_is_not_finite_says_so_and_has_not_converged(config: SinkhornConfig) -> None:
     """Under `jit`, where no value can be refused; its neighbour in the batch has."""
@@ -241,17 +167,7 @@ def test_what_is_not_finite_says_so_and_has_not_converged(config: SinkhornConfig
 SLOW = pytest.mark.slow
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {},
-        {"step": "newton"},
-        {"gradient": "optimistix"},
-        pytest.param({"anderson_memory": 4}, marks=SLOW),
-        pytest.param({"gradient": "stop"}, marks=SLOW),
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("fields", [{}, {"step": "newton"}, {"gradient": "optimistix"}], ids=str)
 def test_too_small_a_budget_is_reported_and_can_raise(fields: Any) -> None:
     scores = scores_of(0, 2, 30, 5, scale=20.0).at[1].multiply(0.001)
     config = implicit(iterations=4, **fields)
@@ -284,9 +200,9 @@ def test_too_small_a_budget_is_reported_and_can_raise(fields: Any) -> None:
 def test_acceleration_accelerates(fields: Any) -> None:
     """Sharp scores, where the plain iteration takes hundreds."""
     scores = scores_of(1, 4, 40, 6, scale=6.0)
-    plain = assign_with_dustbin(scores, 0.0, config=implicit(tolerance=1e-3, iterations=2000))
-    fast = assign_with_dustbin(
-        scores, 0.0, config=implicit(tolerance=1e-3, iterations=2000, **fields)
+    plain, fast = (
+        assign_with_dustbin(scores, 0.0, config=implicit(tolerance=1e-3, iterations=2000, **more))
+        for more in ({}, fields)
     )
     assert plain.converged.all()
     assert fast.converged.all()
@@ -409,15 +325,8 @@ def test_anderson_takes_the_mean_where_all_moves_are_alike() -> None:
 
 def test_anderson_is_the_plain_iteration_where_moves_are_too_long_to_square() -> None:
     scores, log_mu, log_nu = scores_of(2, 12, 5, scale=1e25), *log_marginals(12, 4)
-    plans = [
-        solve(
-            scores,
-            log_mu,
-            log_nu,
-            config=SinkhornConfig(anderson_memory=size, iterations=4, domain="log"),
-        )
-        for size in (0, 3)
-    ]
+    configs = (SinkhornConfig(anderson_memory=n, iterations=4, domain="log") for n in (0, 3))
+    plans = [solve(scores, log_mu, log_nu, config=config) for config in configs]
     assert jnp.isfinite(plans[0].log_plan).all()
     # The potentials: plans of float32 scores of 1e25 are all rounding. The very same code.
     for plain, ours in zip(*(plan.potentials for plan in plans), strict=True):
@@ -455,30 +364,6 @@ def test_scaling_is_for_scores_in_a_row_up_to_60_apart(apart: int, scaled: bool)
     assert (scaling != logarithmic).any() == scaled
 
 
-@pytest.mark.parametrize("iterations", [4, 20])
-def test_too_far_apart_for_scaling_falls_back_to_the_log_domain(iterations: int) -> None:
-    weights = scores_of(4, 12, 5)
-
-    def both(domain: Any) -> Any:
-        def of(scores: jax.Array) -> Any:
-            config = SinkhornConfig(domain=domain, iterations=iterations)
-            log_plan = assign_with_dustbin(scores, 1.0, config=config).log_plan
-            return (weights * jnp.exp(log_plan)).sum(), log_plan
-
-        return jax.jit(jax.grad(of, has_aux=True))
-
-    scaling, logarithmic = both("scaling"), both("log")
-    for scale in (1.0, 40.0, 1e4):
-        scores = scores_of(3, 2, 12, 4, scale=scale)
-        gradient, log_plan = scaling(scores)
-        expected_gradient, expected = logarithmic(scores)
-        # In range: rounding of logarithms of order 10. Beyond it: the very same code.
-        atol = 1e-5 if scale == 1 else 0
-        np.testing.assert_allclose(log_plan, expected, rtol=1e-6, atol=atol)
-        np.testing.assert_allclose(gradient, expected_gradient, rtol=1e-6, atol=1e-6)
-        assert np.isfinite(gradient).all()
-
-
 @pytest.mark.parametrize(
     "fields", [{}, {"anderson_memory": 4}, pytest.param({"step": "newton"}, marks=SLOW)], ids=str
 )
@@ -494,22 +379,12 @@ def test_a_plan_owes_nothing_to_its_batch(fields: Any) -> None:
         np.testing.assert_allclose(plan_of(together)[index], plan_of(alone)[0], rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "config",
-    [
-        pytest.param(SinkhornConfig(), marks=SLOW),
-        implicit(),
-        pytest.param(implicit(gradient="optimistix"), marks=SLOW),
-        pytest.param(SinkhornConfig(domain="log", anderson_memory=3), marks=SLOW),
-    ],
-    ids=["3", "implicit", "optimistix", "log"],
-)
-def test_any_leading_axes_jit_and_vmap_agree(config: SinkhornConfig) -> None:
+def test_any_leading_axes_jit_and_vmap_agree() -> None:
     scores = scores_of(6, 2, 3, 12, 4, scale=2.0)
     weights = scores_of(7, 12, 5)
 
     def of(scores: jax.Array) -> Any:
-        result = assign_with_dustbin(scores, 1.0, config=config)
+        result = assign_with_dustbin(scores, 1.0, config=implicit())
         return (weights * jnp.exp(result.log_plan)).sum(), result
 
     both = jax.grad(of, has_aux=True)
@@ -568,33 +443,17 @@ def test_what_misses_a_marginal_has_not_converged() -> None:
 
 def test_relaxed_masses_too_large_for_a_float_still_have_gradients() -> None:
     """Of the logarithm of the plan."""
-    fields: dict[str, Any] = {"config": implicit(iterations=1000), "row_tau": 0.9}
-    fields["column_tau"] = 0.8
+    taus = {"row_tau": 0.9, "column_tau": 0.8}
+
+    def log_plan(scores: jax.Array) -> jax.Array:
+        config = implicit(iterations=1000)
+        return assign_with_dustbin(scores, 0.0, config=config, **taus).log_plan
+
     scores = scores_of(0, 12, 4, scale=1e3)
-
-    def of(scores: jax.Array) -> jax.Array:
-        return jnp.tanh(0.01 * assign_with_dustbin(scores, 0.0, **fields).log_plan).sum()
-
-    assert jnp.isinf(jnp.exp(assign_with_dustbin(scores, 0.0, **fields).log_plan)).any()
-    gradient = jax.grad(of)(scores)
+    assert jnp.isinf(jnp.exp(log_plan(scores))).any()
+    gradient = jax.grad(lambda x: jnp.tanh(0.01 * log_plan(x)).sum())(scores)
     assert jnp.isfinite(gradient).all()
     assert jnp.abs(gradient).max() > 1e-3
-
-
-@pytest.mark.parametrize("gradient", ["unrolled", "implicit", "optimistix", "stop"])
-def test_counts_and_flags_may_be_used_while_differentiating(gradient: Any) -> None:
-    config = SinkhornConfig() if gradient == "unrolled" else implicit(gradient=gradient)
-    scores = scores_of(6, 2, 12, 4)
-
-    def of(scores: jax.Array, use: bool) -> jax.Array:
-        result = assign_with_dustbin(scores, 1.0, config=config)
-        loss = jnp.exp(2 * result.log_plan).sum()
-        kept = jnp.where(result.finite.all(), loss, 0 * loss) * result.iterations.max()
-        return kept / result.iterations.max() if use else loss
-
-    used, plain = (jax.jit(jax.grad(of), static_argnums=1)(scores, use) for use in (True, False))
-    # A product and a quotient, rounded; entries are sums of terms of 0.02.
-    np.testing.assert_allclose(used, plain, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize("apart", [1.0, 100.0])
@@ -609,14 +468,6 @@ def test_one_column_has_a_plan_and_a_gradient(apart: float) -> None:
     np.testing.assert_allclose(of(scores), np.zeros((2, 6, 1)), atol=1e-6 * apart)
     gradient = jax.grad(lambda scores: (scores_of(1, 2, 6, 1) * of(scores)).sum())(scores)
     np.testing.assert_allclose(gradient, np.zeros((2, 6, 1)), atol=1e-6)
-
-
-def test_no_nan_on_the_way_where_scaling_does_not_do() -> None:
-    """What the unused domain computes is finite: a hunt for NaNs finds none."""
-    scores = jnp.zeros((12, 4)).at[3, 2].set(-80.0)
-    with jax.debug_nans(True):
-        gradient = jax.grad(lambda s: jnp.exp(assign_with_dustbin(s, 1.0).log_plan).max())(scores)
-    assert np.isfinite(gradient).all()
 
 
 @pytest.mark.parametrize(
@@ -716,23 +567,17 @@ def test_eight_devices_give_the_same_plans() -> None:
 CLUSTERS = 8
 MODES: dict[str, dict[str, Any]] = {
     "scaling": {},
-    "log": {"config": SinkhornConfig(domain="log")},
     "scan": {"config": SinkhornConfig(iterations=10)},
     "relaxation": {"config": SinkhornConfig(step=SinkhornStep(1.9), iterations=10)},
     "anderson": {"config": SinkhornConfig(anderson_memory=4, iterations=10)},
     "implicit": {"config": implicit(iterations=30)},
-    "implicit, log": {"config": implicit(iterations=30, domain="log")},
     "implicit, relaxation": {"config": implicit(iterations=30, step=SinkhornStep(1.9))},
-    "implicit, anderson": {"config": implicit(iterations=30, anderson_memory=5)},
     "newton": {"config": implicit(iterations=6, step="newton")},
-    "newton, unrolled": {"config": SinkhornConfig(iterations=6, step="newton")},
     "optimistix": {"config": implicit(iterations=30, gradient="optimistix")},
-    "stop": {"config": SinkhornConfig(gradient="stop")},
     "columns": {"config": implicit(iterations=30), "column_tau": 0.5},
     "mass": {"dustbin": "mass"},
     "row and column": {"dustbin": "row and column"},
     "token": {"config": implicit(iterations=30), "dustbin": "token"},
-    "dual-softmax": {"config": SinkhornConfig(step="dual-softmax")},
 }
 QUICK = {"scaling", "scan", "relaxation", "implicit", "implicit, relaxation", "newton", "columns"}
 PATTERNS: dict[str, Callable[[jax.Array], jax.Array]] = {
@@ -758,9 +603,7 @@ def finite_check(mode: str, mapped: bool) -> Callable[[jax.Array, jax.Array], An
 
 @pytest.mark.parametrize("mapped", [False, pytest.param(True, marks=SLOW)])
 @pytest.mark.parametrize("rows", [CLUSTERS + 1, *(pytest.param(n, marks=SLOW) for n in (40, 2048))])
-@pytest.mark.parametrize(
-    "mode", [pytest.param(mode, marks=() if mode in QUICK else SLOW) for mode in MODES]
-)
+@pytest.mark.parametrize("mode", slow_unless(QUICK, MODES))
 @given(
     pattern=st.sampled_from(sorted(PATTERNS)),
     scale=st.sampled_from([1e-3, 1.0, 10.0, 30.0, 100.0, 1e3, 1e4]),
@@ -786,23 +629,16 @@ def test_never_nan(
 
 
 @pytest.mark.parametrize(
-    ("fields", "taus"),
-    [
-        ({}, {}),
-        pytest.param({"anderson_memory": 5}, {}, marks=SLOW),
-        pytest.param({"step": "newton"}, {}, marks=SLOW),
-        pytest.param({}, {"row_tau": 0.9, "column_tau": 0.8}, marks=SLOW),
-    ],
-    ids=str,
+    "taus", [{}, pytest.param({"row_tau": 0.9, "column_tau": 0.8}, marks=SLOW)], ids=str
 )
-def test_implicit_gradient_in_float32(fields: Any, taus: Any) -> None:
+def test_implicit_gradient_in_float32(taus: Any) -> None:
     """Against the same in float64, which test_sinkhorn_float64.py holds to unrolling."""
     scores = np.asarray(scores_of(10, 4, 64, 16, scale=3.0))
     weights = np.asarray(scores_of(11, 64, 17))
 
     def gradient(dtype: Any, tolerance: float) -> np.ndarray:
         def of(scores: jax.Array) -> jax.Array:
-            config = implicit(tolerance=tolerance, iterations=1000, **fields)
+            config = implicit(tolerance=tolerance, iterations=1000)
             result = assign_with_dustbin(scores, jnp.zeros((), dtype), config=config, **taus)
             return (jnp.asarray(weights, dtype) * jnp.exp(result.log_plan)).sum()
 
@@ -812,7 +648,7 @@ def test_implicit_gradient_in_float32(fields: Any, taus: Any) -> None:
     with jax.enable_x64(True):
         exact = gradient(jnp.float64, 1e-12)
     errors = {x: np.linalg.norm(found - exact) / np.linalg.norm(exact) for x, found in ours.items()}
-    # What is left where the last change was the tolerance: these four contract by 0.5 to 0.83 a
+    # What is left where the last change was the tolerance: these contract by 0.5 to 0.83 a
     # step, so that the worst entry is up to five tolerances off; but in norm over all entries a
     # fourth of one at most, in float64 as well. The rest is rounding, of 1e-6.
     assert errors[1e-5] < 1e-5
@@ -902,19 +738,12 @@ def dustbin_gradient(at: jax.Array, iterations: int = 3, **problem: Any) -> jax.
     return jax.jit(jax.grad(loss))(at)
 
 
-@pytest.mark.parametrize("iterations", [1, 3, 20])
-@pytest.mark.parametrize("z", [-10.0, 1.0, 10.0])
+@pytest.mark.parametrize(("iterations", "z"), [(1, 10.0), (3, 1.0), (20, -10.0)])
 def test_the_published_dustbin_is_dead(iterations: int, z: float) -> None:
     # Sums of 20 float32 terms that cancel.
     assert jnp.abs(dustbin_gradient(jnp.float32(z), iterations=iterations)) < 1e-5
-    plans = [
-        plan_of(
-            assign_with_dustbin(
-                scores_of(5, 20, 4), jnp.float32(x), config=SinkhornConfig(iterations=iterations)
-            )
-        )
-        for x in (0, z)
-    ]
+    config = SinkhornConfig(iterations=iterations)
+    plans = [plan_of(assign_with_dustbin(scores_of(5, 20, 4), x, config=config)) for x in (0.0, z)]
     np.testing.assert_allclose(*plans, atol=1e-5)  # rounding of logarithms of 10
 
 
@@ -946,13 +775,8 @@ def test_softmax_and_dual_softmax_are_torchs() -> None:
     weighted = solve(scores, log_mu, log_nu, config=SinkhornConfig(step="softmax"))
     # Each row has the mass that it is given.
     np.testing.assert_allclose(plan_of(weighted).sum(axis=2), [np.arange(1.0, 8)] * 2, rtol=1e-5)
-    assert (weighted.row_error < 1e-5).all()
     # Steps like any other, which change nothing from the second on.
-    assert weighted.iterations.tolist() == result.iterations.tolist() == [3, 3]
-    assert weighted.finite.tolist() == result.finite.tolist() == [True, True]
-    assert weighted.converged.tolist() == result.converged.tolist() == [False, False]
-    resting = implicit(gradient="stop", step="softmax")
-    rested = solve(scores, log_mu, log_nu, config=resting)
+    rested = solve(scores, log_mu, log_nu, config=implicit(gradient="stop", step="softmax"))
     assert rested.iterations.tolist() == [2, 2]
     assert rested.converged.all()
     # The potentials make the plan, the masses in them.

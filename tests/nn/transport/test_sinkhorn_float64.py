@@ -5,8 +5,7 @@ The float32 side, apart because optimistix mixes no precisions, is in test_sinkh
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping
-from types import MappingProxyType
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -31,16 +30,14 @@ from crisalad_jax.sinkhorn import (
     register_step,
 )
 from crisalad_jax.sinkhorn import solve as solve_transport
+from tests.nn.conftest import slow_unless
+from tests.nn.transport.problems import Way, implicit, pot_plan, relaxed
+
+pytestmark = pytest.mark.usefixtures("float64")
 
 TIGHT = 1e-12
 """What float64 potentials of order 10, rounded at 2e-15, can be asked to come to rest at."""
 ROWS, COLUMNS = 12, 5
-
-
-@pytest.fixture(autouse=True)
-def _float64() -> Iterator[None]:
-    with jax.enable_x64(True):
-        yield
 
 
 class Inputs(NamedTuple):
@@ -68,38 +65,19 @@ def solve(at: Inputs, config: SinkhornConfig, **how: Any) -> SinkhornResult:
 
 
 def to_rest(**fields: Any) -> SinkhornConfig:
-    settings: dict[str, Any] = {"iterations": 5000, "tolerance": TIGHT, "gradient": "implicit"}
-    return SinkhornConfig(**{**settings, **fields})
-
-
-class Way(NamedTuple):
-    """How a problem is solved, and which of its marginals are relaxed."""
-
-    config: SinkhornConfig
-    taus: Mapping[str, float] = MappingProxyType({})
-    solver: Any = None
-
-
-def relaxed(row_tau: float = 1.0, column_tau: float = 1.0) -> dict[str, float]:
-    return {"row_tau": row_tau, "column_tau": column_tau}
+    return implicit(**{"iterations": 5000, "tolerance": TIGHT} | fields)
 
 
 SOLVERS: dict[str, Way] = {
     "scaling": Way(to_rest()),
     "log": Way(to_rest(domain="log")),
-    "relaxation": Way(to_rest(step=SinkhornStep(relaxation=1.3))),
     "anderson": Way(to_rest(anderson_memory=6)),
     "newton": Way(to_rest(step="newton", iterations=40)),
     "fixed": Way(SinkhornConfig(iterations=3000)),
     "optimistix": Way(to_rest(gradient="optimistix")),
-    "optimistix, Newton": Way(
-        to_rest(gradient="optimistix", iterations=100),
-        solver=optimistix.Newton(rtol=TIGHT, atol=TIGHT),
-    ),
     "relaxed rows": Way(to_rest(), relaxed(row_tau=0.6)),
     "relaxed columns": Way(to_rest(domain="log"), relaxed(column_tau=0.8)),
     "relaxed": Way(to_rest(step=SinkhornStep(relaxation=1.2)), relaxed(0.9, 0.7)),
-    "relaxed, anderson": Way(to_rest(anderson_memory=5), relaxed(0.9, 0.7)),
     "relaxed, optimistix, Levenberg-Marquardt": Way(
         to_rest(gradient="optimistix"),
         relaxed(0.9, 0.7),
@@ -125,21 +103,6 @@ def ott_plan(row_tau: float = 1.0, column_tau: float = 1.0) -> np.ndarray:
     out = Sinkhorn(threshold=TIGHT, inner_iterations=1, max_iterations=20000)(problem)
     assert out.converged
     return np.asarray(out.matrix)
-
-
-def pot_plan(row_tau: float = 1.0, column_tau: float = 1.0) -> np.ndarray:
-    at = inputs()
-    mu, nu, cost = np.exp(at.log_mu), np.exp(at.log_nu), -np.asarray(at.scores)
-    epsilon = float(at.epsilon)
-    if row_tau == column_tau == 1:
-        return ot.sinkhorn(mu, nu, cost, epsilon, stopThr=1e-13, numItermax=20000)
-    penalties = tuple(
-        epsilon * tau / (1 - tau) if tau < 1 else np.inf for tau in (row_tau, column_tau)
-    )
-    # "entropy": that of the plan by itself, as here, not against mu nu^T.
-    kind = {"reg_type": "entropy", "c": np.ones(cost.shape)}
-    limits = {"stopThr": 1e-14, "numItermax": 20000}
-    return ot.unbalanced.sinkhorn_unbalanced(mu, nu, cost, epsilon, penalties, **kind, **limits)
 
 
 def long_way(at: Inputs, row_tau: float, column_tau: float, count: int) -> Any:
@@ -182,7 +145,7 @@ def long_gradient(row_tau: float = 1.0, column_tau: float = 1.0, count: int = 30
     return jax.jit(jax.grad(lambda at: score(*long_way(at, row_tau, column_tau, count))))(inputs())
 
 
-def differences(of: Callable[[Inputs], Any], at: Inputs) -> Inputs:
+def differences(of: Callable[[Any], Any], at: Any) -> Any:
     """Central differences of fourth order in every number of the inputs, all at once.
 
     The step leaves 1e-15 times fifth derivatives, which for epsilon are of order 1e8, and 1e4
@@ -211,10 +174,7 @@ def assert_close(ours: Inputs, expected: Inputs, relative: float) -> None:
 QUICK = {"scaling", "log", "newton", "fixed", "optimistix", "relaxed"}
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in SOLVERS],
-)
+@pytest.mark.parametrize("name", slow_unless(QUICK, SOLVERS))
 def test_plan_and_gradient_of_every_solver(name: str) -> None:
     """The plans of ott-jax and of POT, and the gradient of 3000 iterations."""
     config, taus, solver = SOLVERS[name]
@@ -231,7 +191,7 @@ def test_plan_and_gradient_of_every_solver(name: str) -> None:
     # Everyone came to rest at 1e-12: what is left of a geometric series of ratio up to 0.99.
     np.testing.assert_allclose(plan, ott_plan(**taus), atol=1e-10)
     # Relative: what POT stops at is relative to its largest scaling.
-    np.testing.assert_allclose(plan, pot_plan(**taus), rtol=1e-9)
+    np.testing.assert_allclose(plan, pot_plan(*inputs(), **relaxed(**taus)), rtol=1e-9)
     # Of the same 1e-12, what a system of condition number 1e2 or so leaves.
     assert_close(gradient, long_gradient(**taus), 1e-9)
 
@@ -261,10 +221,9 @@ def test_newtons_other_gradients(config: SinkhornConfig) -> None:
     assert_close(ours._replace(**same), expected, 1e-9)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("fields", [{"anderson_memory": 8}, {"step": "newton"}], ids=str)
-def test_plan_nears_the_linear_programme_as_epsilon_falls(seed: int, fields: Any) -> None:
-    at = inputs(seed=seed)
+def test_plan_nears_the_linear_programme_as_epsilon_falls(fields: Any) -> None:
+    at = inputs()
     mu, nu, scores = np.exp(at.log_mu), np.exp(at.log_nu), np.asarray(at.scores)
     best = ot.emd(mu, nu, -scores)
     distances = []
@@ -359,15 +318,10 @@ def test_newton_from_a_temperature_has_the_converged_plan_and_its_gradient(gradi
 @pytest.mark.parametrize(
     ("config", "taus"),
     [
-        (SinkhornConfig(), {}),
-        (
-            SinkhornConfig(step=SinkhornStep(relaxation=1.4), iterations=6, domain="log"),
-            {"row_tau": 0.9},
-        ),
-        (SinkhornConfig(anderson_memory=4, iterations=5), {}),
+        (SinkhornConfig(SinkhornStep(1.4), iterations=6, domain="log"), {"row_tau": 0.9}),
         (SinkhornConfig(anderson_memory=3, iterations=9), {}),
     ],
-    ids=["3", "over-relaxed", "anderson", "scaling"],
+    ids=["over-relaxed", "anderson"],
 )
 def test_gradient_equals_central_differences(config: SinkhornConfig, taus: Any) -> None:
     of = functools.partial(loss, config=config, **taus)
@@ -416,12 +370,11 @@ def _rows_first(problem: Problem, potentials: Potentials) -> Potentials:
 @pytest.mark.parametrize(
     "config",
     [
-        to_rest(gradient="stop", step="test-float64-rows-first"),
         to_rest(gradient="stop", step="test-float64-rows-first", anderson_memory=5, domain="log"),
         to_rest(gradient="optimistix", step="test-float64-rows-first"),
         SinkhornConfig(iterations=300, step="test-float64-rows-first"),
     ],
-    ids=["stop", "anderson", "optimistix", "unrolled"],
+    ids=["anderson", "optimistix", "unrolled"],
 )
 def test_a_step_of_ones_own(config: SinkhornConfig) -> None:
     def of(at: Inputs) -> Any:
@@ -435,10 +388,7 @@ def test_a_step_of_ones_own(config: SinkhornConfig) -> None:
     # Came to rest at 1e-12, as above.
     np.testing.assert_allclose(np.exp(result.log_plan), ott_plan(), atol=1e-10)
     assert result.converged == (config.tolerance is not None)
-    assert result.row_error < 1e-10
     assert result.column_error < 1e-10
-    if config.tolerance is not None:
-        assert result.iterations < 300
     if config.gradient.part_name != "stop":
         assert_close(gradient, long_gradient(), 1e-9)
 
@@ -446,22 +396,20 @@ def test_a_step_of_ones_own(config: SinkhornConfig) -> None:
 # Second order and forward mode
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("config", "taus"),
-    [
-        (SinkhornConfig(), {}),
-        (SinkhornConfig(iterations=9), {}),  # a scan
-        (SinkhornConfig(domain="log"), {}),
-        (to_rest(), {}),
-        (to_rest(), relaxed(0.9, 0.7)),
-        (to_rest(gradient="optimistix"), {}),
-    ],
-    ids=["scaling", "many", "log", "implicit", "relaxed", "optimistix"],
-)
+SECOND: dict[str, Way] = {
+    "unrolled": Way(SinkhornConfig()),
+    "implicit": Way(to_rest()),
+    "unrolled, log": Way(SinkhornConfig(domain="log")),
+    "implicit, relaxed": Way(to_rest(), relaxed(0.9, 0.7)),
+    "optimistix": Way(to_rest(gradient="optimistix")),
+}
+
+
+@pytest.mark.parametrize("name", slow_unless({"unrolled", "implicit"}, SECOND))
 @pytest.mark.parametrize("apart", [0, 2 * SCALING_RANGE], ids=["near", "far"])
-def test_gradient_of_the_gradient(config: SinkhornConfig, taus: Any, apart: float) -> None:
+def test_gradient_of_the_gradient(name: str, apart: float) -> None:
     """Of a gradient's product with a fixed direction, with respect to every input."""
+    config, taus, _ = SECOND[name]
     at, direction = inputs(), inputs(seed=5)
     at = at._replace(scores=at.scores.at[1, 2].add(-apart * at.epsilon))
 
@@ -474,83 +422,23 @@ def test_gradient_of_the_gradient(config: SinkhornConfig, taus: Any, apart: floa
 
 
 FORWARD: dict[str, Way] = {
-    "implicit": Way(to_rest()),
-    "implicit, log": Way(to_rest(domain="log")),
-    "implicit, relaxed": Way(to_rest(), relaxed(0.9, 0.7)),
-    "unrolled": Way(SinkhornConfig()),
-    "unrolled, log": Way(SinkhornConfig(domain="log")),
-    "unrolled, many": Way(SinkhornConfig(iterations=9)),
+    **SECOND,
     "unrolled, anderson": Way(SinkhornConfig(iterations=5, anderson_memory=4)),
     "unrolled, newton": Way(SinkhornConfig(iterations=3, step="newton")),
     "unrolled, relaxed": Way(SinkhornConfig(step=SinkhornStep(relaxation=1.4)), relaxed(0.9, 0.7)),
+    "stop": Way(SinkhornConfig(gradient="stop")),
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(x, marks=() if x in {"implicit", "unrolled"} else pytest.mark.slow)
-        for x in FORWARD
-    ],
-)
-def test_forward_mode(name: str) -> None:
+@pytest.mark.parametrize("name", slow_unless({"unrolled", "implicit"}, FORWARD))
+def test_forward_mode_is_reverse_mode(name: str) -> None:
     config, taus, _ = FORWARD[name]
     of, direction = functools.partial(loss, config=config, **taus), inputs(seed=5)
     _, forward = jax.jit(lambda at: jax.jvp(of, (at,), (direction,)))(inputs())
-
-    def along(length: Any) -> Any:
-        return of(jax.tree.map(lambda a, b: a + length * b, inputs(), direction))
-
-    # See `differences`; the derivative is of order 10.
-    step = 2e-4
-    near, near_back, far, far_back = jax.jit(jax.vmap(along))(step * jnp.array([1.0, -1, 2, -2]))
-    expected = (8 * (near - near_back) - (far - far_back)) / (12 * step)
-    np.testing.assert_allclose(forward, expected, rtol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "config",
-    [to_rest(gradient="optimistix"), SinkhornConfig(gradient="stop")],
-    ids=["optimistix", "stop"],
-)
-def test_forward_mode_is_reverse_mode(config: SinkhornConfig) -> None:
-    of, direction = functools.partial(loss, config=config), inputs(seed=5)
-    _, forward = jax.jvp(of, (inputs(),), (direction,))
-    reverse = sum(jnp.vdot(*pair) for pair in zip(jax.grad(of)(inputs()), direction, strict=True))
+    gradient = jax.jit(jax.grad(of))(inputs())
+    reverse = sum(jnp.vdot(*pair) for pair in zip(gradient, direction, strict=True))
     # Linear systems of one matrix and of its transpose.
     np.testing.assert_allclose(forward, reverse, rtol=1e-9)
-
-
-@pytest.mark.parametrize("apart", [False, True], ids=["near", "far"])
-@pytest.mark.parametrize(
-    "config",
-    [
-        SinkhornConfig(),
-        to_rest(),
-        pytest.param(SinkhornConfig(domain="log"), marks=pytest.mark.slow),
-        pytest.param(SinkhornConfig(iterations=9), marks=pytest.mark.slow),
-    ],
-    ids=["unrolled", "implicit", "log", "many"],
-)
-def test_hessian(config: SinkhornConfig, apart: bool) -> None:
-    """Forward over reverse, against differences of gradients; in range of scaling and beyond."""
-    at = inputs()
-    if apart:
-        at = at._replace(scores=at.scores.at[1, 2].add(-SCALING_RANGE))
-
-    def of(scores: Any) -> Any:
-        return loss(at._replace(scores=scores), config)
-
-    size, step = at.scores.size, 2e-4
-    hessian = jax.jit(jax.hessian(of))(at.scores).reshape(size, size)
-    moves = step * jnp.eye(size).reshape(size, *at.scores.shape)
-    gradients = jax.jit(lambda times: jax.lax.map(jax.grad(of), at.scores + times * moves))
-    near, near_back, far, far_back = map(gradients, (1.0, -1.0, 2.0, -2.0))
-    expected = (8 * (near - near_back) - (far - far_back)) / (12 * step)
-    # As above; entries are of order 1.
-    np.testing.assert_allclose(hessian, expected.reshape(size, size), atol=1e-6)
-    np.testing.assert_allclose(hessian, hessian.T, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["implicit", "unrolled", "implicit, relaxed"])
@@ -559,7 +447,7 @@ def test_vmap_is_one_problem_after_the_other(name: str) -> None:
 
     Derivatives, too.
     """
-    config, taus, _ = FORWARD[name]
+    config, taus, _ = SECOND[name]
     each = [inputs(seed=seed, epsilon=0.5 + 0.2 * seed) for seed in range(3)]
     each[1] = each[1]._replace(scores=each[1].scores.at[1, 2].add(-2 * SCALING_RANGE))
     both = jax.value_and_grad(functools.partial(loss, config=config, **taus))
@@ -576,9 +464,7 @@ def test_vmap_is_one_problem_after_the_other(name: str) -> None:
 
 BEYOND: dict[str, Way] = {
     "unrolled": Way(SinkhornConfig(iterations=4)),
-    "many": Way(SinkhornConfig(iterations=12)),
     "anderson": Way(SinkhornConfig(iterations=5, anderson_memory=3)),
-    "relaxation": Way(SinkhornConfig(step=SinkhornStep(relaxation=1.5))),
     "newton": Way(SinkhornConfig(iterations=3, step="newton")),
     "implicit": Way(to_rest(iterations=60)),
     "stop": Way(SinkhornConfig(gradient="stop")),
@@ -586,13 +472,7 @@ BEYOND: dict[str, Way] = {
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=() if name in {"unrolled", "implicit"} else pytest.mark.slow)
-        for name in BEYOND
-    ],
-)
+@pytest.mark.parametrize("name", slow_unless({"unrolled", "implicit"}, BEYOND))
 def test_beyond_scalings_range_all_is_exactly_the_log_domains(name: str) -> None:
     """Values and gradients, of every problem of the batch as if it were alone."""
     config, taus, _ = BEYOND[name]
@@ -718,14 +598,10 @@ def test_what_a_step_learns_has_a_gradient(domain: Any, far: bool) -> None:
     def of(lengths: Any) -> Any:
         return loss(at, config, step_params={"lengths": lengths})
 
-    lengths, step = params["lengths"].astype(jnp.float64), 1e-4
+    lengths = params["lengths"].astype(jnp.float64)
     ours = jax.jit(jax.grad(of))(lengths)
-    moves = step * jnp.eye(6).reshape(6, 3, 2)
-    values = jax.jit(jax.vmap(of))
-    near, near_back, two, two_back = (values(lengths + x * moves) for x in (1, -1, 2, -2))
-    expected = (8 * (near - near_back) - (two - two_back)) / (12 * step)
     # As above. The last iteration's rows are projected away: its gradient is 0.
-    np.testing.assert_allclose(ours, expected.reshape(3, 2), atol=1e-7)
+    np.testing.assert_allclose(ours, differences(of, lengths), atol=1e-7)
     assert (jnp.abs(ours.ravel()[:5]) > 1e-3).all()
     assert ours[2, 1] == 0
     result = solve(at, config, step_params=params)
@@ -783,13 +659,10 @@ def test_a_steps_own_error_end_and_plan(domain: Any) -> None:
 # A warm start
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("scaling", "log"),
-        *(pytest.param(x, marks=pytest.mark.slow) for x in ("newton", "anderson", "relaxed")),
-    ],
-)
+WARM = ("scaling", "log", "newton", "anderson", "relaxed")
+
+
+@pytest.mark.parametrize("name", slow_unless({"scaling", "log"}, WARM))
 def test_a_warm_start_arrives_sooner_at_the_same_plan(name: str) -> None:
     config, taus, _ = SOLVERS[name]
     at = inputs(2)

@@ -1,7 +1,6 @@
 """What `solve`, `assign_with_dustbin`, a registration and the settings refuse, and say."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -26,10 +25,7 @@ from crisalad_jax.sinkhorn import (
     solve,
 )
 from crisalad_jax.utils.errors import InputError
-
-
-def implicit(**fields: Any) -> SinkhornConfig:
-    return SinkhornConfig(gradient="implicit", tolerance=1e-5, **fields)
+from tests.nn.transport.problems import implicit
 
 
 @register_step("test-input-tuple")
@@ -57,78 +53,77 @@ class _Alone(Step):
 
 
 MU, NU = jnp.zeros(6), jnp.log(jnp.array([1.0, 2.0, 3.0]))
-BAD_CALLS: dict[str, tuple[Callable[[], Any], str]] = {
-    "one axis": (
-        lambda: solve(jnp.zeros(3), MU, NU),
-        r"found scores of shape \(3,\), expected",
-    ),
-    "rows": (
-        lambda: solve(jnp.zeros((5, 3)), MU, NU),
-        r"log_mu found of shape \(6,\), expected \(5,\)",
-    ),
-    "batches": (
-        lambda: solve(jnp.zeros((2, 6, 3)), jnp.zeros((3, 6)), NU),
-        r"log_mu found of shape \(3, 6\), expected \(2, 6\) for scores of \(2, 6, 3\)",
-    ),
-    "epsilons": (
-        lambda: solve(jnp.zeros((6, 3)), MU, NU, epsilon=jnp.ones(3)),
-        r"epsilon found of shape \(3,\), expected \(\)",
-    ),
-    "newton, relaxed rows": (
-        lambda: solve(jnp.zeros((6, 3)), MU, NU, row_tau=0.5, config=SinkhornConfig("newton")),
-        "step newton: found row_tau 0.5 and column_tau 1.0, expected 1",
-    ),
-    "row_tau": (
-        lambda: solve(jnp.zeros((6, 3)), MU, NU, row_tau=0.0),
-        "row_tau found 0.0, expected more than 0 and at most 1",
-    ),
-    "column_tau": (
-        lambda: assign_with_dustbin(jnp.zeros((6, 3)), 1.0, column_tau=1.1),
-        "column_tau found 1.1, expected more than 0 and at most 1",
-    ),
-    "dustbin": (
-        lambda: assign_with_dustbin(jnp.zeros((6, 3)), 1.0, "row"),
-        "^dustbin: found 'row', expected one of column, mass, none, row and column,",
-    ),
+SCORES = jnp.zeros((6, 3))
+BAD_SOLVES: dict[str, tuple[dict[str, Any], str]] = {
+    "one axis": ({"scores": jnp.zeros(3)}, r"found scores of shape \(3,\), expected"),
     "no columns": (
-        lambda: solve(jnp.zeros((6, 0)), MU, MU[:0]),
+        {"scores": SCORES[:, :0], "log_nu": NU[:0]},
         r"found scores of shape \(6, 0\), expected",
     ),
+    "rows": ({"scores": SCORES[:5]}, r"log_mu found of shape \(6,\), expected \(5,\)"),
+    "batches": (
+        {"scores": jnp.zeros((2, 6, 3)), "log_mu": jnp.zeros((3, 6))},
+        r"log_mu found of shape \(3, 6\), expected \(2, 6\) for scores of \(2, 6, 3\)",
+    ),
+    "epsilons": ({"epsilon": jnp.ones(3)}, r"epsilon found of shape \(3,\), expected \(\)"),
+    "row_tau": ({"row_tau": 0.0}, "row_tau found 0.0, expected more than 0 and at most 1"),
+    "column_tau": ({"column_tau": 1.1}, "column_tau found 1.1, expected more than 0 and at most"),
+    "init.row": (
+        {"init": Potentials(jnp.zeros(5), jnp.zeros(3))},
+        r"^sinkhorn: init.row .* \(5,\), expected \(6,\)",
+    ),
+    "init.column": (
+        {"init": (jnp.zeros(6), jnp.zeros(6))},
+        r"^sinkhorn: init.column found of shape \(6,\), expected \(3,\)",
+    ),
+    "newton, relaxed rows": (
+        {"row_tau": 0.5, "config": SinkhornConfig("newton")},
+        "step newton: found row_tau 0.5 and column_tau 1.0, expected 1",
+    ),
     "a step's tuple": (
-        lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-tuple")),
+        {"config": SinkhornConfig("test-input-tuple")},
         r"^step test-input-tuple, step: found to return \(\(float32.*, expected \(Potentials\(row",
     ),
     "a step's state": (
-        lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-state")),
+        {"config": SinkhornConfig("test-input-state")},
         "^step test-input-state, step: found to return .*, float32.*, expected .*, int32",
     ),
     "a step without a state": (
-        lambda: solve(jnp.zeros((6, 3)), MU, NU, config=SinkhornConfig("test-input-alone")),
+        {"config": SinkhornConfig("test-input-alone")},
         r"^step test-input-alone, step: found to return P.*expected \(Potentials.*, None\)",
     ),
-    "assign": (
-        lambda: assign_with_dustbin(jnp.zeros(6), jnp.float32(1)),
-        r"assign_with_dustbin: found scores of shape \(6,",
-    ),
-    "no mass": (
-        lambda: assign_with_dustbin(jnp.zeros((6, 6)), jnp.float32(1)),
-        "6 patches for 6 clusters",
-    ),
-    "token, one": (
-        lambda: assign_with_dustbin(jnp.zeros((6, 3)), jnp.float32(1), "token"),
+}
+BAD_DUSTBINS: dict[str, tuple[tuple[Any, ...], str]] = {
+    "its name": ((SCORES, 1.0, "row"), "^dustbin: found 'row', expected one of column, mass, none"),
+    "one axis": ((SCORES[:, 0], 1.0), r"assign_with_dustbin: found scores of shape \(6,"),
+    "no mass": ((jnp.zeros((6, 6)), 1.0), "6 patches for 6 clusters"),
+    "one score": (
+        (SCORES, jnp.float32(1), "token"),
         r"dustbin: found parameters of shape \(\), expected \(6,\)",
     ),
 }
 
 
+def solve_with(options: dict[str, Any]) -> Any:
+    return solve(**{"scores": SCORES, "log_mu": MU, "log_nu": NU} | options)
+
+
 @pytest.mark.usefixtures("_unchecked")
 @pytest.mark.parametrize("traced", [False, True], ids=["eager", "traced"])
-@pytest.mark.parametrize("name", BAD_CALLS)
+@pytest.mark.parametrize("name", BAD_SOLVES)
 def test_bad_shapes_and_pairs_raise(name: str, traced: bool) -> None:
-    call, message = BAD_CALLS[name]
+    options, message = BAD_SOLVES[name]
     with pytest.raises(InputError, match=message) as raised:
-        jax.eval_shape(call) if traced else call()
+        jax.eval_shape(lambda: solve_with(options)) if traced else solve_with(options)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize("name", BAD_DUSTBINS)
+def test_what_no_dustbin_takes(name: str) -> None:
+    arguments, message = BAD_DUSTBINS[name]
+    with pytest.raises(InputError, match=message):
+        assign_with_dustbin(*arguments)
 
 
 @pytest.mark.usefixtures("_unchecked")
@@ -136,13 +131,10 @@ def test_bad_shapes_and_pairs_raise(name: str, traced: bool) -> None:
     ("scores", "log_mu", "log_nu", "epsilon", "message"),
     [
         (jnp.nan, MU, NU, 1.0, "scores found with NaN or infinity"),
-        (jnp.inf, MU, NU, 1.0, "scores found with NaN or infinity"),
         (0.0, MU.at[1].set(-jnp.inf), NU, 1.0, "found to sum to 5 and 6, expected the same"),
-        (0.0, MU, NU, 0.0, "epsilon found 0.0, expected at least 1.2e-38"),
         (0.0, MU, NU, 1e-300, "epsilon found 1e-300, expected at least"),
         (0.0, MU, NU, jnp.float32(jnp.nan), "epsilon found nan, expected at least"),
         (1e10, MU, NU, 1e-35, "scores overflow, expected numbers that float32 can hold"),
-        (0.0, MU, NU + 1e-3, 1.0, "found to sum to 6 and 6.006, expected the same"),
         (0.0, MU, NU + 3e-4, 1.0, "found to sum to 6 and 6.0018, expected the same"),
         (0.0, jnp.stack([MU, MU - 1]), NU, 1.0, "found to sum to 2.20728 and 6, expected the same"),
     ],
@@ -162,22 +154,20 @@ def test_bad_numbers_raise(
 
 def test_totals_of_a_step_of_another_problem_need_not_agree() -> None:
     """Rows of a softmax send all their mass, whatever the columns' marginals."""
-    plan = jnp.exp(
-        solve(jnp.zeros((6, 3)), MU, NU - 1, config=SinkhornConfig(step="softmax")).log_plan
-    )
+    plan = jnp.exp(solve(SCORES, MU, NU - 1, config=SinkhornConfig(step="softmax")).log_plan)
     np.testing.assert_allclose(plan, 1 / 3, rtol=1e-6)  # a quotient of exponentials in float32
 
 
-def test_totals_need_not_agree_to_the_last_digits() -> None:
+def test_totals_need_not_agree_to_the_last_digits_nor_where_marginals_are_relaxed() -> None:
     """Sums of logarithms in float32 do not."""
-    assert solve(jnp.zeros((6, 3)), MU, NU + 1e-5).finite
+    assert solve(SCORES, MU, NU + 1e-5).finite
+    assert solve(SCORES, MU, NU + 1, column_tau=0.5).finite
 
 
 @pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
-@pytest.mark.parametrize("scores_dtype", [None, jnp.float32], ids=["half", "float32"])
 @pytest.mark.parametrize("coarse", ["both", "rows", "columns"])
 def test_half_precision_marginals_have_the_totals_of_their_rounding(
-    coarse: str, scores_dtype: Any, dtype: Any
+    coarse: str, dtype: Any
 ) -> None:
     """Masses of 256 rows and 65 columns, whose totals differ by up to half a hundredth as given.
 
@@ -195,8 +185,8 @@ def test_half_precision_marginals_have_the_totals_of_their_rounding(
     given = [np.exp(np.asarray(x.astype(jnp.float32), np.float64)) for x in (log_mu, log_nu)]
     totals = [x.sum() for x in given]
     assert abs(totals[0] / totals[1] - 1) > 2e-5
-    scores = jax.random.normal(jax.random.key(0), (256, 65)).astype(scores_dtype or dtype)
-    config = implicit(iterations=300)
+    scores = jax.random.normal(jax.random.key(0), (256, 65)).astype(dtype)
+    config = implicit()
     for call in (solve, jax.jit(solve, static_argnames="config")):
         result = call(scores, log_mu, log_nu, config=config)
         assert result.converged
@@ -241,73 +231,49 @@ def test_whole_numbers_are_logarithms_too() -> None:
     np.testing.assert_allclose(plan, 0.25, rtol=1e-6)  # quotients of exponentials
 
 
-def test_totals_need_not_agree_where_marginals_are_relaxed() -> None:
-    assert solve(jnp.zeros((6, 3)), MU, NU + 1, column_tau=0.5).finite
-
-
 @pytest.mark.usefixtures("_unchecked")
 @pytest.mark.parametrize(
-    ("kind", "fields", "message"),
+    ("fields", "message"),
     [
+        ({"step": "simplex"}, "step: found 'simplex', expected one of .*is a plug-in missing"),
+        ({"step": 3}, "step: found 3, expected a step or its name"),
+        ({"domain": "kernel"}, "domain: found 'kernel'"),
+        ({"gradient": "exact"}, "gradient: found 'exact', expected one of implicit, optim"),
+        ({"tolerance": 0.0, "gradient": "stop"}, "tolerance: found 0.0"),
+        ({"anderson_memory": 1}, "anderson_memory: found 1"),
+        ({"gradient": "implicit"}, "found Implicit.*expected a tolerance"),
+        ({"tolerance": 1e-3}, "expected a fixed number of iterations"),
+        ({"throw": True}, "throw: found True, expected a tolerance"),
         (
-            SinkhornConfig,
-            {"step": "simplex"},
-            "^SinkhornConfig.step: found 'simplex', expected one of dual-softmax, newton, "
-            "sinkhorn, softmax.*is a plug-in missing",
-        ),
-        (SinkhornConfig, {"step": 3}, "SinkhornConfig.step: found 3, expected a step or its name"),
-        (SinkhornConfig, {"domain": "kernel"}, "SinkhornConfig.domain: found 'kernel'"),
-        (
-            SinkhornConfig,
-            {"gradient": "exact"},
-            "SinkhornConfig.gradient: found 'exact', expected one of implicit, optim",
-        ),
-        (
-            SinkhornConfig,
-            {"tolerance": 0.0, "gradient": "stop"},
-            "SinkhornConfig.tolerance: found 0.0",
-        ),
-        (SinkhornConfig, {"anderson_memory": 1}, "SinkhornConfig.anderson_memory: found 1"),
-        (SinkhornConfig, {"anderson_memory": -2}, "SinkhornConfig.anderson_memory: found -2"),
-        (
-            SinkhornConfig,
-            {"gradient": "implicit"},
-            "found Implicit.*expected a tolerance",
-        ),
-        (SinkhornConfig, {"tolerance": 1e-3}, "expected a fixed number of iterations"),
-        (SinkhornConfig, {"throw": True}, "throw: found True, expected a tolerance"),
-        (
-            SinkhornConfig,
             {"gradient": "optimistix", "tolerance": 1e-3, "anderson_memory": 3},
             "anderson_memory: found 3, expected 0; or a whole number from 2, with",
         ),
         (
-            SinkhornConfig,
             {"step": "softmax", "gradient": "implicit", "tolerance": 1e-3},
             "expected a step that says it solves the entropic problem, not 'softmax'",
         ),
-        (
-            SinkhornConfig,
-            {"step": "test-input-tuple", "gradient": "implicit", "tolerance": 1e-3},
-            "expected a step that says it solves the entropic problem, not 'test-input-tuple'",
-        ),
-        (SinkhornStep, {"relaxation": 2.0}, "SinkhornStep.relaxation: found 2.0"),
-        (SinkhornStep, {"relaxation": 0.9}, "SinkhornStep.relaxation: found 0.9"),
-        (SinkhornStep, {"relaxation": float("nan")}, "SinkhornStep.relaxation: found nan"),
-        (
-            SaladConfig,
-            {"dustbin": "row"},
-            "SaladConfig.dustbin: found 'row', expected one of column, mass, none",
-        ),
-        (SaladConfig, {"epsilon": float("inf")}, "SaladConfig.epsilon: found inf"),
-        (SaladConfig, {"row_tau": 0.0}, "SaladConfig.row_tau: found 0.0"),
-        (SaladConfig, {"column_tau": 1.1}, "SaladConfig.column_tau: found 1.1"),
     ],
 )
-def test_bad_settings_raise(kind: type, fields: Any, message: str) -> None:
+def test_bad_settings_raise(fields: Any, message: str) -> None:
     with pytest.raises(InputError, match=message) as raised:
-        kind(**fields)
+        SinkhornConfig(**fields)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields"),
+    [
+        *((SinkhornStep, {"relaxation": bad}) for bad in (2.0, 0.9, float("nan"))),
+        (SaladConfig, {"dustbin": "row"}),
+        (SaladConfig, {"epsilon": float("inf")}),
+        (SaladConfig, {"row_tau": 0.0}),
+        (SaladConfig, {"column_tau": 1.1}),
+    ],
+)
+def test_bad_fields_are_named_with_what_was_found(kind: type, fields: dict[str, Any]) -> None:
+    ((name, bad),) = fields.items()
+    with pytest.raises(InputError, match=f"{kind.__name__}.{name}: found {bad!r}, expected"):
+        kind(**fields)
 
 
 def test_what_is_registered_twice_is_the_later() -> None:
@@ -326,15 +292,6 @@ def test_what_is_registered_twice_is_the_later() -> None:
         config = SinkhornConfig(step="test-input-again", iterations=2)
         result = solve(jnp.zeros((3, 3)), zeros, zeros, config=config)
         assert result.potentials.row.tolist() == [2 * step] * 3
-
-
-def test_a_part_and_its_name_are_one_configuration() -> None:
-    assert SinkhornConfig(step="sinkhorn") == SinkhornConfig(step=SinkhornStep())
-    assert hash(SinkhornConfig(step="sinkhorn")) == hash(SinkhornConfig())
-    assert SinkhornConfig(step=SinkhornStep(1.5)) != SinkhornConfig()
-    assert SinkhornConfig().step.part_name == "sinkhorn"
-    # A part whose fields are alike is another part.
-    assert SinkhornConfig("softmax") != SinkhornConfig("dual-softmax")
 
 
 @register_dustbin("test-input-last-patch")
@@ -364,19 +321,3 @@ def test_a_dustbin_of_ones_own() -> None:
     named = assign_with_dustbin(scores, params, "test-input-last-patch", patches=patches)
     expected = assign_with_dustbin(scores, 2 * patches[..., -1] + 0.5, "token")
     assert (named.log_plan == expected.log_plan).all()
-
-
-@pytest.mark.usefixtures("_unchecked")
-@pytest.mark.parametrize(
-    ("init", "words"),
-    [
-        (
-            Potentials(jnp.zeros(5), jnp.zeros(3)),
-            r"init.row .* \(5,\), expected \(6,\)",
-        ),
-        ((jnp.zeros(6), jnp.zeros(6)), r"init.column found of shape \(6,\), expected \(3,\)"),
-    ],
-)
-def test_potentials_to_start_from_that_do_not_fit_are_refused(init, words):
-    with pytest.raises(InputError, match=f"^sinkhorn: {words}"):
-        solve(jnp.zeros((6, 3)), MU, NU, init=init)
