@@ -12,7 +12,6 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.data.places import read_places
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.model import init_crisalad, tokens_and_statistics
-from crisalad_jax.training import run_files
 from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.losses import LossConfig
@@ -24,7 +23,7 @@ from tests.conftest import MODEL as TESTS_MODEL
 from tests.conftest import RECIPE, assert_equal, random_params
 from tests.nn.test_model import pictures
 from tests.training.programs import run_on_devices
-from tests.training.test_loop import Interrupted, fail_at
+from tests.training.test_loop import interrupt
 
 # Of 64 the multi-resolution adapter's narrow convolutions have 4 channels.
 ADAPTER = AdapterConfig(kind="multi-resolution", bottleneck=2.0)
@@ -121,7 +120,7 @@ def test_micro_batches_are_forward_passes_in_turn() -> None:
 
 
 @pytest.mark.slow
-def test_runs_keep_and_resume_the_statistics(shared, tmp_path) -> None:
+def test_runs_keep_and_resume_the_statistics(shared, tmp_path, monkeypatch) -> None:
     """The weight file holds them, and a resumed run ends with the same bits."""
     config = dataclasses.replace(
         RECIPE, model=MODEL, trainable="adapters+head", epochs=2, patience=None
@@ -133,13 +132,9 @@ def test_runs_keep_and_resume_the_statistics(shared, tmp_path) -> None:
     start = init_crisalad(jax.random.key(0), MODEL)
     assert any(np.abs(x - statistics(start)[n]).max() > 0 for n, x in statistics(whole).items())
 
-    with pytest.MonkeyPatch.context() as patch:
-        fail_at(patch, "train_step", 4)
-        patch.setattr(run_files, "SAVE_SECONDS", -1)
-        with pytest.raises(Interrupted):
-            fit(config, places, tmp_path / "resumed", quiet=True)
-    resumed = fit(config, places, tmp_path / "resumed", quiet=True).params
-    assert_equal(resumed, whole)
+    run = config, places, tmp_path / "resumed"
+    interrupt(monkeypatch, "train_step", 4, *run, quiet=True)
+    assert_equal(fit(*run, quiet=True).params, whole)
 
 
 DEVICES = """

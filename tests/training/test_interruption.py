@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 import time
-from typing import Any
 
 import pytest
 
@@ -60,21 +59,15 @@ def start(shared: pathlib.Path, tmp_path_factory):
     cache = tmp_path_factory.mktemp("cache")
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)}
 
-    def go(out: pathlib.Path, *statements: str, **options: Any) -> subprocess.Popen[str]:
-        command = [
-            sys.executable,
-            "-c",
-            PROGRAM,
-            *map(str, (shared / "city", shared / "town", out)),
-        ]
+    def go(out: pathlib.Path, *statements: str) -> subprocess.Popen[str]:
+        arguments = map(str, (shared / "city", shared / "town", out, *statements))
         return subprocess.Popen(
-            [*command, *statements],
+            [sys.executable, "-c", PROGRAM, *arguments],
             cwd=ROOT,
             env=environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            **options,
         )
 
     return go
