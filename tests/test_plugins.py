@@ -208,24 +208,14 @@ import dataclasses
 import jax.numpy as jnp
 import crisalad_jax as cj
 
-class Average(cj.Aggregator):
+@cj.register_aggregator("bare-array")
+@dataclasses.dataclass(frozen=True)
+class BareArray(cj.Aggregator):
     def token_shape(self, dim):
         return cj.TokenShape(dim, 0, dim)
 
     def apply(self, params, features, grid, *, key):
-        return self.outputs(features.patches.mean(axis=-2))
-
-@cj.register_aggregator("bare-array")
-@dataclasses.dataclass(frozen=True)
-class BareArray(Average):
-    def outputs(self, mean):
-        return mean
-
-@cj.register_aggregator("narrow")
-@dataclasses.dataclass(frozen=True)
-class Narrow(Average):
-    def outputs(self, mean):
-        return cj.Tokens.of_global(mean[..., 1:])
+        return features.patches.mean(axis=-2)
 
 @cj.register_aggregator("by-patch")
 def by_patch(features):
@@ -233,8 +223,6 @@ def by_patch(features):
 """
 BAD_AGGREGATORS = {
     "bare-array": "found to return float32[2,32], "
-    "expected Tokens(global_token=float32[2,32], local=float32[2,0,32])",
-    "narrow": "found to return Tokens(global_token=float32[2,31], local=float32[2,0,31]), "
     "expected Tokens(global_token=float32[2,32], local=float32[2,0,32])",
     "by-patch": "found to return Tokens(global_token=float32[2,0], local=float32[2,12,32]), "
     "expected Tokens(global_token=float32[2,0], local=float32[2,256,32])",
@@ -258,17 +246,12 @@ import crisalad_jax as cj
 def each(batch):
     return batch.similarities.sum(axis=1)
 
-@cj.register_loss("words")
-def words(batch):
-    return "small"
-
 @cj.register_loss("silent")
 def silent(descriptors, labels):
     pass
 """
 BAD_LOSSES = {
     "each": "found to return LossValue(loss=float32[6]), expected LossValue(loss=float32[])",
-    "words": "found to return LossValue(loss=str), expected LossValue(loss=float32[])",
     "silent": "found to return LossValue(loss=None), expected LossValue(loss=float32[])",
 }
 

@@ -10,7 +10,7 @@ from tests.attack.scripts import rows_of
 @pytest.mark.parametrize(
     ("attacks", "scale"),
     [
-        (["maps", "extract .npy"], 0),  # of training: tests/training/test_interruption.py
+        (["maps", "extract .npy"], 0),
         pytest.param(["training"], 1, marks=pytest.mark.slow),
         pytest.param(["maps", "extract .npy", "extract .h5"], 1, marks=pytest.mark.slow),
         pytest.param(["compare"], 1, marks=pytest.mark.slow),

@@ -12,7 +12,7 @@ import torch
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.places import Places, read_places
+from crisalad_jax.data.places import Places
 from crisalad_jax.nn.config import with_aggregator
 from crisalad_jax.nn.model import describe
 from crisalad_jax.training.classifier import init_classifiers, update_classifiers
@@ -28,6 +28,7 @@ from tests.conftest import MODEL, RECIPE, random_params
 from tests.nn.test_model import pictures
 from tests.training.programs import run_on_devices
 from tests.training.test_loop import assert_same_run, interrupt
+from tests.training.test_step import LABELS
 
 # Eight places make two groups of four classes; two steps of three classes each pass over a group
 # more than once. Four epochs train the groups in turn.
@@ -46,12 +47,7 @@ CONFIG = dataclasses.replace(
 STEPS = 8
 CLASSES = (4, 3)
 STEP = StepConfig(CONFIG.model, CONFIG.loss, CONFIG.optimiser, STEPS, 2, classes=CLASSES)
-LABELS, VALID = jnp.array([0, 0, 1, 1, 2, 2]), np.array([True] * 5 + [False])
-
-
-@pytest.fixture(scope="module")
-def places(shared: pathlib.Path) -> Places:
-    return read_places(shared / "city", min_images=2)
+VALID = np.array([True] * 5 + [False])
 
 
 @pytest.fixture(scope="module")

@@ -72,28 +72,19 @@ def test_pairs_of_tuples_by_a_loop():
 def test_triplets_of_tuples_are_torchs(seed):
     """Nanne/pytorch-NetVlad sums torch's loss of each triplet and divides by their number.
 
-    Torch adds 1e-6 to each of 8 differences, which moves a distance by at most 3e-6.
+    Torch adds 1e-6 to each of 8 differences, which moves a distance by at most 3e-6. Gradients of
+    triplets are compared in losses/test_losses.py.
     """
     descriptors, labels = batch(seed)
     margin = 0.1**0.5
     config = LossConfig(kind=TripletConfig(margin, average="all"), miner="none")
 
-    def loss(descriptors):
-        pairs = tuple_pairs(jnp.asarray(labels))
-        return metric_loss(descriptors, jnp.asarray(labels), config, pairs=pairs).loss
-
-    found, gradient = jax.value_and_grad(loss)(jnp.asarray(descriptors))
-    theirs = torch.tensor(descriptors, requires_grad=True)
+    arrays = jnp.asarray(descriptors), jnp.asarray(labels)
+    found = metric_loss(*arrays, config, pairs=tuple_pairs(arrays[1])).loss
+    theirs = torch.tensor(descriptors)
     summed = torch.nn.TripletMarginLoss(margin=margin, p=2, reduction="sum")
     total = sum(summed(*(theirs[[image]] for image in each)) for each in triplets())
-    expected = torch.as_tensor(total / len(triplets()))
-    expected.backward()
-    np.testing.assert_allclose(found, expected.item(), rtol=0, atol=1e-5)
-    assert theirs.grad is not None
-    # Ours differentiates 2 - 2 x.y, theirs |x - y|^2: they differ along the unit vectors alone.
-    along = (np.asarray(gradient) - theirs.grad.numpy()) * descriptors
-    rest = np.asarray(gradient) - theirs.grad.numpy() - along.sum(1, keepdims=True) * descriptors
-    np.testing.assert_allclose(rest, 0, atol=1e-5)
+    np.testing.assert_allclose(found, float(total) / len(triplets()), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from crisalad_jax.config.registry import REGISTRIES
-from crisalad_jax.data.places import read_places
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.training.config import OptimiserConfig
@@ -71,9 +70,8 @@ def test_a_warm_up_of_more_than_a_quarter_is_told_in_a_line_and_shortened(
     assert not told(params, found, steps, per_epoch)
 
 
-def test_it_is_told_once_and_before_the_first_step(shared, tmp_path, monkeypatch) -> None:
+def test_it_is_told_once_and_before_the_first_step(places, tmp_path, monkeypatch) -> None:
     config = dataclasses.replace(RECIPE, optimiser=OptimiserConfig(warmup_steps=STEPS))
-    places = read_places(shared / "city", min_images=2)
     fail_at(monkeypatch, "train_step", 1)
     note = f"found {STEPS} steps for a run of {STEPS}"
     with pytest.warns(Note, match=note) as caught, pytest.raises(Interrupted):

@@ -209,29 +209,13 @@ OPTIMISERS = {
         lambda each: torch.optim.AdamW([each], lr=0.1, betas=(0.9, 0.9), weight_decay=0.05),
         lambda each: torch.optim.lr_scheduler.LinearLR(each, 1.0, 0.2, total_iters=9),
     ),
-    # CricaVPR's, down to a half every three epochs, and with decay.
-    **{
-        f"adam, decay {decay}": (
-            OptimiserConfig(
-                kind="adam", learning_rate=0.1, schedule="step", step_epochs=3, weight_decay=decay
-            ),
-            lambda each, decay=decay: torch.optim.Adam([each], lr=0.1, weight_decay=decay),
-            lambda each: torch.optim.lr_scheduler.StepLR(each, step_size=3, gamma=0.5),
-        )
-        for decay in (0.0, 0.1)
-    },
-    # MixVPR's momentum and weight decay, and a fall after the second epoch.
-    "sgd": (
+    # CricaVPR's, down to a half every three epochs, with decay.
+    "adam": (
         OptimiserConfig(
-            kind="sgd",
-            learning_rate=0.1,
-            schedule="milestones",
-            milestones=(2,),
-            step_gamma=0.3,
-            weight_decay=1e-3,
+            kind="adam", learning_rate=0.1, schedule="step", step_epochs=3, weight_decay=0.1
         ),
-        lambda each: torch.optim.SGD([each], lr=0.1, momentum=0.9, weight_decay=1e-3),
-        lambda each: torch.optim.lr_scheduler.MultiStepLR(each, [2], 0.3),
+        lambda each: torch.optim.Adam([each], lr=0.1, weight_decay=0.1),
+        lambda each: torch.optim.lr_scheduler.StepLR(each, step_size=3, gamma=0.5),
     ),
 }
 """Ours, torch's optimiser, and its schedule."""
@@ -298,33 +282,6 @@ def test_gradients_of_several_batches_equal_torchs(kind: Literal["sgd", "adamw"]
     ours = optimised(config, start, gradients, steps_per_epoch=7)
     # Sums of six steps of order 1, each rounded to 1e-16.
     np.testing.assert_allclose(ours, tensor.detach().numpy(), rtol=0, atol=1e-13)
-
-
-@pytest.mark.slow
-def test_a_gradient_that_waits_changes_no_parameter_and_a_step_not_finite_nothing(params) -> None:
-    """Two batches of five share a step; the last of the epoch steps alone."""
-    optimiser = OptimiserConfig(kind="sgd", learning_rate=1e-2, accumulate=2, weight_decay=0.0)
-    config = dataclasses.replace(STEP, optimiser=optimiser, steps=5, steps_per_epoch=5)
-    state, frozen = init_train_state(params, "head", config)
-    step = functools.partial(train_step, valid=VALID, key=jax.random.key(0), config=config)
-    spoilt = dataclasses.replace(frozen.backbone, cls_token=jnp.full(32, jnp.nan))
-    broken = dataclasses.replace(frozen, backbone=spoilt)
-    before, changed = jax.device_get(state), []
-    for batch in range(5):
-        if batch in (1, 2):  # of a pair's second and first
-            state, metrics = step(state, broken, pictures(6), LABELS)
-            assert not jnp.isfinite(metrics.loss)
-            assert not metrics.updated
-            assert_equal(jax.device_get(state), before)
-        state, metrics = step(state, frozen, pictures(6, batch), LABELS)
-        assert metrics.updated
-        after = jax.device_get(state)
-        pairs = zip(*map(jax.tree.leaves, (after.trainable, before.trainable)), strict=True)
-        changed.append(any((new != old).any() for new, old in pairs))
-        # The rate of the steps 0, 0, 1, 1, 2 of three: linear to 0, in float32.
-        np.testing.assert_allclose(metrics.learning_rate, 1e-2 * (1 - batch // 2 / 3), rtol=1e-6)
-        before = after
-    assert changed == [False, True, False, True, True]
 
 
 def optimised(

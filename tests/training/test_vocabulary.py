@@ -12,7 +12,6 @@ from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
 from crisalad_jax.checkpoints.weights import FORMAT, load_weights, save_weights
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import list_images, read_image
-from crisalad_jax.data.places import read_places
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.vlad import (
@@ -207,7 +206,7 @@ def quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("quick_start")
 def test_training_netvlad_starts_from_the_training_images(
-    capfd, shared, tmp_path, monkeypatch: pytest.MonkeyPatch
+    capfd, shared, places, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same start in every call, which is what lets a run go on; given weights stay."""
     config = dataclasses.replace(RECIPE, model=NETVLAD)
@@ -227,7 +226,6 @@ def test_training_netvlad_starts_from_the_training_images(
 
     for _ in range(2):
         start("run", "--backbone", weights)
-    places = read_places(shared / "city", min_images=2)
     images = [places.path(image) for image in range(len(places.files))]
     expected = with_vocabulary(Model(starts[0], NETVLAD), images, seed=config.seed)
     assert_equal(starts[0], expected)
