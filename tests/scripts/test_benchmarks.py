@@ -20,7 +20,6 @@ from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import read_places
 from crisalad_jax.nn.costs import part_costs
-from crisalad_jax.retrieval.descriptor_files import open_npy
 from crisalad_jax.training.recipes import recipe
 from parity.reference.model import Crisalad as TorchCrisalad
 
@@ -241,11 +240,7 @@ def test_a_tree_of_the_size_of_gsv_cities_is_one(scripts: Any, tmp_path: pathlib
     places = read_places(tmp_path)
     assert places.cities == ("City00", "City01")
     assert places.image_counts.tolist() == [5, 5, 4, 4, 4, 4]
-    first = read_image(places.path(0))
-    assert first.shape == (16, 16, 3)
-    # The same place from another year, and another place; JPEG of quality 95 loses a few levels.
-    assert np.abs(read_image(places.path(1)).astype(int) - first).mean() < 5
-    assert np.abs(read_image(places.path(5)).astype(int) - first).mean() > 20
+    assert read_image(places.path(0)).shape == (16, 16, 3)
 
 
 def test_both_loaders_give_the_same_images(
@@ -264,20 +259,6 @@ def test_both_loaders_give_the_same_images(
         assert place == label == index // 4
         pixels = 255 * (values.numpy() * deviation + mean)
         np.testing.assert_allclose(pixels.transpose(1, 2, 0), image, atol=3)
-
-
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_descriptors_are_written_as_numpy_reads_them(
-    scripts: Any, tmp_path: pathlib.Path, dtype: str
-) -> None:
-    path = tmp_path / "rows.npy"
-    scripts("bench_search").write_descriptors(path, 70_000, 256, dtype)  # in two parts
-    rows = open_npy(path)
-    assert (rows.shape, rows.dtype) == ((70_000, 256), np.dtype(dtype))
-    lengths = np.linalg.norm(rows.astype(np.float32), axis=1)
-    # bfloat16 rounds each number by up to 2^-9 of itself.
-    np.testing.assert_allclose(lengths, 1, atol=2e-3 if dtype == "bfloat16" else 1e-6)
-    assert len(np.unique(rows[:, 0].astype(np.float32))) > 500
 
 
 @pytest.mark.slow

@@ -127,13 +127,15 @@ DEVICES = """
 import jax, numpy as np
 from crisalad_jax.utils.devices import devices_for
 from tests.training.test_batch_norm import *
+from tests.training.test_step import LABELS
 
 devices = devices_for(6)
 assert devices.mesh.size == 2
 state, frozen = init_train_state(PARAMS, "adapters+head", STEP)
 state, frozen = devices.replicate((state, frozen))
-batch = [devices.shard_batch(np.asarray(x)) for x in (pictures(6), LABELS, VALID)]
-state, metrics = train_step(state, frozen, *batch, jax.random.key(0), STEP)
+images, labels, valid = (devices.shard_batch(np.asarray(x)) for x in (pictures(6), LABELS, VALID))
+batch = {"images": images, "labels": labels, "valid": valid}
+state, metrics = take_step(state, frozen, **batch, config=STEP)
 params, alone = stepped()
 assert_close(merge_params(state.trainable, frozen, MODEL), params)
 np.testing.assert_allclose(metrics.loss, alone.loss, rtol=1e-5)

@@ -158,24 +158,10 @@ def test_classification_learns(tmp_path, places):
     assert steps[-1]["loss"] < 0.5 * steps[0]["loss"]
 
 
-@pytest.mark.parametrize(
-    ("loss", "words"),
-    [
-        (
-            LargeMarginCosineConfig(classes=ClassesConfig(groups=3, steps=2)),
-            "city: found 2 classes of .* in the smallest of 3 groups, expected places_per_batch",
-        ),
-        (
-            LargeMarginCosineConfig(classes=ClassesConfig(kind="viewpoints")),
-            r"city: found .*one position for all images of a city",
-        ),
-    ],
-)
-def test_classes_that_cannot_be_made_are_told_before_any_file_is_written(
-    tmp_path, places, loss, words
-):
+def test_classes_that_cannot_be_made_are_told_before_any_file_is_written(tmp_path, places):
+    loss = LargeMarginCosineConfig(classes=ClassesConfig(groups=3, steps=2))
     config = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, kind=loss))
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=r"city: found 2 classes of .* in the smallest of 3 group"):
         fit(config, places, tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
 

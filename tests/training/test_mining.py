@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import pathlib
+import unittest.mock
 
 import jax
 import jax.numpy as jnp
@@ -324,8 +325,8 @@ def test_recipes_are_the_codes():
         assert config.model.image_size == (480, 640)
         assert config.loss == LossConfig(kind=TripletConfig(0.1**0.5, "all"), miner="none")
         sgd = config.optimiser
-        assert (sgd.kind, sgd.learning_rate, sgd.momentum) == ("sgd", 1e-4, 0.9)
-        assert sgd.weight_decay == 1e-3
+        found = sgd.kind, sgd.learning_rate, sgd.momentum, sgd.weight_decay
+        assert found == ("sgd", 1e-4, 0.9, 1e-3)
         # Both stop after more than 10 epochs without gain.
         assert (config.epochs, config.patience, config.monitor) == (30, 11, "R@5")
         assert (config.places_per_batch, config.trainable) == (4, "last-1-blocks+head")
@@ -339,8 +340,8 @@ def test_recipes_are_the_codes():
     assert (selavpr.places_per_batch, selavpr.images_per_place) == (4, 4)
     assert (selavpr.model.descriptor_dim, selavpr.model.image_size) == (1024, (224, 224))
     adam = selavpr.optimiser
-    assert (adam.kind, adam.learning_rate, adam.weight_decay) == ("adam", 1e-5, 0)
-    assert adam.end_lr_fraction == 1
+    found = adam.kind, adam.learning_rate, adam.weight_decay, adam.end_lr_fraction
+    assert found == ("adam", 1e-5, 0, 1)
     assert (selavpr.epochs, selavpr.patience, selavpr.monitor) == (50, 3, "R@5")
     assert selavpr.trainable == "adapters+head"
 
@@ -365,25 +366,14 @@ CONFIG = dataclasses.replace(
 
 def test_training_reads_the_set_as_configured(street, tmp_path, monkeypatch):
     """Radii, and the images of a file, reach the reader."""
-    asked = {}
-
-    def read(data, **options):
-        asked.update(options, data=data)
-        raise InputError("read")
-
+    read = unittest.mock.Mock(side_effect=InputError("read"))
     monkeypatch.setattr("crisalad_jax.training.start.read_query_set", read)
     mining = dataclasses.replace(CONFIG.mining, positive_radius=4.0, negative_radius=50.0)
     config = dataclasses.replace(CONFIG, mining=mining, epochs=1)
-    file = tmp_path / "set.mat"
     with pytest.raises(InputError, match=r"^read$"):
-        train(config, file, tmp_path / "run", images=street, quiet=True)
-    assert asked == {
-        "data": file,
-        "positive_radius": 4.0,
-        "negative_radius": 50.0,
-        "images": street,
-        "on_bad_image": "stop",
-    }
+        train(config, tmp_path / "set.mat", tmp_path / "run", images=street, quiet=True)
+    radii = {"positive_radius": 4.0, "negative_radius": 50.0}
+    read.assert_called_once_with(tmp_path / "set.mat", **radii, images=street, on_bad_image="stop")
 
 
 def test_unreadable_images_are_told_in_mining(tmp_path, capfd):

@@ -128,11 +128,6 @@ def test_blocks_are_counted_from_the_end(params) -> None:
     assert sum(sizes) == 0
 
 
-def test_unknown_parts_raise(params) -> None:
-    with pytest.raises(InputError, match="found 'tail', expected head"):
-        split_params(params, MODEL, "tail")
-
-
 def test_a_step_changes_what_trains_and_nothing_else(params) -> None:
     state, frozen = init_train_state(params, "adapters+head", STEP)
     trainable_names = named_leaves(state.trainable).keys()
