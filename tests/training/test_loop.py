@@ -285,7 +285,8 @@ def test_a_validation_has_its_own_size(params, benchmark, monkeypatch):
     queries = np.stack([resize_image(read_image(q), (56, 84)) for q in benchmark.queries])
     transport = extract_tokens(params, queries, larger).transport
     # Means of numbers below 100, of float32.
-    assert metrics["dustbin_share"] == pytest.approx(transport.dustbin_share.mean(), rel=1e-5)
+    share = float(transport.dustbin_share.mean())
+    assert metrics["dustbin_share"] == pytest.approx(share, rel=1e-5)
 
 
 def validated(config: TrainConfig, params: Crisalad, benchmark: Benchmark) -> validation.Validation:
