@@ -59,14 +59,21 @@ def test_an_installed_packages_entry_points_are_plugins(kind, tmp_path, monkeypa
     assert "first-patch" in REGISTRIES["aggregator"]
 
 
+def load(folder: pathlib.Path, text: str) -> pathlib.Path:
+    """Load a plug-in of this text; return its file."""
+    path = folder / "mine.py"
+    path.write_text(text)
+    load_plugin(str(path))
+    return path
+
+
 # Bad input, in the library and through the command line
 
 BROKEN = {
     "raises": ("import os\nraise RuntimeError('no licence\\nfound')\n",
         "cannot be loaded: it raises RuntimeError in line 2: no licence found"),
-    "imports": ("import no_such_module\n",
-        "cannot be loaded: it raises ModuleNotFoundError in line 1: No module named 'no_such_mo"),
     "syntax": ("x = 1\ndef broken(:\n", "cannot be loaded: it raises SyntaxError in line 2: "),
+    "ends": ("import sys\n\nsys.exit(0)\n", "cannot be loaded: it raises SystemExit in line 3: 0"),
     "bytes": ("x = '\udcff'\n", "cannot be loaded: it raises SyntaxError"),
     "taken": ("""
 import crisalad_jax as cj
@@ -76,32 +83,6 @@ def mine(problem, potentials):
     return potentials
 """, "register_step 'newton': found the name taken by crisalad_jax.nn.transport.steps.NewtonStep, "
         "expected another name for mine"),
-    "thawed": ("""
-import dataclasses
-import crisalad_jax as cj
-
-@cj.register_loss("thawed")
-@dataclasses.dataclass
-class Thawed:
-    scale: float = 1.0
-""", "register_loss 'thawed': found Thawed, expected a subclass of Loss with @datac"),
-    "thawed loss": ("""
-import dataclasses
-import crisalad_jax as cj
-
-@cj.register_loss("thawed")
-@dataclasses.dataclass
-class Thawed(cj.Loss):
-    scale: float = 1.0
-""", "cannot be loaded: it raises TypeError in line 6: cannot inherit non-frozen dataclass from a"),
-    "bare": ("""
-import crisalad_jax as cj
-
-@cj.register_aggregator("bare")
-class Bare(cj.Aggregator):
-    def token_shape(self, dim):
-        return cj.TokenShape(dim, 0, dim)
-""", "register_aggregator 'bare': found Bare, expected a subclass of Aggregator with @"),
     "recipe": ("""
 import crisalad_jax as cj
 
@@ -126,29 +107,15 @@ def test_a_file_that_cannot_be_loaded(name: str, tmp_path: pathlib.Path, capfd: 
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ("none.py", "plugin none.py: found no such file, expected FILE.py or MODULE"),
-        ("none.none", "plugin none.none: found no such module, expected FILE.py or MODULE"),
-        ("", "plugin : found no such module, expected FILE.py or MODULE"),
-    ],
+    ("given", "kind"), [("none.py", "file"), ("none.none", "module"), ("a_folder", "module")]
 )
-def test_a_file_or_module_that_is_not_there(given: str, words: str, capfd: Capture) -> None:
-    with pytest.raises(InputError) as error:
-        load_plugin(given)
-    assert str(error.value) == words
-    fails(capfd, "info", f"--plugin={given}", words=(words,))
-
-
-def test_in_a_process_of_its_own(tmp_path: pathlib.Path) -> None:
-    """One line and code 2, whatever the interpreter would say of a file that is no program."""
-    path = tmp_path / "mine.py"
-    path.write_text(BROKEN["syntax"][0])
-    command = [sys.executable, "-m", "crisalad_jax", "info", "--plugin", path]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith(f"crisalad: plugin {path}: cannot be loaded: it raises SyntaxErr")
-    assert done.stderr.count("\n") == 1
+def test_a_file_or_module_that_is_not_there(
+    given: str, kind: str, tmp_path: pathlib.Path, capfd: Capture, monkeypatch
+) -> None:
+    (tmp_path / "a_folder").mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    words = f"plugin {given}: found no such {kind}, expected FILE.py or MODULE"
+    fails(capfd, "info", "--plugin", given, words=(words,))
 
 
 STEPS = """
@@ -178,7 +145,7 @@ class WidePlan(cj.sinkhorn.Step):
         return jnp.zeros((7, 7))
 """
 BAD_STEPS = {
-    "short": ", step: found to return (Potentials(row=float32[{}2], column=float32[",
+    "short": ", step: found to return (Potentials(row=float32[2], column=float32[",
     "nothing": ", step: found to return (None, None), expected (Potentials(row=float32[",
     "wide-plan": ", log_plan: found to return float32[7,7], expected float32[",
 }
@@ -191,36 +158,30 @@ def save_with_step(path: pathlib.Path, name: str) -> None:
     save_weights(path, Model(random_params(config), config))
 
 
+def solved(config: SinkhornConfig) -> Any:
+    return solve(jnp.zeros((6, 3)), jnp.zeros(6), jnp.log(jnp.full(3, 2.0)), config=config)
+
+
+def refused(words: str, call: Any, *arguments: Any) -> None:
+    """The call raises an InputError of one line that begins with these words."""
+    with pytest.raises(InputError, match=f"^{re.escape(words)}") as error:
+        call(*arguments)
+    assert "\n" not in str(error.value)
+
+
 @pytest.mark.usefixtures("_unchecked")
 @pytest.mark.parametrize("name", BAD_STEPS)
-def test_a_step_that_returns_something_else(
-    name: str, tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture
-) -> None:
-    plugin, weights = tmp_path / "steps.py", tmp_path / "w.safetensors"
-    plugin.write_text(STEPS)
-    load_plugin(str(plugin))
-    words = f"step {name}{BAD_STEPS[name]}"
-    with pytest.raises(InputError) as error:
-        solve(
-            jnp.zeros((6, 3)), jnp.zeros(6), jnp.log(jnp.full(3, 2.0)), config=SinkhornConfig(name)
-        )
-    assert str(error.value).startswith(words.format(""))
-    assert "\n" not in str(error.value)
-    save_with_step(weights, name)
-    data = ("evaluate", "--data", shared / "town", "--weights", weights, "--batch-size", BATCH)
-    words = f"crisalad: {words.format(f'{BATCH},')}"
-    fails(capfd, *data, "--plugin", plugin, "--quiet", words=(words,))
+def test_a_step_that_returns_something_else(name: str, tmp_path: pathlib.Path) -> None:
+    load(tmp_path, STEPS)
+    refused(f"step {name}{BAD_STEPS[name]}", solved, SinkhornConfig(name))
 
 
 def test_a_step_that_makes_nan(
     tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture
 ) -> None:
     """The library's result says so, and an evaluation refuses the descriptors."""
-    plugin, weights = tmp_path / "steps.py", tmp_path / "w.safetensors"
-    plugin.write_text(STEPS)
-    load_plugin(str(plugin))
-    config = SinkhornConfig("not-a-number")
-    result = solve(jnp.zeros((6, 3)), jnp.zeros(6), jnp.log(jnp.full(3, 2.0)), config=config)
+    plugin, weights = load(tmp_path, STEPS), tmp_path / "w.safetensors"
+    result = solved(SinkhornConfig("not-a-number"))
     assert not result.finite
     assert not result.converged
     save_with_step(weights, "not-a-number")
@@ -236,24 +197,14 @@ import dataclasses
 import jax.numpy as jnp
 import crisalad_jax as cj
 
-class Average(cj.Aggregator):
+@cj.register_aggregator("bare-array")
+@dataclasses.dataclass(frozen=True)
+class BareArray(cj.Aggregator):
     def token_shape(self, dim):
         return cj.TokenShape(dim, 0, dim)
 
     def apply(self, params, features, grid, *, key):
-        return self.outputs(features.patches.mean(axis=-2))
-
-@cj.register_aggregator("bare-array")
-@dataclasses.dataclass(frozen=True)
-class BareArray(Average):
-    def outputs(self, mean):
-        return mean
-
-@cj.register_aggregator("narrow")
-@dataclasses.dataclass(frozen=True)
-class Narrow(Average):
-    def outputs(self, mean):
-        return cj.Tokens.of_global(mean[..., 1:])
+        return features.patches.mean(axis=-2)
 
 @cj.register_aggregator("by-patch")
 def by_patch(features):
@@ -262,8 +213,6 @@ def by_patch(features):
 BAD_AGGREGATORS = {
     "bare-array": "found to return float32[2,32], "
     "expected Tokens(global_token=float32[2,32], local=float32[2,0,32])",
-    "narrow": "found to return Tokens(global_token=float32[2,31], local=float32[2,0,31]), "
-    "expected Tokens(global_token=float32[2,32], local=float32[2,0,32])",
     "by-patch": "found to return Tokens(global_token=float32[2,0], local=float32[2,12,32]), "
     "expected Tokens(global_token=float32[2,0], local=float32[2,256,32])",
 }
@@ -271,21 +220,12 @@ BAD_AGGREGATORS = {
 
 @pytest.mark.usefixtures("_unchecked")
 @pytest.mark.parametrize("name", BAD_AGGREGATORS)
-def test_an_aggregator_that_returns_something_else(
-    name: str, tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture
-) -> None:
-    plugin, weights = tmp_path / "mine.py", tmp_path / "w.safetensors"
-    plugin.write_text(AGGREGATORS)
-    load_plugin(str(plugin))
+def test_an_aggregator_that_returns_something_else(name: str, tmp_path: pathlib.Path) -> None:
+    load(tmp_path, AGGREGATORS)
     config = dataclasses.replace(WITHOUT_ENCODER, aggregator=name)
-    params = random_params(config)
-    with pytest.raises(InputError) as error:
-        describe(params, np.zeros((2, *config.image_size, 3), np.uint8), config)
+    pictures = np.zeros((2, *config.image_size, 3), np.uint8)
     words = f"aggregator {name}: {BAD_AGGREGATORS[name]}"
-    assert str(error.value) == words
-    save_weights(weights, Model(params, config))
-    data = ("evaluate", "--data", shared / "town", "--weights", weights, "--batch-size", 2)
-    fails(capfd, *data, "--plugin", plugin, "--quiet", words=(f"crisalad: {words}",))
+    refused(words, describe, random_params(config), pictures, config)
 
 
 LOSSES = """
@@ -295,36 +235,23 @@ import crisalad_jax as cj
 def each(batch):
     return batch.similarities.sum(axis=1)
 
-@cj.register_loss("words")
-def words(batch):
-    return "small"
-
 @cj.register_loss("silent")
 def silent(descriptors, labels):
     pass
 """
 BAD_LOSSES = {
     "each": "found to return LossValue(loss=float32[6]), expected LossValue(loss=float32[])",
-    "words": "found to return LossValue(loss=str), expected LossValue(loss=float32[])",
     "silent": "found to return LossValue(loss=None), expected LossValue(loss=float32[])",
 }
 
 
 @pytest.mark.usefixtures("_unchecked")
 @pytest.mark.parametrize("name", BAD_LOSSES)
-def test_a_loss_that_is_no_number(
-    name: str, tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture
-) -> None:
-    plugin, out = tmp_path / "mine.py", tmp_path / "out"
-    plugin.write_text(LOSSES)
-    load_plugin(str(plugin))
+def test_a_loss_that_is_no_number(name: str, tmp_path: pathlib.Path) -> None:
+    load(tmp_path, LOSSES)
+    config = LossConfig(kind=name)
     words = f"loss {name}: {BAD_LOSSES[name]}"
-    with pytest.raises(InputError) as error:
-        metric_loss(jnp.eye(6), jnp.arange(6) // 2, LossConfig(kind=name))
-    assert str(error.value) == words
-    run = ("train", "--data", shared / "city", "--out", out, "--config", shared / "recipe.json")
-    more = ("--weights", shared / "weights.safetensors", "--plugin", plugin, "--quiet")
-    fails(capfd, *run, *more, "--loss.kind", name, words=(f"crisalad: {words}",))
+    refused(words, metric_loss, jnp.eye(6), jnp.arange(6) // 2, config)
 
 
 RAISES = """
@@ -336,30 +263,41 @@ def raises(problem, potentials):
     return helper(rows)
 
 def helper(rows):
-    raise ValueError("found no rows,\\nexpected some")
+    raise ERROR
 """
 
 
 @pytest.mark.usefixtures("_unchecked")
+@pytest.mark.parametrize(
+    ("raised", "words"),
+    [
+        (
+            'ValueError("found no rows,\\nexpected some")',
+            "ValueError: found no rows, expected some",
+        ),
+        ("SystemExit(0)", "SystemExit: 0"),
+    ],
+)
 def test_a_plug_in_that_raises_while_it_runs_is_named_in_one_line(
-    tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture, monkeypatch
+    raised: str, words: str, tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture
 ) -> None:
-    plugin, weights = tmp_path / "steps.py", tmp_path / "w.safetensors"
-    plugin.write_text(RAISES)
-    load_plugin(str(plugin))
+    plugin, weights = load(tmp_path, RAISES.replace("ERROR", raised)), tmp_path / "w.safetensors"
     save_with_step(weights, "raises")
     data = ("evaluate", "--data", shared / "town", "--weights", weights, "--batch-size", BATCH)
-    words = (
-        f"crisalad: plugin {plugin}: line 10, in helper: ValueError: found no rows, expected some "
-        "(from Python you see the traceback)\n"
-    )
+    words = f"crisalad: plugin {plugin}: line 10, in helper: {words} (from Python you see the"
     fails(capfd, *data, "--plugin", plugin, "--quiet", words=(words,))
+
+
+def test_an_error_elsewhere_names_the_plug_ins_if_there_are_some(
+    tmp_path: pathlib.Path, capfd: Capture, monkeypatch
+) -> None:
+    """What a plug-in returned may break other code; else it is an error of this package."""
 
     def broken(*_: Any, **__: Any) -> None:
         raise ValueError("not a plug-in's")
 
-    # What a plug-in returned may break other code; without plug-ins it is an error of this package.
     monkeypatch.setattr("crisalad_jax.cli.info.run", broken)
+    plugin = load(tmp_path, RAISES)
     words = f"crisalad: plugin {plugin}: ValueError: not a plug-in's (from Python"
     fails(capfd, "info", "--plugin", plugin, words=(words,))
     monkeypatch.setattr(plugins, "_LOADED", {})
@@ -394,23 +332,8 @@ def test_a_gradient_that_returns_something_else_is_named(returned: str | None) -
         "potentials": r"Potentials\(row=float32\[6\], column=float32\[3\]\)",
         "short": r"Solution\(potentials=Potentials\(row=float32\[5\], .*\)",
     }[returned]
-    log_nu = jnp.log(jnp.full(3, 2.0))
     with pytest.raises(InputError, match=f"^gradient wrong: found to return {found}, expected S"):
-        solve(jnp.zeros((6, 3)), jnp.zeros(6), log_nu, config=SinkhornConfig(gradient="wrong"))
-
-
-def test_a_plug_in_that_ends_the_program_is_refused(tmp_path: pathlib.Path) -> None:
-    file = tmp_path / "ends.py"
-    file.write_text("import sys\n\nsys.exit(0)\n")
-    with pytest.raises(InputError, match=r"cannot be loaded: it raises SystemExit in line 3: 0$"):
-        load_plugin(str(file))
-
-
-def test_a_folder_is_no_plug_in(tmp_path: pathlib.Path, monkeypatch) -> None:
-    (tmp_path / "crisalad_some_folder").mkdir()
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(InputError, match=r"found no such module, expected FILE.py or MODULE"):
-        load_plugin("crisalad_some_folder")
+        solved(SinkhornConfig(gradient="wrong"))
 
 
 @pytest.mark.parametrize(
@@ -467,13 +390,10 @@ def test_files_that_need_a_part_that_is_not_there_name_its_plug_in(
     ],
 )
 def test_where_a_part_is_from(module: str, home: str | None, monkeypatch) -> None:
-    path = "/some/where/train_mine.py"
-    monkeypatch.setattr(sys.modules["__main__"], "__file__", path, raising=False)
+    main = sys.modules["__main__"]
+    monkeypatch.setattr(main, "__file__", "/some/where/train_mine.py", raising=False)
     assert plugins.home_of(module) == home
-
-
-def test_of_a_notebook_nothing_is_recorded(monkeypatch) -> None:
-    monkeypatch.delattr(sys.modules["__main__"], "__file__", raising=False)
+    monkeypatch.delattr(main, "__file__")  # as in a notebook
     assert plugins.home_of("__main__") is None
 
 
@@ -540,32 +460,19 @@ def test_plug_ins_all_the_way_in_processes_of_their_own(tmp_path: pathlib.Path, 
         command = [sys.executable, "-m", "crisalad_jax", *map(str, arguments)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == code, done.stderr
-        print(f"$ crisalad {arguments[0]}\n{done.stdout}{done.stderr}")
         return done
 
     plug = ("--plugin", *files)
-    how = (
-        "--preset",
-        "tiny",
-        *CHOSEN,
-        "--epochs",
-        4,
-        "--validate-every",
-        2,
-        "--places-per-batch",
-        4,
-    )
     trained = crisalad(
-        *("train", "--data", city, "--val", town, "--out", tmp_path / "run", "--quiet"),
-        *(*how, *plug),
+        *("train", "--data", city, "--val", town, "--out", tmp_path / "run", "--preset", "tiny"),
+        *("--epochs", 4, "--validate-every", 2, "--places-per-batch", 4, "--quiet"),
+        *(*CHOSEN, *plug),
     )
     assert "best R@5" in trained.stdout
     weights = tmp_path / "run" / "last.safetensors"
     data = ("--data", town, "--weights", weights, "--grouping", "single", "--quiet")
     crisalad("evaluate", *data, *plug, "--json", tmp_path / "table.json")
-    missing = crisalad("evaluate", *data, code=2).stderr
-    assert "found 'network', expected one of column, mass, none" in missing
-    assert missing.count("\n") == 1
+    assert "found 'network', expected one of" in crisalad("evaluate", *data, code=2).stderr
 
     compared = tmp_path / "compared"
     crisalad(
@@ -578,7 +485,6 @@ def test_plug_ins_all_the_way_in_processes_of_their_own(tmp_path: pathlib.Path, 
     for name in ("crisalad", "step-momentum", "attention-pool"):
         for seed in (0, 1):
             assert (compared / name / f"seed-{seed}" / "run" / "last.safetensors").is_file()
-    print((compared / "table.md").read_text())
 
     crisalad(
         *("export", "--weights", weights, "--out", tmp_path / "program", "--platforms", "cpu"),
@@ -594,7 +500,6 @@ def test_plug_ins_all_the_way_in_processes_of_their_own(tmp_path: pathlib.Path, 
         *("--grouping", "single", "--quiet", *plug),
     )
     found, expected = np.load(exported), np.load(tmp_path / "own.npy")
-    print(f"exported against extracted: {np.abs(found - expected).max():.1e}")
     # The script's pictures are Pillow's, whose pixels differ from OpenCV's by a level at times.
     np.testing.assert_allclose(found, expected, atol=1e-3)
     # The program itself makes the same sums, in float32, in another order.
@@ -603,27 +508,9 @@ def test_plug_ins_all_the_way_in_processes_of_their_own(tmp_path: pathlib.Path, 
     (batch,) = cj.image_batches(sorted(images.iterdir()), image_size=(98, 98), batch_size=7)
     np.testing.assert_allclose(program(batch.images), expected, atol=1e-5)
 
-    files[0].write_text(files[0].read_text().replace("jnp.exp(", "jnp.exp(0.5 * "))
-    note = crisalad("evaluate", *data, *plug).stderr
-    assert "found another source of aggregator.sinkhorn.step learnt-epsilon than these" in note
-
-
-def test_a_plug_in_that_ends_the_program_while_it_runs_fails(
-    tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture
-) -> None:
-    plugin, weights = tmp_path / "steps.py", tmp_path / "w.safetensors"
-    plugin.write_text(
-        RAISES.replace('ValueError("found no rows,\\nexpected some")', "SystemExit(0)")
-    )
-    load_plugin(str(plugin))
-    save_with_step(weights, "raises")
-    data = ("evaluate", "--data", shared / "town", "--weights", weights, "--batch-size", BATCH)
-    words = f"crisalad: plugin {plugin}: line 10, in helper: SystemExit: 0 (from Python"
-    fails(capfd, *data, "--plugin", plugin, "--quiet", words=(words,))
-
 
 @pytest.mark.usefixtures("_unchecked")
-@pytest.mark.parametrize("dtype", ["float16", "bfloat16", "int32"])
+@pytest.mark.parametrize("dtype", ["bfloat16", "int32"])
 def test_tokens_parameters_and_losses_of_another_type_are_named(dtype: str) -> None:
     @cj.register_aggregator("half")
     @dataclasses.dataclass(frozen=True)
@@ -661,20 +548,17 @@ def test_tokens_parameters_and_losses_of_another_type_are_named(dtype: str) -> N
 
 
 @pytest.mark.parametrize(
-    ("register", "words"),
+    ("name", "words"),
     [
-        (
-            lambda: cj.register_step(lambda a, b: b),
-            "found <function .*, expected a name without .*: @r",
-        ),
-        (lambda: cj.register_step(3), "found 3, expected a name"),
-        (lambda: cj.register_step(""), "found '', expected a name without"),
-        (lambda: cj.register_step("my:step"), "found 'my:step', expected a name without"),
+        (lambda a, b: b, "found <function .*, expected a name without .*: @r"),
+        (3, "found 3, expected a name"),
+        ("", "found '', expected a name without"),
+        ("my:step", "found 'my:step', expected a name without"),
     ],
 )
-def test_a_registration_without_a_name_is_refused(register: Any, words: str) -> None:
+def test_a_registration_without_a_name_is_refused(name: Any, words: str) -> None:
     with pytest.raises(InputError, match=f"^register_step: {words}"):
-        register()
+        cj.register_step(name)
 
 
 @pytest.mark.parametrize(
@@ -694,11 +578,8 @@ def test_settings_that_no_file_can_keep_are_refused(kind: Any, default: Any, wor
     assert "odd" not in REGISTRIES["loss"]
 
 
-def test_a_field_or_a_preset_of_another_name_is_refused() -> None:
+def test_a_preset_of_another_field_is_refused() -> None:
     base = type(cj.LossConfig().kind)
-    made = dataclasses.make_dataclass("Odd", [("apply", int, 1)], bases=(base,), frozen=True)
-    with pytest.raises(InputError, match=r"found a field 'apply', which has another meaning here$"):
-        cj.register_loss("odd")(made)
     made = dataclasses.make_dataclass("Odd", [("scale", int, 1)], bases=(base,), frozen=True)
     with pytest.raises(InputError, match=r"unexpected keyword argument 'scal'.*; expected all"):
         cj.register_loss("odd", tiny={"scal": 2})(made)
@@ -709,13 +590,8 @@ def test_a_run_goes_on_with_the_source_that_it_began_with_alone(
     tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture, monkeypatch
 ) -> None:
     plugin, out = tmp_path / "mine.py", tmp_path / "out"
-    text = """
-import crisalad_jax as cj
-
-@cj.register_loss("close")
-def close(batch):
-    return 1 - batch.similarities.mean()
-"""
+    text = "import crisalad_jax as cj\n@cj.register_loss('close')\n"
+    text += "def close(batch):\n    return 1 - batch.similarities.mean()\n"
     plugin.write_text(text)
     run = ("train", "--data", shared / "city", "--out", out, "--config", shared / "recipe.json")
     more = ("--weights", shared / "weights.safetensors", "--plugin", plugin, "--quiet")

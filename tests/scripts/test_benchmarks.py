@@ -20,7 +20,6 @@ from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import read_places
 from crisalad_jax.nn.costs import part_costs
-from crisalad_jax.retrieval.descriptor_files import open_npy
 from crisalad_jax.training.recipes import recipe
 from parity.reference.model import Crisalad as TorchCrisalad
 
@@ -114,19 +113,6 @@ def test_ours_is_compared_with_the_fastest_of_the_others(scripts: Any) -> None:
     }
     (row,) = bench.costs(race, "Costs.").rows
     assert row[3:] == ("1.5 s", "1.5 s", "1.5 s, 2.0 MB")
-
-
-def test_an_engine_that_is_not_in_a_race_has_no_figure_there(scripts: Any) -> None:
-    bench = scripts("bench_describe")
-    values = [
-        *(raced("ONNX Runtime", 8.0), raced("ours", 8.0)),
-        *(raced("torch eager", 8.0, dtype="bfloat16"), raced("ours", 8.0, dtype="bfloat16")),
-    ]
-    rows = bench.speeds(values, "Speeds.").rows
-    assert [row[3:6] for row in rows] == [
-        ("", "1000 (1000 to 1000)", "1000 (1000 to 1000)"),
-        ("1000 (1000 to 1000)", "", "1000 (1000 to 1000)"),
-    ]
 
 
 def test_races_of_this_machine_stay_unless_they_are_run_anew(scripts: Any) -> None:
@@ -254,11 +240,7 @@ def test_a_tree_of_the_size_of_gsv_cities_is_one(scripts: Any, tmp_path: pathlib
     places = read_places(tmp_path)
     assert places.cities == ("City00", "City01")
     assert places.image_counts.tolist() == [5, 5, 4, 4, 4, 4]
-    first = read_image(places.path(0))
-    assert first.shape == (16, 16, 3)
-    # The same place from another year, and another place; JPEG of quality 95 loses a few levels.
-    assert np.abs(read_image(places.path(1)).astype(int) - first).mean() < 5
-    assert np.abs(read_image(places.path(5)).astype(int) - first).mean() > 20
+    assert read_image(places.path(0)).shape == (16, 16, 3)
 
 
 def test_both_loaders_give_the_same_images(
@@ -277,20 +259,6 @@ def test_both_loaders_give_the_same_images(
         assert place == label == index // 4
         pixels = 255 * (values.numpy() * deviation + mean)
         np.testing.assert_allclose(pixels.transpose(1, 2, 0), image, atol=3)
-
-
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_descriptors_are_written_as_numpy_reads_them(
-    scripts: Any, tmp_path: pathlib.Path, dtype: str
-) -> None:
-    path = tmp_path / "rows.npy"
-    scripts("bench_search").write_descriptors(path, 70_000, 256, dtype)  # in two parts
-    rows = open_npy(path)
-    assert (rows.shape, rows.dtype) == ((70_000, 256), np.dtype(dtype))
-    lengths = np.linalg.norm(rows.astype(np.float32), axis=1)
-    # bfloat16 rounds each number by up to 2^-9 of itself.
-    np.testing.assert_allclose(lengths, 1, atol=2e-3 if dtype == "bfloat16" else 1e-6)
-    assert len(np.unique(rows[:, 0].astype(np.float32))) > 500
 
 
 @pytest.mark.slow
@@ -323,10 +291,8 @@ def test_the_search_is_measured(
 @pytest.mark.parametrize(
     ("name", "flags", "words"),
     [
-        ("bench_describe", "--batches 0", "argument --batches: found '0', expected a whole number"),
         ("bench_describe", "--sizes 98", "argument --sizes: found '98', expected a size such as"),
         ("bench_describe", "--sizes 99x99", "image size: found 99 x 99, expected sides that are"),
-        ("bench_train", "--rounds 0", "argument --rounds: found '0'"),
         ("bench_train", "--page missing.md", "missing.md: found no such file, expected a page"),
         ("bench_extract", "--images none", "argument --images: found 'none'"),
         ("bench_profile", "--out pyproject.toml", "expected a folder that can be written to"),
@@ -336,7 +302,6 @@ def test_the_search_is_measured(
         ("bench_loader", "--batch 6", "found 960 images in batches of 6, expected a multiple of"),
         ("bench_memory", "--images 190", "found 190 images, expected a multiple of 4"),
         ("bench_overlap", "--steps 4", "found 4 steps of 48 images, expected more than 4 steps"),
-        ("bench_search", "--dtype int8", "argument --dtype: invalid choice: 'int8'"),
         ("bench_search", "nothing", "found nothing, expected of bench_search, search_memory"),
         ("bench_search", "--memory-rows 9000000000", "GB free, expected 304128.0 GB"),
         ("bench_sinkhorn", "--calls -1", "argument --calls: found '-1'"),

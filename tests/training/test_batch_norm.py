@@ -9,39 +9,26 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.data.places import read_places
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.model import init_crisalad, tokens_and_statistics
-from crisalad_jax.training import run_files
-from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.training.loop import fit
-from crisalad_jax.training.losses import LossConfig
-from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
-from crisalad_jax.training.step import StepConfig, init_train_state, train_step
+from crisalad_jax.training.step import init_train_state
 from crisalad_jax.training.trainable import count_trainable, merge_params, split_params
 from crisalad_jax.utils.pytree import named_leaves
-from tests.conftest import MODEL as TESTS_MODEL
 from tests.conftest import RECIPE, assert_equal, random_params
 from tests.nn.test_model import pictures
 from tests.training.programs import run_on_devices
-from tests.training.test_loop import Interrupted, fail_at
+from tests.training.test_loop import interrupt
+from tests.training.test_step import STEP as WITHOUT_NORMS
+from tests.training.test_step import VALID, take_step
 
 # Of 64 the multi-resolution adapter's narrow convolutions have 4 channels.
 ADAPTER = AdapterConfig(kind="multi-resolution", bottleneck=2.0)
 MODEL = dataclasses.replace(
-    TESTS_MODEL,
-    backbone=dataclasses.replace(TESTS_MODEL.backbone, adapter=ADAPTER),
-    aggregator=dataclasses.replace(TESTS_MODEL.aggregator, dropout=0.0),
-    cross_image=dataclasses.replace(TESTS_MODEL.cross_image, dropout=0.0),
+    WITHOUT_NORMS.model,
+    backbone=dataclasses.replace(WITHOUT_NORMS.model.backbone, adapter=ADAPTER),
 )
-STEP = StepConfig(
-    MODEL,
-    LossConfig(kind=MultiSimilarityConfig(base=0.5)),
-    OptimiserConfig(learning_rate=1e-3),
-    10,
-)
-LABELS = jnp.array([0, 0, 1, 1, 2, 2])
-ALL = np.ones(6, bool)
+STEP = dataclasses.replace(WITHOUT_NORMS, model=MODEL)
 PARAMS = random_params(MODEL)
 tokens_of = jax.jit(tokens_and_statistics, static_argnames=("config", "micro_batch"))
 
@@ -59,10 +46,9 @@ def assert_close(found, expected) -> None:
         )
 
 
-def stepped(config=STEP, images=None, valid=ALL):
+def stepped(config=STEP, valid=VALID):
     state, frozen = init_train_state(PARAMS, "adapters+head", config)
-    images = pictures(6) if images is None else images
-    state, metrics = train_step(state, frozen, images, LABELS, valid, jax.random.key(0), config)
+    state, metrics = take_step(state, frozen, valid=valid, config=config)
     return merge_params(state.trainable, frozen, config.model), metrics
 
 
@@ -121,38 +107,35 @@ def test_micro_batches_are_forward_passes_in_turn() -> None:
 
 
 @pytest.mark.slow
-def test_runs_keep_and_resume_the_statistics(shared, tmp_path) -> None:
+def test_runs_keep_and_resume_the_statistics(places, tmp_path, monkeypatch) -> None:
     """The weight file holds them, and a resumed run ends with the same bits."""
     config = dataclasses.replace(
         RECIPE, model=MODEL, trainable="adapters+head", epochs=2, patience=None
     )
-    places = read_places(shared / "city", min_images=2)
     whole = fit(config, places, tmp_path / "whole", quiet=True).params
     written, _ = load_weights(tmp_path / "whole" / "last.safetensors")
     assert_equal(statistics(written), statistics(whole))
     start = init_crisalad(jax.random.key(0), MODEL)
     assert any(np.abs(x - statistics(start)[n]).max() > 0 for n, x in statistics(whole).items())
 
-    with pytest.MonkeyPatch.context() as patch:
-        fail_at(patch, "train_step", 4)
-        patch.setattr(run_files, "SAVE_SECONDS", -1)
-        with pytest.raises(Interrupted):
-            fit(config, places, tmp_path / "resumed", quiet=True)
-    resumed = fit(config, places, tmp_path / "resumed", quiet=True).params
-    assert_equal(resumed, whole)
+    run = config, places, tmp_path / "resumed"
+    interrupt(monkeypatch, "train_step", 4, *run, quiet=True)
+    assert_equal(fit(*run, quiet=True).params, whole)
 
 
 DEVICES = """
 import jax, numpy as np
 from crisalad_jax.utils.devices import devices_for
 from tests.training.test_batch_norm import *
+from tests.training.test_step import LABELS
 
 devices = devices_for(6)
 assert devices.mesh.size == 2
 state, frozen = init_train_state(PARAMS, "adapters+head", STEP)
 state, frozen = devices.replicate((state, frozen))
-batch = [devices.shard_batch(np.asarray(x)) for x in (pictures(6), LABELS, ALL)]
-state, metrics = train_step(state, frozen, *batch, jax.random.key(0), STEP)
+images, labels, valid = (devices.shard_batch(np.asarray(x)) for x in (pictures(6), LABELS, VALID))
+batch = {"images": images, "labels": labels, "valid": valid}
+state, metrics = take_step(state, frozen, **batch, config=STEP)
 params, alone = stepped()
 assert_close(merge_params(state.trainable, frozen, MODEL), params)
 np.testing.assert_allclose(metrics.loss, alone.loss, rtol=1e-5)

@@ -8,7 +8,6 @@ import shutil
 import pytest
 
 from crisalad_jax.config.io import read_config
-from crisalad_jax.data.places import read_places
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.utils.errors import InputError
@@ -22,11 +21,6 @@ LONG = dataclasses.replace(
     optimiser=OptimiserConfig(learning_rate=1e-3, end_lr_fraction=0.2, decay_steps=4),
     patience=None,
 )
-
-
-@pytest.fixture(scope="module")
-def places(shared):
-    return read_places(shared / "city", min_images=2)
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import pathlib
-import shutil
+import unittest.mock
 
 import jax
 import jax.numpy as jnp
@@ -20,18 +20,16 @@ from crisalad_jax.data.reading import image_batches
 from crisalad_jax.experiments.train import train
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.model import describe
-from crisalad_jax.training import run_files
 from crisalad_jax.training.config import MiningConfig, TrainConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.losses import LossConfig, Role, metric_loss, tuple_labels, tuple_pairs
 from crisalad_jax.training.losses.pairwise import SelaVprLoss, TripletConfig
 from crisalad_jax.training.mining import Mined, Miner
-from crisalad_jax.training.optimiser import learning_rate_schedule
 from crisalad_jax.training.run_files import checksum_of_places
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import RECIPE, assert_equal
 from tests.data.test_query_set import write_street
-from tests.training.test_loop import Interrupted, assert_same_params, fail_at, metrics_of
+from tests.training.test_loop import assert_same_params, interrupt, metrics_of
 
 ROLES = np.array([[0, 1, 2, 2, 2], [0, 1, 2, 3, 3], [0, 1, 3, 3, 3]])
 """Three tuples: of three negatives, of one, and of none."""
@@ -75,28 +73,19 @@ def test_pairs_of_tuples_by_a_loop():
 def test_triplets_of_tuples_are_torchs(seed):
     """Nanne/pytorch-NetVlad sums torch's loss of each triplet and divides by their number.
 
-    Torch adds 1e-6 to each of 8 differences, which moves a distance by at most 3e-6.
+    Torch adds 1e-6 to each of 8 differences, which moves a distance by at most 3e-6. Gradients of
+    triplets are compared in losses/test_losses.py.
     """
     descriptors, labels = batch(seed)
     margin = 0.1**0.5
     config = LossConfig(kind=TripletConfig(margin, average="all"), miner="none")
 
-    def loss(descriptors):
-        pairs = tuple_pairs(jnp.asarray(labels))
-        return metric_loss(descriptors, jnp.asarray(labels), config, pairs=pairs).loss
-
-    found, gradient = jax.value_and_grad(loss)(jnp.asarray(descriptors))
-    theirs = torch.tensor(descriptors, requires_grad=True)
+    arrays = jnp.asarray(descriptors), jnp.asarray(labels)
+    found = metric_loss(*arrays, config, pairs=tuple_pairs(arrays[1])).loss
+    theirs = torch.tensor(descriptors)
     summed = torch.nn.TripletMarginLoss(margin=margin, p=2, reduction="sum")
     total = sum(summed(*(theirs[[image]] for image in each)) for each in triplets())
-    expected = torch.as_tensor(total / len(triplets()))
-    expected.backward()
-    np.testing.assert_allclose(found, expected.item(), rtol=0, atol=1e-5)
-    assert theirs.grad is not None
-    # Ours differentiates 2 - 2 x.y, theirs |x - y|^2: they differ along the unit vectors alone.
-    along = (np.asarray(gradient) - theirs.grad.numpy()) * descriptors
-    rest = np.asarray(gradient) - theirs.grad.numpy() - along.sum(1, keepdims=True) * descriptors
-    np.testing.assert_allclose(rest, 0, atol=1e-5)
+    np.testing.assert_allclose(found, float(total) / len(triplets()), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -336,8 +325,8 @@ def test_recipes_are_the_codes():
         assert config.model.image_size == (480, 640)
         assert config.loss == LossConfig(kind=TripletConfig(0.1**0.5, "all"), miner="none")
         sgd = config.optimiser
-        assert (sgd.kind, sgd.learning_rate, sgd.momentum) == ("sgd", 1e-4, 0.9)
-        assert sgd.weight_decay == 1e-3
+        found = sgd.kind, sgd.learning_rate, sgd.momentum, sgd.weight_decay
+        assert found == ("sgd", 1e-4, 0.9, 1e-3)
         # Both stop after more than 10 epochs without gain.
         assert (config.epochs, config.patience, config.monitor) == (30, 11, "R@5")
         assert (config.places_per_batch, config.trainable) == (4, "last-1-blocks+head")
@@ -351,30 +340,10 @@ def test_recipes_are_the_codes():
     assert (selavpr.places_per_batch, selavpr.images_per_place) == (4, 4)
     assert (selavpr.model.descriptor_dim, selavpr.model.image_size) == (1024, (224, 224))
     adam = selavpr.optimiser
-    assert (adam.kind, adam.learning_rate, adam.weight_decay) == ("adam", 1e-5, 0)
-    assert adam.end_lr_fraction == 1
+    found = adam.kind, adam.learning_rate, adam.weight_decay, adam.end_lr_fraction
+    assert found == ("adam", 1e-5, 0, 1)
     assert (selavpr.epochs, selavpr.patience, selavpr.monitor) == (50, 3, "R@5")
     assert selavpr.trainable == "adapters+head"
-
-
-@pytest.mark.filterwarnings("ignore:The epoch parameter:UserWarning")
-@pytest.mark.parametrize(("name", "steps_first"), [("netvlad", True), ("patch-netvlad", False)])
-def test_learning_rates_are_torchs(name, steps_first):
-    """Nanne's loop calls `scheduler.step(epoch)` before an epoch, Patch-NetVLAD's after it."""
-    optimiser = torch.optim.SGD([torch.nn.Parameter(torch.ones(1))], lr=1e-4)
-    schedule = torch.optim.lr_scheduler.StepLR(optimiser, step_size=5, gamma=0.5)
-    expected = []
-    for epoch in range(1, 31):
-        optimiser.step()
-        if steps_first:
-            schedule.step(epoch)
-        expected.append(optimiser.param_groups[0]["lr"])
-        if not steps_first:
-            schedule.step(epoch)
-    ours = learning_rate_schedule(recipe("b14", name).optimiser, 30 * 7, 7)
-    for step in range(30 * 7):
-        # Powers of a half, in float32.
-        assert float(ours(step)) == pytest.approx(expected[step // 7], rel=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -397,25 +366,14 @@ CONFIG = dataclasses.replace(
 
 def test_training_reads_the_set_as_configured(street, tmp_path, monkeypatch):
     """Radii, and the images of a file, reach the reader."""
-    asked = {}
-
-    def read(data, **options):
-        asked.update(options, data=data)
-        raise InputError("read")
-
+    read = unittest.mock.Mock(side_effect=InputError("read"))
     monkeypatch.setattr("crisalad_jax.training.start.read_query_set", read)
     mining = dataclasses.replace(CONFIG.mining, positive_radius=4.0, negative_radius=50.0)
     config = dataclasses.replace(CONFIG, mining=mining, epochs=1)
-    file = tmp_path / "set.mat"
     with pytest.raises(InputError, match=r"^read$"):
-        train(config, file, tmp_path / "run", images=street, quiet=True)
-    assert asked == {
-        "data": file,
-        "positive_radius": 4.0,
-        "negative_radius": 50.0,
-        "images": street,
-        "on_bad_image": "stop",
-    }
+        train(config, tmp_path / "set.mat", tmp_path / "run", images=street, quiet=True)
+    radii = {"positive_radius": 4.0, "negative_radius": 50.0}
+    read.assert_called_once_with(tmp_path / "set.mat", **radii, images=street, on_bad_image="stop")
 
 
 def test_unreadable_images_are_told_in_mining(tmp_path, capfd):
@@ -468,21 +426,13 @@ def test_a_run_learns_from_its_tuples(whole):
     assert all(line["gradient_norm"] > 0 for line in lines)
 
 
-@pytest.mark.parametrize("saves", ["rarely", "always"])
-@pytest.mark.parametrize(
-    "call", [1, 4, *(pytest.param(call, marks=pytest.mark.slow) for call in (2, 3, 6))]
-)
+@pytest.mark.parametrize("call", [1, 4, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_run_interrupted_in_a_round_goes_on_with_its_tuples(
-    street, whole, tmp_path, monkeypatch, call, saves
+    street, whole, tmp_path, monkeypatch, call
 ):
     """Ends at a step, or (call 1) as the first tuples were just mined."""
     queries, out = read_query_set(street), tmp_path / "run"
-    with monkeypatch.context() as patch:
-        fail_at(patch, "train_step", call)
-        if saves == "always":
-            patch.setattr(run_files, "SAVE_SECONDS", -1)
-        with pytest.raises(Interrupted):
-            fit(CONFIG, queries, out, quiet=True)
+    interrupt(monkeypatch, "train_step", call, CONFIG, queries, out, quiet=True)
     fit(CONFIG, queries, out, quiet=True)
     assert metrics_of(out) == metrics_of(whole)
     assert_same_params(*(load_weights(each / "last.safetensors")[0] for each in (out, whole)))
@@ -521,29 +471,8 @@ def test_every_round_is_mined_by_the_model_as_it_is(street, tmp_path, monkeypatc
 
         mine(again, 2 * number, describe_all)
         assert_equal(again.mined, found)
-    first, second = seen[0][0], seen[1][0]
-    assert any(
-        not np.array_equal(*leaves)
-        for leaves in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True)
-    )
-
-
-def test_an_older_state_has_its_own_tuples(street, whole, tmp_path, monkeypatch):
-    """The newest state is damaged and deleted, as the message says: the one before goes on."""
-    queries, out = read_query_set(street), tmp_path / "run"
-    with monkeypatch.context() as patch:
-        fail_at(patch, "train_step", 5)
-        patch.setattr(run_files, "SAVE_SECONDS", -1)
-        with pytest.raises(Interrupted):
-            fit(CONFIG, queries, out, quiet=True)
-    newest, older = sorted(
-        (path for path in (out / "state").iterdir() if path.name.isdigit()),
-        key=lambda path: -int(path.name),
-    )
-    assert (newest.name, older.name) == ("4", "3")  # of two rounds
-    shutil.rmtree(newest)
-    fit(CONFIG, queries, out, quiet=True)
-    assert metrics_of(out) == metrics_of(whole)
+    with pytest.raises(AssertionError):  # of other parameters, which the steps between changed
+        assert_equal(seen[0][0], seen[1][0])
 
 
 def test_the_wrong_kind_of_set_is_refused(street, shared, tmp_path):

@@ -49,8 +49,6 @@ def test_as_json_and_for_the_terminal():
     assert f"{summary.frozen_parameters:,} parameters" in "\n".join(summary_lines(summary))
 
 
-def test_what_is_refused():
+def test_no_images_are_refused():
     with pytest.raises(InputError, match="batch size: found 0"):
         model_summary(MODEL, images=0)
-    with pytest.raises(InputError, match="trainable: found the last 3 blocks, expected at most 2"):
-        model_summary(MODEL, "last-3-blocks+head")
