@@ -433,7 +433,7 @@ def test_convert_refuses_in_one_line(capfd, tmp_path, public):
 
 
 @pytest.mark.slow
-def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public):
+def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public, weights):
     model = dataclasses.replace(
         RECIPE.model, backbone=dataclasses.replace(BACKBONE.backbone, adapter=AdapterConfig())
     )
@@ -443,8 +443,8 @@ def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public):
         *("train", "--config", tmp_path / "recipe.json", "--backbone", public),
         *("--data", shared / "city", "--out", tmp_path / "run", "--quiet"),
     )
-    words = ("--backbone: found with --weights",)
-    fails(capfd, *arguments, "--weights", public, words=words)
+    words = ("--backbone: found beside --weights",)
+    fails(capfd, *arguments, "--weights", weights, words=words)
     words = (f"{public}: this backbone is another", "backbone.depth: found 2, expected 3")
     fails(capfd, *arguments, "--model.backbone.depth", 3, words=words)
     assert not (tmp_path / "run").exists()
