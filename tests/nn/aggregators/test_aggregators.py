@@ -45,7 +45,7 @@ DIMENSION_FIRST = {"boq", "conv-ap", "edtformer", "fol", "mixvpr", "salad"}
 """Whose authors' code flattens (dimension, token)."""
 
 
-@pytest.mark.parametrize("name", REGISTRIES["aggregator"])
+@pytest.mark.parametrize("name", list(REGISTRIES["aggregator"]))
 def test_descriptors_have_the_published_order(name: str) -> None:
     aggregator = REGISTRIES["aggregator"].make(name)
     tokens = Tokens.of_local(jnp.arange(12.0).reshape(3, 4))
