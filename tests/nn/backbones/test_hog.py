@@ -21,7 +21,7 @@ from crisalad_jax.utils.errors import InputError
 from tests.cli.test_cli import Capture, fails, succeeds
 from tests.conftest import RECIPE
 
-PHOTOGRAPHS = pathlib.Path(__file__).parents[3] / "shared" / "data"
+PHOTOGRAPHS = pathlib.Path(__file__).parents[4] / "shared" / "data"
 
 
 CONFIG = cj.ModelConfig(
