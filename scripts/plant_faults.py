@@ -202,7 +202,7 @@ def nearest_tests(file: pathlib.Path) -> list[str]:
 
 
 def _run(
-    copy_of_root: str, tests: list[str], answer: multiprocessing.connection.Connection
+    copy_of_root: str, tests: Sequence[str], answer: multiprocessing.connection.Connection
 ) -> None:
     """Run tests in this process until one fails, and send its name."""
     import pytest
@@ -246,11 +246,14 @@ class Copies:
             if (ROOT.parent / "shared").is_dir():  # photographs that some tests read
                 (root.parent / "shared").symlink_to(ROOT.parent / "shared")
             self._free.put(root)
+        # What compiles to the same program as before is not compiled again.
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder / "programs")
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(LIBRARIES)
 
     def run(
-        self, file: pathlib.Path, fault: Fault | None, tests: list[str], limit: float
+        self, file: pathlib.Path, fault: Fault | None, tests: Sequence[str], limit: float
     ) -> tuple[str | None, float]:
         """Plant a fault, run tests, and take it out.
 
@@ -311,12 +314,13 @@ def main() -> None:
         concurrent.futures.ThreadPoolExecutor(arguments.workers) as pool,
     ):
         copies = Copies(pathlib.Path(folder), arguments.workers)
-        tests = {file: nearest_tests(file) for file in files}
-        whole = pool.map(lambda file: copies.run(file, None, tests[file], 1200), files)
-        without = dict(zip(files, whole, strict=True))
-        for file, (failed, _) in without.items():
+        tests = {file: tuple(nearest_tests(file)) for file in files}
+        of_tests = {tests[file]: file for file in files}
+        whole = pool.map(lambda one: copies.run(of_tests[one], None, one, 1200), of_tests)
+        without = dict(zip(of_tests, whole, strict=True))
+        for chosen, (failed, _) in without.items():
             if failed is not None:
-                sys.exit(f"{file}: {failed} fails without a fault")
+                sys.exit(f"{of_tests[chosen]}: {failed} fails without a fault")
         work = [
             (file, fault)
             for file in files
@@ -327,7 +331,7 @@ def main() -> None:
 
         def outcome(item: tuple[pathlib.Path, Fault]) -> Outcome:
             file, fault = item
-            seen, seconds = copies.run(file, fault, tests[file], 60 + 3 * without[file][1])
+            seen, seconds = copies.run(file, fault, tests[file], 60 + 3 * without[tests[file]][1])
             return Outcome(str(file), fault.line, fault.before, fault.after, seen, seconds)
 
         for number, found in enumerate(pool.map(outcome, work), 1):
