@@ -51,12 +51,13 @@ def join_processes(
     is_valid = count is None and index is None
     if coordinator != "auto":
         fits = count is not None and index is not None and 0 <= index < count
-        is_valid = fits and re.fullmatch(r".+:\d{1,5}", coordinator) is not None
+        port = re.fullmatch(r".+:(\d{1,5})", coordinator)
+        is_valid = fits and port is not None and 0 < int(port[1]) < 2**16
     require(
         is_valid,
         f"processes: found process {index} of {count} with {coordinator}, expected "
-        "--coordinator-address HOST:PORT --num-processes COUNT --process-id INDEX, with an index "
-        "from 0 and below the count; or auto alone",
+        "--coordinator-address HOST:PORT --num-processes COUNT --process-id INDEX, with a port of "
+        "1 to 65535, and an index from 0 and below the count; or auto alone",
     )
     given: dict[str, Any] = {}
     if coordinator != "auto":

@@ -303,7 +303,10 @@ def test_a_signal_to_one_process_stops_all_and_all_go_on(shared, by_devices, tmp
 
 @pytest.mark.parametrize(
     "given",
-    [("auto", 2, None), ("host:1", None, 0), ("host:1", 2, 2), ("host:1", 2, -1), ("host", 2, 0)],
+    [
+        *(("auto", 2, None), ("host:1", None, 0), ("host:1", 2, 2), ("host:1", 2, -1)),
+        *(("host", 2, 0), ("host:0", 2, 0), ("host:65536", 2, 0)),
+    ],
 )
 def test_processes_that_make_no_sense_are_refused(given):
     with pytest.raises(InputError, match=r"^processes: found .* expected"):
