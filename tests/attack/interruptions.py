@@ -345,8 +345,8 @@ def attack_training(bench: Bench, scale: float) -> list[Row]:
 
 def attack_busy(bench: Bench, _: float) -> list[Row]:
     """Signal commands whose main thread is in a library, as XLA is for minutes when it compiles."""
-    import crisalad_jax.retrieval.extract
     import crisalad_jax.training.trainer
+    from crisalad_jax.retrieval.jax_describer import JaxDescriber
 
     row = Row(
         "signals while a library works in the main thread",
@@ -362,7 +362,7 @@ def attack_busy(bench: Bench, _: float) -> list[Row]:
         return step(*given, **options)
 
     places = {
-        "extract .npy": (crisalad_jax.retrieval.extract, "group", busy),
+        "extract .npy": (JaxDescriber, "attend", busy),
         "train": (crisalad_jax.training.trainer, "train_step", busy),
     }
     for name, steps, signals in (

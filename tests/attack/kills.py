@@ -157,6 +157,7 @@ def marked(given: Sequence[str], marks: Marks, *settings: tuple[Any, str, Any]) 
 
     def work() -> int:
         for holder, name, value in settings:
+            assert hasattr(holder, name)  # or it is not what the command uses
             setattr(holder, name, value)
         marks.install()
         code = command(given, ready=lambda: marks.say("start"))
