@@ -423,12 +423,21 @@ def read_ahead(
 
 
 def one_ahead(stream: Generator[_Item, None, None]) -> Generator[_Item, None, None]:
-    """Yield a stream's items, each computed in a thread while the item before it is in use."""
-    with contextlib.closing(stream), ThreadPoolExecutor(1) as thread:
-        ahead = thread.submit(next, stream, None)
-        while (item := ahead.result()) is not None:
-            ahead = thread.submit(next, stream, None)
-            yield item
+    """Yield a stream's items, each computed in a thread while the item before it is in use.
+
+    The first two are not: where there is one, as in a search of a small map, a thread would take
+    longer to start than the search.
+    """
+    with contextlib.closing(stream):
+        yield from itertools.islice(stream, 1)
+        item = next(stream, None)
+        if item is None:
+            return
+        with ThreadPoolExecutor(1) as thread:
+            while item is not None:
+                ahead = thread.submit(next, stream, None)
+                yield item
+                item = ahead.result()
 
 
 def _same_size_runs(

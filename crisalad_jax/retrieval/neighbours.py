@@ -111,8 +111,12 @@ def similarities_of(
         row = np.cumsum(is_new) - 1
         similarities[piece] = exact_similarities(queries, rows, query[piece], row)
 
-    with ThreadPoolExecutor(usable_cores()) as threads:
-        list(threads.map(fill, range(0, len(order), size)))
+    starts = range(0, len(order), size)
+    if len(starts) == 1:  # a thread would take longer to start
+        fill(0)
+    else:
+        with ThreadPoolExecutor(usable_cores()) as threads:
+            list(threads.map(fill, starts))
     return similarities
 
 
