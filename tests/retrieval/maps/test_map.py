@@ -354,7 +354,7 @@ def test_what_is_no_map_is_refused_and_left_alone(tmp_path):
     (tmp_path / "file").write_text("x")
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_text("x")
-    append = functools.partial(append_until, images=1)
+    append = functools.partial(append_until, total=1)
     for call, name, words in (
         (Map.open, "photos", r"photos: found a\.jpg and no map\.json"),
         (Map.open, "none", "none: found no map"),
