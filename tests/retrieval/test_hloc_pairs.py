@@ -52,14 +52,6 @@ def by_name(names, rows) -> dict:
     return dict(zip(names, rows, strict=True))
 
 
-def test_pairs_are_the_nearest_of_the_database():
-    rows = unit_rows(9)
-    queries, database = by_name("abc", rows[:3]), by_name("defghi", rows[3:])
-    found = nearest_pairs("abc", rows[:3], "defghi", rows[3:], k=2)
-    expected = brute_force(queries, database, 2)
-    assert found == [(query, name) for query in "abc" for name in expected[query]]
-
-
 @pytest.mark.parametrize("k", [1, 3, 4, 50])
 def test_no_image_is_paired_with_itself(k):
     """Among themselves; a k beyond what there is gives all others."""

