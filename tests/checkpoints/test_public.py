@@ -6,7 +6,6 @@ import io
 import json
 import os
 import pathlib
-import sys
 import zipfile
 from collections.abc import Callable
 from typing import Any
@@ -444,13 +443,6 @@ def test_targets_and_layouts_that_do_not_fit(tmp_path: pathlib.Path) -> None:
     long = tmp_path / f"{'x' * 245}.ckpt"  # the temporary name beside it must not be longer
     convert(ours, long)
     assert long.read_bytes() == public.read_bytes()
-
-
-def test_without_torch_its_files_ask_for_it(tmp_path: pathlib.Path, monkeypatch) -> None:
-    source = written(tmp_path, "dinov2")
-    monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(ModuleNotFoundError, match="torch"):
-        read_checkpoint(source)
 
 
 def test_an_archive_that_unpacks_to_more_than_its_size_is_not_read(tmp_path: pathlib.Path) -> None:

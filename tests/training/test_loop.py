@@ -486,17 +486,6 @@ def test_a_run_resumes_only_from_the_same_weights_and_places(tmp_path, places, p
         fit(RECIPE, other, tmp_path, initial=params)
 
 
-def test_a_damaged_state_is_one_line_that_names_it_and_the_way_back(tmp_path, places, params):
-    save_steps(RECIPE, places, tmp_path, params, (0, 2))
-    for path in (tmp_path / "state" / "2" / "state").rglob("*"):
-        if path.is_file():
-            path.write_bytes(path.read_bytes()[:3])
-    with pytest.raises(InputError, match=r"damaged.*delete it to resume from step 0") as error:
-        fit(RECIPE, places, tmp_path, initial=params)
-    assert str(error.value).startswith(str(tmp_path / "state" / "2"))
-    assert "\n" not in str(error.value)
-
-
 def test_a_folder_belongs_to_one_configuration(run):
     check_run(run, ENDLESS)
     with pytest.raises(InputError, match=r"seed: found 6, expected 5.*another folder"):

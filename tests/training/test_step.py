@@ -115,19 +115,6 @@ def test_a_norm_that_the_aggregator_leaves_out_stays_frozen() -> None:
         assert ("backbone.norm.weight" in names) == last_norm
 
 
-def test_blocks_are_counted_from_the_end(params) -> None:
-    trainable, frozen = split_params(params, MODEL, "last-1-blocks+head")
-    for tree, block in ((frozen, "0"), (trainable, "1")):
-        weight = named_leaves(tree)[f"backbone.blocks.{block}.attn.qkv.weight"]
-        index = int(block)
-        np.testing.assert_array_equal(
-            weight, params.backbone.blocks.attn.qkv.weight[index : index + 1]
-        )
-    nothing, _ = split_params(params, MODEL, "last-0-blocks+head")
-    sizes = [leaf.size for name, leaf in named_leaves(nothing).items() if ".blocks." in name]
-    assert sum(sizes) == 0
-
-
 def test_a_step_changes_what_trains_and_nothing_else(params) -> None:
     state, frozen = init_train_state(params, "adapters+head", STEP)
     trainable_names = named_leaves(state.trainable).keys()
@@ -461,17 +448,6 @@ def test_frozen_weights_in_half_the_memory_change_no_bit() -> None:
     assert_equal(*results)
 
 
-def test_training_learns(params) -> None:
-    """Thirty steps on one batch of six pictures lower its loss."""
-    config = dataclasses.replace(STEP, steps=100)
-    state, frozen = init_train_state(params, "all", config)
-    found = []
-    for _ in range(30):
-        state, metrics = take_step(state, frozen, config=config)
-        found.append(float(metrics.loss))
-    assert found[-1] < found[0] - 0.2
-
-
 @pytest.mark.parametrize(
     ("classes", "key", "words"),
     [
@@ -493,20 +469,6 @@ def test_another_configuration_or_loss_is_named(params) -> None:
         init_train_state(params, "head", config)
     with pytest.raises(InputError, match=r"^GivenLoss.function: found 'triplet', expected"):
         step_config(config, steps=5, loss="triplet")
-
-
-@pytest.mark.slow
-def test_a_setting_of_a_loss_keeps_its_default(params) -> None:
-    """A third argument of another name is not given which images are valid."""
-    seen = []
-
-    def loss(descriptors, labels, temperature=0.25):
-        seen.append(temperature)
-        return (descriptors[0] * descriptors[1]).sum() / temperature
-
-    static = step_config(TrainConfig(model=MODEL), steps=5, loss=loss)
-    take_step(*init_train_state(params, "head", static), config=static)
-    assert set(seen) == {0.25}
 
 
 def test_labels_that_32_bits_cannot_tell_apart_are_refused(params) -> None:
