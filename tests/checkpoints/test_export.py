@@ -232,15 +232,6 @@ def test_a_script_fills_the_last_batch_or_refuses(
         list(script.batches(paths, manifest | {"grouping": "batch"}, 16))
 
 
-def test_a_script_refuses_a_file_that_was_changed(
-    beside: pathlib.Path, tmp_path: pathlib.Path, scripts: Any
-):
-    manifest = json.loads((beside / "manifest.json").read_text())
-    manifest["program"]["sha256"] = "0" * 64
-    with pytest.raises(SystemExit, match=r"found other bytes than manifest\.json says"):
-        scripts("run_exported").load(beside, manifest)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PLAIN)
 def test_other_models_for_all_platforms(name: str):

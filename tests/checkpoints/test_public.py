@@ -28,7 +28,6 @@ from crisalad_jax.checkpoints.public import (
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
-from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, describe, init_crisalad, self_mask
@@ -306,24 +305,12 @@ def test_adapters_come_along_where_they_are_the_same(tmp_path: pathlib.Path, kin
     np.testing.assert_array_equal(found[name], wanted[name] if same else named_leaves(start)[name])
 
 
-@pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        (
-            {"depth": 3, "registers": 4},
-            "backbone.depth: found 2, exp.* backbone.registers: found 0",
-        ),
-        (None, "backbone: found vit, expected dinov3"),
-    ],
-)
-def test_another_backbone_is_refused(tmp_path: pathlib.Path, fields: Any, words: str) -> None:
+def test_another_backbone_is_refused(tmp_path: pathlib.Path) -> None:
     source = written(tmp_path, "dinov2")
-    config, start = DinoV3Config(dim=64, depth=2, heads=1), None
-    if fields is not None:
-        model, start = fresh("depthwise", **fields)
-        config = model.backbone
+    model, start = fresh("depthwise", depth=3, registers=4)
+    words = "backbone.depth: found 2, exp.* backbone.registers: found 0"
     with pytest.raises(InputError, match=f"{source}: this backbone is another .*: {words}"):
-        read_backbone(source, config, start)
+        read_backbone(source, model.backbone, start)
 
 
 # Bad files
@@ -366,7 +353,6 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
     "empty": (lambda: b"", "not a whole torch checkpoint"),
     "cut": (lambda: whole(small())[:9999], "not a whole torch checkpoint: "),
     "old, cut": (lambda: whole(small(), new=False)[:338], "not a whole torch checkpoint"),
-    "a list": (lambda: [1, 2], "found list, expected nothing but tensors by name"),
     "a number for a name": (lambda: {**small(), 3: BIAS}, "found 3, expected nothing but"),
     "double": (
         lambda: small(norm_bias=BIAS.double()),
@@ -398,7 +384,6 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: whole(Opens(pathlib.Path("made")), new=False),
         "refused: it asks for [a-z]+.mkdir, expected nothing but tenso",
     ),
-    "safetensors: text": (lambda: b"no checkpoint", "not a whole safetensors file"),
     "safetensors: eight bits": (
         lambda: safetensors.torch.save({"layernorm.bias": BIAS.to(torch.float8_e4m3fn)}),
         "found a type that numpy does not know: .*float8",
@@ -428,8 +413,6 @@ def test_a_file_that_is_no_model(tmp_path: pathlib.Path, monkeypatch, kind: str)
 
 def test_targets_and_layouts_that_do_not_fit(tmp_path: pathlib.Path) -> None:
     public, ours = written(tmp_path, "dino-salad"), tmp_path / "ours.safetensors"
-    with pytest.raises(InputError, match=r"found a public checkpoint .dino-salad. and format d"):
-        convert(public, tmp_path / "x.safetensors", "dinov2")
     convert(public, ours)
     for target, layout, words in (
         ("x.pth", "dinov2", "format dinov2: found a model of aggregator salad"),

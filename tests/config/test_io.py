@@ -19,15 +19,12 @@ CHANGED = dataclasses.replace(
     recipe("tiny"), cities=("Aston", "Brill"), patience=4, augmentation=recipe("b14").augmentation
 )
 VIT = {"name": "vit"}
-RECIPES_OF_PRESETS = {"changed": CHANGED} | {
-    f"{preset} {name}": recipe(preset, name)
-    for preset in PRESETS
-    for name in sorted({*RECIPES, *AGGREGATORS, *LOSSES})
-}
+CONFIGS = {"changed": CHANGED} | {preset: recipe(preset) for preset in PRESETS}
+CONFIGS |= {name: recipe("b14", name) for name in sorted({*RECIPES, *AGGREGATORS, *LOSSES})}
 
 
-@pytest.mark.parametrize("config", RECIPES_OF_PRESETS.values(), ids=RECIPES_OF_PRESETS)
-def test_every_recipe_of_every_preset_survives_a_file(tmp_path, config):
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+def test_every_preset_and_every_recipe_survives_a_file(tmp_path, config):
     plain = to_plain(config)
     write_json(tmp_path / "config.json", plain)
     found = read_config(TrainConfig, tmp_path / "config.json")
@@ -49,12 +46,9 @@ def test_fields_left_out_take_their_defaults():
     ("value", "words"),
     [
         ({"model": {"imag_size": [98, 98]}}, ["imag_size", "config.model"]),
-        ({"model": {"image_size": [100, 98]}}, ["found 100 x 98", "nearest: 98 x 98"]),
         ({"model": {"image_size": [98]}}, ["config.model.image_size"]),
         ({"model": {"backbone": VIT | {"dim": "32"}}}, ["'32'", "a whole", "backbone.dim"]),
-        ({"model": {"backbone": VIT | {"ffn": "relu"}}}, ["relu", "swiglu", "model.backbone.ffn"]),
         ({"model": {"backbone": {"dim": 32}}}, ["None", "config.model.backbone"]),
-        ({"model": None}, ["config.model"]),
         ({"epochs": 3.7}, ["3.7", "expected a whole number", "config.epochs"]),
         ({"epochs": 0}, ["epochs", "expected more than 0"]),
         ({"cities": "Rome"}, ["'Rome'", "tuple, each text", "config.cities"]),
@@ -62,7 +56,6 @@ def test_fields_left_out_take_their_defaults():
         ({"model": {"aggregator": {"name": ["gem"]}}}, ["['gem']", "config.model.aggregator"]),
         ({"model": {"aggregator": {"name": "gem", "clusters": 2}}}, ["found clusters"]),
         ({"model": {"aggregator": {"name": "gem"}, "gem": {}}}, ["found gem", "config.model"]),
-        ({"augmentation": ["light"]}, ["['light']", "config.augmentation"]),
         ([], ["found []", "an object"]),
     ],
 )

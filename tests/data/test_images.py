@@ -294,12 +294,8 @@ def test_list_images_follows_links_but_not_in_circles(tmp_path):
 
 
 def test_list_images_of_nothing(tmp_path):
-    with pytest.raises(InputError, match=f"{tmp_path.name}: found no image, expected files that"):
-        list_images(tmp_path)
     (tmp_path / "notes.txt").touch()
     with pytest.raises(InputError, match=r"found no image among 1 \.txt, expected"):
         list_images(tmp_path)
     with pytest.raises(InputError, match=r"notes\.txt: found a file, expected a folder"):
         list_images(tmp_path / "notes.txt")
-    with pytest.raises(InputError, match="missing: found nothing, expected a folder"):
-        list_images(tmp_path / "missing")

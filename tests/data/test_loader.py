@@ -290,7 +290,6 @@ def test_an_abandoned_iterator_does_not_hold_up_the_exit(places):
     [
         ({"start_step": 4}, "start_step, part: found 4 .*, expected 0 to 3"),
         ({"image_size": (0, 14)}, "image_size"),
-        ({"images_per_place": 4}, "place 0 has 3 images"),
         ({"on_bad_image": "black"}, "on_bad_image: found 'black', expected one of skip, stop"),
         ({"threads": -1}, "threads: found -1"),
         ({"augmentation": "nonne"}, "^augmentation: found 'nonne', expected one of .*none"),

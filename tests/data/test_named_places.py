@@ -196,11 +196,9 @@ UNFIT = "^.*walk: found arguments that do not fit each other, expected --cities 
         ({"place_radius": 0}, r"^--place-radius: found 0, expected metres above 0$"),
         ({"place_frames": 1}, r"^--place-frames: found 1, expected at least 2$"),
         ({"place_radius": 5, "place_frames": 4}, UNFIT),
-        ({"positions": "gps.csv"}, UNFIT),
         ({"place_frames": 4, "cities": ["a"]}, UNFIT),
         ({"place_frames": 4, "fps": 2.0}, r"^--fps: found 2 without a video"),
         ({"place_radius": 5}, r"walk: found no position of 7 images, expected --positions TA"),
-        ({}, r"walk: found .*, expected the layout of .*; --place-radius METRES makes places by"),
     ],
 )
 def test_arguments_that_do_not_fit_are_told(tmp_path, given, words):
@@ -298,7 +296,6 @@ def test_a_table_with_positions_makes_classes(folders):
         ("name;place\n", "found no place with at least 4 images"),
         ("name,place,heading\n", "found columns name, place, heading, expected"),
         ("name,place\nlone/1.jpg,\n", "line 2: found no place, expected"),
-        ("name,place\nlone/1.jpg,a\nlone/1.jpg,b\n", "found 'lone/1.jpg' twice, on line 2 too"),
     ],
 )
 def test_bad_tables(folders, text, message):

@@ -120,12 +120,7 @@ def test_a_repeated_row_is_one_image(tmp_path):
     assert read_places(tmp_path).image_counts.tolist() == [4]
 
 
-def test_no_dataframes(tmp_path):
-    words = r"^.*none: found no such folder, expected the layout of G.*places\.csv, or one folder a"
-    with pytest.raises(InputError, match=words):
-        read_places(tmp_path / "none")
-    with pytest.raises(InputError, match="found no image"):
-        read_places(tmp_path)
+def test_no_tables(tmp_path):
     (tmp_path / "Dataframes").mkdir()
     with pytest.raises(InputError, match="no CSV file"):
         read_places(tmp_path)
@@ -154,12 +149,11 @@ def test_a_missing_image_is_named_with_its_line_or_left_out_with_a_note(two_citi
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"min_images": 6}, "at least 6 images; the largest has 5"),
         ({"cities": ["A", "Paris"]}, r"\(--cities\): found A, Paris, expected some of .*: A, B"),
         ({"cities": ["A", "A"]}, "found A, A, expected .*, each once"),
     ],
 )
-def test_too_few_images_and_bad_cities(two_cities, given, message):
+def test_bad_cities(two_cities, given, message):
     with pytest.raises(InputError, match=message):
         read_places(two_cities, **given)
 
@@ -248,7 +242,6 @@ def test_within_city_shuffles_places_and_cities():
     ("changes", "message"),
     [
         ({"images_per_place": 5}, "place 0 of city0 has 4 images, expected at least .* 5"),
-        ({"places_per_batch": 7}, "found 6 places, expected places_per_batch 7 "),
         ({"places_per_batch": 0}, "found places_per_batch=0, .* expected numbers from 1"),
         ({"steps": 0}, "found .*steps=0, expected numbers from 1"),
         ({"order": "random"}, "order: found 'random', expected one of shuffled, within-city"),

@@ -5,7 +5,6 @@ import json
 import logging
 import pathlib
 import re
-import shutil
 from collections.abc import Callable
 from typing import Any
 
@@ -200,21 +199,6 @@ def test_an_interrupted_run_goes_on_as_if_it_had_not_been(
     assert_same_run(tmp_path / "run", run)
     assert result.steps == STEPS
     assert_same_params(result.params, load_weights(run / "last.safetensors")[0])
-
-
-def test_a_finished_run_is_not_trained_further(
-    tmp_path, places, params, benchmark, run, monkeypatch
-):
-    shutil.copytree(run, tmp_path / "run")
-    fail_at(monkeypatch, "train_step", 1)
-    fail_at(monkeypatch, "evaluate", 1)
-    result = fit(
-        ENDLESS, places, tmp_path / "run", validation=benchmark, initial=params, quiet=True
-    )
-    assert result.steps == STEPS
-    assert result.best_recall == max(line.get("R@5", 0) for line in metrics_of(run))
-    assert_same_params(result.params, load_weights(run / "last.safetensors")[0])
-    assert_same_run(tmp_path / "run", run)
 
 
 def scripted(
@@ -461,8 +445,6 @@ def test_unreadable_images_are_counted_each_time_they_come_up(tmp_path, city, pa
     ("change", "arguments", "words"),
     [
         ({"trainable": "last-3-blocks+head"}, {}, "last 3 blocks"),
-        ({"places_per_batch": 9}, {}, "8 places"),
-        ({"images_per_place": 4, "min_images": 4}, {}, "images_per_place 4"),
         ({}, {"num_threads": -1}, "num_threads: found -1, expected at least 0"),
         ({}, {"shard_state": True}, "shard_state: found one device"),
     ],
@@ -484,12 +466,6 @@ def test_a_run_resumes_only_from_the_same_weights_and_places(tmp_path, places, p
     other = dataclasses.replace(places, files=(*places.files[:-1], "Images/Brill/another.jpg"))
     with pytest.raises(InputError, match=f"{tmp_path}: the run started from other places"):
         fit(RECIPE, other, tmp_path, initial=params)
-
-
-def test_a_folder_belongs_to_one_configuration(run):
-    check_run(run, ENDLESS)
-    with pytest.raises(InputError, match=r"seed: found 6, expected 5.*another folder"):
-        check_run(run, dataclasses.replace(ENDLESS, seed=6))
 
 
 @pytest.mark.parametrize("name", ["thesis.tex", ".bashrc", ".git"])

@@ -101,6 +101,14 @@ def test_what_trains_is_chosen_by_name(params, trainable: str, prefixes: tuple[s
         np.testing.assert_array_equal(whole[name], leaf)
 
 
+def test_blocks_are_counted_from_the_end(params) -> None:
+    last, _ = split_params(params, MODEL, "last-1-blocks+head")
+    weight = named_leaves(last)["backbone.blocks.1.attn.qkv.weight"]
+    np.testing.assert_array_equal(weight, params.backbone.blocks.attn.qkv.weight[1:])
+    none, _ = split_params(params, MODEL, "last-0-blocks+head")
+    assert not any(leaf.size for name, leaf in named_leaves(none).items() if ".blocks." in name)
+
+
 def test_a_norm_that_the_aggregator_leaves_out_stays_frozen() -> None:
     """It has no gradient: weight decay alone would move it."""
     boq = BoqConfig(channels=16, queries=3, rows=2)

@@ -54,8 +54,6 @@ def test_nothing_tells(hall):
     benchmark = read_folders(hall)
     assert benchmark.name == "hall (two folders, no ground truth)"
     assert benchmark.positives is None
-    with refused(r"hall: hall \(two.*: no ground truth, nothing to score"):
-        benchmark.ground_truth()
     with refused(r"found --radius, expected .* with positions"):
         open_benchmark(hall, radius=5)
 

@@ -121,9 +121,10 @@ def brute_force(*, radius: float = 25, degrees: float | None = None, subtask: bo
     return database, queries, matches
 
 
-@pytest.mark.parametrize("subtask", [False, True])
-@pytest.mark.parametrize("degrees", [None, 40.0, 0.0, 180.0])
-@pytest.mark.parametrize("radius", [25.0, 12.0])
+@pytest.mark.parametrize(
+    ("radius", "degrees", "subtask"),
+    [(25.0, None, False), (12.0, None, True), (25.0, 40.0, True), (12.0, 0.0, False)],
+)
 def test_positives_equal_brute_force(tmp_path, radius, degrees, subtask):
     root = write_msls(tmp_path)
     benchmark = read_msls(root, radius=radius, max_heading_difference=degrees, subtask=subtask)
