@@ -99,10 +99,8 @@ def there_and_back(folder: pathlib.Path, source: pathlib.Path, width: int) -> No
     assert descriptors.shape == (2, width)
     # float32 rounding of a sum of thousands of squares.
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, atol=1e-5)
-    del params
     convert(ours, back)
-    if source.stat().st_size < 2**20:  # else the answer would fill the screen
-        assert same_bits(torch.load(back), torch.load(source))
+    assert same_bits(torch.load(back), torch.load(source))
     assert back.read_bytes() == source.read_bytes()
 
 
@@ -121,23 +119,6 @@ def test_indoor_vprs_file_is_the_same_network_within_a_module(tmp_path: pathlib.
     convert(within, tmp_path / "ours.safetensors")
     convert(tmp_path / "ours.safetensors", tmp_path / "back.pth", format)
     assert (tmp_path / "back.pth").read_bytes() == within.read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("name", "width"),
-    [
-        ("dinov2_vits14_reg4", 384),
-        pytest.param("dino_salad", 8448, marks=pytest.mark.slow),
-        pytest.param("CricaVPR", 10752, marks=pytest.mark.slow),
-        pytest.param("dinov2_vitg14_reg4", 1536, marks=pytest.mark.slow),
-    ],
-)
-def test_full_size(tmp_path: pathlib.Path, name: str, width: int) -> None:
-    shapes = public_layout(name)
-    if width == 1536:  # all of its forty blocks take 4.5 GB a copy
-        shapes = fewer_blocks(shapes, 2)
-    source = save(tmp_path / "public.pth", nested(random_state(shapes)))
-    there_and_back(tmp_path, source, width)
 
 
 @pytest.mark.parametrize(("registers", "ffn"), [(0, "mlp"), (4, "swiglu")])

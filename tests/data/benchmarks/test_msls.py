@@ -157,15 +157,6 @@ def test_positives_equal_brute_force(tmp_path, radius, degrees, subtask):
         np.testing.assert_allclose(found, [places[key] for key in expected], atol=1e-3)
 
 
-def test_the_heading_limit_is_inclusive(tmp_path):
-    images = [Image(f"d{i}", 0, 0, angle) for i, angle in enumerate((40, 320, 41, 319.5))]
-    sides = {"database": images, "query": [Image("q", 0, 0, 0)]}
-    root = write_msls(tmp_path, {"sf": sides})
-    benchmark = read_msls(root, max_heading_difference=40)
-    assert benchmark.name == "MSLS of sf, raw, 1 queries, 25 m and 40 degrees"
-    assert lists_of(benchmark.positives) == [[0, 1]]
-
-
 def test_other_splits(tmp_path):
     images = {"database": [Image("d", 1, 2, 3)], "query": [Image("q", 1, 2, 3)]}
     root = write_msls(tmp_path, {"tokyo": images, "goa": images})
