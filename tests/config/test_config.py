@@ -14,7 +14,6 @@ from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.config.io import read_config
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
-from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
@@ -310,15 +309,6 @@ def test_the_recipe_of_starter_is_that_of_its_last_run():
     assert dataclasses.replace(shipped, image_size=run.model.image_size) == run.model
 
 
-def test_the_run_without_the_cameras_faults_is_an_epoch_of_starters_but_for_them():
-    docs = ROOT / "docs"
-    run = read_config(TrainConfig, docs / "starter" / "first.json")
-    without = read_config(TrainConfig, docs / "small" / "no_faults.json")
-    names = [field.name for field in dataclasses.fields(LightAugmentConfig)]
-    light = LightAugmentConfig(**{name: getattr(run.augmentation, name) for name in names})
-    assert without == dataclasses.replace(run, augmentation=light, epochs=1)
-
-
 def test_an_unknown_name_lists_the_known():
     with pytest.raises(InputError, match=r"^colour: found '', expected one of blue, red$"):
         choose("colour", "", {"red": 1, "blue": 2})
@@ -331,16 +321,6 @@ LOCAL_FLOATS = {"normalisation": "local-contrast", "pixels": "floats"}
 
 def of_clusters(clusters: int) -> ModelConfig:
     return ModelConfig(aggregator=SaladConfig(clusters=clusters))
-
-
-@pytest.mark.parametrize(
-    ("height", "width", "nearest"),
-    [(224, 230, "224 x 224"), (0, 98, "14 x 98")],
-)
-def test_sides_are_multiples_of_14(height, width, nearest):
-    words = rf"found {height} x {width}, expected .* 14 \(nearest: {nearest}\)"
-    with pytest.raises(InputError, match=words):
-        of_clusters(4).check_image_size((height, width))
 
 
 @pytest.mark.parametrize(("clusters", "side"), [(3, 28), (4, 42), (64, 126), (63, 112)])

@@ -115,6 +115,19 @@ def interrupt(
             fit(*arguments, **options)
 
 
+def transport_of(model: Model, benchmark: Benchmark) -> dict[str, Any]:
+    """Means of the transport's statistics of the queries, which are read here again."""
+    size = model.config.image_size
+    queries = np.stack([resize_image(read_image(q), size) for q in benchmark.queries])
+    transport = extract_tokens(model.params, queries, model.config).transport
+    assert transport is not None
+    # Of a batch of another size: float32 rounding of means of numbers below 100.
+    return {
+        name: pytest.approx(float(each.mean()), rel=1e-5)
+        for name, each in transport._asdict().items()
+    }
+
+
 def test_a_run_leaves_its_files(run: pathlib.Path, benchmark: Benchmark):
     names = "config.json metrics.jsonl tensorboard state last.safetensors best.safetensors"
     assert {path.name for path in run.iterdir()} == set(names.split())
@@ -133,18 +146,9 @@ def test_a_run_leaves_its_files(run: pathlib.Path, benchmark: Benchmark):
     (result,) = evaluate(
         Model(params, config), benchmark, groupings=("single",), reading=Reading(quiet=True)
     )
-    size = config.image_size
-    queries = np.stack([resize_image(read_image(q), size) for q in benchmark.queries])
-    transport = extract_tokens(params, queries, config).transport
-    assert transport is not None
-    watched = {name: float(each.mean()) for name, each in transport._asdict().items()}
-    assert validations[-1] == {
-        "step": 6,
-        "epoch": 3,
-        **{f"R@{k}": recall for k, recall in result.recalls.items()},
-        # Of a batch of another size: float32 rounding of means of numbers below 100.
-        **{name: pytest.approx(value, rel=1e-5) for name, value in watched.items()},
-    }
+    recalls = {f"R@{k}": recall for k, recall in result.recalls.items()}
+    expected = {"step": 6, "epoch": 3} | recalls | transport_of(Model(params, config), benchmark)
+    assert validations[-1] == expected
     assert all(set(TransportStatistics._fields) < line.keys() for line in steps)
 
 
@@ -266,11 +270,8 @@ def test_a_validation_has_its_own_size(params, benchmark, monkeypatch):
     metrics = validated(config, params, benchmark).metrics
     larger = dataclasses.replace(RECIPE.model, image_size=(56, 84))
     assert seen == [larger]
-    queries = np.stack([resize_image(read_image(q), (56, 84)) for q in benchmark.queries])
-    transport = extract_tokens(params, queries, larger).transport
-    # Means of numbers below 100, of float32.
-    share = float(transport.dustbin_share.mean())
-    assert metrics["dustbin_share"] == pytest.approx(share, rel=1e-5)
+    watched = transport_of(Model(params, larger), benchmark)
+    assert {name: metrics[name] for name in watched} == watched
 
 
 def validated(config: TrainConfig, params: Crisalad, benchmark: Benchmark) -> validation.Validation:
