@@ -309,6 +309,15 @@ def test_the_recipe_of_starter_is_that_of_its_last_run():
     assert dataclasses.replace(shipped, image_size=run.model.image_size) == run.model
 
 
+def test_the_run_without_the_cameras_faults_is_an_epoch_of_starters_but_for_them():
+    docs = ROOT / "docs"
+    run = read_config(TrainConfig, docs / "starter" / "first.json")
+    without = read_config(TrainConfig, docs / "small" / "no_faults.json")
+    names = [field.name for field in dataclasses.fields(LightAugmentConfig)]
+    light = LightAugmentConfig(**{name: getattr(run.augmentation, name) for name in names})
+    assert without == dataclasses.replace(run, augmentation=light, epochs=1)
+
+
 def test_an_unknown_name_lists_the_known():
     with pytest.raises(InputError, match=r"^colour: found '', expected one of blue, red$"):
         choose("colour", "", {"red": 1, "blue": 2})

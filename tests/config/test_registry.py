@@ -117,7 +117,7 @@ def test_a_cell_that_runs_again_brings_the_same_part(birds):
     [
         *(
             (part, f"found {name}, expected a subclass of Bird with @dataclasses.dataclass\\(froz")
-            for part, name in ((Plain, "Plain"), (chirp, "chirp"), (3, "int"))
+            for part, name in ((Registry, "Registry"), (Plain, "Plain"), (chirp, "chirp"))
         ),
         (Named, "found a field 'name', which has another meaning here$"),
         (Needy, ".* missing 1 required keyword-only argument: 'weight'; expected all methods, a"),
@@ -139,6 +139,8 @@ def test_a_function_is_a_part_where_the_kind_says_so(monkeypatch):
     assert birds.register("chirp")(chirp) is chirp
     assert birds.make("chirp").call() == "chirp"
     assert birds.make("chirp") == birds.make("chirp")
+    with pytest.raises(InputError, match=r"^register_bird 'three': found int, expected a subclass"):
+        birds.register("three")(3)  # type: ignore[type-var]
 
 
 @pytest.mark.parametrize("name", ["swan", "", None, ["duck"]])

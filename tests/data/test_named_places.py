@@ -186,6 +186,7 @@ UNFIT = "^.*walk: found arguments that do not fit each other, expected --cities 
         ({"place_radius": 0}, r"^--place-radius: found 0, expected metres above 0$"),
         ({"place_frames": 1}, r"^--place-frames: found 1, expected at least 2$"),
         ({"place_radius": 5, "place_frames": 4}, UNFIT),
+        ({"positions": "gps.csv"}, UNFIT),
         ({"place_frames": 4, "cities": ["a"]}, UNFIT),
         ({"place_frames": 4, "fps": 2.0}, r"^--fps: found 2 without a video"),
         ({"place_radius": 5}, r"walk: found no position of 7 images, expected --positions TA"),
