@@ -14,6 +14,7 @@ from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.config.io import read_config
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
+from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
