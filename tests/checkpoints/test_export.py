@@ -232,15 +232,6 @@ def test_a_script_fills_the_last_batch_or_refuses(
         list(script.batches(paths, manifest | {"grouping": "batch"}, 16))
 
 
-def test_a_script_refuses_a_file_that_was_changed(
-    beside: pathlib.Path, tmp_path: pathlib.Path, scripts: Any
-):
-    manifest = json.loads((beside / "manifest.json").read_text())
-    manifest["program"]["sha256"] = "0" * 64
-    with pytest.raises(SystemExit, match=r"found other bytes than manifest\.json says"):
-        scripts("run_exported").load(beside, manifest)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PLAIN)
 def test_other_models_for_all_platforms(name: str):
@@ -261,10 +252,7 @@ def test_other_models_for_all_platforms(name: str):
     [
         ({"platforms": ()}, "format: found stablehlo with grouping single, 0 platforms"),
         ({"grouping": "any"}, "format: found stablehlo with grouping any"),
-        (
-            {"format": "openvino", "weights_inside": True},
-            "format: found openvino with grouping single, 2 platforms and weights inside True",
-        ),
+        ({"format": "openvino", "weights_inside": True}, "2 platforms and weights inside True"),
     ],
 )
 def test_what_cannot_be_asked_for(fields: dict[str, Any], words: str):

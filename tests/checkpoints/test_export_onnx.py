@@ -228,6 +228,10 @@ def test_a_conversion_computes_what_jax_does(name: str, tmp_path: pathlib.Path):
             np.testing.assert_allclose(program(images), expected, rtol=1e-5, atol=1e-6)
 
 
+LOOP = SinkhornConfig(tolerance=1e-3, gradient="stop")
+THROWING = dataclasses.replace(LOOP, throw=True)
+
+
 def refused(config: ModelConfig, how: ExportConfig, out: pathlib.Path) -> str:
     """What is said; nothing is left behind."""
     params = init_crisalad(jax.random.key(0), config)
@@ -238,37 +242,22 @@ def refused(config: ModelConfig, how: ExportConfig, out: pathlib.Path) -> str:
 
 
 @pytest.mark.parametrize(
-    ("fields", "how", "words"),
+    ("field", "value", "how", "words"),
     [
+        ("aggregator.sinkhorn", LOOP, {"format": "onnx"}, "onnx or openvino: found the operation "),
+        ("aggregator.sinkhorn", THROWING, {}, "SinkhornConfig.throw: found True"),
+        ("compute_dtype", "bfloat16", {"format": "openvino"}, "found bfloat16 with openvino, exp"),
         (
-            {"aggregator.sinkhorn": SinkhornConfig(tolerance=1e-3, gradient="stop")},
-            ExportConfig(format="onnx"),
-            "format onnx or openvino: found the operation while",
-        ),
-        (
-            {"aggregator.sinkhorn": SinkhornConfig(throw=True, tolerance=1e-3, gradient="stop")},
-            ExportConfig(),
-            "SinkhornConfig.throw: found True",
-        ),
-        (
-            {"compute_dtype": "bfloat16"},
-            ExportConfig(format="openvino"),
-            "compute dtype: found bfloat16 with openvino, expected float32",
-        ),
-        (
-            {"preprocessing.normalisation": "local-contrast"},
-            ExportConfig(pixels="floats"),
-            "pixels: found floats with normalisation local-contrast",
+            *("preprocessing.normalisation", "local-contrast", {"pixels": "floats"}),
+            "found floats with normalisation local-contrast",
         ),
     ],
 )
 def test_what_a_program_cannot_do(
-    fields: dict[str, Any], how: ExportConfig, words: str, tmp_path: pathlib.Path
+    field: str, value: Any, how: dict[str, Any], words: str, tmp_path: pathlib.Path
 ):
-    config = MODEL
-    for name, value in fields.items():
-        config = put(config, name, value)
-    assert refused(config, how, tmp_path / "out").startswith(words)
+    config = put(MODEL, field, value)
+    assert words in refused(config, ExportConfig(**how), tmp_path / "out")
 
 
 def test_a_program_that_differs_is_not_written(

@@ -128,31 +128,22 @@ def test_the_first_of_what_is_wrong_is_listed() -> None:
     )
 
 
-def without(state: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
-    return {key: array for key, array in state.items() if key not in names}
-
-
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("name", "shape", "words"),
     [
-        (lambda s: without(s, "cls_token"), "found no cls_token"),
-        (
-            lambda s: s | {"cls_token": np.zeros((1, 1, 48))},
-            "backbone of width 48, expected a multiple of 64",
-        ),
-        (
-            lambda s: s | {"pos_embed": np.zeros((1, 7, 64))},
-            "found 7 position embeddings, expected 1 and a square",
-        ),
-        (
-            lambda s: {k: v for k, v in s.items() if not k.startswith("blocks.0.")},
-            "found no blocks.0.mlp.fc2.weight, expected an array of more than 1 axes",
-        ),
+        ("cls_token", None, "found no cls_token"),
+        ("cls_token", (1, 1, 48), "backbone of width 48, expected a multiple of 64"),
+        ("pos_embed", (1, 7, 64), "found 7 position embeddings, expected 1 and a square"),
+        ("blocks.0.mlp.fc2.weight", None, "found no blocks.0.mlp.fc2.weight, expected an array of"),
     ],
 )
-def test_what_is_no_model_is_refused(change, words: str) -> None:
+def test_what_is_no_model_is_refused(name: str, shape: Any, words: str) -> None:
+    state = small_state()
+    array = state.pop(name)
+    if shape is not None:
+        state[name] = np.zeros(shape, array.dtype)
     with pytest.raises(InputError, match=rf"^file\.pth: .*{words}"):
-        infer(change(small_state()), source="file.pth")
+        infer(state, source="file.pth")
 
 
 @pytest.mark.parametrize("layout", ["dinov2", "huggingface", "dino-salad", "cricavpr"])

@@ -4,12 +4,10 @@ import dataclasses
 import pathlib
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.io
 
-from crisalad_jax import describe
 from crisalad_jax.checkpoints.formats import infer, public_shapes, to_params
 from crisalad_jax.checkpoints.matlab_io import CONVOLUTIONS, read_matlab
 from crisalad_jax.checkpoints.public import convert, read_checkpoint
@@ -96,18 +94,3 @@ def test_every_cut_is_told(tmp_path: pathlib.Path) -> None:
         (tmp_path / "cut.mat").write_bytes(whole[:size])
         with pytest.raises(InputError, match=r"cut\.mat"):
             read_matlab(tmp_path / "cut.mat")
-
-
-@pytest.mark.slow
-def test_descriptors_of_a_file_are_hlocs(tmp_path: pathlib.Path) -> None:
-    """At full size: 150 million numbers."""
-    hloc, golden = (get("netvlad_vgg16_hloc") for get in (zoo.random_state, zoo.golden))
-    average = np.broadcast_to(np.float32(MEAN), (224, 224, 3))
-    write_matlab(tmp_path / "Pitts30K_struct.mat", hloc, np.ascontiguousarray(average))
-    read = read_checkpoint(tmp_path / "Pitts30K_struct.mat")
-    assert (read.format, read.config) == infer(hloc, source="hloc")
-    params = jax.tree.map(jnp.asarray, read.params)
-    found = describe(params, golden["images"], read.config)
-    # Forty times what float32 makes here, as in parity/test_zoo.py.
-    error = np.linalg.norm(found - golden["descriptor"])
-    assert error < 2e-5 * np.linalg.norm(golden["descriptor"])

@@ -6,7 +6,6 @@ import io
 import json
 import os
 import pathlib
-import sys
 import zipfile
 from collections.abc import Callable
 from typing import Any
@@ -29,7 +28,6 @@ from crisalad_jax.checkpoints.public import (
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
-from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, describe, init_crisalad, self_mask
@@ -101,10 +99,8 @@ def there_and_back(folder: pathlib.Path, source: pathlib.Path, width: int) -> No
     assert descriptors.shape == (2, width)
     # float32 rounding of a sum of thousands of squares.
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, atol=1e-5)
-    del params
     convert(ours, back)
-    if source.stat().st_size < 2**20:  # else the answer would fill the screen
-        assert same_bits(torch.load(back), torch.load(source))
+    assert same_bits(torch.load(back), torch.load(source))
     assert back.read_bytes() == source.read_bytes()
 
 
@@ -123,23 +119,6 @@ def test_indoor_vprs_file_is_the_same_network_within_a_module(tmp_path: pathlib.
     convert(within, tmp_path / "ours.safetensors")
     convert(tmp_path / "ours.safetensors", tmp_path / "back.pth", format)
     assert (tmp_path / "back.pth").read_bytes() == within.read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("name", "width"),
-    [
-        ("dinov2_vits14_reg4", 384),
-        pytest.param("dino_salad", 8448, marks=pytest.mark.slow),
-        pytest.param("CricaVPR", 10752, marks=pytest.mark.slow),
-        pytest.param("dinov2_vitg14_reg4", 1536, marks=pytest.mark.slow),
-    ],
-)
-def test_full_size(tmp_path: pathlib.Path, name: str, width: int) -> None:
-    shapes = public_layout(name)
-    if width == 1536:  # all of its forty blocks take 4.5 GB a copy
-        shapes = fewer_blocks(shapes, 2)
-    source = save(tmp_path / "public.pth", nested(random_state(shapes)))
-    there_and_back(tmp_path, source, width)
 
 
 @pytest.mark.parametrize(("registers", "ffn"), [(0, "mlp"), (4, "swiglu")])
@@ -307,24 +286,12 @@ def test_adapters_come_along_where_they_are_the_same(tmp_path: pathlib.Path, kin
     np.testing.assert_array_equal(found[name], wanted[name] if same else named_leaves(start)[name])
 
 
-@pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        (
-            {"depth": 3, "registers": 4},
-            "backbone.depth: found 2, exp.* backbone.registers: found 0",
-        ),
-        (None, "backbone: found vit, expected dinov3"),
-    ],
-)
-def test_another_backbone_is_refused(tmp_path: pathlib.Path, fields: Any, words: str) -> None:
+def test_another_backbone_is_refused(tmp_path: pathlib.Path) -> None:
     source = written(tmp_path, "dinov2")
-    config, start = DinoV3Config(dim=64, depth=2, heads=1), None
-    if fields is not None:
-        model, start = fresh("depthwise", **fields)
-        config = model.backbone
+    model, start = fresh("depthwise", depth=3, registers=4)
+    words = "backbone.depth: found 2, exp.* backbone.registers: found 0"
     with pytest.raises(InputError, match=f"{source}: this backbone is another .*: {words}"):
-        read_backbone(source, config, start)
+        read_backbone(source, model.backbone, start)
 
 
 # Bad files
@@ -364,10 +331,8 @@ DEEP = {"backbone": {"name": "vit", "depth": 10**9}}
 DECLARED = json.dumps({"format": "reference", "config": DEEP, "aggregator": {}})
 COUNT = next(name for name in SMALL["cricavpr"] if name.endswith("num_batches_tracked"))
 BAD: dict[str, tuple[Callable[[], Any], str]] = {
-    "empty": (lambda: b"", "not a whole torch checkpoint"),
     "cut": (lambda: whole(small())[:9999], "not a whole torch checkpoint: "),
     "old, cut": (lambda: whole(small(), new=False)[:338], "not a whole torch checkpoint"),
-    "a list": (lambda: [1, 2], "found list, expected nothing but tensors by name"),
     "a number for a name": (lambda: {**small(), 3: BIAS}, "found 3, expected nothing but"),
     "double": (
         lambda: small(norm_bias=BIAS.double()),
@@ -378,10 +343,6 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
     "a float count": (
         lambda: nested(random_state(SMALL["cricavpr"]) | {COUNT: torch.zeros(())}),
         "num_batches_tracked found float32, expected int64",
-    ),
-    "extra and missing": (
-        lambda: {k.replace("norm.bias", "norm.shift"): v for k, v in small().items()},
-        "2 blocks: .*norm.bias missing; .*norm.shift unknown",
     ),
     "a depth for an age": (
         lambda: {"state_dict": declaring(small(), DECLARED)},
@@ -399,7 +360,6 @@ BAD: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: whole(Opens(pathlib.Path("made")), new=False),
         "refused: it asks for [a-z]+.mkdir, expected nothing but tenso",
     ),
-    "safetensors: text": (lambda: b"no checkpoint", "not a whole safetensors file"),
     "safetensors: eight bits": (
         lambda: safetensors.torch.save({"layernorm.bias": BIAS.to(torch.float8_e4m3fn)}),
         "found a type that numpy does not know: .*float8",
@@ -429,11 +389,8 @@ def test_a_file_that_is_no_model(tmp_path: pathlib.Path, monkeypatch, kind: str)
 
 def test_targets_and_layouts_that_do_not_fit(tmp_path: pathlib.Path) -> None:
     public, ours = written(tmp_path, "dino-salad"), tmp_path / "ours.safetensors"
-    with pytest.raises(InputError, match=r"found a public checkpoint .dino-salad. and format d"):
-        convert(public, tmp_path / "x.safetensors", "dinov2")
     convert(public, ours)
     for target, layout, words in (
-        ("x.pth", "dinov2", "format dinov2: found a model of aggregator salad"),
         ("x.onnx", None, "x.onnx: found suffix '.onnx', expected .pth or .pt or .ckpt$"),
         ("x" * 300 + ".pth", None, "too long"),
         ("x.pth", "huggingface", "x.pth: found suffix '.pth', expected .safetensors$"),
@@ -444,13 +401,6 @@ def test_targets_and_layouts_that_do_not_fit(tmp_path: pathlib.Path) -> None:
     long = tmp_path / f"{'x' * 245}.ckpt"  # the temporary name beside it must not be longer
     convert(ours, long)
     assert long.read_bytes() == public.read_bytes()
-
-
-def test_without_torch_its_files_ask_for_it(tmp_path: pathlib.Path, monkeypatch) -> None:
-    source = written(tmp_path, "dinov2")
-    monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(ModuleNotFoundError, match="torch"):
-        read_checkpoint(source)
 
 
 def test_an_archive_that_unpacks_to_more_than_its_size_is_not_read(tmp_path: pathlib.Path) -> None:

@@ -158,7 +158,6 @@ OBJECTS = {
     "defaultdict": collections.defaultdict(list, {"loss": [1.0]}),
     "DictConfig": Config(optim=Config(lr=0.1), kind=Kind.SMALL),
     "a dictionary with attributes": Beside(),
-    "NumPy": {"recall": np.float64(0.5), "all": np.arange(3)},
 }
 
 

@@ -99,14 +99,11 @@ def test_another_checksum_is_refused_unless_it_is_not_verified(path, digest):
 
 
 @pytest.mark.parametrize("verify", [True, False])
-def test_another_format_or_none_is_refused(path, verify):
-    write_sealed(path, ARRAYS, "crisalad-jax some 1", VALUE)
-    with pytest.raises(InputError, match=r"^\S+a\.safetensors: found .*'crisalad-jax some 1'"):
+@pytest.mark.parametrize("value", [VALUE, []])
+def test_a_file_without_a_checksum_is_refused(path, value, verify):
+    safetensors.numpy.save_file(ARRAYS, path, metadata={FORM: json.dumps(value)})
+    with pytest.raises(InputError, match=r"\(metadata\): found no checksum, expected one in"):
         load(path, verify=verify)
-    for value in (VALUE, [], 3):
-        safetensors.numpy.save_file(ARRAYS, path, metadata={FORM: json.dumps(value)})
-        with pytest.raises(InputError, match=r"\(metadata\): found no checksum, expected one in"):
-            load(path, verify=verify)
 
 
 def test_an_array_in_another_order_is_written_as_it_reads(path):

@@ -160,24 +160,6 @@ def test_a_file_of_another_format_is_refused(tmp_path, shared):
             load_weights(path)
 
 
-@pytest.mark.parametrize("inside", [True, False])
-def test_weights_that_changed_are_refused_unless_they_are_not_verified(tmp_path, shared, inside):
-    """A number's last bit, or a field of the configuration that no parameter depends on."""
-    path = tmp_path / "w.safetensors"
-    data = bytearray((shared / "weights.safetensors").read_bytes())
-    if inside:
-        data[-1] ^= 1
-    else:
-        old = b'\\"compute_dtype\\": \\"float32\\"'
-        assert data.count(old) == 1
-        data = data.replace(old, b'\\"compute_dtype\\":\\"bfloat16\\"')
-    path.write_bytes(data)
-    with pytest.raises(InputError, match=f"^{path}: found other bytes than were written"):
-        load_weights(path)
-    _, config = load_weights(path, verify=False)
-    assert config.compute_dtype == ("float32" if inside else "bfloat16")
-
-
 SCORE, DUST = "aggregator.score.fc1.weight", "aggregator.dust_bin"
 
 
@@ -189,10 +171,6 @@ SCORE, DUST = "aggregator.score.fc1.weight", "aggregator.dust_bin"
         (lambda a: a.update({SCORE: a[SCORE].T.copy()}), [SCORE, "(16, 32), expected", "(32, 16)"]),
         (lambda a: a.update({SCORE: a[SCORE].astype("f8")}), ["float64", "expected float32"]),
         (lambda a: a.update({DUST: np.float32(np.nan)[...]}), [f"{DUST} holds NaN or infinity"]),
-        (
-            lambda a: [a.pop(name) for name in list(a) if name.startswith("aggregator.")],
-            ["aggregator.cluster_features.fc1.bias missing; ", " more"],
-        ),
     ],
 )
 def test_weights_that_do_not_fit_are_listed(tmp_path, shared, change, words):
@@ -209,7 +187,6 @@ def test_weights_that_do_not_fit_are_listed(tmp_path, shared, change, words):
     ("value", "words"),
     [
         ({"config": None}, "found no config, expected config, version"),
-        ({"config": []}, r"found \[\], expected an object of fields @ config"),
         ({"parts": []}, r"found \[\], expected dict @ config.parts"),
         ({"model_sha256": 7}, "found 7, expected text @ config.model_sha256"),
         ({"config": {"cross_image": {"layers": 900}}}, "far from the sizes"),

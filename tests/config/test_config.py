@@ -320,33 +320,17 @@ def test_the_run_without_the_cameras_faults_is_an_epoch_of_starters_but_for_them
 
 
 def test_an_unknown_name_lists_the_known():
-    with pytest.raises(InputError, match=r"^preset: found 'b16', expected one of b14, g14, l14"):
-        recipe("b16")
-    words = r"^recipe: found 'dbow', .* anyloc, .*scratch.*, or a registered .* \(is a plug-in mis"
-    with pytest.raises(InputError, match=words):
-        recipe("b14", "dbow")
     with pytest.raises(InputError, match=r"^colour: found '', expected one of blue, red$"):
         choose("colour", "", {"red": 1, "blue": 2})
 
 
 MULTI_RESOLUTION = AdapterConfig(kind="multi-resolution", bottleneck=0.25)
 NARROW = {"dim": 96, "heads": 2, "adapter": MULTI_RESOLUTION}
-FIVE_HEADS = {"aggregator": "gem-pyramid", "cross_image": CrossImageConfig(heads=5)}
 LOCAL_FLOATS = {"normalisation": "local-contrast", "pixels": "floats"}
 
 
 def of_clusters(clusters: int) -> ModelConfig:
     return ModelConfig(aggregator=SaladConfig(clusters=clusters))
-
-
-@pytest.mark.parametrize(
-    ("height", "width", "nearest"),
-    [(224, 230, "224 x 224"), (99, 98, "98 x 98"), (1, 14, "14 x 14"), (0, 98, "14 x 98")],
-)
-def test_sides_are_multiples_of_14(height, width, nearest):
-    words = rf"found {height} x {width}, expected .* 14 \(nearest: {nearest}\)"
-    with pytest.raises(InputError, match=words):
-        of_clusters(4).check_image_size((height, width))
 
 
 @pytest.mark.parametrize(("clusters", "side"), [(3, 28), (4, 42), (64, 126), (63, 112)])
@@ -369,11 +353,8 @@ def test_more_patches_than_clusters(clusters, side):
         (ViTConfig, {"dim": 6, "heads": 1, "position_init": "sincos"}, "dim: found 6, .* of 4"),
         (ViTConfig, NARROW, "found 0.25, expected a width for dim 96, 24, .* of 16"),
         (ModelConfig, {"aggregator": "gem-pyramid", "image_size": (28, 56)}, "at least 42 x 42, a"),
-        (ModelConfig, FIVE_HEADS, "CrossImageConfig.heads: found 5, .*divisor of the 768 numbers"),
-        (ModelConfig, {"aggregator": AnyLocConfig(layer=12)}, "found 12, expected -12 to 11"),
         (ModelConfig, {"aggregator": "anyloc"}, "found 2, expected 0 for aggregator anyloc, wi"),
         (ModelConfig, {"aggregator": ConvApConfig(side=3), "image_size": (28, 56)}, "42 x 42, a p"),
-        (ModelConfig, {"cross_image": CrossImageConfig(heads=12)}, "found 12, .* of the 128 num"),
         (ModelConfig, {"aggregator": SaladConfig(token_dim=200)}, "token: found True, expected F"),
         (BoqConfig, {"channels": 200}, "found 200, expected a multiple of its 3 heads, one for"),
         (SaladConfig, {"dropout": 1.0}, "SaladConfig.dropout: found 1.0, expected .* less than 1"),
@@ -385,14 +366,11 @@ def test_more_patches_than_clusters(clusters, side):
         (LargeMarginCosineConfig, {"margin": 1.0}, "LargeMarginCosineConfig.margin: found 1.0"),
         (ClassesConfig, {"groups": 0}, "ClassesConfig.groups: found 0"),
         (ClassesConfig, {"sector": 50.0}, "found 2 sectors of 50 degrees, expected a divisor of"),
-        (RandAugmentConfig, {"magnitude": 31}, "RandAugmentConfig.magnitude: found 31"),
-        (LightAugmentConfig, {"crop": 1.0}, "LightAugmentConfig.crop: found 1.0"),
         (OptimiserConfig, {"b2": 1.0}, "OptimiserConfig.b2: found 1.0"),
         (TrainConfig, {"images_per_place": 1}, "TrainConfig.images_per_place: found 1"),
         (TrainConfig, {"min_images": 3}, "TrainConfig.min_images: found 3, expected at least 4"),
         (TrainConfig, {"trainable": "tail"}, "TrainConfig.trainable: found 'tail', expected head"),
         (TrainConfig, {"validation_size": (320, 322)}, "image size: found 320 x 322, expected"),
-        (TrainConfig, {"seed": -1}, "TrainConfig.seed: found -1"),
     ],
 )
 @pytest.mark.usefixtures("_unchecked")
@@ -407,10 +385,8 @@ def test_what_does_not_fit_is_refused_in_one_line(kind, fields, words):
     [
         (CrossImageConfig, {"layers": 1.5}, "1.5", "a whole number"),
         (CrossImageConfig, {"layers": True}, "True", "a whole number"),
-        (CrossImageConfig, {"dropout": None}, "None", "a number"),
         (CrossImageConfig, {"global_token": 1}, "1", "True or False"),
         (ViTConfig, {"adapter": "mlp"}, "'mlp'", "AdapterConfig"),
-        (SaladConfig, {"sinkhorn": 3}, "3", "SinkhornConfig"),
         (SinkhornConfig, {"tolerance": "1e-3"}, "'1e-3'", "a finite number above 0, or None"),
         (ModelConfig, {"image_size": [224, 224]}, "[224, 224]", "a tuple of 2, each a whole num"),
         (ModelConfig, {"image_size": (224, 2.5)}, "(224, 2.5)", "a tuple of 2, each a whole num"),
@@ -425,12 +401,6 @@ def test_a_field_of_another_type_is_refused_by_its_name(kind, fields, found, exp
     with pytest.raises(InputError, match=words) as caught:
         kind(**fields)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.usefixtures("_unchecked")
-def test_a_replaced_field_is_checked_too():
-    with pytest.raises(InputError, match=r"^TrainConfig\.model: found 'tiny', expected Mod"):
-        dataclasses.replace(recipe("tiny"), model="tiny")  # pyright: ignore
 
 
 @pytest.mark.usefixtures("_unchecked")

@@ -1,7 +1,6 @@
 """Configurations there and back through JSON, and what of a file is refused."""
 
 import dataclasses
-import json
 from typing import Any
 
 import numpy as np
@@ -20,15 +19,12 @@ CHANGED = dataclasses.replace(
     recipe("tiny"), cities=("Aston", "Brill"), patience=4, augmentation=recipe("b14").augmentation
 )
 VIT = {"name": "vit"}
-RECIPES_OF_PRESETS = {"changed": CHANGED} | {
-    f"{preset} {name}": recipe(preset, name)
-    for preset in PRESETS
-    for name in sorted({*RECIPES, *AGGREGATORS, *LOSSES})
-}
+CONFIGS = {"changed": CHANGED} | {preset: recipe(preset) for preset in PRESETS}
+CONFIGS |= {name: recipe("b14", name) for name in sorted({*RECIPES, *AGGREGATORS, *LOSSES})}
 
 
-@pytest.mark.parametrize("config", RECIPES_OF_PRESETS.values(), ids=RECIPES_OF_PRESETS)
-def test_every_recipe_of_every_preset_survives_a_file(tmp_path, config):
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+def test_every_preset_and_every_recipe_survives_a_file(tmp_path, config):
     plain = to_plain(config)
     write_json(tmp_path / "config.json", plain)
     found = read_config(TrainConfig, tmp_path / "config.json")
@@ -37,14 +33,6 @@ def test_every_recipe_of_every_preset_survives_a_file(tmp_path, config):
     assert to_plain(found) == plain
     model = from_plain(ModelConfig, plain["model"], source="here")
     assert model == config.model
-
-
-def test_plain_values_are_json():
-    plain = to_plain(recipe("tiny"))
-    assert json.loads(json.dumps(plain)) == plain
-    assert plain["model"]["image_size"] == [98, 98]
-    assert plain["model"]["aggregator"]["sinkhorn"]["iterations"] == 3
-    assert plain["loss"]["kind"]["name"] == "multi-similarity"
 
 
 def test_fields_left_out_take_their_defaults():
@@ -58,12 +46,9 @@ def test_fields_left_out_take_their_defaults():
     ("value", "words"),
     [
         ({"model": {"imag_size": [98, 98]}}, ["imag_size", "config.model"]),
-        ({"model": {"image_size": [100, 98]}}, ["found 100 x 98", "nearest: 98 x 98"]),
         ({"model": {"image_size": [98]}}, ["config.model.image_size"]),
         ({"model": {"backbone": VIT | {"dim": "32"}}}, ["'32'", "a whole", "backbone.dim"]),
-        ({"model": {"backbone": VIT | {"ffn": "relu"}}}, ["relu", "swiglu", "model.backbone.ffn"]),
         ({"model": {"backbone": {"dim": 32}}}, ["None", "config.model.backbone"]),
-        ({"model": None}, ["config.model"]),
         ({"epochs": 3.7}, ["3.7", "expected a whole number", "config.epochs"]),
         ({"epochs": 0}, ["epochs", "expected more than 0"]),
         ({"cities": "Rome"}, ["'Rome'", "tuple, each text", "config.cities"]),
@@ -71,7 +56,6 @@ def test_fields_left_out_take_their_defaults():
         ({"model": {"aggregator": {"name": ["gem"]}}}, ["['gem']", "config.model.aggregator"]),
         ({"model": {"aggregator": {"name": "gem", "clusters": 2}}}, ["found clusters"]),
         ({"model": {"aggregator": {"name": "gem"}, "gem": {}}}, ["found gem", "config.model"]),
-        ({"augmentation": ["light"]}, ["['light']", "config.augmentation"]),
         ([], ["found []", "an object"]),
     ],
 )
@@ -83,15 +67,6 @@ def test_what_does_not_fit_is_named_in_one_line(value, words):
     assert "\n" not in message
     for word in words:
         assert word in message
-
-
-@pytest.mark.parametrize("content", [b"{", b"\xff\xfe\x00", b"[]"])
-def test_a_file_that_is_no_configuration_is_named(tmp_path, content):
-    path = tmp_path / "config.json"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=f"^{path}: ") as caught:
-        read_config(ModelConfig, path)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_written_configuration_that_was_changed_is_refused(tmp_path):

@@ -39,15 +39,6 @@ def test_a_preset_is_printed_by_what_differs():
     )
 
 
-def test_long_calls_take_a_line_for_each_field():
-    assert repr(cj.PRESETS["g14"]).splitlines() == [
-        "ModelConfig(",
-        "    backbone=ViTConfig(dim=1536, depth=40, heads=24, ffn='swiglu'),",
-        "    aggregator='salad',",
-        ")",
-    ]
-
-
 @pytest.mark.parametrize("name", RECIPES)
 def test_what_is_printed_makes_the_configuration_again(name):
     config = cj.recipe("l14" if name == "selavpr" else "b14", name)
@@ -114,11 +105,6 @@ def test_an_answer_of_a_map_prints_in_short_lines():
         "    image=MapImage(name='a.jpg', bytes=7176, position=(500000.0, 5000200.25), root=' ...,",
         ")",
     ]
-
-
-def test_a_line_has_a_width():
-    lines = repr(cj.Tokens(["x" * 50] * 4, {"y" * 50: 1})).splitlines()  # type: ignore[arg-type]
-    assert [len(line) for line in lines[1:-1]] == [89, 68]
 
 
 ABSTRACT = {cj.Aggregator, cj.Augmentation, cj.Backbone, cj.Loss}

@@ -1,7 +1,6 @@
 """Reading and listing images, against Pillow."""
 
 import io
-import pathlib
 import struct
 import zlib
 
@@ -33,8 +32,6 @@ FORMATS = {
     "jp2": ("JPEG2000", {}),
     "ppm": ("PPM", {}),
 }
-
-PHOTOGRAPHS = pathlib.Path(__file__).parents[2].parent / "shared" / "data" / "toy_streets"
 
 
 def smooth_picture(height=60, width=80, channels=3, seed=0):
@@ -261,27 +258,23 @@ def test_no_file(tmp_path):
 
 def test_list_images(tmp_path):
     names = ["b/2.JPG", "b/10.jpeg", "a.png", "b.tif", "b/c/x.WebP", "b-1.bmp", "é.TIFF"]
-    ignored = [".hidden.jpg", "b/.cache/y.jpg", "notes.txt", "jpg", "z.jpg.part", "b/._2.JPG"]
-    touch_all(tmp_path, names + ignored)
-    with pytest.warns(Note, match="skipped 3 other files: 1 .part, 1 .txt, 1 without a suffix$"):
-        found = [path.relative_to(tmp_path).as_posix() for path in list_images(tmp_path)]
-    assert found == sorted(names)
-    with pytest.warns(Note):
-        again = [str(path) for path in list_images(str(tmp_path))]
-    assert again == [f"{tmp_path}/{name}" for name in found]
+    touch_all(tmp_path, [*names, ".hidden.jpg", "b/.cache/y.jpg", "b/._2.JPG"])
+    found = list_images(str(tmp_path))
+    assert [path.relative_to(tmp_path).as_posix() for path in found] == sorted(names)
 
 
 def test_what_is_no_image_is_counted_in_one_note(tmp_path):
     """Not counted: hidden files, tables, and what is named as an image (sidecars)."""
     names = ["1.jpg", "4.raw.jpg", "sub/2.png"]
     counted = ["3.heic", "a.txt", "sub/b.TXT", "walk.mp4", "c.npy", "d.json", "e.xml", "f.dng"]
+    counted += ["jpg", "z.jpg.part"]
     quiet = [".DS_Store", "positions.csv", "1.json", "sub/2.png.xmp", "4.raw"]
     touch_all(tmp_path, [*names, *counted, *quiet, "1.heic"])
     with pytest.warns(Note) as notes:
         assert list_images(tmp_path) == [tmp_path / name for name in names]
     (line,) = (str(note.message) for note in notes)
-    rest = "1 .dng, 1 .heic, 1 .json, 1 .mp4, 1 .npy, 1 .xml"
-    assert line == f"{tmp_path}: skipped 8 other files: 2 .txt, {rest}"
+    rest = "1 .dng, 1 .heic, 1 .json, 1 .mp4, 1 .npy, 1 .part, 1 .xml, 1 without a suffix"
+    assert line == f"{tmp_path}: skipped 10 other files: 2 .txt, {rest}"
     rest = "1 .dng, 1 .heic, 1 .json, 1 .npy, 1 .txt, 1 .xml$"
     with pytest.warns(Note, match=rf"\*: skipped 6 other files: {rest}"):
         source = open_source(tmp_path / "[13acdef]*")
@@ -297,22 +290,8 @@ def test_list_images_follows_links_but_not_in_circles(tmp_path):
 
 
 def test_list_images_of_nothing(tmp_path):
-    with pytest.raises(InputError, match=f"{tmp_path.name}: found no image, expected files that"):
-        list_images(tmp_path)
     (tmp_path / "notes.txt").touch()
     with pytest.raises(InputError, match=r"found no image among 1 \.txt, expected"):
         list_images(tmp_path)
     with pytest.raises(InputError, match=r"notes\.txt: found a file, expected a folder"):
         list_images(tmp_path / "notes.txt")
-    with pytest.raises(InputError, match="missing: found nothing, expected a folder"):
-        list_images(tmp_path / "missing")
-
-
-def test_photographs_read_and_resize_as_by_pillow():
-    if not PHOTOGRAPHS.is_dir():
-        pytest.skip("no photographs beside the checkout")
-    for path in list_images(PHOTOGRAPHS)[::8]:
-        expected = Image.open(path).convert("RGB").resize((224, 224), Image.Resampling.BILINEAR)
-        resized = resize_image(read_image(path), (224, 224))
-        # One level from the resize, two from the JPEG decoder, as above.
-        assert largest_difference(resized, np.asarray(expected)) <= 3

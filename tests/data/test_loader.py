@@ -13,7 +13,7 @@ import pytest
 
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data import loader
-from crisalad_jax.data.augmentations import AUGMENTATIONS, NoAugmentation
+from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.data.images import read_image
@@ -112,13 +112,6 @@ def test_threads_restarts_and_caches_do_not_change_a_bit(places, augmentation):
         assert_same(train(places, augmentation=augmentation, cache=cache), whole)
 
 
-@pytest.mark.parametrize("name", sorted(AUGMENTATIONS))
-def test_an_augmentation_goes_by_its_name(places, name):
-    assert_same(
-        train(places, augmentation=name), train(places, augmentation=AUGMENTATIONS.make(name))
-    )
-
-
 def test_opencv_has_one_thread_while_batches_are_read(places):
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
@@ -214,17 +207,6 @@ def test_a_bad_training_image(places, content):
     np.testing.assert_array_equal(images[valid], np.concatenate([b.images for b in whole])[valid])
 
 
-def test_a_bad_image_keeps_its_index(places):
-    paths = [places.path(i) for i in range(4)]
-    paths[1].write_bytes(b"no image")
-    with pytest.raises(InputError, match=paths[1].name):
-        list(image_batches(paths, image_size=SIZE, batch_size=4))
-    (batch,) = image_batches(paths, image_size=SIZE, batch_size=6, on_bad_image="skip")
-    assert batch.valid.tolist() == [True, False, True, True, False, False]
-    assert batch.indices.tolist() == [0, 1, 2, 3, -1, -1]
-    assert not batch.images[~batch.valid].any()
-
-
 def test_cache_decodes_once_within_its_budget(places):
     paths = [places.path(i) for i in range(4)]
     height, width = SIZE
@@ -308,7 +290,6 @@ def test_an_abandoned_iterator_does_not_hold_up_the_exit(places):
     [
         ({"start_step": 4}, "start_step, part: found 4 .*, expected 0 to 3"),
         ({"image_size": (0, 14)}, "image_size"),
-        ({"images_per_place": 4}, "place 0 has 3 images"),
         ({"on_bad_image": "black"}, "on_bad_image: found 'black', expected one of skip, stop"),
         ({"threads": -1}, "threads: found -1"),
         ({"augmentation": "nonne"}, "^augmentation: found 'nonne', expected one of .*none"),
@@ -318,12 +299,6 @@ def test_an_abandoned_iterator_does_not_hold_up_the_exit(places):
 def test_bad_arguments_raise_at_the_call(places, changes, message):
     with pytest.raises(InputError, match=message):
         start(places, **changes)
-
-
-def test_bad_arguments_of_plain_batches_raise_at_the_call(places):
-    for size, batch_size, words in ((SIZE, 0, "batch size: found 0"), ((0, 14), 1, "image_size")):
-        with pytest.raises(InputError, match=words):
-            image_batches([places.path(0)], image_size=size, batch_size=batch_size)
 
 
 class Cutting(NoAugmentation):

@@ -96,16 +96,6 @@ def test_degrees_are_metres_of_utm(tmp_path, degrees, radius, counts):
         assert _near(places) == [[1], [0], []]
 
 
-def test_places_across_zones_and_across_the_world(tmp_path):
-    """14 m apart across the edge of zones 31 and 32 is one place; equal numbers are two."""
-    names = ("@0720065.35@5415121.13@31@U@.jpg", "@0279934.65@5415121.13@32@U@.jpg")
-    far = "@0720065.35@5415121.13@10@U@.jpg"
-    touch_all(tmp_path, [*names, far])
-    places = read_places(tmp_path, place_radius=20, min_images=1)
-    assert places.names == (names[1], far)
-    assert places.files == (*names[::-1], far)
-
-
 def test_exif_data_says_where(tmp_path):
     # 0.36 seconds of latitude are 111.3 km / 3600 x 0.36 = 11.1 m.
     for name, seconds in (("a.jpg", 46.56), ("b.jpg", 46.92)):
@@ -200,7 +190,6 @@ UNFIT = "^.*walk: found arguments that do not fit each other, expected --cities 
         ({"place_frames": 4, "cities": ["a"]}, UNFIT),
         ({"place_frames": 4, "fps": 2.0}, r"^--fps: found 2 without a video"),
         ({"place_radius": 5}, r"walk: found no position of 7 images, expected --positions TA"),
-        ({}, r"walk: found .*, expected the layout of .*; --place-radius METRES makes places by"),
     ],
 )
 def test_arguments_that_do_not_fit_are_told(tmp_path, given, words):
@@ -298,7 +287,6 @@ def test_a_table_with_positions_makes_classes(folders):
         ("name;place\n", "found no place with at least 4 images"),
         ("name,place,heading\n", "found columns name, place, heading, expected"),
         ("name,place\nlone/1.jpg,\n", "line 2: found no place, expected"),
-        ("name,place\nlone/1.jpg,a\nlone/1.jpg,b\n", "found 'lone/1.jpg' twice, on line 2 too"),
     ],
 )
 def test_bad_tables(folders, text, message):

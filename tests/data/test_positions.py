@@ -17,16 +17,6 @@ def test_names_say_east_and_north():
     }
 
 
-@pytest.mark.parametrize("axes", [("east", "north"), ("lat", "lon")])
-def test_a_table_in_any_order_with_more_columns(tmp_path, axes):
-    path = tmp_path / "positions.csv"
-    text = f'\ufeff{axes[1]},time,name,{axes[0]}\n2.5,x,"a, b.jpg",1\n-4e1,y,c/d.jpg,3\n'
-    path.write_text(text, encoding="utf-8")
-    _, found = read_image_table(path, all_positions=True)
-    assert found.axes == axes
-    assert found.of == {"a, b.jpg": (1.0, 2.5), "c/d.jpg": (3.0, -40.0)}
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -146,11 +146,6 @@ SCHEDULES = {
         ),
         steps=30 * EPOCH,
     ),
-    "VLAD-BuFF": lambda: stepped(
-        recipe("b14", "vlad-buff").optimiser,
-        lambda each: torch.optim.lr_scheduler.LinearLR(each, 1.0, 0.2, total_iters=4000),
-        steps=4100,
-    ),
 }
 
 

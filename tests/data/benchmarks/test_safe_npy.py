@@ -93,7 +93,6 @@ class Call:
 @pytest.mark.parametrize(
     ("call", "name"),
     [
-        (Call(os.system, "true"), r"(posix|nt)\.system"),
         (Call(eval, "1"), "(builtins|__builtin__).eval"),
         (Call(getattr, "", "join"), "(builtins|__builtin__).getattr"),
         (Call(np.load, "x"), "numpy.load"),
@@ -145,21 +144,14 @@ def test_what_is_no_array_is_refused_and_takes_no_memory(tmp_path, case):
     assert not hasattr(np.ndarray, "x")
 
 
-@pytest.mark.parametrize("damage", ["missing", "empty", "cut", "text", "another object", "version"])
-def test_damaged_files(tmp_path, damage):
+def test_damaged_files(tmp_path):
     path = tmp_path / "a.npy"
-    np.save(path, ragged([1, 2], [3]), allow_pickle=True)
-    content = path.read_bytes()
-    path.unlink()
-    if damage != "missing":
-        replacement = {
-            "empty": b"",
-            "cut": content[:-20],
-            "text": b"0 1\n1 2\n",
-            "another object": content[:128] + pickle.dumps([1, 2]),
-            "version": content[:6] + b"\x09" + content[7:],
-        }
-        path.write_bytes(replacement[damage])
-    words = "found no such file" if damage == "missing" else "cannot be read"
-    with refused(rf"a\.npy: {words}"):
+    with refused(r"a\.npy: found no such file"):
         read_npy(path)
+    np.save(path, ragged([1, 2], [3]), allow_pickle=True)
+    whole = path.read_bytes()
+    another, version = whole[:128] + pickle.dumps([1, 2]), whole[:6] + b"\x09" + whole[7:]
+    for data in (b"", whole[:-20], b"0 1\n1 2\n", another, version):
+        path.write_bytes(data)
+        with refused(r"a\.npy: cannot be read"):
+            read_npy(path)
