@@ -1,6 +1,7 @@
 """Reading and listing images, against Pillow."""
 
 import io
+import pathlib
 import struct
 import zlib
 
@@ -32,6 +33,9 @@ FORMATS = {
     "jp2": ("JPEG2000", {}),
     "ppm": ("PPM", {}),
 }
+
+
+PHOTOGRAPHS = pathlib.Path(__file__).parents[2].parent / "shared" / "data" / "toy_streets"
 
 
 def smooth_picture(height=60, width=80, channels=3, seed=0):
@@ -295,3 +299,13 @@ def test_list_images_of_nothing(tmp_path):
         list_images(tmp_path)
     with pytest.raises(InputError, match=r"notes\.txt: found a file, expected a folder"):
         list_images(tmp_path / "notes.txt")
+
+
+def test_photographs_read_and_resize_as_by_pillow():
+    if not PHOTOGRAPHS.is_dir():
+        pytest.skip("no photographs beside the checkout")
+    for path in list_images(PHOTOGRAPHS)[::8]:
+        expected = Image.open(path).convert("RGB").resize((224, 224), Image.Resampling.BILINEAR)
+        resized = resize_image(read_image(path), (224, 224))
+        # One level from the resize, two from the JPEG decoder, as above.
+        assert largest_difference(resized, np.asarray(expected)) <= 3

@@ -17,6 +17,9 @@ from tests.data.test_class_groups import places_of
 COLUMNS = ["place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid"]
 
 
+REAL = Path(__file__).parents[2].parent / "shared" / "data"
+
+
 def make_rows(city_id: str, place: int, images: int) -> list[list[str]]:
     # lat and lon as no float would print them, northdeg beyond 360
     return [
@@ -242,3 +245,12 @@ def test_within_city_shuffles_places_and_cities():
 def test_bad_epoch_arguments(changes, message):
     with pytest.raises(InputError, match=message):
         draw(uneven(2, 3), **({"places_per_batch": 2} | changes))
+
+
+@pytest.mark.skipif(not (REAL / "sped_train").is_dir(), reason="needs the real photographs")
+def test_real_training_set():
+    places = read_places(REAL / "sped_train", min_images=2)
+    assert places.cities == ("SPED",)
+    assert places.image_counts.tolist() == [2] * 400
+    with pytest.raises(InputError, match="at least 4 images; the largest has 2"):
+        read_places(REAL / "sped_train")

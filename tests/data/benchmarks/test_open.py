@@ -25,6 +25,9 @@ from tests.data.benchmarks.trees import (
 FLAGS = Path(__file__).parents[3] / "crisalad_jax" / "cli" / "flags.py"
 
 
+REAL = Path(__file__).parents[3].parent / "shared" / "data"
+
+
 def test_open_benchmark_finds_the_layout(tmp_path):
     write_utm(tmp_path / "a" / "images" / "val", np.zeros((2, 2)), np.zeros((1, 2)))
     assert open_benchmark(tmp_path / "a", radius=5.0).name == "a/val (@UTM, 5 m)"
@@ -146,3 +149,23 @@ def test_the_help_names_every_layout():
 def test_an_unknown_layout_is_refused(tmp_path):
     with refused(r"layout: found 'gsv', expected one of .*vpr-bench"):
         open_benchmark(tmp_path, layout="gsv")
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="needs the real photographs")
+def test_real_sets():
+    sped = open_benchmark(REAL / "sped_val")
+    assert sped.name == "sped_val/test (@UTM, 25 m)"
+    assert [len(p) for p in sped.ground_truth()] == [1] * 147
+    for path, positives in zip(sped.queries, sped.ground_truth(), strict=True):
+        # the file names carry the place as well as its placeholder coordinates
+        assert path.name.split("@")[1] == sped.database[positives[0]].name.split("@")[1]
+
+    corridor = open_benchmark(REAL / "corridor")
+    assert corridor.name == "corridor (VPR-Bench)"
+    assert len(corridor.database) == len(corridor.queries) == 111
+    for i, positives in enumerate(corridor.ground_truth()):
+        assert positives.tolist() == list(range(max(0, i - 2), min(110, i + 2) + 1))
+
+    streets = open_benchmark(REAL / "toy_streets")
+    assert streets.name == "toy_streets (two folders, no ground truth)"
+    assert (len(streets.database), len(streets.queries), streets.positives) == (17, 5, None)
