@@ -16,6 +16,7 @@ SOME = (
     ("inputs", 0, "a sample", 16),
     ("interruptions", 0, "some", 18),
     ("kills", 0, "maps, extract .npy", 7),  # of training: tests/training/test_interruption.py
+    ("service", 0, "appends", 40),  # of the others: tests/retrieval/serve
 )
 ALL = (
     ("damage", 1, "", 4800),
@@ -29,6 +30,7 @@ ALL = (
     ("kills", 1, "maps, extract .npy, extract .h5", 100),
     ("kills", 1, "compare", 6),
     ("memory", 1, "", 7),
+    ("service", 1, "", 2000),
 )
 
 
