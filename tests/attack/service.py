@@ -186,6 +186,8 @@ def attack_appends(bench: Bench, scale: float) -> list[Row]:
     folder.parent.mkdir(parents=True)
     with served(bench, "appends", folder=folder) as service:
         resource.prlimit(service.process.pid, resource.RLIMIT_FSIZE, (100_000, 100_000))
+        # Fewer than the map's files in the end, twice as many as there are clients.
+        resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE, (128, 128))
         small, large, path = noise(20, 0), noise(250, 0), "/".join(["a" * 190] * 5)
         rows = {"good": (good, 201), "bad": (bad, 500), "ask": (asked, 200), "long": (long, 400)}
 
@@ -197,7 +199,7 @@ def attack_appends(bench: Bench, scale: float) -> list[Row]:
         def beside(number: int) -> tuple[str, int, bytes]:
             if number % 10 == 9:
                 return "long", *service.ask("POST", f"/images?name={number}/{path}", small)
-            return "ask", *service.ask("POST", "/locate?k=1", small)
+            return "ask", *service.ask("POST", "/locate?k=100", small)
 
         work = [(call, number) for number in range(count) for call in (one, beside)]
         bench.random.shuffle(work)

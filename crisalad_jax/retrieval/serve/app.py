@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import collections
 import contextlib
 import dataclasses
 import functools
@@ -407,9 +408,10 @@ def make_app(
 
 def _check_parameters(request: Request) -> None:
     """Check that the URL has no parameter twice, of which the last one would count."""
-    names = [name for name, _ in request.query_params.multi_items()]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(f"{twice[0]}: found it {len(twice)} times, expected it once")
+    counts = collections.Counter(name for name, _ in request.query_params.multi_items())
+    for name, count in counts.most_common(1):
+        if count > 1:
+            raise InputError(f"{name}: found it {count} times, expected it once")
 
 
 def bracketed(host: str) -> str:

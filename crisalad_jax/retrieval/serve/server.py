@@ -6,7 +6,6 @@ import ipaddress
 import math
 import os
 import pathlib
-import resource
 import socket
 from collections.abc import Callable, Iterator
 
@@ -27,6 +26,7 @@ from crisalad_jax.retrieval.serve.app import (
 )
 from crisalad_jax.retrieval.serve.worker import MapWorker
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.host import most_files
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.signals import SignalState, defer_signals
 
@@ -34,10 +34,8 @@ _GRACE = 30
 """Seconds that requests in flight have, after a signal, until they are dropped."""
 _HEAD, _EXCHANGE = 10, 120
 """Seconds in which the head of a request has to arrive, and all of it and be read its answer."""
-_MOST_CONNECTIONS = 512
-"""Most connections, also where the process may have more files open."""
-_ACCEPTED, _QUEUE = 2, 2048
-"""Connections accepted at once, and those that wait for it in the kernel."""
+_MOST_CONNECTIONS, _ACCEPTED, _QUEUE = 512, 2, 2048
+"""Most connections, those accepted at once, and those that wait for that in the kernel."""
 _SHORTEST_TOKEN = 16
 
 
@@ -140,7 +138,8 @@ class _Connection(H11Protocol):
         """Take a connection in place of the one that has kept the service waiting for longest."""
         super().connection_made(transport)
         self.since = self.loop.time()
-        most = most_connections()
+        # The map, pictures and connections on their way need some of the other half.
+        most = min(most_files() // 2, _MOST_CONNECTIONS)
         if len(self.connections) > most:
             waiting = (each for each in self.connections if each.patience < math.inf)
             oldest = min(waiting, key=lambda each: each.since)
@@ -164,16 +163,9 @@ class _Connection(H11Protocol):
                 h11.EndOfMessage(),
             ):
                 self.transport.write(self.conn.send(event) or b"")
+        if self.cycle is not None:
+            self.cycle.disconnected = True  # its own answer would be a second one
         self.transport.close()
-
-
-def most_connections() -> int:
-    """Return how many connections there may be: half of the files that may be open.
-
-    The map, the model and pictures need some of these too, and so do connections on their way.
-    """
-    files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    return _MOST_CONNECTIONS if files < 0 else min(files // 2, _MOST_CONNECTIONS)
 
 
 class Server(uvicorn.Server):
