@@ -57,7 +57,7 @@ from crisalad_jax.utils.version import VERSION
 MOST_ANSWERS = 100
 """Largest k."""
 MOST_PIXELS = 2**26
-"""Pixels that a picture may have by default, which no camera of a phone or robot exceeds."""
+"""Pixels that a picture may have by default; some phones exceed that in their highest setting."""
 _LANES = ((2**22, 4), (2**24, 1), (math.inf, 1))
 """Most pixels of a picture, and how many of these are decoded at once: large ones, each of which
 takes seconds, hold up no small ones."""
@@ -257,6 +257,7 @@ def make_app(
     places, since = worker.places, time.monotonic()
     cores = usable_cores()
     lanes = [(most, ThreadPoolExecutor(min(cores, count), "decode")) for most, count in _LANES]
+    shown = ThreadPoolExecutor(min(cores, 2), "thumbnails")
     thumbnail = functools.lru_cache(_THUMBNAILS)(read_thumbnail)
     waiting = asyncio.Semaphore(most_waiting)
     # Apart, so that clients who stop in the middle of a picture keep no whole ones waiting.
@@ -274,16 +275,13 @@ def make_app(
             if origin not in (None, own):
                 raise HTTPException(403, f"Origin: found {origin!r}, expected {own}")
 
-    async def in_thread(call: Any, *arguments: Any, pixels: int = 0) -> Any:
-        lane = next(lane for most, lane in lanes if pixels <= most)
-        return await asyncio.get_running_loop().run_in_executor(lane, call, *arguments)
-
     async def prepare(data: bytes, name: str) -> Pixels:
         def decode() -> Pixels:
             return prepare_image(decode_image(data, name), places.config, name)
 
-        pixels = await in_thread(check_picture, data, name, max_pixels)
-        return await in_thread(decode, pixels=pixels)
+        pixels = await asyncio.to_thread(check_picture, data, name, max_pixels)
+        lane = next(lane for most, lane in lanes if pixels <= most)
+        return await asyncio.get_running_loop().run_in_executor(lane, decode)
 
     app = fastapi.FastAPI(
         title="crisalad serve",
@@ -346,7 +344,8 @@ def make_app(
     async def show_image(number: int, _: _Nothing) -> Response:
         """Show an image of the map."""
         try:
-            data = await in_thread(thumbnail, places, map_images, number)
+            loop = asyncio.get_running_loop()
+            data = await loop.run_in_executor(shown, thumbnail, places, map_images, number)
         except InputError as error:
             raise HTTPException(404, str(error)) from error
         return Response(data, media_type="image/jpeg")
@@ -385,7 +384,7 @@ def make_app(
             pixels = await prepare(data, asked.name)
             # A map in other axes leaves out what EXIF data says, as `crisalad index` does.
             if position is None and places.axes in (None, AXES[1]):
-                said = await in_thread(exif_position, io.BytesIO(data))
+                said = await asyncio.to_thread(exif_position, io.BytesIO(data))
                 position = said and Positions(AXES[1], {asked.name: said})
             addition = Addition(pixels, data, asked.name, position)
             number = await asyncio.wrap_future(worker.submit(addition))

@@ -29,9 +29,8 @@ a temporary file's name is longer."""
 _LEVELS = 20
 """Most parts of a new image's name."""
 Image.init()
-_FORMATS = {"JPEG", "PNG", "WEBP", "BMP", "TIFF", "GIF", "AVIF", "JPEG2000", "PPM"} & set(
-    Image.OPEN
-)
+_KNOWN = ("JPEG", "PNG", "WEBP", "BMP", "TIFF", "GIF", "AVIF", "JPEG2000", "PPM")
+_FORMATS = [each for each in _KNOWN if each in Image.OPEN]
 """Pillow's names of the formats that are read; OpenCV would decode others too."""
 _MOST_SCANS = 32
 """Most scans of a JPEG: encoders write some ten, and each takes as long as all of a plain one."""
@@ -81,7 +80,7 @@ def check_picture(data: bytes, name: str, most_pixels: int) -> int:
         InputError: it is of another format, too large, or a JPEG of too many scans.
     """
     try:
-        with Image.open(io.BytesIO(data), formats=list(_FORMATS)) as image:
+        with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
             pixels = image.width * image.height
     except Exception as error:  # of a damaged file any
         found = f"{len(data)} bytes that do not decode" if data else "an empty file"

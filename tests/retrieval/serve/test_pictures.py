@@ -62,9 +62,15 @@ def test_large_pictures_hold_up_no_small_ones(folder, params, pictures, monkeypa
         assert data != large or go_on.wait(60)
         return decode(data, name)
 
+    def slow_thumbnail(*_):
+        assert go_on.wait(60)
+        return b""
+
     monkeypatch.setattr(app, "decode_image", slow)
+    monkeypatch.setattr(app, "read_thumbnail", slow_thumbnail)
     with serving(folder, params) as own, concurrent.futures.ThreadPoolExecutor(8) as pool:
-        waiting = [pool.submit(own.ask, "POST", "/locate", large) for _ in range(8)]
+        waiting = [pool.submit(own.ask, "POST", "/locate", large) for _ in range(4)]
+        waiting += [pool.submit(own.ask, "GET", f"/images/{number}") for number in range(4)]
         assert own.ask("POST", "/locate", pictures[0].read_bytes()).status == 200
         assert not any(each.done() for each in waiting)
         go_on.set()
