@@ -80,11 +80,14 @@ class Service(NamedTuple):
 
 
 @contextlib.contextmanager
-def served(bench: Bench, name: str, *, folder: pathlib.Path | None = None) -> Iterator[Service]:
-    """Serve a copy of the world's map, open for appending."""
+def served(
+    bench: Bench, name: str, *, files: int = 1024, folder: pathlib.Path | None = None
+) -> Iterator[Service]:
+    """Serve a copy of the world's map, open for appending, with so many files open at most."""
     folder, log = folder or bench.folder / f"{name}.map", bench.folder / f"{name}.log"
     shutil.copytree(bench.world.path("map"), folder)
-    command = [sys.executable, "-m", "crisalad_jax", "serve", "--map", str(folder), "--quiet"]
+    command = ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", sys.executable]
+    command += ["-m", "crisalad_jax", "serve", "--map", str(folder), "--quiet"]
     environment = {**os.environ, **bench.environment}
     environment.pop("CRISALAD_TOKEN", None)
     with (
@@ -150,18 +153,17 @@ def attack_connections(bench: Bench, scale: float) -> list[Row]:
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
     apart = concurrent.futures.ProcessPoolExecutor(1, multiprocessing.get_context("fork"))
-    with served(bench, "half-open") as service, apart as pool:
-        resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE, (DESCRIPTORS, DESCRIPTORS))
+    with served(bench, "half-open", files=DESCRIPTORS) as service, apart as pool:
         end, slowest = time.monotonic() + seconds, 0.0
         held = pool.submit(_hold_all, service.port, end)
         while time.monotonic() < end:
             time.sleep(0.5)
-            for ask in (("GET", "/health"), ("POST", "/locate?k=1", picture_bytes())):
+            for path, body in (("/health", None), ("/locate?k=1", picture_bytes())):
                 start = time.monotonic()
-                status, words = service.ask(*ask)
+                status, words = service.ask("GET" if body is None else "POST", path, body)
                 took = time.monotonic() - start
                 slowest = max(slowest, took)
-                row.note(status == 200 and took < LIMIT, f"{ask[1]}: {status} {words} {took:.1f} s")
+                row.note(status == 200 and took < LIMIT, f"{path}: {status} {words!r} {took:.1f} s")
         held.result()
         row.note(service.lines() < 100, f"{service.lines()} lines in the log")
     row.promise += f" (here {slowest:.2f} s at most)"
@@ -184,10 +186,9 @@ def attack_appends(bench: Bench, scale: float) -> list[Row]:
     gone = Row("served appends: to a map that was moved", "500, health says 503, nothing is made")
     folder = pathlib.Path(*[bench.folder, *["d" * 200] * (3000 // 200)], "map")
     folder.parent.mkdir(parents=True)
-    with served(bench, "appends", folder=folder) as service:
+    # Fewer than the map's files in the end.
+    with served(bench, "appends", files=128, folder=folder) as service:
         resource.prlimit(service.process.pid, resource.RLIMIT_FSIZE, (100_000, 100_000))
-        # Fewer than the map's files in the end, twice as many as there are clients.
-        resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE, (128, 128))
         small, large, path = noise(20, 0), noise(250, 0), "/".join(["a" * 190] * 5)
         rows = {"good": (good, 201), "bad": (bad, 500), "ask": (asked, 200), "long": (long, 400)}
 

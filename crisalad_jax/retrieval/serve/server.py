@@ -8,6 +8,7 @@ import os
 import pathlib
 import socket
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import h11
 import uvicorn
@@ -140,10 +141,11 @@ class _Connection(H11Protocol):
         self.since = self.loop.time()
         # The map, pictures and connections on their way need some of the other half.
         most = min(most_files() // 2, _MOST_CONNECTIONS)
-        if len(self.connections) > most:
-            waiting = (each for each in self.connections if each.patience < math.inf)
+        connections: set[Any] = self.connections
+        if len(connections) > most:
+            waiting = (each for each in connections if each.patience < math.inf)
             oldest = min(waiting, key=lambda each: each.since)
-            self.connections.discard(oldest)
+            connections.discard(oldest)
             oldest.transport.abort()
             warn(f"found more than {most} connections at once: those that wait longest are ended")
 
@@ -159,7 +161,7 @@ class _Connection(H11Protocol):
             headers = [*self.server_state.default_headers, *answer.raw_headers]
             for event in (
                 h11.Response(status_code=400, headers=headers, reason=b"Bad Request"),
-                h11.Data(data=answer.body),
+                h11.Data(data=bytes(answer.body)),
                 h11.EndOfMessage(),
             ):
                 self.transport.write(self.conn.send(event) or b"")
@@ -206,7 +208,8 @@ class Server(uvicorn.Server):
     async def on_tick(self, counter: int) -> bool:
         """Look for a signal and for clients that are too slow, ten times a second."""
         now = asyncio.get_running_loop().time()
-        for each in tuple(self.server_state.connections):
+        connections: tuple[Any, ...] = tuple(self.server_state.connections)
+        for each in connections:
             if now > each.since + each.patience:
                 each.transport.abort()
         return await super().on_tick(counter) or bool(self._stop.number)
