@@ -262,6 +262,17 @@ def _bmp(width: int, height: int) -> bytes:
     return b"BM" + struct.pack("<IHHI", 1178, 0, 0, 1078) + head + bytes(1024) + b"\0\1"
 
 
+def _tile() -> bytes:
+    """Return a small grey TIFF in a large tile."""
+    data, side = zlib.compress(bytes(8192 * 8192), 9), 8192
+    fields = {256: 8, 257: 8, 258: 8, 259: 8, 262: 1, 277: 1, 322: side, 323: side, 324: 8}
+    pairs = sorted({**fields, 325: len(data)}.items())
+    entries = b"".join(struct.pack("<HHII", field, 4, 1, value) for field, value in pairs)
+    data += bytes(len(data) % 2)
+    head = b"II*\0" + struct.pack("<I", 8 + len(data)) + data
+    return head + struct.pack("<H", len(pairs)) + entries + bytes(4)
+
+
 BOMBS: Mapping[str, tuple[int, Callable[[], bytes]]] = {
     "WebP of 16383 x 16383": (400, lambda: _saved(16383, 16383, "WEBP", lossless=True, method=0)),
     "PNG of 16384 x 16384": (400, lambda: _png(16384, 16384)),
@@ -278,6 +289,8 @@ BOMBS: Mapping[str, tuple[int, Callable[[], bytes]]] = {
     "TIFF of 8000 x 8000": (200, lambda: _saved(8000, 8000, "TIFF", compression="tiff_deflate")),
     "JPEG 2000 of 8000 x 8000": (200, lambda: _saved(8000, 8000, "JPEG2000")),
     "AVIF of 8000 x 8000": (200, lambda: _saved(8000, 8000, "AVIF", speed=10)),
+    "PNG of 1400 x 1400, 16 bits": (200, lambda: _png(1400, 1400, depth=16, colour=6, channels=4)),
+    "TIFF of 8 x 8 in a tile of 8192 x 8192": (200, _tile),
     "progressive JPEG of 8000 x 8000": (200, lambda: _scans(8000, 8000, 0)),
 }
 """Small files of pictures that take long to decode, and whether they are."""

@@ -58,7 +58,7 @@ MOST_ANSWERS = 100
 """Largest k."""
 MOST_PIXELS = 2**26
 """Pixels that a picture may have by default; some phones exceed that in their highest setting."""
-_LANES = ((2**22, 4), (2**24, 1), (math.inf, 1))
+_LANES = ((2**21, 4), (2**24, 1), (math.inf, 1))
 """Most pixels of a picture, and how many of these are decoded at once: large ones, each of which
 takes seconds, hold up no small ones."""
 _THUMBNAILS = 512
@@ -260,8 +260,6 @@ def make_app(
     shown = ThreadPoolExecutor(min(cores, 2), "thumbnails")
     thumbnail = functools.lru_cache(_THUMBNAILS)(read_thumbnail)
     waiting = asyncio.Semaphore(most_waiting)
-    # Apart, so that clients who stop in the middle of a picture keep no whole ones waiting.
-    uploads = asyncio.Semaphore(2 * most_waiting)
 
     async def check_access(request: Request, given: _Bearer) -> None:
         """With a token whoever brings it may ask; without one no page of another site."""
@@ -353,8 +351,7 @@ def make_app(
     @guarded.post("/locate", openapi_extra=_BODY)
     async def locate(request: Request, asked: Annotated[_Asked, Query()]) -> Located:
         """Find the most similar images of the map to a picture."""
-        async with _room(uploads):
-            data, name = await receive_picture(request, max_bytes)
+        data, name = await receive_picture(request, max_bytes)
         async with _room(waiting):
             start = time.perf_counter()
             question = Question(await prepare(data, name), asked.k or k)
@@ -377,8 +374,7 @@ def make_app(
             raise HTTPException(403, "images: found a map that is only read, expected --append")
         check_new_name(asked.name)
         position = asked.position()
-        async with _room(uploads):
-            data, _ = await receive_picture(request, max_bytes)
+        data, _ = await receive_picture(request, max_bytes)
         async with _room(waiting):
             start = time.perf_counter()
             pixels = await prepare(data, asked.name)

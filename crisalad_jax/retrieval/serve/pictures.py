@@ -2,6 +2,7 @@
 
 import asyncio
 import io
+import math
 import os
 import pathlib
 
@@ -32,6 +33,8 @@ Image.init()
 _KNOWN = ("JPEG", "PNG", "WEBP", "BMP", "TIFF", "GIF", "AVIF", "JPEG2000", "PPM")
 _FORMATS = [each for each in _KNOWN if each in Image.OPEN]
 """Pillow's names of the formats that are read; OpenCV would decode others too."""
+_PLAIN = ("JPEG", "MPO", "PNG", "WEBP", "BMP", "PPM")
+"""Those that take as long as their head says. Tiles and frames of others have their own sizes."""
 _MOST_SCANS = 32
 """Most scans of a JPEG: encoders write some ten, and each takes as long as all of a plain one."""
 _SIDE = 480
@@ -73,15 +76,15 @@ async def receive_picture(request: Request, most_bytes: int) -> tuple[bytes, str
         raise HTTPException(408, f"image: found half of it after {_PATIENCE:g} s") from error
 
 
-def check_picture(data: bytes, name: str, most_pixels: int) -> int:
-    """Check what a picture's head says before it is decoded; return its number of pixels.
+def check_picture(data: bytes, name: str, most_pixels: int) -> float:
+    """Check what a picture's head says before it is decoded; return how many pixels it may take.
 
     Raises:
         InputError: it is of another format, too large, or a JPEG of too many scans.
     """
     try:
         with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
-            pixels = image.width * image.height
+            pixels, kind = image.width * image.height, image.format
     except Exception as error:  # of a damaged file any
         found = f"{len(data)} bytes that do not decode" if data else "an empty file"
         expected = f"an image ({' '.join(IMAGE_SUFFIXES)})"
@@ -91,7 +94,7 @@ def check_picture(data: bytes, name: str, most_pixels: int) -> int:
         raise InputError(f"{name}: found {pixels} pixels, expected {expected}")
     if (scans := jpeg_scans(data)) > _MOST_SCANS:
         raise InputError(f"{name}: found a JPEG of {scans} scans, expected at most {_MOST_SCANS}")
-    return pixels
+    return pixels if kind in _PLAIN else math.inf
 
 
 def check_new_name(name: str) -> None:

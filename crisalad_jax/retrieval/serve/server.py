@@ -35,7 +35,7 @@ _GRACE = 30
 """Seconds that requests in flight have, after a signal, until they are dropped."""
 _HEAD, _EXCHANGE = 10, 120
 """Seconds in which the head of a request has to arrive, and all of it and be read its answer."""
-_MOST_CONNECTIONS, _ACCEPTED, _QUEUE = 512, 2, 2048
+_MOST_CONNECTIONS, _ACCEPTED, _QUEUE = 256, 2, 2048
 """Most connections, those accepted at once, and those that wait for that in the kernel."""
 _SHORTEST_TOKEN = 16
 

@@ -55,8 +55,12 @@ def test_what_takes_long_is_not_decoded(small, data, words):
     assert words is None or words in reply.json["error"]
 
 
-def test_large_pictures_hold_up_no_small_ones(folder, params, pictures, monkeypatch):
-    go_on, decode, large = threading.Event(), app.decode_image, saved(2400, 1800, "PNG")
+@pytest.mark.parametrize(
+    "large", [saved(1700, 1300, "PNG"), *(saved(9, 9, kind) for kind in ("TIFF", "AVIF"))]
+)
+def test_large_pictures_hold_up_no_small_ones(folder, params, pictures, monkeypatch, large):
+    """Nor do those whose head does not say how large their parts are."""
+    go_on, decode = threading.Event(), app.decode_image
 
     def slow(data, name):
         assert data != large or go_on.wait(60)
