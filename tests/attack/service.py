@@ -306,7 +306,7 @@ def attack_pictures(bench: Bench, scale: float) -> list[Row]:
     )
     beside = Row(
         "served pictures that take long: a question beside 12 of each kind",
-        f"it is answered within {2 * LIMIT:g} s",
+        f"it is answered within {3 * LIMIT:g} s",
     )
     names = [name for name, (status, _) in BOMBS.items() if scale >= 1 or status == 400]
     with served(bench, "pictures") as service:
@@ -329,7 +329,7 @@ def attack_pictures(bench: Bench, scale: float) -> list[Row]:
                 status, words = service.ask("POST", "/locate?k=1", small)
                 took = time.monotonic() - start
                 bench.say(f"    a question beside 12: {took:.2f} s")
-                beside.note(status == 200 and took < 2 * LIMIT, f"{name}: {status}, {took:.1f} s")
+                beside.note(status == 200 and took < 3 * LIMIT, f"{name}: {status}, {took:.1f} s")
                 found = collections.Counter(bomb.result()[0] for bomb in bombs)
                 beside.note(set(found) == {expected}, f"{name}: {found}")
             alone.note(service.peak() - started < MEMORY, f"12 of {name}: {service.peak():.0f} MB")
