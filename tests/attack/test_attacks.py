@@ -15,8 +15,8 @@ SOME = (
     ("disks", 0, "convert", 4),
     ("inputs", 0, "a sample", 16),
     ("interruptions", 0, "some", 18),
-    ("kills", 0, "maps, extract .npy", 7),  # of training: tests/training/test_interruption.py
-    ("service", 0, "appends", 40),  # of the others: tests/retrieval/serve
+    # Of training: tests/training/test_interruption.py; of the service: tests/retrieval/serve.
+    ("kills", 0, "maps, extract .npy", 7),
 )
 ALL = (
     ("damage", 1, "", 4800),
