@@ -34,6 +34,8 @@ class Serve(DecodeFlags):
     """Answers to a picture, where the request names no number."""
     max_bytes: int = 20 * 2**20
     """Bytes that a request may have."""
+    max_pixels: int = 2**26
+    """Pixels that a picture may have; larger ones are not decoded."""
     verify: bool = True
     """Check the map's descriptors against their checksums; --no-verify skips that, where files are
     huge."""
@@ -53,6 +55,6 @@ def run(arguments: Serve) -> None:
 
     given = vars(arguments) | {"token": token, "ready": ready}
     given["weights"] = find_given(arguments.weights, quiet=arguments.quiet)
-    for name in ("token_file", "max_pixels", "plugin"):
+    for name in ("token_file", "plugin"):
         del given[name]
     serve_map(given.pop("map"), **given)

@@ -4,6 +4,7 @@ JPEG markers are from ITU-T T.81 annex B, PNG chunks from the W3C PNG specificat
 """
 
 import collections
+import itertools
 import os
 import pathlib
 import re
@@ -50,8 +51,9 @@ _PNG_SIDE = 1_000_000
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _AVIF = (b"ftypavif", b"ftypavis")
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-# Any marker except the stuffed byte FF00, the restarts FFD0..FFD7 and the fill FFFF.
-_JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+# Any marker except the stuffed byte FF00, the fill FFFF, and FF01 and the restarts FFD0..FFD7,
+# which have no segment.
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd7\xff]")
 _JPEG_FRAMES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 # OpenCV's flags for reduced grey images; with the colour flag they reduce RGB images too.
 _REDUCED = (
@@ -188,6 +190,12 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
         position = marker.end()
         yield data[position - 1], position
         position += int.from_bytes(data[position : position + 2], "big")
+
+
+def jpeg_scans(data: bytes) -> int:
+    """Count the scans of a JPEG; other files have none."""
+    codes = (code for code, _ in _jpeg_segments(data)) if data.startswith(b"\xff\xd8") else ()
+    return sum(code == 0xDA for code in itertools.takewhile(0xD9.__ne__, codes))
 
 
 def _reduction(data: bytes, enough: tuple[int, int] | None) -> int:

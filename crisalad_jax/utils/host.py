@@ -1,6 +1,7 @@
 """The share of the machine that this process may use."""
 
 import os
+import resource
 
 
 def usable_cores() -> int:
@@ -8,3 +9,9 @@ def usable_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def most_files() -> int:
+    """Return how many files this process may have open, connections among them."""
+    files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return 2**20 if files == resource.RLIM_INFINITY else files

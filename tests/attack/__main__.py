@@ -16,7 +16,7 @@ import tempfile
 from crisalad_jax.utils.files import atomic_path, split_markers
 from tests.attack.world import ROOT
 
-SCRIPTS = ("kills", "interruptions", "memory", "disks", "damage", "inputs")
+SCRIPTS = ("kills", "interruptions", "memory", "disks", "damage", "inputs", "service")
 PAGE = ROOT / "docs" / "reliability.md"
 
 

@@ -15,7 +15,8 @@ SOME = (
     ("disks", 0, "convert", 4),
     ("inputs", 0, "a sample", 16),
     ("interruptions", 0, "some", 18),
-    ("kills", 0, "maps, extract .npy", 7),  # of training: tests/training/test_interruption.py
+    # Of training: tests/training/test_interruption.py; of the service: tests/retrieval/serve.
+    ("kills", 0, "maps, extract .npy", 7),
 )
 ALL = (
     ("damage", 1, "", 4800),
@@ -29,6 +30,7 @@ ALL = (
     ("kills", 1, "maps, extract .npy, extract .h5", 100),
     ("kills", 1, "compare", 6),
     ("memory", 1, "", 7),
+    ("service", 1, "", 2000),
 )
 
 

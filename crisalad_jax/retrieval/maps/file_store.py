@@ -11,12 +11,14 @@ from crisalad_jax.retrieval.chunks import Block, Descriptors, Queries, blocks, g
 from crisalad_jax.retrieval.neighbours import QUERY_CHUNK, Neighbours, nearest
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source, npy_header, write_npy
+from crisalad_jax.utils.host import most_files
 from crisalad_jax.utils.shapes import Float, Int64
 
 _BLOCK = 2**23
 """Largest size of a block of descriptors, and of its products with some queries, in numbers."""
 _MAPPED = 8192
-"""Number of files that stay mapped, at most; Linux allows a process 65,530 mappings."""
+"""Number of files that stay mapped, at most; Linux allows a process 65,530 mappings. Each takes a
+descriptor, of which these take a sixteenth at most."""
 
 
 class FileStore:
@@ -31,7 +33,7 @@ class FileStore:
         self._folder, self._length, self._dtype = folder, length, np.dtype(dtype)
         self._counts: dict[int, int] = {}
         """Number of descriptors in each file, by the number of its first, in ascending order."""
-        self._mapped = functools.lru_cache(_MAPPED)(self._open)
+        self._mapped = functools.lru_cache(min(_MAPPED, most_files() // 16))(self._open)
 
     def _path(self, first: int) -> pathlib.Path:
         return self._folder / f"{first:010d}.npy"
@@ -75,7 +77,10 @@ class FileStore:
 
         def files() -> Iterator[Block]:
             for first in [first for first in self._counts if first < count]:
-                yield from blocks(self._open(first), str(self._path(first)), size)
+                rows = self._open(first)
+                # A block of small files would keep a descriptor open for each of its parts.
+                rows = np.array(rows) if len(rows) < size // 8 else rows
+                yield from blocks(rows, str(self._path(first)), size)
 
         read_rows = functools.partial(self.rows, release=True)
         return nearest(lambda: joined(files(), size), queries, k, read_rows, 2 * size)

@@ -136,6 +136,7 @@ class Map:
         self.components = read_components(folder, metadata)
         """The components that shorten descriptors, and those of queries; None is none."""
         self._segments, self._numbers = segments, dict[str, int]()
+        self._opened_at = os.stat(segments.folder)
         self._close = weakref.finalize(self, segments.store.close)
         self._approximate: Approximate | None = None
         self._describer: tuple[object, Describer] | None = None
@@ -234,6 +235,14 @@ class Map:
             InputError: it is not one that this package knows.
         """
         return model_config(self.metadata, self.folder)
+
+    @property
+    def exists(self) -> bool:
+        """Whether the map is still where it was opened: it was not moved, removed or replaced."""
+        with contextlib.suppress(OSError):
+            there = os.stat(self._segments.folder)
+            return os.path.samestat(there, self._opened_at) and (self.folder / METADATA).is_file()
+        return False
 
     def image(self, name: str) -> MapImage | None:
         """Return what the map knows of the image of this name; None if it has none."""
@@ -415,8 +424,11 @@ class Map:
 
         Raises:
             InputError: a name that is there already or twice, descriptors that are no unit vectors,
-                positions that have no place among the map's, or a store that cannot be written to.
+                positions that have no place among the map's, a store that cannot be written to, or
+                a map that is no longer where it was opened.
         """
+        if not self.exists:
+            raise InputError(f"{self.folder}: found the opened map gone, expected it in this place")
         descriptors = self._unit_rows("descriptors", descriptors)
         if twice := len(names) - len(set(names) - self._numbers.keys()):
             raise InputError(

@@ -2,13 +2,16 @@
 
 import asyncio
 import base64
+import collections
 import contextlib
 import dataclasses
 import functools
 import hashlib
 import io
+import math
 import os
 import pathlib
+import re
 import secrets
 import sys
 import time
@@ -22,8 +25,8 @@ from fastapi import Query
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
-from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -33,7 +36,12 @@ from crisalad_jax.data.resize import Pixels
 from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.maps.map import Answer
 from crisalad_jax.retrieval.maps.query import answer_fields, position_fields
-from crisalad_jax.retrieval.serve.pictures import check_new_name, read_thumbnail, receive_picture
+from crisalad_jax.retrieval.serve.pictures import (
+    check_new_name,
+    check_picture,
+    read_thumbnail,
+    receive_picture,
+)
 from crisalad_jax.retrieval.serve.worker import (
     Addition,
     MapFailedError,
@@ -48,12 +56,16 @@ from crisalad_jax.utils.version import VERSION
 
 MOST_ANSWERS = 100
 """Largest k."""
-_DECODERS = 4
-"""Largest number of pictures decoded at once: each may have --max-pixels of three bytes."""
+MOST_PIXELS = 2**26
+"""Pixels that a picture may have by default; some phones exceed that in their highest setting."""
+_LANES = ((2**21, 4), (2**24, 1), (math.inf, 1))
+"""Most pixels of a picture, and how many of these are decoded at once: large ones, each of which
+takes seconds, hold up no small ones."""
 _THUMBNAILS = 512
 """Number of thumbnails in memory, some 30 kB each."""
 _DOTS = 4000
 """Number of places that the page draws at most."""
+FAILED = "the map or the model failed; the service's terminal says why"
 _LOCAL = ("localhost", "127.0.0.1", "[::1]")
 
 _FILE = pathlib.Path(__file__).with_name("page.html")
@@ -223,6 +235,7 @@ def make_app(
     map_images: str | os.PathLike[str] | None = None,
     k: int = 5,
     max_bytes: int = 20 * 2**20,
+    max_pixels: int = MOST_PIXELS,
     most_waiting: int = 128,
 ) -> ASGIApp:
     """Make the application that answers for a map.
@@ -235,17 +248,18 @@ def make_app(
         map_images: folder of the map's images; None is where they were.
         k: answers to a picture where the request names no number.
         max_bytes: largest body of a request.
+        max_pixels: most pixels of a picture that a request brings.
         most_waiting: number of requests with a picture at once; more are told to come again.
 
     Returns:
         An ASGI application.
     """
     places, since = worker.places, time.monotonic()
-    decoders = ThreadPoolExecutor(min(usable_cores(), _DECODERS), "decode")
+    cores = usable_cores()
+    lanes = [(most, ThreadPoolExecutor(min(cores, count), "decode")) for most, count in _LANES]
+    shown = ThreadPoolExecutor(min(cores, 2), "thumbnails")
     thumbnail = functools.lru_cache(_THUMBNAILS)(read_thumbnail)
     waiting = asyncio.Semaphore(most_waiting)
-    # Apart, so that clients who stop in the middle of a picture keep no whole ones waiting.
-    uploads = asyncio.Semaphore(2 * most_waiting)
 
     async def check_access(request: Request, given: _Bearer) -> None:
         """With a token whoever brings it may ask; without one no page of another site."""
@@ -259,12 +273,13 @@ def make_app(
             if origin not in (None, own):
                 raise HTTPException(403, f"Origin: found {origin!r}, expected {own}")
 
-    async def in_thread(call: Any, *arguments: Any) -> Any:
-        return await asyncio.get_running_loop().run_in_executor(decoders, call, *arguments)
+    async def prepare(data: bytes, name: str) -> Pixels:
+        def decode() -> Pixels:
+            return prepare_image(decode_image(data, name), places.config, name)
 
-    def prepare(data: bytes, name: str) -> Pixels:
-        config = places.config
-        return prepare_image(decode_image(data, name), config, name)
+        pixels = await asyncio.to_thread(check_picture, data, name, max_pixels)
+        lane = next(lane for most, lane in lanes if pixels <= most)
+        return await asyncio.get_running_loop().run_in_executor(lane, decode)
 
     app = fastapi.FastAPI(
         title="crisalad serve",
@@ -272,11 +287,13 @@ def make_app(
         version=VERSION,
         docs_url=None,  # FastAPI's page loads scripts from another server
         redoc_url=None,
+        redirect_slashes=False,  # to an address of the client's choice, its Host
+        dependencies=[fastapi.Depends(_check_parameters)],
         responses=_PROBLEM,
         exception_handlers=dict.fromkeys((*_CLIENTS, MapFailedError, Exception), _answer_error),
     )
-    hosts = [*_LOCAL, bracketed(host)] if token is None else ["*"]
-    app.add_middleware(TrustedHostMiddleware, allowed_hosts=hosts)
+    names = "|".join(map(re.escape, (*_LOCAL, bracketed(host))))
+    own_host = re.compile(rf"({names})(:\d+)?" if token is None else ".*", re.IGNORECASE)
     guarded = fastapi.APIRouter(dependencies=[fastapi.Depends(check_access)])
 
     @app.get("/", include_in_schema=False)
@@ -286,6 +303,8 @@ def make_app(
     @app.get("/health")
     async def health(_: _Nothing) -> Health:
         """Tell that the service runs, of which model, how it searches, and since when."""
+        if not places.exists:
+            raise HTTPException(503, FAILED)
         return Health(
             status="ok",
             images=len(places),
@@ -323,7 +342,8 @@ def make_app(
     async def show_image(number: int, _: _Nothing) -> Response:
         """Show an image of the map."""
         try:
-            data = await in_thread(thumbnail, places, map_images, number)
+            loop = asyncio.get_running_loop()
+            data = await loop.run_in_executor(shown, thumbnail, places, map_images, number)
         except InputError as error:
             raise HTTPException(404, str(error)) from error
         return Response(data, media_type="image/jpeg")
@@ -331,11 +351,10 @@ def make_app(
     @guarded.post("/locate", openapi_extra=_BODY)
     async def locate(request: Request, asked: Annotated[_Asked, Query()]) -> Located:
         """Find the most similar images of the map to a picture."""
-        async with _room(uploads):
-            data, name = await receive_picture(request, max_bytes)
+        data, name = await receive_picture(request, max_bytes)
         async with _room(waiting):
             start = time.perf_counter()
-            question = Question(await in_thread(prepare, data, name), asked.k or k)
+            question = Question(await prepare(data, name), asked.k or k)
             found = await asyncio.wrap_future(worker.submit(question))
         neighbours = [
             Neighbour(
@@ -355,14 +374,13 @@ def make_app(
             raise HTTPException(403, "images: found a map that is only read, expected --append")
         check_new_name(asked.name)
         position = asked.position()
-        async with _room(uploads):
-            data, _ = await receive_picture(request, max_bytes)
+        data, _ = await receive_picture(request, max_bytes)
         async with _room(waiting):
             start = time.perf_counter()
-            pixels = await in_thread(prepare, data, asked.name)
+            pixels = await prepare(data, asked.name)
             # A map in other axes leaves out what EXIF data says, as `crisalad index` does.
             if position is None and places.axes in (None, AXES[1]):
-                said = await in_thread(exif_position, io.BytesIO(data))
+                said = await asyncio.to_thread(exif_position, io.BytesIO(data))
                 position = said and Positions(AXES[1], {asked.name: said})
             addition = Addition(pixels, data, asked.name, position)
             number = await asyncio.wrap_future(worker.submit(addition))
@@ -370,12 +388,25 @@ def make_app(
         return Appended(number, asked.name, there, len(places), _milliseconds(start))
 
     async def answer(scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer HEAD as GET; the server leaves out the body."""
+        """Answer who names this service's host, and HEAD as GET: the server leaves out the body."""
+        host = Headers(scope=scope).get("host", "")
+        if not own_host.fullmatch(host):
+            problem = {"error": f"Host: found {host!r}, expected this machine's, or a token"}
+            await JSONResponse(problem, 400)(scope, receive, send)
+            return
         method = "GET" if scope.get("method") == "HEAD" else scope.get("method")
         await app({**scope, "method": method}, receive, send)
 
     app.include_router(guarded)
     return answer
+
+
+def _check_parameters(request: Request) -> None:
+    """Check that the URL has no parameter twice, of which the last one would count."""
+    counts = collections.Counter(name for name, _ in request.query_params.multi_items())
+    for name, count in counts.most_common(1):
+        if count > 1:
+            raise InputError(f"{name}: found it {count} times, expected it once")
 
 
 def bracketed(host: str) -> str:
@@ -415,5 +446,5 @@ async def _answer_error(_: Request, error: Exception) -> Response:
     elif not isinstance(error, _CLIENTS):
         # The client learns nothing of the machine; who runs the service sees why.
         print(f"crisalad: {one_line(error)}", file=sys.stderr, flush=True)
-        status, reason = 500, "the map or the model failed; the service's terminal says why"
+        status, reason = 500, FAILED
     return JSONResponse({"error": one_line(reason)}, status, headers)

@@ -1,18 +1,21 @@
 """Pictures that requests bring, and small ones of the map's images."""
 
 import asyncio
+import io
+import math
 import os
 import pathlib
 
 import cv2
 import numpy as np
 from fastapi import HTTPException, Request
+from PIL import Image
 from starlette.datastructures import UploadFile
 from starlette.types import Message
 
-from crisalad_jax.data.images import read_image
+from crisalad_jax.data.images import IMAGE_SUFFIXES, jpeg_scans, read_image
 from crisalad_jax.data.resize import resize_image
-from crisalad_jax.data.video import file_of
+from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.serve.worker import ADDED
 from crisalad_jax.utils.errors import InputError
@@ -24,8 +27,19 @@ _FIELDS = 10
 _LONGEST, _LONGEST_PATH = 200, 1000
 """Most bytes of each part of a new image's name, and of all: file systems take 255 of a part, and
 a temporary file's name is longer."""
+_LEVELS = 20
+"""Most parts of a new image's name."""
+Image.init()
+_KNOWN = ("JPEG", "PNG", "WEBP", "BMP", "TIFF", "GIF", "AVIF", "JPEG2000", "PPM")
+_FORMATS = [each for each in _KNOWN if each in Image.OPEN]
+"""Pillow's names of the formats that are read; OpenCV would decode others too."""
+_PLAIN = ("JPEG", "MPO", "PNG", "WEBP", "BMP", "PPM")
+"""Those that take as long as their head says. Tiles and frames of others have their own sizes."""
+_MOST_SCANS = 32
+"""Most scans of a JPEG: encoders write some ten, and each takes as long as all of a plain one."""
 _SIDE = 480
 """Largest side of a thumbnail in pixels."""
+Image.MAX_IMAGE_PIXELS = None  # `check_picture` has a limit of its own, and decodes nothing
 
 
 async def receive_picture(request: Request, most_bytes: int) -> tuple[bytes, str]:
@@ -62,17 +76,40 @@ async def receive_picture(request: Request, most_bytes: int) -> tuple[bytes, str
         raise HTTPException(408, f"image: found half of it after {_PATIENCE:g} s") from error
 
 
+def check_picture(data: bytes, name: str, most_pixels: int) -> float:
+    """Check what a picture's head says before it is decoded; return how many pixels it may take.
+
+    Raises:
+        InputError: it is of another format, too large, or a JPEG of too many scans.
+    """
+    try:
+        with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
+            pixels, kind = image.width * image.height, image.format
+    except Exception as error:  # of a damaged file any
+        found = f"{len(data)} bytes that do not decode" if data else "an empty file"
+        expected = f"an image ({' '.join(IMAGE_SUFFIXES)})"
+        raise InputError(f"{name}: found {found}, expected {expected}") from error
+    if pixels > most_pixels:
+        expected = f"at most {most_pixels} (--max-pixels raises that)"
+        raise InputError(f"{name}: found {pixels} pixels, expected {expected}")
+    if (scans := jpeg_scans(data)) > _MOST_SCANS:
+        raise InputError(f"{name}: found a JPEG of {scans} scans, expected at most {_MOST_SCANS}")
+    return pixels if kind in _PLAIN else math.inf
+
+
 def check_new_name(name: str) -> None:
     """Check that a name is a plain path below a folder, without hidden parts.
 
     Raises:
-        InputError: a part is empty, hidden or too long, or the name has control characters.
+        InputError: a part is empty, hidden or too long, there are too many, the name has control
+            characters or was not UTF-8, or it is a frame's of a video.
 
     Example:
         >>> check_new_name("tuesday/0001.jpg")
     """
     # First, since what cannot be encoded is not printable either.
-    plain = name.isprintable() and "\\" not in name and len(name.encode()) <= _LONGEST_PATH
+    plain = name.isprintable() and not set("\\\ufffd") & set(name) and frame_time(name) is None
+    plain = plain and len(name.encode()) <= _LONGEST_PATH and name.count("/") < _LEVELS
     if not plain or any(
         not part or part.startswith(".") or part != part.strip() or len(part.encode()) > _LONGEST
         for part in name.split("/")

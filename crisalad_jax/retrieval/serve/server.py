@@ -1,24 +1,42 @@
 """The server: opens a map, compiles its model, and answers until a signal ends it."""
 
+import asyncio
 import contextlib
 import ipaddress
+import math
 import os
 import pathlib
 import socket
 from collections.abc import Callable, Iterator
+from typing import Any
 
+import h11
 import uvicorn
+from starlette.responses import JSONResponse
 from starlette.types import ASGIApp
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from crisalad_jax.config.checks import check_count, require
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
-from crisalad_jax.retrieval.serve.app import HEADERS, MOST_ANSWERS, bracketed, make_app
+from crisalad_jax.retrieval.serve.app import (
+    HEADERS,
+    MOST_ANSWERS,
+    MOST_PIXELS,
+    bracketed,
+    make_app,
+)
 from crisalad_jax.retrieval.serve.worker import MapWorker
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.host import most_files
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.signals import SignalState, defer_signals
 
 _GRACE = 30
 """Seconds that requests in flight have, after a signal, until they are dropped."""
+_HEAD, _EXCHANGE = 10, 120
+"""Seconds in which the head of a request has to arrive, and all of it and be read its answer."""
+_MOST_CONNECTIONS, _ACCEPTED, _QUEUE = 256, 2, 2048
+"""Most connections, those accepted at once, and those that wait for that in the kernel."""
 _SHORTEST_TOKEN = 16
 
 
@@ -33,6 +51,7 @@ def serve_map(
     append: bool = False,
     map_images: str | os.PathLike[str] | None = None,
     max_bytes: int = 20 * 2**20,
+    max_pixels: int = MOST_PIXELS,
     batch_size: int = 16,
     verify: bool = True,
     quiet: bool = False,
@@ -52,6 +71,7 @@ def serve_map(
         append: whether requests may add images to the map, which no other process can then.
         map_images: folder of the map's pictures; None is where they were.
         max_bytes: largest body of a request.
+        max_pixels: most pixels of a picture that a request brings.
         batch_size: largest number of pictures described together, each as if it were alone.
         verify: whether to compare the map's descriptors with their checksums.
         quiet: whether to show no progress bar.
@@ -94,9 +114,60 @@ def serve_map(
             map_images=map_images,
             k=k,
             max_bytes=max_bytes,
+            max_pixels=max_pixels,
         )
         address = f"http://{bracketed(host)}:{listener.getsockname()[1]}"
         Server(app, stop, lambda: ready(address)).run([listener])
+
+
+class _Connection(H11Protocol):
+    """A connection, which ends where its client keeps the service waiting."""
+
+    since = 0.0
+    """When the client began to send its request: at once, or after the last answer."""
+
+    @property
+    def patience(self) -> float:
+        """Seconds that the client has for what it is to do; endless where the service is to."""
+        if self.transport.get_write_buffer_size():
+            return _EXCHANGE  # to read the answer
+        if self.cycle is None or self.cycle.response_complete:
+            return _HEAD
+        return _EXCHANGE if self.cycle.more_body else math.inf
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Take a connection in place of the one that has kept the service waiting for longest."""
+        super().connection_made(transport)
+        self.since = self.loop.time()
+        # The map, pictures and connections on their way need some of the other half.
+        most = min(most_files() // 2, _MOST_CONNECTIONS)
+        connections: set[Any] = self.connections
+        if len(connections) > most:
+            waiting = (each for each in connections if each.patience < math.inf)
+            oldest = min(waiting, key=lambda each: each.since)
+            connections.discard(oldest)
+            oldest.transport.abort()
+            warn(f"found more than {most} connections at once: those that wait longest are ended")
+
+    def on_response_complete(self) -> None:
+        """Wait for the next request."""
+        self.since = self.loop.time()
+        super().on_response_complete()
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer what is not HTTP as all other errors, where an answer has not begun."""
+        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            answer = JSONResponse({"error": msg}, 400, {"Connection": "close"})
+            headers = [*self.server_state.default_headers, *answer.raw_headers]
+            for event in (
+                h11.Response(status_code=400, headers=headers, reason=b"Bad Request"),
+                h11.Data(data=bytes(answer.body)),
+                h11.EndOfMessage(),
+            ):
+                self.transport.write(self.conn.send(event) or b"")
+        if self.cycle is not None:
+            self.cycle.disconnected = True  # its own answer would be a second one
+        self.transport.close()
 
 
 class Server(uvicorn.Server):
@@ -107,10 +178,11 @@ class Server(uvicorn.Server):
         config = uvicorn.Config(
             app,
             loop="asyncio",  # uvloop would take the signals that `defer_signals` handles
-            http="h11",
+            http=_Connection,
             ws="none",
             lifespan="off",
-            log_level="warning",
+            log_level="error",  # a warning of each request that is not HTTP would fill a disk
+            backlog=_ACCEPTED,
             access_log=False,
             server_header=False,
             proxy_headers=False,
@@ -128,10 +200,18 @@ class Server(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start, and call `ready`."""
         await super().startup(sockets)
+        # uvicorn has one number for both; accepted at once, as many would take all descriptors.
+        for listener in sockets or ():
+            listener.listen(_QUEUE)
         self._ready()
 
     async def on_tick(self, counter: int) -> bool:
-        """Look for a signal, ten times a second."""
+        """Look for a signal and for clients that are too slow, ten times a second."""
+        now = asyncio.get_running_loop().time()
+        connections: tuple[Any, ...] = tuple(self.server_state.connections)
+        for each in connections:
+            if now > each.since + each.patience:
+                each.transport.abort()
         return await super().on_tick(counter) or bool(self._stop.number)
 
 

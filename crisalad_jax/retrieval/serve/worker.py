@@ -21,9 +21,12 @@ from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, real_path
 from crisalad_jax.utils.progress import progress_bar
+from crisalad_jax.utils.temporaries import made_folder
 
 ADDED = "added"
 """Folder in the map's own of the images that requests added."""
+_LONGEST_FILE = 3800
+"""Most bytes of a file's whole path. Linux takes 4,095; a temporary file's name is longer."""
 
 
 class NameTakenError(InputError):
@@ -158,8 +161,9 @@ class MapWorker:
             raise MapFailedError("positions in several axes or zones, to be appended one by one")
         known = {name: at for each in fitted for name, at in each.of.items()}
         try:
-            with contextlib.ExitStack() as undo:
+            with contextlib.ExitStack() as folders, contextlib.ExitStack() as undo:
                 for work in works:
+                    folders.enter_context(made_folder((root / work.name).parent))
                     with atomic_path(root / work.name, durable=True) as temporary:
                         temporary.write_bytes(work.data)
                     undo.callback((root / work.name).unlink, missing_ok=True)
@@ -177,6 +181,8 @@ class MapWorker:
     def _check_name(self, name: str) -> None:
         """Raise `NameTakenError` for an image of the map, or a name that crosses another's path."""
         path = self.places.folder / ADDED / name
+        if len(os.fsencode(path.absolute())) > _LONGEST_FILE:
+            raise InputError(f"name: found {len(name.encode())} bytes, expected fewer in this map")
         crossed = os.path.isdir(path) or any(map(os.path.isfile, path.parents))
         if crossed or self.places.image(name) is not None:
             expected = "expected one that neither an image nor a folder of the map has"

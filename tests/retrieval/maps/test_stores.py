@@ -1,13 +1,16 @@
 """Both stores against brute force in float64, and against each other."""
 
 import fcntl
+import os
 import pathlib
+import resource
 import sys
 
 import numpy as np
 import pymilvus
 import pytest
 
+from crisalad_jax.retrieval.maps import file_store
 from crisalad_jax.retrieval.maps import milvus_store as milvus
 from crisalad_jax.retrieval.maps.store import Store, check_store, open_store, store_name
 from crisalad_jax.retrieval.neighbours import Neighbours
@@ -60,6 +63,26 @@ def test_search_is_exact_over_all_additions(store, k):
     exact = np.take_along_axis(queries @ rows.T, expected, axis=1)
     np.testing.assert_allclose(found.similarities, exact, atol=ROUNDING, rtol=0)
     assert (found.indices.dtype, found.similarities.dtype) == (np.int64, np.float32)
+
+
+def open_files() -> list[int]:
+    return [int(name) for name in os.listdir("/proc/self/fd")]
+
+
+def test_a_map_of_many_additions_leaves_descriptors_to_others(tmp_path, monkeypatch):
+    """Each file that stays mapped has one of the files that the process may have open."""
+    monkeypatch.setattr(file_store, "most_files", lambda: 64)
+    store, rows = opened(tmp_path, "files"), unit_rows(60)
+    fill(store, rows, (1,) * 60)
+    before, (soft, hard) = open_files(), resource.getrlimit(resource.RLIMIT_NOFILE)
+    np.testing.assert_array_equal(store.rows(np.arange(60)), rows)
+    assert len(open_files()) <= len(before) + 4
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(open_files()) + 8, hard))
+    try:
+        found = store.search(rows, 60, 60)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    np.testing.assert_array_equal(found.indices[:, 0], np.arange(60))
 
 
 def test_of_equal_descriptors_the_lower_number_is_found(store):

@@ -133,7 +133,7 @@ def test_a_form_is_as_good_as_a_body(service, pictures, expected):
     [
         ("POST", "/locate", b"", 400, "image: found an empty file, expected an image (.jpg"),
         ("POST", "/locate", b"hello", 400, "image: found 5 bytes that do not decode"),
-        ("POST", "/locate", b"\xff\xd8\xff\xe0 cut", 400, "image: found an image cut short"),
+        ("POST", "/locate", b"\xff\xd8\xff\xe0 cut", 400, "image: found 8 bytes that do"),
         ("POST", "/locate?k=0", b"", 400, "k: found '0'"),
         ("POST", "/locate?k=101", b"", 400, "k: found '101'"),
         ("POST", "/locate?k=x", b"", 400, "k: found 'x'"),
@@ -145,6 +145,8 @@ def test_a_form_is_as_good_as_a_body(service, pictures, expected):
         ("GET", "/images/-1", None, 404, "number: found -1"),
         ("GET", "/images/..%2f..%2fmap.json", None, 404, "not found"),
         ("GET", "/docs", None, 404, "not found"),
+        ("GET", "/map/", None, 404, "not found"),
+        ("POST", "/locate?k=1&k=2", b"", 400, "k: found it 2 times, expected it once"),
         # Of every route; a wrong name is told before the picture is looked at.
         ("POST", "/locate?top=3", b"hello", 400, "top: found '3', extra inputs are not permitted"),
         ("POST", "/locate?k=3&K=4", b"", 400, "K: found '4', extra inputs are not permitted"),
@@ -276,9 +278,13 @@ def test_other_sites_are_refused(service, pictures):
     for origin in ("null", own.replace("http", "https"), "http://127.0.0.1:9"):
         assert service.ask("POST", "/locate", data, Origin=origin).status == 403
     for path in ("/", "/map", "/no-route"):
-        for host in ("evil.example", "127.0.0.1.evil.example", "", "[", "a@[::1"):
+        for host in (
+            *("evil.example", "127.0.0.1.evil.example", "", "[", "a@[::1", "127.0.0.1:x"),
+            *("evil.example@127.0.0.1", "[::1].evil.example", "127a0a0a1", "localhost:80@a"),
+        ):
             reply = service.ask("GET", path, Host=host)
-            assert (reply.status, reply.data) == (400, b"Invalid host header")
+            words = f"Host: found {host!r}, expected this machine's, or a token"
+            assert (reply.status, reply.json) == (400, {"error": words})
     for host in ("localhost:8000", "127.0.0.1", "[::1]:8000", "LOCALHOST"):
         assert service.ask("GET", "/map", Host=host).status == 200
         own = {"Host": host, "Origin": f"http://{host}"}
@@ -422,7 +428,9 @@ def test_a_token(folder, params, pictures):
     with serving(folder, params, token=token) as own:
         for path in ("/", "/health", "/openapi.json"):
             assert own.ask("GET", path).status == 200
-        for given in ({}, {"Authorization": "Bearer other"}, {"Authorization": f"Basic {token}"}):
+        wrong = ("other", "", token[:-1], token[:1], f"{token}0", f"0{token}", f"{token} 0")
+        schemes = ("Bearer", f"Basic {token}", *(f"Bearer {each}" for each in wrong))
+        for given in ({}, *({"Authorization": each} for each in schemes)):
             for method, path in (("GET", "/map"), ("GET", "/images/0"), ("POST", "/locate")):
                 reply = own.ask(method, path, **given)
                 assert (reply.status, reply.headers["www-authenticate"]) == (401, "Bearer")
@@ -460,6 +468,10 @@ def test_images_are_added_for_good(own_map, params, pictures):
             ("/images?name=", 400, "name: found ''"),
             ("/images?name=" + 201 * "a", 400, "of parts of 1 to 200 bytes"),
             ("/images?name=" + "/".join([150 * "%C3%A9"] * 4), 400, "of parts of 1 to 200 bytes"),
+            ("/images?name=" + "/".join(21 * "a"), 400, "name: found"),
+            ("/images?name=%FF.jpg", 400, "name: found"),  # not UTF-8
+            ("/images?name=walk.mp4%23t=12.5", 400, "name: found"),
+            ("/images?name=b.jpg&name=c.jpg", 400, "name: found it 2 times, expected it once"),
             ("/images", 400, "name: field required"),
             ("/images?name=b.jpg&lat=1&lon=2", 400, "125 degrees of longitude from the middle of"),
             ("/images?name=b.jpg&x=1&y=2", 400, "found positions in x, y, expected east, north"),
@@ -539,6 +551,66 @@ def test_an_addition_that_cannot_be_written_fails_alone(own_map, params, picture
         assert not (own_map / ADDED / "bad.jpg").exists()
         monkeypatch.undo()
         assert own.ask("POST", "/images?name=bad.jpg", data).json["number"] == 13
+
+
+def test_a_failed_addition_leaves_its_folder_to_others(own_map, params, pictures, monkeypatch):
+    data = pictures[1].read_bytes()
+
+    def full(*_, **__):
+        raise OSError("No space left on device")
+
+    with serving(own_map, params, appends=True) as own:
+        monkeypatch.setattr(own.worker.places, "append", full)
+        assert own.ask("POST", "/images?name=a/b/c.jpg", data).status == 500
+        assert not (own_map / ADDED).exists()
+        monkeypatch.undo()
+        assert own.ask("POST", "/images?name=a/b", data).status == 201
+
+
+def test_a_path_that_is_too_long_is_refused_alone(own_map, params, pictures):
+    deep = own_map.parent.joinpath(*[200 * "d"] * 15, "map")
+    deep.parent.mkdir(parents=True)
+    own_map.rename(deep)
+    data, long = pictures[1].read_bytes(), "/".join(["a" * 190] * 5)
+    with serving(deep, params, appends=True) as own:
+        paths = ["/locate", f"/images?name={long}", "/images?name=a.jpg", f"/images?name=b/{long}"]
+        with concurrent.futures.ThreadPoolExecutor(len(paths)) as pool:
+            replies = list(pool.map(lambda path: own.ask("POST", path, data), paths))
+    assert [reply.status for reply in replies] == [200, 400, 201, 400]
+    assert replies[1].json["error"] == "name: found 954 bytes, expected fewer in this map"
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_map_that_was_moved_takes_no_images(own_map, params, pictures, replaced):
+    data, moved = pictures[1].read_bytes(), own_map.with_name("moved.map")
+    with serving(own_map, params, appends=True) as own:
+        assert own.ask("GET", "/health").status == 200
+        own_map.rename(moved)
+        if replaced:
+            shutil.copytree(moved, own_map)
+        for method, path, status in (("POST", "/images?name=a.jpg", 500), ("GET", "/health", 503)):
+            reply = own.ask(method, path, data if method == "POST" else None)
+            assert reply.status == status
+            assert reply.json["error"].startswith("the map or the model failed; ")
+        if not replaced:
+            assert not own_map.exists()
+            moved.rename(own_map)
+            assert own.ask("GET", "/health").status == 200
+            assert own.ask("POST", "/images?name=a.jpg", data).status == 201
+    with Map.open(own_map) as places:
+        assert len(places) == (7 if replaced else 8)
+    assert (own_map / ADDED).exists() is not replaced
+
+
+def test_each_question_of_a_batch_has_its_own_number_of_answers(service, pictures):
+    go_on, data = threading.Event(), pictures[1].read_bytes()
+    service.worker._thread.submit(go_on.wait, 60)
+    with concurrent.futures.ThreadPoolExecutor(TOGETHER) as pool:
+        replies = pool.map(lambda k: service.ask("POST", f"/locate?k={k}", data), (1, 6, 3))
+        while len(service.worker._waiting) < TOGETHER:
+            time.sleep(0.01)
+        go_on.set()
+        assert [len(reply.json["neighbours"]) for reply in replies] == [1, 6, 3]
 
 
 def test_too_many_are_told_to_come_again(folder, params, pictures):
