@@ -25,7 +25,7 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog
 from crisalad_jax.training.mining import Mined
 from crisalad_jax.training.step import TrainState
-from crisalad_jax.utils.files import read_json, wrap_os_errors, write_json
+from crisalad_jax.utils.files import check_no_links, read_json, wrap_os_errors, write_json
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remove_temporaries
@@ -112,6 +112,7 @@ class RunFiles:
         has_fewer_epochs = check_run(out, config)
         with contextlib.ExitStack() as opened:
             opened.enter_context(lock(out))
+            check_no_links(out)
             if not (out / "config.json").exists():
                 write_json(out / "config.json", to_plain(config))
             for folder in (out, out / "best"):

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import json
 import os
 import pathlib
@@ -226,6 +227,21 @@ def check_new_folder(path: str | os.PathLike[str]) -> None:
         raise InputError(f"{path}: found the folder that this runs in, expected another")
     if path.exists() and any(path.iterdir()):
         raise InputError(f"{path}: found a folder with files in it, expected a new or empty one")
+
+
+def check_no_links(folder: pathlib.Path, *, itself: bool = False) -> None:
+    """Check that nothing in a folder is a link, through which work there would change other files.
+
+    Args:
+        folder: the folder, which need not exist; it may come from somebody else.
+        itself: whether the folder may not be a link either, as one whose name is not the user's.
+
+    Raises:
+        InputError: a file or a folder in it, at any depth, is a link.
+    """
+    for path in itertools.chain([folder] if itself else [], folder.rglob("*")):
+        if path.is_symlink():
+            raise InputError(f"{path}: found a link, expected the file or folder itself")
 
 
 def _check_place(path: str | os.PathLike[str], kind: str, expected: str) -> None:

@@ -16,7 +16,7 @@ from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.maps.store import check_store, store_name
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json
+from crisalad_jax.utils.files import check_no_links, read_json
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.temporaries import LOCK, is_temporary
 
@@ -110,12 +110,16 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
     A map without images, which a killed process left, counts as none.
 
     Raises:
-        InputError: the folder holds other things than a map, or the map is damaged or of another
-            format.
+        InputError: the folder holds other things than a map, or the map is damaged, of another
+            format, or has a link in it.
     """
     folder = pathlib.Path(folder)
-    path = folder / METADATA
-    if not path.exists():
+    path, metadata = folder / METADATA, None
+    if path.exists():
+        # Who edits the metadata removes its checksum. A changed key would be an unknown field.
+        value = read_json(path, "a map", sealed=False)
+        metadata = from_plain(MapMetadata, value, source=str(path))
+    else:
         # A process killed before it has made the map leaves its lock and temporary files behind.
         own = (LOCK, SEGMENTS, COMPONENTS, SHARES)
         there = [*folder.glob("*"), *(folder / SEGMENTS).glob("*")]
@@ -125,9 +129,7 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
             raise InputError(
                 f"{folder}: found {first} and no {METADATA}, expected a map or an empty folder"
             )
-        return None
-    # Who edits the metadata removes its checksum. A changed key would be an unknown field.
-    metadata = from_plain(MapMetadata, read_json(path, "a map", sealed=False), source=str(path))
+    check_no_links(folder)
     return metadata if has_images(folder) else None
 
 
