@@ -38,6 +38,14 @@ class Positions(NamedTuple):
     zone: Zone | None = None
     """The zone of east and north; None where it is unknown, and of other axes."""
 
+    def check(self) -> None:
+        """Raise InputError where a number is NaN, or larger than any position's."""
+        for name, at in self.of.items():
+            if not all(abs(each) <= MOST_METRES for each in at):
+                raise InputError(
+                    f"{name}: found position {at}, expected numbers of at most {MOST_METRES:g}"
+                )
+
     def fitted(
         self, source: object, axes: tuple[str, str] | None, zone: Zone | None
     ) -> "Positions":
@@ -52,8 +60,10 @@ class Positions(NamedTuple):
             zone: the map's; None where it is unknown.
 
         Raises:
-            InputError: other axes without a known zone, or a place far from the map's zone.
+            InputError: what `check` raises; other axes without a known zone, or a place far from
+                the map's zone.
         """
+        self.check()
         metres, degrees, _ = AXES
         if axes in (None, self.axes) and (
             axes != metres or zone == self.zone or None in (zone, self.zone)

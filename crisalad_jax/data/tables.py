@@ -18,6 +18,8 @@ from crisalad_jax.utils.files import LARGEST, check_source
 
 MOST_METRES = 1e8
 """Largest coordinate in metres: twice the Earth's circumference, and its square is finite."""
+_LINE = 2**20
+"""Letters after which a line is cut: its rest then has too many fields, or too few."""
 _MOST = {"lat": 90.0, "lon": 180.0} | dict.fromkeys(("east", "north", "x", "y"), MOST_METRES)
 """Largest number of a column of positions."""
 
@@ -128,10 +130,10 @@ def _lines(path: pathlib.Path) -> Iterator[tuple[Any, list[str]]]:
     """Yield the separator and the columns, then the number and the fields of every row."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            first = file.readline()
+            first = file.readline(_LINE)
             file.seek(0)
             separator = ";" if first.count(";") > first.count(",") else ","
-            reader = csv.reader(file, delimiter=separator)
+            reader = csv.reader(iter(lambda: file.readline(_LINE), ""), delimiter=separator)
             columns = [column.strip() for column in next(filter(None, reader), [])]
             yield separator, columns
             for row in filter(None, reader):

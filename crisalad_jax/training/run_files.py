@@ -112,7 +112,6 @@ class RunFiles:
         has_fewer_epochs = check_run(out, config)
         with contextlib.ExitStack() as opened:
             opened.enter_context(lock(out))
-            check_no_links(out)
             if not (out / "config.json").exists():
                 write_json(out / "config.json", to_plain(config))
             for folder in (out, out / "best"):
@@ -244,6 +243,7 @@ def check_run(out: pathlib.Path, config: TrainConfig) -> bool:
         is_free = not out.exists() or (out.is_dir() and not holds_other_files(out))
         require(is_free, f"{out}: found {found}, expected a run or a new or empty folder")
         return False
+    check_no_links(out)
     existing = read_config(TrainConfig, path)
     epochs = max(existing.epochs, config.epochs)
     wrong = differences(config, dataclasses.replace(existing, epochs=epochs))

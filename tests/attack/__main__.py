@@ -16,7 +16,9 @@ import tempfile
 from crisalad_jax.utils.files import atomic_path, split_markers
 from tests.attack.world import ROOT
 
-SCRIPTS = ("kills", "interruptions", "memory", "disks", "damage", "inputs")
+SCRIPTS = (
+    *("kills", "interruptions", "memory", "disks", "damage", "inputs", "hostile", "surroundings"),
+)
 PAGE = ROOT / "docs" / "reliability.md"
 
 

@@ -13,6 +13,7 @@ from tests.attack.world import ROOT
 SOME = (
     ("damage", 0, "", 32),
     ("disks", 0, "convert", 4),
+    ("hostile", 0, "a sample", 12),
     ("inputs", 0, "a sample", 16),
     ("interruptions", 0, "some", 18),
     ("kills", 0, "maps, extract .npy", 7),  # of training: tests/training/test_interruption.py
@@ -21,6 +22,7 @@ ALL = (
     ("damage", 1, "", 4800),
     ("disks", 1, "", 200),
     ("disks", 0.6, "train limited, evaluate limited, extract .h5 limited, index limited", 24),
+    ("hostile", 1, "", 400),
     ("inputs", 1, "", 1600),
     ("interruptions", 1, "forks", 192),
     ("interruptions", 1, "programs, training, busy, closed output", 88),
@@ -29,6 +31,8 @@ ALL = (
     ("kills", 1, "maps, extract .npy, extract .h5", 100),
     ("kills", 1, "compare", 6),
     ("memory", 1, "", 7),
+    ("surroundings", 1, "20 columns, python -O, python -W error, C locale, no home", 40),
+    ("surroundings", 1, "another user, a home to read, no /dev/shm, /tmp full", 0),
 )
 
 

@@ -2,7 +2,8 @@
 
 import pytest
 
-from crisalad_jax.data.positions import read_image_table, utm_positions
+from crisalad_jax.data.positions import Positions, read_image_table, utm_positions
+from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import refused
 
 
@@ -15,6 +16,12 @@ def test_names_say_east_and_north():
         "a/@0012.50@5000000.25@10@S@.jpg": (12.5, 5000000.25),
         "@1@-2@.png": (1.0, -2.0),
     }
+
+
+@pytest.mark.parametrize("at", [(float("nan"), 0.0), (0.0, 1e200), (-2e8, 0.0)])
+def test_a_position_that_no_map_stores_is_refused(at):
+    with pytest.raises(InputError, match=r"^a.jpg: found position .*, expected numbers of at most"):
+        Positions(("x", "y"), {"a.jpg": at}).fitted("map", None, None)
 
 
 @pytest.mark.parametrize("axes", [("east", "north"), ("lat", "lon")])

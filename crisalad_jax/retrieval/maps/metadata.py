@@ -28,6 +28,11 @@ METADATA, SEGMENTS = "map.json", "segments"
 """Names of the metadata's file, and of the folder of additions."""
 COMPONENTS, SHARES = "pca.safetensors", "shares"
 """Names of the components that shorten descriptors, and of the folder of shares to be joined."""
+_PARTS = (
+    *(METADATA, SEGMENTS, COMPONENTS, SHARES, LOCK),
+    *("calibration.json", "approximate", "added"),
+)
+"""All names that a map may have in its folder."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,6 +120,8 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
     """
     folder = pathlib.Path(folder)
     path, metadata = folder / METADATA, None
+    for name in _PARTS:
+        check_no_links(folder / name, itself=True)
     if path.exists():
         # Who edits the metadata removes its checksum. A changed key would be an unknown field.
         value = read_json(path, "a map", sealed=False)
@@ -129,7 +136,6 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
             raise InputError(
                 f"{folder}: found {first} and no {METADATA}, expected a map or an empty folder"
             )
-    check_no_links(folder)
     return metadata if has_images(folder) else None
 
 
