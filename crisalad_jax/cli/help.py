@@ -111,7 +111,7 @@ def _shorten(action: argparse.Action, width: int) -> None:
         flag = action.option_strings[0]
         action.option_strings = [flag.replace("--", "--[no-]", 1) if tail == " (on)" else flag]
     lines = 1 if len(_heading(action)) > _COLUMN - 4 else 2
-    room = lines * width - len(tail) - (lines - 1) * _RAGGED
+    room = max(_RAGGED, lines * width - len(tail) - (lines - 1) * _RAGGED)
     clauses = [text[: match.start()] for match in _ENDS.finditer(text)]
     whole = [each for each in clauses if len(each) <= room and each.count("(") == each.count(")")]
     short = whole[-1] if whole else textwrap.shorten(text, room, placeholder=" ...")
