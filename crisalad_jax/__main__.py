@@ -29,23 +29,25 @@ def main() -> None:
 def keep_on_without_reader() -> None:
     """Let the program go on where the reader of its output is gone, as after `| head`.
 
-    A full disk raises an `InputError` once, at the write or flush that meets it. Letters that the
-    encoding lacks are escaped. Standard error stays as it is: who reads that knows that the program
-    goes on.
+    A full disk raises an `InputError` once, at the write or flush that meets it; under standard
+    error it raises none, and the results go on. Letters that the encoding lacks are escaped.
     """
-    if sys.stdout is None:  # it was closed, as by `>&-`
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
-    else:
-        sys.stdout = io.TextIOWrapper(
-            io.BufferedWriter(_Output(sys.stdout.fileno(), "w", closefd=False)),
-            encoding=sys.stdout.encoding,
-            errors="backslashreplace",
-            line_buffering=sys.stdout.isatty(),
-        )
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # it was closed, as by `>&-`
+            stream = open(os.devnull, "w")  # noqa: SIM115
+        else:
+            stream = io.TextIOWrapper(
+                io.BufferedWriter(_Output(stream.fileno(), "w", closefd=False)),
+                encoding=stream.encoding,
+                errors="backslashreplace",
+                line_buffering=stream.line_buffering,
+            )
+        setattr(sys, name, stream)
 
 
 class _Output(io.FileIO):
-    """A file that drops what is written after its reader is gone, or after an error was raised.
+    """A file that drops what is written after its reader is gone, or after an error.
 
     Python flushes once more at its end, and would end with a traceback of its own.
     """
@@ -58,7 +60,7 @@ class _Output(io.FileIO):
                 return super().write(data)
             except OSError as error:
                 self._failed = True
-                if not isinstance(error, BrokenPipeError):
+                if not isinstance(error, BrokenPipeError) and self.fileno() != 2:
                     raise InputError(f"standard output: {error.strerror}") from error
         return memoryview(data).nbytes
 

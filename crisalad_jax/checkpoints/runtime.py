@@ -275,6 +275,9 @@ def _load(
     """Load the programs, while the bytes of their files are compared with their checksums."""
     parts = [manifest, manifest[ATTEND]] if ATTEND in manifest else [manifest]
     entries = [part[name] for part in parts for name in ("program", "weights") if part[name]]
+    for entry in entries:
+        if os.path.basename(entry["file"]) != entry["file"]:
+            raise InputError(f"{folder}: found file {entry['file']!r}, expected a name in it")
     files = {folder / entry["file"]: entry["sha256"] for entry in entries}
     with concurrent.futures.ThreadPoolExecutor() as pool:
         digests = pool.map(sha256_of, files if verify else ())

@@ -39,12 +39,13 @@ def write_safetensors(
     # The library writes the memory as it lies, whatever the order of the axes.
     arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     with atomic_path(path) as temporary:
+        temporary.touch()
+        mode = temporary.stat().st_mode
         try:
             safetensors.numpy.save_file(arrays, temporary, metadata=dict(metadata))
         except safetensors.SafetensorError as error:  # a full disk too
             raise InputError(f"{path}: cannot be written: {error}") from error
-        # The library creates files that only their owner can read: widen their mode.
-        temporary.chmod(0o644)
+        temporary.chmod(mode)  # the library makes files that only their owner can read
 
 
 def write_sealed(

@@ -85,17 +85,21 @@ def _usage() -> str:
     return "\n".join(lines)
 
 
+_MAX_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS"
+
+
 def _limit_pixels(given: Sequence[str]) -> None:
     """Set the largest image that OpenCV decodes, before OpenCV is imported."""
     from crisalad_jax.config.flags import find_flag
 
-    pixels = find_flag(given, "--max-pixels")
-    if pixels is not None:
-        require(
-            pixels.isdecimal() and 0 < int(pixels) < 2**40,
-            f"--max-pixels: found {pixels!r}, expected a number of pixels",
-        )
-        os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] = pixels
+    pixels, source = find_flag(given, "--max-pixels"), "--max-pixels"
+    if pixels is None:  # OpenCV would abort the process
+        pixels, source = os.environ[_MAX_PIXELS], _MAX_PIXELS
+    require(
+        pixels.isdecimal() and len(pixels) <= 12 and int(pixels) > 0,
+        f"{source}: found {pixels!r}, expected a number of pixels",
+    )
+    os.environ[_MAX_PIXELS] = pixels
 
 
 def _run(name: str, arguments: list[str], keep_programs: bool) -> None:

@@ -15,8 +15,9 @@ from typing import Any
 from crisalad_jax.config.flags import plain_metavar
 
 SHORT, ALL = "--help", "--help-all"
-_WIDTH, _COLUMN = 100, 30
-"""Most columns of the help, and of its flags; what is wider has its text on the next line."""
+_WIDTH, _LEAST, _COLUMN = 100, 60, 30
+"""Most and fewest columns of the help, which a narrower terminal wraps, and the most of its flags;
+what is wider has its text on the next line."""
 _RAGGED = 12
 """Columns that a line may leave empty where a long word follows."""
 _CHOICES = 6
@@ -61,7 +62,7 @@ def short_help(name: str, module: Any, kind: type) -> str:
     """
     actions = flags_parser(kind, f"crisalad {name}")._actions
     named = {(each.option_strings or [each.dest])[0].removeprefix("--"): each for each in actions}
-    width = min(_WIDTH, shutil.get_terminal_size((_WIDTH, 24)).columns)
+    width = min(_WIDTH, max(_LEAST, shutil.get_terminal_size((_WIDTH, 24)).columns))
     for action in actions:
         _shorten(action, width - _COLUMN)
     required = [each for each in actions if each.required or not each.option_strings]
@@ -110,7 +111,7 @@ def _shorten(action: argparse.Action, width: int) -> None:
         flag = action.option_strings[0]
         action.option_strings = [flag.replace("--", "--[no-]", 1) if tail == " (on)" else flag]
     lines = 1 if len(_heading(action)) > _COLUMN - 4 else 2
-    room = lines * width - len(tail) - (lines - 1) * _RAGGED
+    room = max(_RAGGED, lines * width - len(tail) - (lines - 1) * _RAGGED)
     clauses = [text[: match.start()] for match in _ENDS.finditer(text)]
     whole = [each for each in clauses if len(each) <= room and each.count("(") == each.count(")")]
     short = whole[-1] if whole else textwrap.shorten(text, room, placeholder=" ...")

@@ -1,7 +1,6 @@
 """Read where images were taken: from @UTM names, a table, or EXIF data (CIPA DC-008, 4.6.6)."""
 
 import contextlib
-import math
 import os
 import pathlib
 import warnings
@@ -13,7 +12,7 @@ import numpy as np
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.tables import MOST_METRES as MOST_METRES
-from crisalad_jax.data.tables import matched, read_table
+from crisalad_jax.data.tables import matched, number_of, read_table
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float64
 
@@ -39,6 +38,14 @@ class Positions(NamedTuple):
     zone: Zone | None = None
     """The zone of east and north; None where it is unknown, and of other axes."""
 
+    def check(self) -> None:
+        """Raise InputError where a number is NaN, or larger than any position's."""
+        for name, at in self.of.items():
+            if not all(abs(each) <= MOST_METRES for each in at):
+                raise InputError(
+                    f"{name}: found position {at}, expected numbers of at most {MOST_METRES:g}"
+                )
+
     def fitted(
         self, source: object, axes: tuple[str, str] | None, zone: Zone | None
     ) -> "Positions":
@@ -53,8 +60,10 @@ class Positions(NamedTuple):
             zone: the map's; None where it is unknown.
 
         Raises:
-            InputError: other axes without a known zone, or a place far from the map's zone.
+            InputError: what `check` raises; other axes without a known zone, or a place far from
+                the map's zone.
         """
+        self.check()
         metres, degrees, _ = AXES
         if axes in (None, self.axes) and (
             axes != metres or zone == self.zone or None in (zone, self.zone)
@@ -86,12 +95,9 @@ class Positions(NamedTuple):
 
 def utm_position(name: str) -> tuple[float, float] | None:
     """Read east and north in metres from a name `@UTM_east@UTM_north@...`; None for other names."""
-    fields = name.split("@")
-    try:
-        east, north = float(fields[1]), float(fields[2])
-    except (IndexError, ValueError):
-        return None
-    return (east, north) if math.isfinite(east) and math.isfinite(north) else None
+    _, east, north, *_ = [*name.split("@"), "", ""]
+    metres = number_of(east), number_of(north)
+    return metres if all(abs(each) <= MOST_METRES for each in metres) else None
 
 
 def utm_zones(names: Sequence[str]) -> list[Zone | None]:
@@ -122,7 +128,8 @@ def utm_zones(names: Sequence[str]) -> list[Zone | None]:
 def _zone_of(name: str) -> Zone | None:
     _, _, north, number, letter, *_ = [*name.split("@"), *[""] * 5]
     letter = letter.upper()
-    if not (number.isdecimal() and 1 <= int(number) <= 60 and letter and letter in _BANDS):
+    is_number = number.isdecimal() and len(number) <= 3
+    if not (is_number and 1 <= int(number) <= 60 and letter and letter in _BANDS):
         return None
     south = letter < "N"
     if letter == "S":

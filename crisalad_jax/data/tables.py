@@ -7,6 +7,7 @@ import csv
 import math
 import os
 import pathlib
+import re
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator
 from typing import Any, NamedTuple
@@ -17,8 +18,16 @@ from crisalad_jax.utils.files import LARGEST, check_source
 
 MOST_METRES = 1e8
 """Largest coordinate in metres: twice the Earth's circumference, and its square is finite."""
+_LINE = 2**20
+"""Letters after which a line is cut: its rest then has too many fields, or too few."""
 _MOST = {"lat": 90.0, "lon": 180.0} | dict.fromkeys(("east", "north", "x", "y"), MOST_METRES)
 """Largest number of a column of positions."""
+
+
+def number_of(text: str) -> float:
+    """Return the decimal number that a text is, NaN where it is none; `float` reads 1_0 as 10."""
+    plain = re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", text, re.ASCII | re.IGNORECASE)
+    return float(text) if plain else math.nan
 
 
 class Row(NamedTuple):
@@ -52,10 +61,7 @@ class Row(NamedTuple):
             InputError: the field is not one, or larger than such a position can be.
         """
         text, most = self.fields[column], _MOST.get(column, math.inf)
-        try:
-            value = float(text.replace(",", ".") if self.has_commas and "." not in text else text)
-        except ValueError:
-            value = math.nan
+        value = number_of(text.replace(",", ".") if self.has_commas and "." not in text else text)
         if not (math.isfinite(value) and abs(value) <= most):
             limits = f" from -{most:g} to {most:g}" if most < math.inf else ""
             raise InputError(f"{self.where}: {column}: found {text!r}, expected a number{limits}")
@@ -124,10 +130,10 @@ def _lines(path: pathlib.Path) -> Iterator[tuple[Any, list[str]]]:
     """Yield the separator and the columns, then the number and the fields of every row."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            first = file.readline()
+            first = file.readline(_LINE)
             file.seek(0)
             separator = ";" if first.count(";") > first.count(",") else ","
-            reader = csv.reader(file, delimiter=separator)
+            reader = csv.reader(iter(lambda: file.readline(_LINE), ""), delimiter=separator)
             columns = [column.strip() for column in next(filter(None, reader), [])]
             yield separator, columns
             for row in filter(None, reader):

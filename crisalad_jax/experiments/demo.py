@@ -32,6 +32,7 @@ from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import check_no_links
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries
 
@@ -72,6 +73,7 @@ def run_demo(config: DemoConfig, out: pathlib.Path, *, quiet: bool = False) -> D
             writes there.
     """
     with lock(out):
+        check_no_links(out)
         if not (out / "city").exists() and holds_other_files(out):
             raise InputError(
                 f"{out}: found files but no demo, expected a demo or a new or empty folder"

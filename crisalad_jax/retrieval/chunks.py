@@ -32,11 +32,13 @@ def as_rows(array: np.ndarray, name: str, length: int | None = None) -> Descript
     Numpy has no name for bfloat16: a .npy file holds it as two bytes without a type ("V2").
 
     Raises:
-        InputError: the array is not a matrix, is empty, or is of another length.
+        InputError: the array is not a matrix of real numbers, is empty, or is of another length.
     """
     array = np.asanyarray(array)
     if array.dtype == np.dtype("V2"):
         array = array.view(ml_dtypes.bfloat16)
+    if array.dtype.kind in "cOSUMm" or array.dtype.type is np.void:
+        raise InputError(f"{name}: found numbers of type {array.dtype}, expected real ones")
     if array.ndim != 2 or 0 in array.shape or length not in (None, array.shape[1]):
         raise InputError(
             f"{name}: found shape {array.shape}, expected (images, {length or 'descriptor'}), "

@@ -47,6 +47,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import (
     atomic_path,
     check_format,
+    check_no_links,
     check_target,
     read_json,
     real_path,
@@ -198,6 +199,7 @@ def extract(
     out = pathlib.Path(out)
     common = {name: value for name, value in record.items() if name not in ("weights", "images")}
     folder = out.with_name(f"{out.name}.shares")
+    check_no_links(folder, itself=True)
     shares = Shares(folder, Share.parse(share), digest_of(names, common | work.settings()))
     is_there = all(file.exists() for file in targets(out))
     known = read_json(record_of(out), "a record of descriptors") if is_there else {}
@@ -404,6 +406,7 @@ def _work_folder(out: StrPath | None) -> Iterator[pathlib.Path]:
             yield pathlib.Path(temporary)
         return
     folder = pathlib.Path(out).with_name(f"{pathlib.Path(out).name}.partial")
+    check_no_links(folder, itself=True)
     with lock(folder):
         remove_temporaries(folder)
         try:

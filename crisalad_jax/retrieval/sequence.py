@@ -103,9 +103,10 @@ class BayesFilter:
             The state before the first frame.
 
         Raises:
-            InputError: `along` of another length, or that decreases.
+            InputError: no places, a similarity that is not finite, or `along` of another length,
+                or that decreases.
         """
-        common = common.astype(np.float64)
+        common = _checked("common", common, (max(1, np.size(common)),))
         count = len(common)
         along = np.arange(count, dtype=np.float64) if along is None else along.astype(np.float64)
         if along.shape != common.shape or not (np.diff(along) >= 0).all():
@@ -149,11 +150,11 @@ class BayesFilter:
             The state after this frame.
 
         Raises:
-            InputError: `moved` below 0.
+            InputError: `moved` below 0, or similarities that are not one finite number a place.
         """
         if not moved >= 0:
             raise InputError(f"moved: found {moved}, expected at least 0")
-        row = similarities.astype(np.float64)
+        row = _checked("similarities", similarities, state.common.shape)
         seen, frames = state.seen + row, state.frames + 1
         if self.adapt:
             mean = (seen + _PRIOR_FRAMES * state.common) / (frames + _PRIOR_FRAMES)
@@ -201,6 +202,14 @@ class Followed(NamedTuple):
     """Number of the most probable image of the map."""
     probabilities: Float64[np.ndarray, " frame"]
     """Probability that the camera is there; images beside it share what they have in common."""
+
+
+def _checked(name: str, values: PerPlace, shape: tuple[int, ...]) -> PerPlace:
+    """Return finite numbers of this shape, in float64; raise InputError where they are others."""
+    if np.shape(values) != shape or not np.isfinite(values).all():
+        found = f"shape {np.shape(values)}" if np.shape(values) != shape else "NaN or infinity"
+        raise InputError(f"{name}: found {found}, expected shape {shape} of finite numbers")
+    return np.asarray(values, np.float64)
 
 
 def _without_means(row: PerPlace, mean: PerPlace, common: PerPlace) -> PerPlace:

@@ -25,7 +25,7 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog
 from crisalad_jax.training.mining import Mined
 from crisalad_jax.training.step import TrainState
-from crisalad_jax.utils.files import read_json, wrap_os_errors, write_json
+from crisalad_jax.utils.files import check_no_links, read_json, wrap_os_errors, write_json
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remove_temporaries
@@ -243,6 +243,7 @@ def check_run(out: pathlib.Path, config: TrainConfig) -> bool:
         is_free = not out.exists() or (out.is_dir() and not holds_other_files(out))
         require(is_free, f"{out}: found {found}, expected a run or a new or empty folder")
         return False
+    check_no_links(out)
     existing = read_config(TrainConfig, path)
     epochs = max(existing.epochs, config.epochs)
     wrong = differences(config, dataclasses.replace(existing, epochs=epochs))

@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, ParamSpec, Protocol, TypeVar, cast
 
 import jax
@@ -101,14 +101,22 @@ def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) 
     return cast(Jitted[_P, _R], call)
 
 
-def number_types(leaves: Sequence[Any] = ()) -> contextlib.AbstractContextManager[Any]:
+@contextlib.contextmanager
+def number_types(leaves: Sequence[Any] = ()) -> Iterator[None]:
     """Compute in JAX's 32-bit mode, unless a configuration among the `leaves` is of float64.
 
     A program may be in the 64-bit mode for another package. Numbers without a type of their own, as
-    of `jnp.zeros` or an optimiser's schedule, would be float64 in it, and results other ones.
+    of `jnp.zeros` or an optimiser's schedule, would be float64 in it, and results other ones. It
+    may also forbid promotion or compiling, which the code here relies on.
     """
     wide = any(getattr(leaf, "compute_dtype", None) == "float64" for leaf in leaves)
-    return contextlib.nullcontext() if wide else jax.enable_x64(False)
+    with (
+        jax.numpy_rank_promotion("allow"),
+        jax.numpy_dtype_promotion("standard"),
+        jax.disable_jit(False),
+        contextlib.nullcontext() if wide else jax.enable_x64(False),
+    ):
+        yield
 
 
 def _precision_of(leaves: Sequence[Any]) -> contextlib.AbstractContextManager[None]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import json
 import os
 import pathlib
@@ -25,6 +26,8 @@ from crisalad_jax.utils.temporaries import in_use, made_folder, temporary_beside
 LARGEST = 2**30
 """Most bytes of a file that is read whole, such as a text or an image: a file that takes no room on
 the disk may claim any number."""
+LARGEST_TEXT, _LARGEST_JSON = 2**27, 2**26
+"""The same of texts and of JSON, whose letters and values take many times as much memory."""
 
 
 def is_html(start: bytes) -> bool:
@@ -96,29 +99,30 @@ def user_cache() -> pathlib.Path:
     return caches / "crisalad-jax"
 
 
-def read_bytes(path: str | os.PathLike[str], expected: str) -> bytes:
-    """Read a regular file of at most `LARGEST` bytes.
+def read_bytes(path: str | os.PathLike[str], expected: str, *, largest: int = LARGEST) -> bytes:
+    """Read a regular file.
 
     Args:
         path: the file.
         expected: what kind of file, for messages.
+        largest: most bytes that it may have.
 
     Raises:
         InputError: as `check_source`.
         PermissionError: the file may not be read.
     """
-    check_source(path, expected, largest=LARGEST)
+    check_source(path, expected, largest=largest)
     return pathlib.Path(path).read_bytes()
 
 
 def read_text(path: str | os.PathLike[str], expected: str) -> str:
-    """Read a regular file of UTF-8 text, with or without a byte order mark.
+    """Read a file of UTF-8 text of at most `LARGEST_TEXT` bytes, a byte order mark left out.
 
     Raises:
         InputError: as `read_bytes`, or other bytes.
     """
     try:
-        return read_bytes(path, expected).decode("utf-8-sig")
+        return read_bytes(path, expected, largest=LARGEST_TEXT).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: found bytes that are no UTF-8 (at {error.start}), expected {expected}"
@@ -168,7 +172,7 @@ def read_json(path: str | os.PathLike[str], expected: str, *, sealed: bool = Tru
     Raises:
         InputError: as `read_bytes` and `parse_json`; or the bytes are not those that were written.
     """
-    data = read_bytes(path, expected)
+    data = read_bytes(path, expected, largest=_LARGEST_JSON)
     value = parse_json(data, str(path), expected)
     if isinstance(value, dict) and CHECKSUM in value:
         check_checksum(data, value.pop(CHECKSUM), path)
@@ -226,6 +230,21 @@ def check_new_folder(path: str | os.PathLike[str]) -> None:
         raise InputError(f"{path}: found the folder that this runs in, expected another")
     if path.exists() and any(path.iterdir()):
         raise InputError(f"{path}: found a folder with files in it, expected a new or empty one")
+
+
+def check_no_links(folder: pathlib.Path, *, itself: bool = False) -> None:
+    """Check that nothing in a folder is a link, through which work there would change other files.
+
+    Args:
+        folder: the folder, which need not exist; it may come from somebody else.
+        itself: whether the folder may not be a link either, as one whose name is not the user's.
+
+    Raises:
+        InputError: a file or a folder in it, at any depth, is a link.
+    """
+    for path in itertools.chain([folder] if itself else [], folder.rglob("*")):
+        if path.is_symlink():
+            raise InputError(f"{path}: found a link, expected the file or folder itself")
 
 
 def _check_place(path: str | os.PathLike[str], kind: str, expected: str) -> None:

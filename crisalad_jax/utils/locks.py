@@ -1,10 +1,12 @@
 """Locks of folders: one process at a time writes into a run, a map, a comparison or a report."""
 
 import contextlib
+import errno
 import fcntl
 import os
 import pathlib
 import socket
+import stat
 import time
 from collections.abc import Iterator
 
@@ -69,18 +71,27 @@ def _acquire(folder: pathlib.Path) -> contextlib.ExitStack | None:
         stack.enter_context(made_folder(folder))
         is_held = False
         while not is_held:
-            with wrap_os_errors(folder):
-                file = stack.enter_context(path.open("a", encoding="utf-8"))
+            with wrap_os_errors(path):
+                file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+                stack.callback(os.close, file)
+                kind = os.fstat(file)
+                # The words below would overwrite the file behind a link.
+                if not stat.S_ISREG(kind.st_mode) or kind.st_nlink > 1:
+                    raise OSError(errno.EMLINK, "found a hard link or no file, expected a lock")
                 try:
                     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
                     return None
+                except OSError:  # a disk without locks: nobody holds an empty file
+                    if kind.st_size == 0:
+                        path.unlink(missing_ok=True)
+                    raise
             # The last holder may have removed the file between the two calls.
-            is_held = os.fstat(file.fileno()).st_nlink > 0
+            is_held = os.fstat(file).st_nlink > 0
         stack.enter_context(in_use(path))
         with contextlib.suppress(OSError):  # a full disk has no room for that
-            os.ftruncate(file.fileno(), 0)
-            os.write(file.fileno(), f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+            os.ftruncate(file, 0)
+            os.write(file, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
         return stack.pop_all()
 
 

@@ -1,21 +1,32 @@
 """Read MATLAB's `.mat` files by scipy, which runs nothing of them."""
 
 import os
+import struct
+import zlib
 from typing import Any
 
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
 
+_COMPRESSED = 15
+"""Type of an element that zlib packed (MAT-File Format, MathWorks, table 1-1)."""
+
 
 def load_mat(
-    path: str | os.PathLike[str], expected: str, *, damaged: str, **options: Any
+    path: str | os.PathLike[str],
+    expected: str,
+    *,
+    damaged: str,
+    largest: int = LARGEST,
+    **options: Any,
 ) -> dict[str, Any]:
-    """Return the variables of a file of at most `LARGEST` bytes.
+    """Return the variables of a file.
 
     Args:
         path: the file.
         expected: what kind of file, for messages.
         damaged: what the message calls a file that scipy cannot read.
+        largest: most bytes that it may have, compressed or not.
         **options: of `scipy.io.loadmat`.
 
     Raises:
@@ -24,7 +35,11 @@ def load_mat(
     # Import here: scipy takes half a second.
     import scipy.io
 
-    check_source(path, expected, largest=LARGEST)
+    check_source(path, expected, largest=largest)
+    if not _unpacks_to(path, largest):
+        raise InputError(
+            f"{path}: found more than {largest} bytes once it is unpacked, expected {expected}"
+        )
     try:
         return scipy.io.loadmat(path, **options)
     except NotImplementedError as error:
@@ -34,3 +49,24 @@ def load_mat(
     except Exception as error:  # a damaged file can raise anything at all
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(f"{path}: {damaged}: {reason}") from error
+
+
+def _unpacks_to(path: str | os.PathLike[str], largest: int) -> bool:
+    """Return whether the compressed elements of a file of version 5 unpack to so many bytes."""
+    with open(path, "rb") as file:
+        order = {b"IM": "<", b"MI": ">"}.get(file.read(128)[126:])
+        while order and len(tag := file.read(8)) == 8 and largest >= 0:
+            kind, left = struct.unpack(f"{order}II", tag)
+            if not left:
+                break
+            if kind != _COMPRESSED:
+                file.seek(left, os.SEEK_CUR)
+                continue
+            unpack = zlib.decompressobj()
+            while left and largest >= 0 and (data := file.read(min(left, 2**16))):
+                left -= len(data)
+                try:
+                    largest -= len(unpack.decompress(data))
+                except zlib.error:  # scipy says what is damaged
+                    return True
+    return largest >= 0

@@ -9,6 +9,10 @@ from typing import Any
 _PACKAGE = __name__.partition(".")[0]
 
 
+_LONGEST = 8192
+"""Most letters of a message, which may quote a path or a value of any length."""
+
+
 class Note(UserWarning):
     """A warning that something was done, or found, that a user may not expect."""
 
@@ -56,8 +60,9 @@ def printable(text: str) -> str:
 
 
 def one_line(error: object) -> str:
-    """Return an error's message in one printable line."""
-    return printable(" ".join(str(error).split()))
+    """Return an error's message in one printable line, without the middle of a very long one."""
+    words = " ".join(str(error).split())
+    return printable(words if len(words) <= _LONGEST else f"{words[:1000]} ... {words[-1000:]}")
 
 
 def counted(count: int, noun: str) -> str:

@@ -16,7 +16,10 @@ import tempfile
 from crisalad_jax.utils.files import atomic_path, split_markers
 from tests.attack.world import ROOT
 
-SCRIPTS = ("kills", "interruptions", "memory", "disks", "damage", "inputs", "service")
+SCRIPTS = (
+    *("kills", "interruptions", "memory", "disks", "damage", "inputs"),
+    *("service", "hostile", "surroundings"),
+)
 PAGE = ROOT / "docs" / "reliability.md"
 
 

@@ -13,6 +13,7 @@ from tests.attack.world import ROOT
 SOME = (
     ("damage", 0, "", 32),
     ("disks", 0, "convert", 4),
+    ("hostile", 0, "a sample", 12),
     ("inputs", 0, "a sample", 16),
     ("interruptions", 0, "some", 18),
     # Of training: tests/training/test_interruption.py; of the service: tests/retrieval/serve.
@@ -22,6 +23,7 @@ ALL = (
     ("damage", 1, "", 4800),
     ("disks", 1, "", 200),
     ("disks", 0.6, "train limited, evaluate limited, extract .h5 limited, index limited", 24),
+    ("hostile", 1, "", 400),
     ("inputs", 1, "", 1600),
     ("interruptions", 1, "forks", 192),
     ("interruptions", 1, "programs, training, busy, closed output", 88),
@@ -31,6 +33,8 @@ ALL = (
     ("kills", 1, "compare", 6),
     ("memory", 1, "", 7),
     ("service", 1, "", 2000),
+    ("surroundings", 1, "20 columns, python -O, python -W error, C locale, no home", 40),
+    ("surroundings", 1, "another user, a home to read, no /dev/shm, /tmp full", 0),
 )
 
 

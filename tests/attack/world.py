@@ -46,6 +46,7 @@ COMMANDS: Mapping[str, str] = {
     "query": "query @images --map @map --quiet --json OUT/answers.json --gallery OUT/gallery.png",
     "pca": "pca --descriptors @d.npy --dim 3 --quiet --out OUT/pca.safetensors",
     "export": "export --weights @weights.safetensors --out OUT/program",
+    "export .onnx": "export --weights @weights.safetensors --out OUT/onnx --format onnx",
     "convert": "convert @weights.safetensors OUT/public.pth --format reference",
     "info": "info --weights @weights.safetensors --json OUT/info.json",
     "compare": "compare --train @city --test @town --preset tiny --methods gem --seeds 1 "
@@ -58,14 +59,15 @@ COMMANDS: Mapping[str, str] = {
     "--image-size 98 98 --out OUT/ablation --quiet",
 }
 """Commands that write files into OUT; `@` is what `World.path` returns."""
-VERBS = tuple(name for name in COMMANDS if name not in ("vocabulary", "ablate"))
-"""All but two that take as long as others and do much the same."""
+VERBS = tuple(name for name in COMMANDS if name not in ("vocabulary", "ablate", "export .onnx"))
+"""All but three that take as long as others and do much the same."""
 PRODUCTS: Mapping[str, str] = {
     "d.npy": "extract .npy",
     "d.h5": "extract .h5",
     "map": "index",
     "pca.safetensors": "pca",
     "program": "export",
+    "onnx": "export .onnx",
     "run": "train",
     "comparison": "compare",
 }

@@ -25,6 +25,7 @@ from crisalad_jax.checkpoints.public import (
     read_checkpoint,
     write_checkpoint,
 )
+from crisalad_jax.checkpoints.safetensors_io import write_safetensors
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
@@ -138,6 +139,16 @@ def test_hugging_face_there_and_back(tmp_path: pathlib.Path, registers: int, ffn
     assert again.format == "dinov2"
     theirs = to_state(again.params, again.config, "huggingface", again.extras)
     assert all(theirs[name].tobytes() == array.numpy().tobytes() for name, array in state.items())
+
+
+def test_weights_have_the_rights_of_any_new_file(tmp_path: pathlib.Path) -> None:
+    before = os.umask(0o077)
+    try:
+        write_safetensors(tmp_path / "a.safetensors", {"a": np.zeros(3)}, {})
+        (tmp_path / "other").touch()
+    finally:
+        os.umask(before)
+    assert [path.stat().st_mode & 0o777 for path in tmp_path.iterdir()] == [0o600, 0o600]
 
 
 @pytest.mark.parametrize(

@@ -247,6 +247,30 @@ def test_a_full_disk_at_standard_output_is_one_line(more):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device of Linux alone")
+def test_a_full_disk_at_standard_error_loses_what_is_said_there_alone():
+    said = (
+        "import sys; from crisalad_jax.__main__ import keep_on_without_reader as keep; keep();"
+        "print('progress', file=sys.stderr); print('result')"
+    )
+    for program, code, out in (
+        (["-c", said], 0, b"result\n"),
+        (["-m", "crisalad_jax", "models", "--none"], 2, b""),
+    ):
+        with open("/dev/full", "w") as full:
+            command = [sys.executable, *program]
+            done = subprocess.run(command, stdout=subprocess.PIPE, stderr=full)
+        assert (done.returncode, done.stdout) == (code, out)
+
+
+@pytest.mark.parametrize("pixels", ["abc", "-1", "", "9" * 5000])
+def test_a_limit_of_pixels_that_is_none_is_one_line(capfd, monkeypatch, shared, pixels):
+    """OpenCV aborts the process at such a value."""
+    monkeypatch.setenv("OPENCV_IO_MAX_IMAGE_PIXELS", pixels)
+    words = f"OPENCV_IO_MAX_IMAGE_PIXELS: found {pixels!r}, expected a number of pixels"
+    fails(capfd, "extract", "--images", shared / "town", "--out", "d.npy", words=(words,))
+
+
 def test_a_closed_standard_output_is_no_error():
     command = [sys.executable, "-m", "crisalad_jax", "info", "--help"]
     shell = ["sh", "-c", 'exec "$@" >&-', "sh", *command]

@@ -86,6 +86,15 @@ def files(folder):
 # Help
 
 
+@pytest.mark.parametrize("columns", [10, 20, 40, 50])
+def test_help_in_a_narrow_terminal_is_that_of_60_columns(capfd, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", "60")
+    expected = {command: runs(capfd, command, "--help")[0] for command in COMMANDS}
+    assert max(len(text) for text in expected.values()) > 600
+    monkeypatch.setenv("COLUMNS", str(columns))
+    assert {command: runs(capfd, command, "--help")[0] for command in COMMANDS} == expected
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_is_short_and_tells_of_an_example_that_parses(capfd, command):
     out, _ = runs(capfd, command, "--help")

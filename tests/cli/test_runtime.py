@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import shutil
 import subprocess
 import sys
 
@@ -10,10 +11,13 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
+from crisalad_jax.checkpoints.runtime import open_runtime
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
 from crisalad_jax.data.images import read_image
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.retrieval.describe import prepare_image
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import write_json
 from tests.cli.test_cli import Capture, fails, runs
 from tests.conftest import MODEL
 
@@ -146,6 +150,17 @@ def test_bad_input_is_one_line(exported, shared, tmp_path, capfd, monkeypatch):
     words = ("describe.onnx.data: found other bytes than were written",)
     fails(capfd, *extract[:-1], "openvino", words=words)
     assert not (tmp_path / "d.npy").exists()
+
+
+def test_a_program_outside_of_its_folder_is_not_opened(exported, tmp_path):
+    folder = tmp_path / "program"
+    shutil.copytree(exported, folder)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["program"]["file"] = "../" + manifest["program"]["file"]
+    del manifest["checksum"]
+    write_json(folder / "manifest.json", manifest)
+    with pytest.raises(InputError, match=f"^{folder}: found file '../describe.onnx', expected a"):
+        open_runtime(folder, "onnxruntime")
 
 
 def test_a_program_of_other_weights_is_not_a_maps(exported, shared, tmp_path, capfd):

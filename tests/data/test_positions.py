@@ -2,19 +2,26 @@
 
 import pytest
 
-from crisalad_jax.data.positions import read_image_table, utm_positions
+from crisalad_jax.data.positions import Positions, read_image_table, utm_positions
+from crisalad_jax.utils.errors import InputError
 from tests.data.benchmarks.trees import refused
 
 
 def test_names_say_east_and_north():
-    found = utm_positions(
-        ["a/@0012.50@5000000.25@10@S@.jpg", "@1@-2@.png", "plain.jpg", "@x@y@.jpg", "@nan@1@.jpg"]
-    )
+    others = ["plain.jpg", "@x@y@.jpg", "@nan@1@.jpg", "@1_0@2@.jpg", "@1e200@0@.jpg", "@1@2e8@"]
+    others += ["@inf@0@.jpg", "@\u0661@2@.jpg", "@@.jpg", "@1@@.jpg"]
+    found = utm_positions(["a/@0012.50@5000000.25@10@S@.jpg", "@1@-2@.png", *others])
     assert found.axes == ("east", "north")
     assert found.of == {
         "a/@0012.50@5000000.25@10@S@.jpg": (12.5, 5000000.25),
         "@1@-2@.png": (1.0, -2.0),
     }
+
+
+@pytest.mark.parametrize("at", [(float("nan"), 0.0), (0.0, 1e200), (-2e8, 0.0)])
+def test_a_position_that_no_map_stores_is_refused(at):
+    with pytest.raises(InputError, match=r"^a.jpg: found position .*, expected numbers of at most"):
+        Positions(("x", "y"), {"a.jpg": at}).fitted("map", None, None)
 
 
 @pytest.mark.parametrize(
@@ -25,6 +32,7 @@ def test_names_say_east_and_north():
         ("name,east,north\na,1\n", r"line 2: found 2 fields, expected 3 \(name,east,north\)"),
         ("name,east,north\na,1,inf\n", "line 2: north: found 'inf', expected a number from"),
         ("name,east,north\na,1,1e300\n", r"line 2: north: found '1e300', expected .* to 1e\+08"),
+        ("name,east,north\na,1,1_0\n", "line 2: north: found '1_0', expected a number from"),
         ("name,lat,lon\na,91,0\n", "line 2: lat: found '91', expected a number from -90 to 90"),
         (b"name,east,north\n\xff,1,2\n", "cannot be read as UTF-8 CSV: 'utf-8'"),
         (None, "found no such file"),

@@ -1,5 +1,6 @@
 """Names of Windows and macOS in tables and lists, in every reader of them."""
 
+import tracemalloc
 import unicodedata
 
 import numpy as np
@@ -9,8 +10,9 @@ from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.positions import positions_of
 from crisalad_jax.data.sources import open_source
-from crisalad_jax.data.tables import Disk, matched
+from crisalad_jax.data.tables import Disk, matched, read_table
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import read_json
 from tests.data.benchmarks.test_netvlad import write as write_mat
 from tests.data.benchmarks.trees import lists_of, touch
 
@@ -98,3 +100,26 @@ def test_a_name_means_itself_first(tmp_path):
     assert matched(["a\\b", "a/b", "c"], ["a/b", "a\\b"]) == {"a\\b": "a\\b", "a/b": "a/b"}
     assert Disk().find(tmp_path, "../x/b.jpg") is None
     assert Disk().find(tmp_path / "a", "..\\a\\b.jpg") == tmp_path / "a" / ".." / "a" / "b.jpg"
+
+
+@pytest.mark.parametrize("start", ["", "name,lat,lon\n", 'name,lat,lon\n"', "name;"])
+def test_a_line_of_100_mb_is_read_no_further_than_it_takes_to_refuse_it(tmp_path, start):
+    path = tmp_path / "long.csv"
+    with path.open("wb") as file:
+        file.write(start.encode())
+        file.truncate(10**8)
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"long.csv: cannot be read as UTF-8 CSV: field larger"):
+        read_table(path, "name")[2].__next__()
+    assert tracemalloc.get_traced_memory()[1] < 3e7
+    tracemalloc.stop()
+
+
+def test_a_list_and_json_have_a_size_beyond_which_they_are_not_read(tmp_path):
+    for name in ("list.txt", "recipe.json"):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(2**27 + 1)
+    with pytest.raises(InputError, match=r"list.txt: found 134217729 bytes, expected a list of"):
+        open_source(tmp_path / "list.txt")
+    with pytest.raises(InputError, match=r"recipe.json: found 134217729 bytes, expected a recipe"):
+        read_json(tmp_path / "recipe.json", "a recipe")

@@ -264,6 +264,8 @@ def test_wrong_shapes_and_numbers_are_named():
     rows, none = _random_unit(0, 9, 4), np.zeros((0, 4), np.float32)
     for arguments, message in [
         ((none, rows, 1), r"^database: found shape \(0, 4\)"),
+        ((rows, rows.astype(complex), 1), "^queries: found numbers of type complex128, expected"),
+        ((rows.astype(object), rows, 1), "^database: found numbers of type object, expected"),
         ((rows, none, 1), r"^queries: found shape \(0, 4\)"),
         ((rows, _random_unit(1, 2, 5), 1), r"^queries: found shape .* expected \(images, 4\)"),
         ((rows, rows, 0), "^k: found 0"),

@@ -186,3 +186,16 @@ def test_a_step_back_is_refused(moved):
     settings = BayesFilter()
     with pytest.raises(InputError, match=f"moved: found {moved}, expected at least 0"):
         settings.step(settings.start(np.zeros(3)), np.eye(3)[0], moved)
+
+
+@pytest.mark.parametrize("common", [np.ones(0), np.array([0.5, np.nan]), np.ones((2, 2))])
+def test_no_places_and_no_numbers_are_refused(common):
+    with pytest.raises(InputError, match=r"^common: found .*, expected shape \(\d,\) of finite"):
+        BayesFilter().start(common)
+
+
+@pytest.mark.parametrize("row", [np.array([0.5, np.nan]), np.array([np.inf, 0.0]), np.ones(3)])
+def test_a_frame_without_a_number_for_each_place_is_refused(row):
+    start = BayesFilter().start(np.array([0.5, 0.5]))
+    with pytest.raises(InputError, match=r"^similarities: found .*, expected shape \(2,\) of"):
+        BayesFilter().step(start, row)

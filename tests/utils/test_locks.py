@@ -1,6 +1,7 @@
 """Locks of folders: one process at a time, whatever becomes of the one before it."""
 
 import contextlib
+import errno
 import fcntl
 import os
 import pathlib
@@ -192,12 +193,44 @@ def test_a_folder_that_cannot_be_locked_is_one_line(tmp_path):
     (tmp_path / "file").write_text("x")
     (tmp_path / "out" / LOCK).mkdir(parents=True)
     for name, words in (
-        ("file/deep", "cannot make this folder: Not a directory"),
-        ("out", "cannot be written: Is a directory"),
+        ("file/deep", ": cannot make this folder: Not a directory"),
+        ("out", f"/{LOCK}: cannot be written: Is a directory"),
     ):
-        with pytest.raises(InputError, match=f"^{tmp_path / name}: {words}"), lock(tmp_path / name):
-            pass
+        with pytest.raises(InputError, match=f"^{tmp_path / name}{words}"):
+            lock(tmp_path / name).__enter__()
     assert sorted(os.listdir(tmp_path)) == ["file", "out"]
+
+
+@pytest.mark.parametrize("link", [os.symlink, os.link])
+def test_a_lock_that_is_a_link_changes_nothing_behind_it(tmp_path, link):
+    mine, folder = tmp_path / "thesis.txt", tmp_path / "foreign"
+    mine.write_text("mine")
+    folder.mkdir()
+    link(mine, folder / LOCK)
+    with pytest.raises(InputError, match=f"^{folder / LOCK}: cannot be written: .*link"):
+        lock(folder).__enter__()
+    assert (mine.read_text(), os.listdir(folder)) == ("mine", [LOCK])
+
+
+@pytest.mark.parametrize("kind", ["pipe", "a link to nothing"])
+def test_a_lock_that_is_no_file_is_one_line(tmp_path, kind):
+    if kind == "pipe":
+        os.mkfifo(tmp_path / LOCK)
+    else:
+        (tmp_path / LOCK).symlink_to(tmp_path / "new")
+    with pytest.raises(InputError, match=f"^{tmp_path / LOCK}: cannot be written: .*link"):
+        lock(tmp_path).__enter__()
+    assert os.listdir(tmp_path) == [LOCK]
+
+
+def test_a_disk_without_locks_keeps_no_lock_file(tmp_path, monkeypatch):
+    def without(file, how):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", without)
+    with pytest.raises(InputError, match=f"{LOCK}: cannot be written: No locks available"):
+        lock(tmp_path / "new").__enter__()
+    assert os.listdir(tmp_path) == []
 
 
 def test_the_next_writer_waits_and_tells_of_the_first(tmp_path):

@@ -53,6 +53,17 @@ def test_parameters_are_float32_and_the_same(name: str) -> None:
     assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {jnp.dtype("float32")}
 
 
+def test_a_program_that_forbids_promotion_and_compiling_gets_the_same_descriptors() -> None:
+    expected = describe(PARAMS, IMAGES, MODEL)
+    with (
+        jax.numpy_rank_promotion("raise"),
+        jax.numpy_dtype_promotion("strict"),
+        jax.disable_jit(),
+    ):
+        found = describe(PARAMS, IMAGES, MODEL)
+    assert_equal(found, expected)
+
+
 @dataclasses.dataclass(frozen=True)
 class Shifted(Aggregator):
     """As people write them: of JAX's default types."""

@@ -13,6 +13,7 @@ from crisalad_jax.data.benchmarks.benchmark import Benchmark, within
 from crisalad_jax.data.benchmarks.on_disk import find_images
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import LARGEST_TEXT
 from crisalad_jax.utils.mat_files import load_mat
 
 _SIDES = (
@@ -45,7 +46,8 @@ def read_netvlad(
             are missing, a negative radius.
     """
     path = pathlib.Path(path)
-    contents = load_mat(path, "a .mat file with dbStruct", damaged="cannot be read as a .mat file")
+    expected, damaged = "a .mat file with dbStruct", "cannot be read as a .mat file"
+    contents = load_mat(path, expected, damaged=damaged, largest=LARGEST_TEXT)
     images_of, metres = [], []
     try:
         struct = contents["dbStruct"].reshape(-1)[0]

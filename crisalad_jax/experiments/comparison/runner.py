@@ -50,7 +50,7 @@ from crisalad_jax.training.loop import fit
 from crisalad_jax.training.start import with_vocabulary_of
 from crisalad_jax.training.trainer import run_keys
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import real_path, split_markers, write_json
+from crisalad_jax.utils.files import check_no_links, real_path, split_markers, write_json
 from crisalad_jax.utils.locks import POLL, BusyFolderError, lock
 from crisalad_jax.utils.output import Note
 from crisalad_jax.utils.target import target
@@ -140,6 +140,7 @@ def carry_out(
             f"{out}: found files but no comparison, expected one or a new or empty folder"
         )
     with lock(out, wait=True, quiet=quiet):
+        check_no_links(out)
         write_json(path, to_plain(config))
     runs = runs_of(prepared, out)
     start = config.backbone or "nothing"

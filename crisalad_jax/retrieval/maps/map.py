@@ -25,7 +25,7 @@ from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import Zone
-from crisalad_jax.data.positions import Positions
+from crisalad_jax.data.positions import AXES, Positions
 from crisalad_jax.retrieval.chunks import Descriptors, Queries, as_unit_rows
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import (
@@ -264,6 +264,7 @@ class Map:
             ]
             axes = record["axes"] and (record["axes"][0], record["axes"][1])
             zone = record["zone"] and Zone(int(record["zone"][0]), bool(record["zone"][1]))
+            Positions(axes or AXES[2], {i.name: i.position for i in images if i.position}).check()
             if not isinstance(root, str) or not isinstance(added, str | None):
                 raise TypeError(f"found root {root!r}, expected text, and added {added!r}, a time")
         except (ValueError, LookupError, TypeError, OverflowError) as error:

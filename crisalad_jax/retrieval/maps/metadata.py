@@ -16,7 +16,7 @@ from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.maps.store import check_store, store_name
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json
+from crisalad_jax.utils.files import check_no_links, read_json
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.temporaries import LOCK, is_temporary
 
@@ -28,6 +28,11 @@ METADATA, SEGMENTS = "map.json", "segments"
 """Names of the metadata's file, and of the folder of additions."""
 COMPONENTS, SHARES = "pca.safetensors", "shares"
 """Names of the components that shorten descriptors, and of the folder of shares to be joined."""
+_PARTS = (
+    *(METADATA, SEGMENTS, COMPONENTS, SHARES, LOCK),
+    *("calibration.json", "approximate", "added"),
+)
+"""All names that a map may have in its folder."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -110,12 +115,18 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
     A map without images, which a killed process left, counts as none.
 
     Raises:
-        InputError: the folder holds other things than a map, or the map is damaged or of another
-            format.
+        InputError: the folder holds other things than a map, or the map is damaged, of another
+            format, or has a link in it.
     """
     folder = pathlib.Path(folder)
-    path = folder / METADATA
-    if not path.exists():
+    path, metadata = folder / METADATA, None
+    for name in _PARTS:
+        check_no_links(folder / name, itself=True)
+    if path.exists():
+        # Who edits the metadata removes its checksum. A changed key would be an unknown field.
+        value = read_json(path, "a map", sealed=False)
+        metadata = from_plain(MapMetadata, value, source=str(path))
+    else:
         # A process killed before it has made the map leaves its lock and temporary files behind.
         own = (LOCK, SEGMENTS, COMPONENTS, SHARES)
         there = [*folder.glob("*"), *(folder / SEGMENTS).glob("*")]
@@ -125,9 +136,6 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
             raise InputError(
                 f"{folder}: found {first} and no {METADATA}, expected a map or an empty folder"
             )
-        return None
-    # Who edits the metadata removes its checksum. A changed key would be an unknown field.
-    metadata = from_plain(MapMetadata, read_json(path, "a map", sealed=False), source=str(path))
     return metadata if has_images(folder) else None
 
 

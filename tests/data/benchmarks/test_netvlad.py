@@ -7,6 +7,8 @@ import pytest
 import scipy.io
 
 from crisalad_jax.data.benchmarks import open_benchmark, read_netvlad
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.mat_files import load_mat
 from tests.data.benchmarks.trees import lists_of, refused, touch_all
 
 GENERATOR = np.random.default_rng(0)
@@ -155,3 +157,14 @@ def test_bad_files(tmp_path):
     path.write_bytes(header + bytes(512))
     with refused(r"a.mat: found MATLAB's format 7.3, expected 7"):
         read_netvlad(path)
+
+
+def test_a_small_file_that_unpacks_to_much_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    path = tmp_path / "a.mat"
+    scipy.io.savemat(path, {"dbStruct": np.zeros(3_000_000, np.uint8)}, do_compression=True)
+    assert path.stat().st_size < 10_000
+    expected = {"expected": "a set", "damaged": "damaged"}
+    assert load_mat(path, **expected, largest=3_001_000)["dbStruct"].size == 3_000_000
+    monkeypatch.setattr(scipy.io, "loadmat", None)
+    with pytest.raises(InputError, match=r"a.mat: found more than 2999999 bytes once it is unp"):
+        load_mat(path, **expected, largest=2_999_999)

@@ -64,6 +64,27 @@ def reseal(path: pathlib.Path, **changes) -> None:
     write_record(path, json.loads(path.read_text()))
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["segments", "segments/0000000000.npy", "added", "added/a", "approximate", "calibration.json"],
+)
+def test_a_link_in_a_map_is_neither_read_nor_written_through(tmp_path, folder, name):
+    outside, link = tmp_path / "outside", folder / name
+    if link.exists():
+        link.rename(outside)
+    else:
+        link.parent.mkdir(exist_ok=True)
+        outside.mkdir()
+        (outside / "0000000009.npy").write_text("mine")
+    link.symlink_to(outside)
+    before = sorted(outside.rglob("*"))
+    for enter in (Map.open, lambda path: open_for_appending(path, metadata("files")).__enter__()):
+        with pytest.raises(InputError, match=f"^{link}: found a link, expected the file or folder"):
+            enter(folder)
+    assert sorted(outside.rglob("*")) == before
+    assert not (folder / ".crisalad-lock").exists()
+
+
 # What is in it
 
 
