@@ -96,7 +96,8 @@ def test_help_in_a_narrow_terminal_is_that_of_60_columns(capfd, monkeypatch, col
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_is_short_and_tells_of_an_example_that_parses(capfd, command):
+def test_help_is_short_and_tells_of_an_example_that_parses(capfd, monkeypatch, command):
+    monkeypatch.setenv("COLUMNS", "100")
     out, _ = runs(capfd, command, "--help")
     usage, *lines = out.splitlines()
     assert usage.startswith(f"usage: crisalad {command} ")
