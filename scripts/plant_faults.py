@@ -183,21 +183,23 @@ def draw(faults: Sequence[Fault], count: int, seed: str) -> list[Fault]:
 def nearest_tests(file: pathlib.Path) -> list[str]:
     """List the test files of a module.
 
-    They are those of its folder that import it; else of its room; else any; else its folder's.
+    Of one in a folder of its room, they are the folder's; else those of its room that import it;
+    else any that do; else its room's. Those come first that import it.
     """
     module = ".".join(file.with_suffix("").parts).removesuffix(".__init__")
     package, _, name = module.rpartition(".")
     imports = (f"from {module} import", f"import {module}", f"from {package} import {name}")
-    folder = ROOT / "tests" / pathlib.Path(*file.parts[1:-1])
-    room = ROOT / "tests" / pathlib.Path(*file.parts[1:2]).with_suffix("")
 
     def near(test: pathlib.Path) -> bool:
         text = test.read_text()
         return test.stem == f"test_{file.stem}" or any(words in text for words in imports)
 
-    around = [sorted(place.rglob("test_*.py")) for place in (folder, room, ROOT / "tests")]
-    of_module = [[*filter(near, tests)] for tests in around]
-    chosen = next(filter(None, of_module + around))
+    tests = ROOT / "tests"
+    room, folder = tests / "/".join(file.parts[1:2]), tests.joinpath(*file.parts[1:-1])
+    of_room = sorted(room.rglob("test_*.py"))
+    of_folder = sorted(folder.rglob("test_*.py")) if folder != room else []
+    ways = (of_folder, [*filter(near, of_room)], [*filter(near, tests.rglob("test_*.py"))], of_room)
+    chosen = sorted(next(filter(None, ways)), key=lambda test: not near(test))
     return [str(test.relative_to(ROOT)) for test in chosen]
 
 
