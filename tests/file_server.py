@@ -19,6 +19,8 @@ class FileServer:
     modified: str | None = None
     length: int | None = None
     """Length that it says, in place of the file's own."""
+    shift: int = 0
+    """Bytes by which a part begins behind what was asked for."""
     statuses: list[int] = dataclasses.field(default_factory=list)
     """Codes of the next answers, in place of the file."""
     cuts: list[int] = dataclasses.field(default_factory=list)
@@ -65,7 +67,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def _send(self, state: FileServer, data: bytes, wanted: str | None) -> None:
         start, condition = 0, self.headers.get("If-Range")
         if wanted is not None and state.ranges and condition in (state.etag, state.modified):
-            start = int(wanted.removeprefix("bytes=").rstrip("-"))
+            start = int(wanted.removeprefix("bytes=").rstrip("-")) + state.shift
         if start and start >= len(data):
             self.send_error(416)
             return

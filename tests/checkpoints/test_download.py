@@ -67,6 +67,13 @@ CUT = {"cuts": [100_000]}
 REST = "bytes=100000-"
 
 
+def test_a_part_that_begins_elsewhere_is_not_joined(server, tmp_path):
+    cut_short(server, tmp_path, 100_000)
+    server.shift = 10
+    assert fetch(server, tmp_path).read_bytes() == DATA
+    assert server.asked == [("/file", REST), ("/file", None)]
+
+
 @pytest.mark.parametrize(
     ("answers", "asked"),
     [

@@ -152,6 +152,21 @@ def test_levels_are_the_normed_tokens_of_backbones_cut_short(depths: tuple[int, 
         np.testing.assert_allclose(found.patches, patches, atol=1e-6)
 
 
+def test_norms_have_dinov2s_epsilon() -> None:
+    """Its code norms with an epsilon of 1e-6; here the tokens' deviation is of that size."""
+    config = dataclasses.replace(CONFIG, depth=1, layer_scale_init=1e-3)
+    params = jax.tree.map(lambda leaf: 1e-3 * leaf, config.init(jax.random.key(0)))
+    params = dataclasses.replace(params, norm=LayerNorm(jnp.full(16, 2.0), jnp.full(16, 0.5)))
+    requests = FeatureSpec(norm=False), FeatureSpec()
+    features = [config.apply(params, images(1, 28, 42), request)[0] for request in requests]
+    raw, found = (np.asarray(each.patches) for each in features)
+    assert 1e-4 < raw.std() < 1e-2
+    weight, bias = torch.full((16,), 2.0), torch.full((16,), 0.5)
+    expected = torch.nn.functional.layer_norm(torch.tensor(raw), (16,), weight, bias, eps=1e-6)
+    # Rounding of means and squares in float32.
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
 HALF = ViTConfig(dim=32, depth=2, heads=2, position_grid=3)
 """Of heads of 16, which cuDNN takes; 3 x 4 patches and a class token are padded to 16 tokens."""
 INSERTED = jax.random.normal(jax.random.key(9), (2, 32))
