@@ -71,7 +71,15 @@ def form(data: bytes, field: str = "image") -> tuple[bytes, dict[str, str]]:
     }
 
 
-def test_many_clients_get_the_answers_of_query(service, pictures, expected):
+def test_many_clients_get_the_answers_of_query(service, pictures, expected, monkeypatch):
+    search, threads = Map.search, set()
+
+    def recorded(*arguments):
+        threads.add(threading.get_ident())
+        return search(*arguments)
+
+    monkeypatch.setattr(Map, "search", recorded)
+
     def client(number):
         mine = [pictures[(number + i) % len(pictures)] for i in range(EACH)]
         return [(path.name, service.ask("POST", "/locate?k=3", path.read_bytes())) for path in mine]
@@ -83,6 +91,7 @@ def test_many_clients_get_the_answers_of_query(service, pictures, expected):
         assert reply.status == 200
         assert_answers(reply.json["neighbours"], expected[name])
         assert reply.json["latency_ms"] > 0
+    assert len(threads) == 1  # which owns the map
 
 
 def test_a_map_of_the_model_in_the_package_is_served_by_it(sides, pictures, tmp_path):
@@ -188,6 +197,7 @@ def test_a_form_without_a_picture(service, pictures):
 def test_a_form_with_two_files_or_too_many_fields(service, pictures):
     data, headers = form(pictures[0].read_bytes())
     first = data.removesuffix(b"--b--\r\n")
+    field = b'--b\r\nContent-Disposition: form-data; name="k"\r\n\r\n3\r\n'
     reply = service.ask("POST", "/locate", first + data, **headers)
     assert (reply.status, reply.json["error"]) == (
         400,
@@ -195,6 +205,7 @@ def test_a_form_with_two_files_or_too_many_fields(service, pictures):
     )
     for body, words in (
         (first * 11 + b"--b--\r\n", "Too many files. Maximum number of files is 10."),
+        (field * 11 + b"--b--\r\n", "Too many fields. Maximum number of fields is 10."),
         (b"--b\r\nno form", "Invalid multipart data."),
     ):
         reply = service.ask("POST", "/locate", body, **headers)
@@ -476,6 +487,7 @@ def test_images_are_added_for_good(own_map, params, pictures):
             ("/images?name=b.jpg&lat=1&lon=2", 400, "125 degrees of longitude from the middle of"),
             ("/images?name=b.jpg&x=1&y=2", 400, "found positions in x, y, expected east, north"),
             ("/images?name=b.jpg&lat=91&lon=2", 400, "lat: found '91'"),
+            ("/images?name=b.jpg&lat=1&lon=180.5", 400, "lon: found '180.5'"),
             ("/images?name=b.jpg&east=1", 400, "found east, expected east and north, or lat"),
             ("/images?name=b.jpg&east=nan&north=1", 400, "east: found 'nan'"),
         ):
