@@ -621,7 +621,7 @@ SAMPLE, SAMPLED = "a sample", ("links: locks", "code: torch", "names of plug-ins
 
 def _sample(bench: Bench, scale: float) -> list[Try]:
     quick = [each for each in tries() if each.group in SAMPLED]
-    return bench.random.sample(quick, part_of(100, scale, least=12))
+    return bench.random.sample(quick, part_of(100, scale, least=6))
 
 
 def attacks() -> dict[str, Attack]:

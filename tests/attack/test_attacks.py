@@ -13,7 +13,7 @@ from tests.attack.world import ROOT
 SOME = (
     ("damage", 0, "", 32),
     ("disks", 0, "convert", 4),
-    ("hostile", 0, "a sample", 12),
+    ("hostile", 0, "a sample", 6),
     ("inputs", 0, "a sample", 16),
     ("interruptions", 0, "some", 18),
     # Of training: tests/training/test_interruption.py; of the service: tests/retrieval/serve.
