@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.special
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -71,16 +72,26 @@ def test_over_relaxed_iterations_by_hand(fields: Any) -> None:
     np.testing.assert_allclose(plan_of(result), np.exp(scores + row[:, None] + column), rtol=1e-5)
 
 
-def test_over_relaxation_never_makes_the_dual_fall() -> None:
-    """Where the step of 1.9 everywhere does: of columns with far too little mass."""
+@pytest.mark.parametrize("taus", [(1.0, 1.0), (0.97, 1.0), (0.3, 0.97)])
+def test_over_relaxation_never_makes_the_dual_fall(taus: tuple[float, float]) -> None:
+    """Where the step of 1.9 everywhere does: of columns with far too little mass.
+
+    The dual of relaxed marginals is that of Chizat et al., Math. Comp. 2018.
+    """
     scores = np.asarray(scores_of(0, 30, 5, scale=4.0), np.float64)
     log_mu, log_nu = np.zeros(30), np.log([1.0, 1, 1, 1, 26])
 
+    def worth(log_mass: np.ndarray, potential: np.ndarray, tau: float) -> float:
+        weight = tau / (1 - tau) if tau < 1 else np.inf
+        gain = potential if tau == 1 else -weight * np.expm1(-potential / weight)
+        return np.exp(log_mass) @ gain
+
     def dual(row: np.ndarray, column: np.ndarray) -> float:
         plan = np.exp(scores + row[:, None] + column)
-        return row.sum() + np.exp(log_nu) @ column - plan.sum()
+        return worth(log_mu, row, taus[0]) + worth(log_nu, column, taus[1]) - plan.sum()
 
-    problem = Problem.of(*(jnp.asarray(x, jnp.float32) for x in (scores, log_mu, log_nu)))
+    arrays = (jnp.asarray(x, jnp.float32) for x in (scores, log_mu, log_nu))
+    problem = Problem.of(*arrays, *taus)
     at, step, duals = Potentials(jnp.zeros(30), jnp.zeros(5)), SinkhornStep(relaxation=1.9), []
     for number in range(20):
         at, _ = step.step(problem, at, None, jnp.asarray(number))
@@ -426,6 +437,26 @@ def test_newton_meets_sharp_scores_in_float32() -> None:
         rows, columns = scores.shape[1:]
         # The tolerance, and rounding of logarithms of 500 or 1000.
         np.testing.assert_allclose(masses, [[1] * columns + [rows - columns]] * 4, rtol=1.2e-3)
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.75, False), (1.25, True)])
+def test_the_last_change_is_within_the_tolerance_or_it_has_not_converged(
+    share: float, expected: bool
+) -> None:
+    """By numpy, with relaxed rows; four iterations are all that there are."""
+    scores = np.asarray(scores_of(2, 7, 3), np.float64)
+    log_mu, log_nu = np.log(np.linspace(0.5, 1.5, 7)), np.log([2.0, 4.0, 1.0])
+    row, column, changes = np.zeros(7), np.zeros(3), []
+    for _ in range(4):
+        old = np.concatenate([row, column])
+        column = log_nu - scipy.special.logsumexp(scores + row[:, None], axis=0)
+        row = 0.7 * (log_mu - scipy.special.logsumexp(scores + column, axis=1))
+        changes.append(np.abs(np.concatenate([row, column]) - old).max())
+    config = implicit(iterations=4, tolerance=share * changes[-1])
+    masses = jnp.asarray(log_mu), jnp.asarray(log_nu)
+    result = solve(jnp.asarray(scores), *masses, config=config, row_tau=0.7)
+    assert changes[-2] > 1.25 * changes[-1]
+    assert bool(result.converged) is expected
 
 
 def test_what_misses_a_marginal_has_not_converged() -> None:

@@ -126,6 +126,7 @@ def test_a_calibration_that_is_not_this_maps_is_refused(folder):
         assert places.calibration.min_similarity == 0.4
     for changes, words in (
         ({"min_similarity": 1.5}, r"found similarity 1.5, expected one from -1 to 1"),
+        ({"min_similarity": -1.5}, r"found similarity -1.5, expected one from -1 to 1"),
         ({"format": 2}, r"found 2, expected one of 1 @ config\.format"),
     ):
         path.write_text(json.dumps(value | changes))
