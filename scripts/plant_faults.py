@@ -16,6 +16,7 @@ import concurrent.futures
 import contextlib
 import copy
 import dataclasses
+import itertools
 import json
 import multiprocessing
 import multiprocessing.connection
@@ -87,9 +88,7 @@ def faults_of(source: str) -> list[Fault]:
     Messages, annotations, docstrings and f-strings are left alone.
     """
     lines = source.encode().splitlines(keepends=True)
-    starts = [0]
-    for line in lines:
-        starts.append(starts[-1] + len(line))
+    starts = [0, *itertools.accumulate(map(len, lines))]
     faults: list[Fault] = []
 
     def add(node: ast.stmt | ast.expr, after: str) -> None:

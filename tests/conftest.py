@@ -49,6 +49,8 @@ from crisalad_jax.utils.pytree import named_leaves
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+PHOTOGRAPHS = pathlib.Path(__file__).parents[2] / "shared" / "data"
+"""Real photographs beside the checkout, where there are any."""
 MODEL = ModelConfig(
     image_size=(42, 56),
     backbone=ViTConfig(dim=32, depth=2, heads=2, position_grid=3),

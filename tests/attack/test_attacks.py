@@ -34,6 +34,7 @@ ALL = (
     ("memory", 1, "", 7),
     ("service", 1, "", 2000),
     ("surroundings", 1, "20 columns, python -O, python -W error, C locale, no home", 40),
+    ("surroundings", 1, "switches of JAX", 8),
     ("surroundings", 1, "another user, a home to read, no /dev/shm, /tmp full", 0),
 )
 

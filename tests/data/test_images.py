@@ -1,7 +1,6 @@
 """Reading and listing images, against Pillow."""
 
 import io
-import pathlib
 import struct
 import zlib
 
@@ -16,6 +15,7 @@ from crisalad_jax.data.resize import resize_image
 from crisalad_jax.data.sources import open_source
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
+from tests.conftest import PHOTOGRAPHS
 from tests.data.benchmarks.trees import refused, touch_all
 
 FORMATS = {
@@ -33,9 +33,6 @@ FORMATS = {
     "jp2": ("JPEG2000", {}),
     "ppm": ("PPM", {}),
 }
-
-
-PHOTOGRAPHS = pathlib.Path(__file__).parents[2].parent / "shared" / "data" / "toy_streets"
 
 
 def smooth_picture(height=60, width=80, channels=3, seed=0):
@@ -304,7 +301,7 @@ def test_list_images_of_nothing(tmp_path):
 def test_photographs_read_and_resize_as_by_pillow():
     if not PHOTOGRAPHS.is_dir():
         pytest.skip("no photographs beside the checkout")
-    for path in list_images(PHOTOGRAPHS)[::8]:
+    for path in list_images(PHOTOGRAPHS / "toy_streets")[::8]:
         expected = Image.open(path).convert("RGB").resize((224, 224), Image.Resampling.BILINEAR)
         resized = resize_image(read_image(path), (224, 224))
         # One level from the resize, two from the JPEG decoder, as above.

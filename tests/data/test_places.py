@@ -11,13 +11,11 @@ import pytest
 from crisalad_jax.data.places import Places, epoch_batches, read_places
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
+from tests.conftest import PHOTOGRAPHS
 from tests.data.benchmarks.trees import touch_all
 from tests.data.test_class_groups import places_of
 
 COLUMNS = ["place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid"]
-
-
-REAL = Path(__file__).parents[2].parent / "shared" / "data"
 
 
 def make_rows(city_id: str, place: int, images: int) -> list[list[str]]:
@@ -247,10 +245,10 @@ def test_bad_epoch_arguments(changes, message):
         draw(uneven(2, 3), **({"places_per_batch": 2} | changes))
 
 
-@pytest.mark.skipif(not (REAL / "sped_train").is_dir(), reason="needs the real photographs")
+@pytest.mark.skipif(not (PHOTOGRAPHS / "sped_train").is_dir(), reason="needs the real photographs")
 def test_real_training_set():
-    places = read_places(REAL / "sped_train", min_images=2)
+    places = read_places(PHOTOGRAPHS / "sped_train", min_images=2)
     assert places.cities == ("SPED",)
     assert places.image_counts.tolist() == [2] * 400
     with pytest.raises(InputError, match="at least 4 images; the largest has 2"):
-        read_places(REAL / "sped_train")
+        read_places(PHOTOGRAPHS / "sped_train")

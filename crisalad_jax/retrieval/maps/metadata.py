@@ -119,14 +119,10 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
             format, or has a link in it.
     """
     folder = pathlib.Path(folder)
-    path, metadata = folder / METADATA, None
+    path = folder / METADATA
     for name in _PARTS:
         check_no_links(folder / name, itself=True)
-    if path.exists():
-        # Who edits the metadata removes its checksum. A changed key would be an unknown field.
-        value = read_json(path, "a map", sealed=False)
-        metadata = from_plain(MapMetadata, value, source=str(path))
-    else:
+    if not path.exists():
         # A process killed before it has made the map leaves its lock and temporary files behind.
         own = (LOCK, SEGMENTS, COMPONENTS, SHARES)
         there = [*folder.glob("*"), *(folder / SEGMENTS).glob("*")]
@@ -136,6 +132,9 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
             raise InputError(
                 f"{folder}: found {first} and no {METADATA}, expected a map or an empty folder"
             )
+        return None
+    # Who edits the metadata removes its checksum. A changed key would be an unknown field.
+    metadata = from_plain(MapMetadata, read_json(path, "a map", sealed=False), source=str(path))
     return metadata if has_images(folder) else None
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.benchmarks import LAYOUTS, open_benchmark
+from tests.conftest import PHOTOGRAPHS
 from tests.data.benchmarks.test_msls import write_msls
 from tests.data.benchmarks.test_netvlad import write as write_mat
 from tests.data.benchmarks.test_netvlad import write_images as write_mat_images
@@ -23,9 +24,6 @@ from tests.data.benchmarks.trees import (
 )
 
 FLAGS = Path(__file__).parents[3] / "crisalad_jax" / "cli" / "flags.py"
-
-
-REAL = Path(__file__).parents[3].parent / "shared" / "data"
 
 
 def test_open_benchmark_finds_the_layout(tmp_path):
@@ -151,21 +149,21 @@ def test_an_unknown_layout_is_refused(tmp_path):
         open_benchmark(tmp_path, layout="gsv")
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="needs the real photographs")
+@pytest.mark.skipif(not PHOTOGRAPHS.is_dir(), reason="needs the real photographs")
 def test_real_sets():
-    sped = open_benchmark(REAL / "sped_val")
+    sped = open_benchmark(PHOTOGRAPHS / "sped_val")
     assert sped.name == "sped_val/test (@UTM, 25 m)"
     assert [len(p) for p in sped.ground_truth()] == [1] * 147
     for path, positives in zip(sped.queries, sped.ground_truth(), strict=True):
         # the file names carry the place as well as its placeholder coordinates
         assert path.name.split("@")[1] == sped.database[positives[0]].name.split("@")[1]
 
-    corridor = open_benchmark(REAL / "corridor")
+    corridor = open_benchmark(PHOTOGRAPHS / "corridor")
     assert corridor.name == "corridor (VPR-Bench)"
     assert len(corridor.database) == len(corridor.queries) == 111
     for i, positives in enumerate(corridor.ground_truth()):
         assert positives.tolist() == list(range(max(0, i - 2), min(110, i + 2) + 1))
 
-    streets = open_benchmark(REAL / "toy_streets")
+    streets = open_benchmark(PHOTOGRAPHS / "toy_streets")
     assert streets.name == "toy_streets (two folders, no ground truth)"
     assert (len(streets.database), len(streets.queries), streets.positives) == (17, 5, None)

@@ -19,10 +19,7 @@ from crisalad_jax.nn.backbones.hog import HogConfig
 from crisalad_jax.training.step import init_train_state, step_config
 from crisalad_jax.utils.errors import InputError
 from tests.cli.test_cli import Capture, fails, succeeds
-from tests.conftest import RECIPE
-
-PHOTOGRAPHS = pathlib.Path(__file__).parents[4] / "shared" / "data"
-
+from tests.conftest import PHOTOGRAPHS, RECIPE
 
 CONFIG = cj.ModelConfig(
     image_size=(128, 128),
