@@ -18,6 +18,7 @@ import safetensors.numpy
 from crisalad_jax.utils.checksums import CHECKSUM, ChangedFileError
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source, parse_json
+from crisalad_jax.utils.temporaries import in_use, temporary_beside
 
 WEIGHTS = "crisalad-jax 4"
 """Format of a weight file, the only key of its metadata. Its value is JSON: the file's checksum,
@@ -38,14 +39,17 @@ def write_safetensors(
     """
     # The library writes the memory as it lies, whatever the order of the axes.
     arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
-    with atomic_path(path) as temporary:
+    with atomic_path(path) as temporary, in_use(folder := temporary_beside(temporary)):
         temporary.touch()
-        mode = temporary.stat().st_mode
+        # The library writes under a random name in the folder, which a killed process leaves.
+        folder.mkdir()
+        file = folder / temporary.name
         try:
-            safetensors.numpy.save_file(arrays, temporary, metadata=dict(metadata))
+            safetensors.numpy.save_file(arrays, file, metadata=dict(metadata))
         except safetensors.SafetensorError as error:  # a full disk too
             raise InputError(f"{path}: cannot be written: {error}") from error
-        temporary.chmod(mode)  # the library makes files that only their owner can read
+        file.chmod(temporary.stat().st_mode)  # the library's files are their owner's alone
+        os.replace(file, temporary)
 
 
 def write_sealed(

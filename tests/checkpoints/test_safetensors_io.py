@@ -11,6 +11,7 @@ import safetensors.numpy
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_safetensors, write_sealed
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.temporaries import is_temporary
 from tests.utils.test_checksums import flips
 
 CHANGED = "found other bytes than were written, expected those of its checksum"
@@ -51,6 +52,22 @@ def test_a_file_holds_the_digest_of_its_contents(path):
     for name, array in ARRAYS.items():
         np.testing.assert_array_equal(ours[name], array)
         assert ours[name].dtype == array.dtype
+
+
+def test_what_a_kill_leaves_is_what_the_next_writer_removes(tmp_path, monkeypatch):
+    """The library writes `.tmpXXXXXX` beside the file that it is given, and then renames it."""
+    write, seen = safetensors.numpy.save_file, []
+
+    def killed(arrays, target, **options):
+        folder = pathlib.Path(target).parent
+        (folder / ".tmpErgpBx").touch()  # its own, of an earlier kill
+        write(arrays, target, **options)
+        seen.extend(path for path in tmp_path.iterdir() if not is_temporary(path))
+
+    monkeypatch.setattr(safetensors.numpy, "save_file", killed)
+    write_sealed(tmp_path / "a.safetensors", ARRAYS, FORM, VALUE)
+    assert seen == []
+    assert [path.name for path in tmp_path.iterdir()] == ["a.safetensors"]
 
 
 def test_one_other_byte_is_refused(path):
