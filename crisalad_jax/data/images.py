@@ -51,6 +51,10 @@ _PNG_SIDE = 1_000_000
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _AVIF = (b"ftypavif", b"ftypavis")
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_PNM_HEADER = re.compile(
+    rb"P[2356]" + 2 * (rb"(?:\s|#[^\n]*\n)+" + rb"\d{1,9}") + rb"(?:\s|#[^\n]*\n)+(\d{1,5})\b"
+)
+"""Width, height, and the value of white."""
 # Any marker except the stuffed byte FF00, the fill FFFF, and FF01 and the restarts FFD0..FFD7,
 # which have no segment.
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd7\xff]")
@@ -148,6 +152,7 @@ def decode_image(
             found = f"an image cut short after {len(data)} bytes, or damaged"
         elif data:
             image = _decoded(np.frombuffer(data, np.uint8), data[:12], _reduction(data, enough))
+            image = _full_range(image, data)
     except cv2.error as error:
         found = " ".join(error.err.split())
         if "MAX_IMAGE_PIXELS" in found:
@@ -172,6 +177,18 @@ def _decoded(data: np.ndarray, start: bytes, reduction: int) -> np.ndarray | Non
     if image is None or image.ndim == 2 or not is_bgr:
         return image
     return np.ascontiguousarray(image[..., 2::-1])
+
+
+def _full_range(image: np.ndarray | None, data: bytes) -> np.ndarray | None:
+    """Spread a PNM's values over its 8 or 16 bits: its header says what white is (Netpbm)."""
+    header = _PNM_HEADER.match(data)
+    if image is None or header is None:
+        return image
+    white, most = int(header[1]), np.iinfo(image.dtype).max
+    is_text = data[1] in b"23"  # of which OpenCV spreads 8 bits itself
+    if not 0 < white < most or (is_text and most == 255):
+        return image
+    return np.rint(np.minimum(image, white) / white * most).astype(image.dtype)  # as Pillow
 
 
 def _jpeg_is_whole(data: bytes) -> bool:

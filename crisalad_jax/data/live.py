@@ -171,7 +171,7 @@ class Camera:
         self.name = _name(given)
         """What messages call it: no user or password of a URL."""
         self._begins = pathlib.Path(given).name if self._is_file else self.name
-        is_number = given.isdecimal() and not self._is_file
+        is_number = given.isdecimal() and len(given) < 10 and not self._is_file  # 32 bits
         known = self._is_file or is_number or "://" in given
         self._capture = cv2.VideoCapture(int(given) if is_number else given)
         whole = known and self._capture.isOpened() and self._capture.grab()

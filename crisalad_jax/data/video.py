@@ -240,8 +240,9 @@ def read_frame(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
 
 
 _IN_VIDEO = re.compile(r"(.+)#t=(\d+(?:\.\d+)?)", re.S)
-_SINCE_1970 = re.compile(r"(?<![\d.])(1\d{9})(?:\.(\d+)|(\d{3}|\d{6}|\d{9}))?(?![\d])")
-"""Seconds from 2001 to 2033, then decimals, or the digits of milli-, micro- or nanoseconds."""
+_SINCE_1970 = re.compile(r"(?<![\d.])(1\d{9})(?:\.(\d+)|(\d{3}|\d{6}|[_-]?\d{9}))?(?![\d])")
+"""Seconds from 2001 to 2033, then decimals, or the digits of milli-, micro- or nanoseconds.
+ROS writes seconds and nanoseconds apart."""
 
 
 class Moment(NamedTuple):
@@ -268,4 +269,4 @@ def moment_of(name: str | os.PathLike[str]) -> Moment | None:
     if len(found) != 1:
         return None
     whole, decimals, digits = found[0]
-    return Moment("", float(f"{whole}.{decimals or digits or 0}"))
+    return Moment("", float(f"{whole}.{decimals or digits.lstrip('_-') or 0}"))

@@ -114,6 +114,28 @@ def test_sixteen_bits_stay_for_the_model_to_reduce(tmp_path, suffix):
     np.testing.assert_array_equal(read_image(tmp_path / f"a{suffix}"), rgb >> 8)
 
 
+@pytest.mark.parametrize("white", [1, 15, 100, 254, 255, 1023, 4095, 65534, 65535])
+@pytest.mark.parametrize("kind", ["P2", "P3", "P5", "P6"])
+def test_white_of_a_pnm_is_what_its_header_says(tmp_path, kind, white):
+    """Pillow is another reader; the specification says that values are shares of the largest."""
+    channels = 3 if kind in ("P3", "P6") else 1
+    values = np.linspace(0, white, 48 * channels).round().astype(int).reshape(6, 8, channels)
+    head = f"{kind}\n# 1 2 3\n8 6 # a camera's\n{white}\n".encode()
+    if kind in ("P2", "P3"):
+        data = head + " ".join(map(str, values.ravel())).encode() + b"\n"
+    else:
+        data = head + values.astype(">u2" if white > 255 else np.uint8).tobytes()
+    (tmp_path / "a.pnm").write_bytes(data)
+    found = read_pixels(tmp_path / "a.pnm")
+    assert found.dtype == (np.uint16 if white > 255 else np.uint8)
+    shares = values / white * np.iinfo(found.dtype).max
+    # The nearest whole number; of texts OpenCV drops what is behind the point.
+    is_cut = white < 256 and kind in ("P2", "P3")
+    np.testing.assert_array_less(np.abs(found - shares), 1 if is_cut else 0.5 + 1e-9)
+    if white < 256 and not is_cut:
+        np.testing.assert_array_equal(read_image(tmp_path / "a.pnm"), pillow_rgb(data))
+
+
 @pytest.mark.parametrize(
     ("dtype", "unit"), [(np.float32, 0.01), (np.float64, 0.01), (np.int32, 1), (np.int16, -1)]
 )

@@ -164,6 +164,7 @@ def test_a_camera_ends_when_it_is_told_to(tmp_path):
 @pytest.mark.parametrize(
     ("camera", "words"),
     [
+        (str(2**31), "camera: found no frame from camera-2147483648,"),
         ("97", "camera: found no frame from camera-97, expected a number from 0, a URL or a video"),
         ("http://u:pass@127.0.0.1:9/x?pass@#x", "found no frame from http://127.0.0.1:9/x, exp"),
         ("{here}/text.avi", "text.avi, expected a number from 0"),

@@ -140,6 +140,9 @@ def test_metres_come_before_seconds_and_are_of_one_zone(tmp_path):
         ("20190612143501.jpg", None),
         ("13050311021.png", None),
         ("1305031102_1305031103.png", None),
+        ("1403636579_763555584.png", ("", 1403636579.763555584)),  # as ROS exports write
+        ("1403636579-163555584.png", ("", 1403636579.163555584)),
+        ("1403636579_7.png", ("", 1403636579.0)),  # a number of another kind
         ("@0584580.17@4477007.90@17@T@.jpg", None),
     ],
 )
