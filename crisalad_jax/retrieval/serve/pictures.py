@@ -72,6 +72,8 @@ async def receive_picture(request: Request, most_bytes: int) -> tuple[bytes, str
                         400, f"image: found a form of {names}, expected one file of this name"
                     )
                 return await image.read(), image.filename or "image"
+    except UnicodeError as error:  # of a codec that the form names
+        raise HTTPException(400, f"image: found a form of another charset: {error}") from error
     except TimeoutError as error:
         raise HTTPException(408, f"image: found half of it after {_PATIENCE:g} s") from error
 

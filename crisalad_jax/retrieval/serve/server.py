@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import ipaddress
+import logging
 import math
 import os
 import pathlib
@@ -31,6 +32,8 @@ from crisalad_jax.utils.host import most_files
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.signals import SignalState, defer_signals
 
+# It would write a line of each form that is not whole.
+logging.getLogger("python_multipart").setLevel(logging.ERROR)
 _GRACE = 30
 """Seconds that requests in flight have, after a signal, until they are dropped."""
 _HEAD, _EXCHANGE = 10, 120
