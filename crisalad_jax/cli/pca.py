@@ -10,8 +10,9 @@ from crisalad_jax.cli.common import echo, pick
 from crisalad_jax.cli.flags import WEIGHTS, JsonFlag, QuietFlag
 from crisalad_jax.config.checks import require
 from crisalad_jax.nn.model import Model
-from crisalad_jax.retrieval.descriptor_files import open_npy
-from crisalad_jax.retrieval.pca import SAMPLES, PcaConfig, fit_pca, save_pca
+from crisalad_jax.retrieval.describer import describer_of
+from crisalad_jax.retrieval.descriptor_files import MADE_BY, open_npy, read_record
+from crisalad_jax.retrieval.pca import SAMPLES, PcaConfig, fit_pca, save_pca, shortened
 
 EXAMPLE = "crisalad pca --descriptors photos.npy --dim 512 --out pca.safetensors"
 
@@ -47,17 +48,19 @@ def run(arguments: Pca) -> dict[str, Any]:
     dim = model.config.projection.dim if model else 0
     require(not dim, f"{weights}: found a model with a projection to {dim} numbers already")
     descriptors = open_npy(arguments.descriptors, verify=arguments.verify)
+    made = read_record(arguments.descriptors)
     pca = fit_pca(
         descriptors,
         arguments.dim,
         PcaConfig(arguments.whiten, arguments.renormalise),
+        model=made.get(MADE_BY, ""),
         name=str(arguments.descriptors),
         **pick(arguments, "samples", "seed", "quiet"),
     )
     if model is None:
         save_pca(arguments.out, pca)
     else:
-        pca.check(model.config.descriptor_dim, str(weights))
+        shortened(pca, describer_of(model), str(weights))
         layer, projection = pca.projection()
         params = dataclasses.replace(model.params, projection=layer)
         config = dataclasses.replace(model.config, projection=projection)

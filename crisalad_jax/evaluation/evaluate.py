@@ -97,7 +97,7 @@ def evaluate(
     parsed = check_evaluation(groupings, seed=seed, seeds=seeds, precision=precision)
     describer = describer_of(model, groupings)
     config = describer.config
-    _, is_unit = shortened(pca, config, "model")
+    _, is_unit = shortened(pca, describer, "model")
     if rerank is not None:
         rerank.check(config, len(benchmark.database))
         if rerank.model is None:

@@ -35,6 +35,8 @@ from crisalad_jax.utils.shapes import Float, Int
 
 _DIGESTS = "files"
 """Key of the digests in the record, by the files' roles."""
+MADE_BY = "model_sha256"
+"""Key of the `model_hash` in the record of descriptors that this package made."""
 _SUFFIXES = (".npy", ".h5")
 _INFLATION = 1100
 """Largest ratio of numbers to bytes that deflate, HDF5's compression, reaches."""
@@ -43,6 +45,13 @@ _INFLATION = 1100
 def record_of(path: pathlib.Path) -> pathlib.Path:
     """Return the path of the JSON file that tells how the descriptors in `path` were made."""
     return path.with_name(f"{path.name}.json")
+
+
+def read_record(path: pathlib.Path) -> dict[str, Any]:
+    """Read how the descriptors in `path` were made; nothing where they have no record."""
+    record = record_of(path)
+    known = read_json(record, "a record of descriptors") if record.is_file() else {}
+    return known if isinstance(known, dict) else {}
 
 
 def targets(path: pathlib.Path) -> list[pathlib.Path]:

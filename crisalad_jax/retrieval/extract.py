@@ -6,7 +6,7 @@ import itertools
 import os
 import pathlib
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -31,9 +31,10 @@ from crisalad_jax.retrieval.describe import (
 )
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.descriptor_files import (
+    MADE_BY,
     open_npy,
     read_descriptors,
-    record_of,
+    read_record,
     targets,
     write_descriptors,
     write_rows,
@@ -49,7 +50,6 @@ from crisalad_jax.utils.files import (
     check_format,
     check_no_links,
     check_target,
-    read_json,
     real_path,
     wrap_os_errors,
 )
@@ -150,9 +150,10 @@ def extract(
     )
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca, verify=verify)
     made_by = "--pairs" if pairs is not None else "model" if weights is None else str(weights)
-    length, is_unit = shortened(components, describer.config, made_by, unit=pairs is not None)
+    length, is_unit = shortened(components, describer, made_by, unit=pairs is not None)
     paths, names = _listed(images, root, fps, reading)
-    others = None if pairs is None else _others(pairs, names, database, length, verify=verify)
+    made = {} if out is None and database is None else _made(describer, components)
+    others = None if pairs is None else _others(pairs, names, database, length, made, verify=verify)
     reading = reading.fitted(len(paths))
     source = str(images) if isinstance(images, str | os.PathLike) else "images"
     work = _Work(
@@ -167,6 +168,7 @@ def extract(
         "seed": seed,
         "pca": f"{length} components" if isinstance(pca, Pca) else pca and str(pca),
         "model": to_plain(describer.config),
+        **made,
     }
 
     def finish(
@@ -202,7 +204,7 @@ def extract(
     check_no_links(folder, itself=True)
     shares = Shares(folder, Share.parse(share), digest_of(names, common | work.settings()))
     is_there = all(file.exists() for file in targets(out))
-    known = read_json(record_of(out), "a record of descriptors") if is_there else {}
+    known = read_record(out) if is_there else {}
     if known.get(_SHARES) == shares.digest:  # joined from shares of these images and settings
         listed, descriptors = read_descriptors(out)
         return Extracted(listed, descriptors, known["skipped"])
@@ -456,13 +458,33 @@ def _inside(path: pathlib.Path, root: StrPath) -> pathlib.PurePath:
     return whole.relative_to(holder)
 
 
+def _made(describer: Describer, components: Pca | None) -> dict[str, str | None]:
+    """Return what descriptors that are compared have to share, for their record."""
+    return {
+        MADE_BY: describer.digest,
+        "pca_sha256": None if components is None else pca_hash(components),
+    }
+
+
 def _others(
-    pairs: StrPath, names: list[str], database: StrPath | None, length: int, *, verify: bool
+    pairs: StrPath,
+    names: list[str],
+    database: StrPath | None,
+    length: int,
+    made: Mapping[str, str | None],
+    *,
+    verify: bool,
 ) -> tuple[list[str], Descriptors] | None:
     """Read the descriptors to pair the images with; None pairs them with themselves."""
     check_names(pairs, names)
     if database is None:
         return None
+    known = read_record(pathlib.Path(database))
+    require(
+        MADE_BY not in known or all(known.get(key) == value for key, value in made.items()),
+        f"{database}: found descriptors of another model, or shortened in another way, by their "
+        "record; expected them as those that are paired with them",
+    )
     listed, descriptors = read_descriptors(database, verify=verify)
     check_names(pairs, listed)
     as_rows(descriptors, str(database), length)

@@ -20,9 +20,9 @@ from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Float32, Float64
 
 if TYPE_CHECKING:
-    from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.layers import Linear
     from crisalad_jax.nn.projection import ProjectionConfig
+    from crisalad_jax.retrieval.describer import Describer
 
 FORMAT = "crisalad-jax pca 2"
 """The one key of a file's metadata; its value is JSON: the file's checksum and the `PcaConfig`."""
@@ -61,6 +61,8 @@ class Pca(NamedTuple):
     total: Float32[np.ndarray, ""]
     """Variance of the fitted descriptors in all directions."""
     config: PcaConfig
+    model: str = ""
+    """The `model_hash` of the model whose descriptors were fitted; "" where it is not known."""
 
     @property
     def kept(self) -> float:
@@ -121,22 +123,28 @@ class Pca(NamedTuple):
 
 
 def shortened(
-    pca: Pca | None, config: "ModelConfig", name: str, *, unit: bool = False
+    pca: Pca | None, describer: "Describer", name: str, *, unit: bool = False
 ) -> tuple[int, bool]:
     """Check that components fit a model; return the descriptors' length, and if they are unit.
 
     Args:
         pca: the components; None leaves descriptors as they are.
-        config: the model's configuration.
+        describer: the model.
         name: what messages call the model, or what asks for the descriptors.
         unit: whether these have to be unit vectors.
 
     Raises:
         InputError: the components were fitted to other descriptors, or no unit vectors are left.
     """
+    config = describer.config
     length, is_unit = config.descriptor_dim, config.unit_length
     if pca is not None:
         pca.check(length, name)
+        require(
+            not pca.model or pca.model == describer.digest,
+            f"{name}: found components that were fitted to descriptors of model {pca.model[:12]}, "
+            "expected those of this model",
+        )
         length, is_unit = len(pca.components), pca.config.renormalise
     require(
         is_unit or not unit,
@@ -153,6 +161,7 @@ def fit_pca(
     *,
     samples: int | None = SAMPLES,
     seed: int = 0,
+    model: str = "",
     name: str = "descriptors",
     quiet: bool = True,
 ) -> Pca:
@@ -168,6 +177,7 @@ def fit_pca(
         config: whether to whiten, and whether to normalise.
         samples: fit at most so many descriptors, drawn at random; None for all.
         seed: draws them.
+        model: the `model_hash` of the model that made the descriptors, which others are refused by.
         name: what messages call the descriptors, such as their file.
         quiet: no progress bar.
 
@@ -221,7 +231,7 @@ def fit_pca(
     largest = np.take_along_axis(components, np.abs(components).argmax(axis=1)[:, None], axis=1)
     found = (mean, components * np.sign(largest), variances, whole)
     mean, components, variances, whole = (np.asarray(array, np.float32) for array in found)
-    return Pca(mean, components, variances, whole, config or PcaConfig())
+    return Pca(mean, components, variances, whole, config or PcaConfig(), model)
 
 
 def _rows_at_a_time(length: int) -> int:
@@ -265,7 +275,7 @@ def save_pca(path: str | os.PathLike[str], pca: Pca) -> None:
         InputError: the file cannot be written.
     """
     arrays = {name: np.array(getattr(pca, name), order="C") for name in _ARRAYS}
-    write_sealed(path, arrays, FORMAT, {"config": to_plain(pca.config)})
+    write_sealed(path, arrays, FORMAT, {"config": to_plain(pca.config), "model": pca.model})
 
 
 @takes(path=PATH)
@@ -301,4 +311,5 @@ def load_pca(path: str | os.PathLike[str], *, verify: bool = True) -> Pca:
         array.dtype == WIDE and np.isfinite(array).all() for array in arrays.values()
     ):
         raise InputError(f"{path}: found arrays {found}, expected {shapes} of finite float32")
-    return Pca(**arrays, config=from_plain(PcaConfig, value.get("config"), source=str(path)))
+    config = from_plain(PcaConfig, value.get("config"), source=str(path))
+    return Pca(**arrays, config=config, model=str(value.get("model", "")))

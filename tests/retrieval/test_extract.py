@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 
+from crisalad_jax.checkpoints.weights import model_hash
 from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval import extract as extract_module
@@ -72,6 +73,27 @@ def test_components_in_memory(params, town, expected, tmp_path):
     loose = fit_pca(expected, 3, PcaConfig(renormalise=False))
     with pytest.raises(InputError, match="--pairs: found descriptors whose lengths are left"):
         run(params, town, pca=loose, pairs=tmp_path / "pairs.txt")
+
+
+def test_only_descriptors_of_the_same_model_are_paired_or_shortened(params, town, tmp_path):
+    """Others of the same length would give pairs and components that mean nothing."""
+    other = jax.tree.map(lambda leaf: leaf * 1.01, params)
+    out, pairs = tmp_path / "d.npy", tmp_path / "pairs.txt"
+    found = run(params, town, out)
+    digest = model_hash(params, MODEL)
+    assert json.loads((tmp_path / "d.npy.json").read_text())["model_sha256"] == digest
+    assert run(params, town, pairs=pairs, database=out, k=1).pairs
+    words = "d.npy: found descriptors of another model, or shortened in another way"
+    with pytest.raises(InputError, match=words):
+        run(other, town, tmp_path / "e.npy", pairs=pairs, database=out)
+    for place, turned in (("a", 1), ("b", -1)):  # other components of the same length
+        fitted = fit_pca(turned * found.descriptors[: 4 + turned], 2, model=digest)
+        run(params, town, tmp_path / f"{place}.npy", pca=fitted)
+    with pytest.raises(InputError, match=r"a\.npy: found descriptors of another model"):
+        run(params, town, pca=fitted, pairs=pairs, database=tmp_path / "a.npy")
+    with pytest.raises(InputError, match=f"fitted to descriptors of model {digest[:12]}"):
+        run(other, town, tmp_path / "e.npy", pca=fitted)
+    assert not list(tmp_path.glob("e.*"))
 
 
 def test_unreadable_images_of_a_list(params, town, tmp_path):

@@ -127,11 +127,12 @@ def test_bad_descriptors_are_named():
 
 
 def test_what_is_saved_comes_back(tmp_path):
-    found = fit_pca(_descriptors(30, 12), 5, PcaConfig(whiten=True, renormalise=False))
+    config = PcaConfig(whiten=True, renormalise=False)
+    found = fit_pca(_descriptors(30, 12), 5, config, model="ab12")
     path = tmp_path / "new" / "pca.safetensors"
     save_pca(path, found)
     again = load_pca(path)
-    assert again.config == found.config
+    assert (again.config, again.model) == (found.config, "ab12")
     for a, b in zip(again[:4], found[:4], strict=True):
         np.testing.assert_array_equal(a, b)
     assert [one.name for one in path.parent.iterdir()] == ["pca.safetensors"]

@@ -94,12 +94,11 @@ def new_metadata(
             of another length; what `check_store` raises.
     """
     check_store(store, dtype)
-    config = describer.config
-    length, _ = shortened(pca, config, str(weights), unit=True)
+    length, _ = shortened(pca, describer, str(weights), unit=True)
     return MapMetadata(
         model=describer.digest,
         weights=recorded(weights),
-        config=to_plain(config),
+        config=to_plain(describer.config),
         descriptor_length=length,
         store=store_name(store, folder),
         dtype=dtype,
