@@ -39,8 +39,13 @@ class Positions(NamedTuple):
     """The zone of east and north; None where it is unknown, and of other axes."""
 
     def check(self) -> None:
-        """Raise InputError where a number is NaN, or larger than any position's."""
+        """Raise InputError for other axes, or where a position is not two numbers in range."""
+        if self.axes not in AXES:
+            raise InputError(f"positions: found axes {self.axes}, expected one of {AXES}")
         for name, at in self.of.items():
+            is_pair = isinstance(at, Sequence) and len(at) == 2
+            if not is_pair or not all(isinstance(x, int | float) for x in at):
+                raise InputError(f"{name}: found position {at!r}, expected two Python numbers")
             if not all(abs(each) <= MOST_METRES for each in at):
                 raise InputError(
                     f"{name}: found position {at}, expected numbers of at most {MOST_METRES:g}"

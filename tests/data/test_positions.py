@@ -1,5 +1,6 @@
 """Positions from names and tables."""
 
+import numpy as np
 import pytest
 
 from crisalad_jax.data.positions import Positions, read_image_table, utm_positions
@@ -22,6 +23,20 @@ def test_names_say_east_and_north():
 def test_a_position_that_no_map_stores_is_refused(at):
     with pytest.raises(InputError, match=r"^a.jpg: found position .*, expected numbers of at most"):
         Positions(("x", "y"), {"a.jpg": at}).fitted("map", None, None)
+
+
+@pytest.mark.parametrize(
+    "at", [(np.float32(1), np.float32(2)), np.ones(2), (1.0, 2.0, 3.0), "12", None, ("1", "2")]
+)
+def test_what_is_no_pair_of_numbers_is_refused(at):
+    """JSON, which maps keep them in, has no numbers of NumPy."""
+    with pytest.raises(InputError, match=r"^a.jpg: found position .*, expected two Python numbers"):
+        Positions(("x", "y"), {"a.jpg": at}).fitted("map", None, None)
+
+
+def test_other_axes_are_refused():
+    with pytest.raises(InputError, match=r"found axes .*lon.*lat.*, expected one of"):
+        Positions(("lon", "lat"), {"a.jpg": (1.0, 2.0)}).fitted("map", None, None)
 
 
 @pytest.mark.parametrize(

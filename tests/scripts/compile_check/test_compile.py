@@ -13,7 +13,7 @@ ROOT = pathlib.Path(__file__).parents[3]
 EXPECTED = ROOT / "docs" / "accelerators" / "compile_check.json"
 OURS = ("XLA_FLAGS", "JAX_PLATFORMS")
 """Variables of the tests, which a user has not set."""
-NEEDS = {"h100": "jax_plugins.xla_cuda12", "v5e": "libtpu"}
+NEEDS = {"h100": "jax_plugins.xla_cuda12", "v5e": "libtpu", "v6e": "libtpu"}
 
 
 def compile_check(target: str, *arguments: object) -> subprocess.CompletedProcess[str]:
