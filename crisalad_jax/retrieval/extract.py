@@ -194,9 +194,7 @@ def extract(
 
     if share is None or out is None:
         with _work_folder(out) as folder:
-            # A single batch is nothing to resume: it needs no digest of the model.
-            resumes = out is not None and len(paths) > reading.batch_size
-            rows, skipped = work.resume(folder, resumes=resumes)
+            rows, skipped = work.resume(folder, resumes=out is not None)
             return finish([rows], skipped, folder)
     out = pathlib.Path(out)
     common = {name: value for name, value in record.items() if name not in ("weights", "images")}
