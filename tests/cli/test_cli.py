@@ -20,7 +20,7 @@ import torch
 import crisalad_jax.cli
 from crisalad_jax.checkpoints.formats import public_shapes
 from crisalad_jax.checkpoints.public import read_checkpoint
-from crisalad_jax.checkpoints.weights import load_weights, save_weights
+from crisalad_jax.checkpoints.weights import load_weights, model_hash, save_weights
 from crisalad_jax.cli import main
 from crisalad_jax.config.io import read_config, to_plain
 from crisalad_jax.data.images import list_images, read_image
@@ -606,6 +606,8 @@ def test_extract_writes_descriptors_names_and_configuration(
         "pca": None,
         "skipped": [],
         "model": to_plain(MODEL),
+        "model_sha256": model_hash(params, MODEL),
+        "pca_sha256": None,
     }
 
 
