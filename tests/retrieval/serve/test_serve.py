@@ -211,11 +211,10 @@ def test_a_form_with_two_files_or_too_many_fields(service, pictures):
     ):
         reply = service.ask("POST", "/locate", body, **headers)
         assert (reply.status, reply.json) == (400, {"error": words})
-    for charset in ("undefined", "punycode"):
-        named = {"Content_Type": f"{headers['Content_Type']}; charset={charset}"}
-        reply = service.ask("POST", "/locate", data, **named)
-        assert reply.status == 400
-        assert reply.json["error"].startswith("image: found a form of another charset: ")
+    named = {"Content_Type": f"{headers['Content_Type']}; charset=undefined"}  # no text is of it
+    reply = service.ask("POST", "/locate", data, **named)
+    assert reply.status == 400
+    assert reply.json["error"].startswith("image: found a form of another charset: ")
     assert not logging.getLogger("python_multipart.multipart").isEnabledFor(logging.WARNING)
 
 
