@@ -293,11 +293,10 @@ class _Work:
     def settings(self) -> dict[str, Any]:
         """Return what all rows depend on, except the images."""
         return {
-            "digest": self.describer.digest,
+            **_made(self.describer, self.components),
             "config": to_plain(self.describer.config),
             "batch_size": self.reading.batch_size,
             "rows": "descriptors" if self.grouping == "single" else "tokens",
-            "pca": self.components and pca_hash(self.components),
         }
 
     def opened(self, folder: pathlib.Path) -> Segments:
@@ -457,7 +456,7 @@ def _inside(path: pathlib.Path, root: StrPath) -> pathlib.PurePath:
 
 
 def _made(describer: Describer, components: Pca | None) -> dict[str, str | None]:
-    """Return what descriptors that are compared have to share, for their record."""
+    """Return the hashes that tell what made descriptors: compared ones share them."""
     return {
         MADE_BY: describer.digest,
         "pca_sha256": None if components is None else pca_hash(components),
