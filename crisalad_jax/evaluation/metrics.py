@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Int64
 
-from crisalad_jax.config.short_repr import brief
+from crisalad_jax.config.checks import check_count, require
+from crisalad_jax.config.short_repr import brief, in_one_line
 from crisalad_jax.utils.errors import InputError
 
 
@@ -55,8 +56,10 @@ def recalls(
         K -> fraction of the queries, 0 to 1.
 
     Raises:
-        InputError: what `right_retrievals` raises.
+        InputError: a K below 1, or what `right_retrievals` raises.
     """
+    for k in ks:
+        check_count("ks", k)
     right = right_retrievals(indices, positives)
     return {k: float(right[:, :k].any(axis=1).mean()) for k in ks}
 
@@ -86,7 +89,15 @@ def bootstrap_interval(
         hits: in how many of the trials each query was a hit.
         trials: for instance the seeds of a shuffle; the interval does not hold their spread.
         confidence: of the interval, above 0 and below 1.
+
+    Raises:
+        InputError: no queries, a hit below 0 or above `trials`, or such a confidence.
     """
+    require(
+        np.size(hits) > 0 and bool(np.isin(hits, np.arange(trials + 1)).all()),
+        f"hits: found {in_one_line(hits)}, expected numbers of hits, from 0 to {trials}",
+    )
+    require(0 < confidence < 1, f"confidence: found {confidence}, expected above 0 and below 1")
     queries = len(hits)
     size = queries * trials + 1
     frequencies = np.bincount(hits, minlength=trials + 1) / queries
@@ -130,7 +141,11 @@ def accepted(
     Returns:
         The similarities from the highest on; and for each threshold the index in them of the last
         accepted query, and the number of accepted queries that are right.
+
+    Raises:
+        InputError: a similarity is NaN.
     """
+    require(not np.isnan(similarities).any(), "similarities: found NaN, expected numbers")
     order = np.argsort(-similarities, kind="stable")
     ordered = similarities[order]
     last = np.flatnonzero(np.append(ordered[1:] != ordered[:-1], True))
@@ -158,7 +173,7 @@ def precision_recall(
         The curve, or None if no query has a positive, for then recall is undefined.
 
     Raises:
-        InputError: what `right_retrievals` raises.
+        InputError: a similarity is NaN, or what `right_retrievals` raises.
     """
     right = right_retrievals(indices[:, :1], positives)[:, 0]
     answerable = sum(np.size(wanted) > 0 for wanted in positives)

@@ -98,7 +98,7 @@ def operating_point(
         similarity reaches the precision, the one of the highest precision.
 
     Raises:
-        InputError: such a precision, or what `right_retrievals` raises.
+        InputError: such a precision, a similarity that is NaN, or what `right_retrievals` raises.
 
     Example:
         >>> import numpy as np

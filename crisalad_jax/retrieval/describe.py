@@ -6,13 +6,13 @@ Nothing here imports JAX: what computes is a `Describer`.
 import itertools
 import os
 import pathlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.short_repr import brief
+from crisalad_jax.config.short_repr import brief, in_one_line
 from crisalad_jax.data.loader import ImageBatch
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
@@ -76,8 +76,10 @@ def _as_list(name: str, given: Any) -> list[Any]:
     """Return what was given, a file or a list, as a list.
 
     Raises:
-        InputError: the list is empty.
+        InputError: it is neither, or an empty list.
     """
+    if not isinstance(given, str | os.PathLike | Iterable):
+        raise InputError(f"{name}: found {in_one_line(given)}, expected images")
     found = [given] if isinstance(given, str | os.PathLike) else list(given)
     if not found:
         raise InputError(f"{name}: found none, expected at least one image")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
-from crisalad_jax.config.checks import PATH, check_seed, check_types, require, takes
+from crisalad_jax.config.checks import PATH, check_count, check_seed, check_types, require, takes
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.retrieval.chunks import WIDE, Descriptors, as_rows, blocks, sample
@@ -196,10 +196,11 @@ def fit_pca(
         (50, 3)
     """
     check_seed("seed", seed)
+    check_count("dim", dim)
     descriptors = as_rows(descriptors, name)
     total, length = descriptors.shape
     count = total if samples is None else min(samples, total)
-    if not 1 <= dim <= min(count - 1, length):
+    if dim > min(count - 1, length):
         raise InputError(
             f"dim: found {dim}, expected 1 to {min(count - 1, length)}, the highest rank that "
             f"{count} descriptors of length {length} can have about their mean"

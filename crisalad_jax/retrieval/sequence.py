@@ -108,7 +108,9 @@ class BayesFilter:
         """
         common = _checked("common", common, (max(1, np.size(common)),))
         count = len(common)
-        along = np.arange(count, dtype=np.float64) if along is None else along.astype(np.float64)
+        along = (
+            np.arange(count, dtype=np.float64) if along is None else np.asarray(along, np.float64)
+        )
         if along.shape != common.shape or not (np.diff(along) >= 0).all():
             raise InputError(
                 f"along: found shape {along.shape}, expected {common.shape}, in ascending order"

@@ -36,6 +36,12 @@ def test_positives_that_cannot_be_counted_are_refused(queries, positives):
         scores.recalls(np.zeros((queries, 3), np.int64), [np.array(each) for each in positives])
 
 
+@pytest.mark.parametrize("k", [0, -1, 1.5])
+def test_a_k_that_is_no_count_is_refused(k):
+    with pytest.raises(InputError, match=f"^ks: found {k}, expected "):
+        scores.recalls(np.zeros((1, 3), np.int64), [np.array([1])], ks=(1, k))
+
+
 # intervals
 
 
@@ -71,7 +77,29 @@ def test_the_same_trial_thrice_is_that_trial():
     assert scores.bootstrap_interval(np.full(50, 1), trials=3) == (1 / 3, 1 / 3)
 
 
+@pytest.mark.parametrize(
+    ("hits", "trials", "confidence", "words"),
+    [
+        ([], 1, 0.95, r"hits: found array\(\[\].*, expected numbers of hits, from 0 to 1"),
+        ([0, -1], 1, 0.95, "hits: found .*, from 0 to 1"),
+        ([0, 3], 2, 0.95, "hits: found .*, from 0 to 2"),
+        ([0, 1], 1, 95, "confidence: found 95, expected above 0 and below 1"),
+        ([0, 1], 1, 0.0, "confidence: found 0.0, expected"),
+    ],
+)
+def test_hits_without_an_interval_are_refused(hits, trials, confidence, words):
+    with pytest.raises(InputError, match=f"^{words}"):
+        scores.bootstrap_interval(np.array(hits, int), trials, confidence)
+
+
 # precision and recall
+
+
+def test_a_similarity_that_is_nan_is_refused():
+    with pytest.raises(InputError, match=r"^similarities: found NaN, expected numbers"):
+        scores.precision_recall(
+            np.zeros((2, 1), np.int64), np.array([[0.5], [np.nan]]), 2 * [np.array([0])]
+        )
 
 
 def _curve(similarities, right, answerable=None):

@@ -61,6 +61,8 @@ def test_nothing_and_other_types_are_refused(params: Crisalad) -> None:
         describe_images(Model(params, MODEL), [])
     with pytest.raises(InputError, match="files: found none, expected at least one image"):
         describe_files(Model(params, MODEL), [])
+    with pytest.raises(InputError, match="files: found None, expected images"):
+        describe_files(Model(params, MODEL), None)
     with pytest.raises(InputError, match="image: found float64 of shape"):
         describe_images(Model(params, MODEL), [np.zeros((9, 9, 3))])
     with pytest.raises(InputError, match=r"no-file\.png"):

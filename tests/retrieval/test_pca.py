@@ -99,7 +99,8 @@ def test_too_many_components_name_the_rank():
         (np.ones((20, 12), np.float32), 2, "at most 0, the rank"),
         (rows, 13, "1 to 12, .* 40 descriptors"),
         (_descriptors(12, 30), 12, "1 to 11"),
-        (rows, 0, "1 to 12"),
+        (rows, 0, "at least 1"),
+        (rows, 2.5, "a whole number of at least 1"),
     ):
         with pytest.raises(InputError, match=f"^dim: found {dim}, expected {words}"):
             fit_pca(some, dim)

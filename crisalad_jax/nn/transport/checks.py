@@ -42,10 +42,10 @@ def check_inputs(
         len(shape) >= 2 and 0 not in shape[-2:],
         f"sinkhorn: found scores of shape {shape}, expected (..., rows, columns)",
     )
-    vectors = {"log_mu": (log_mu, rows), "log_nu": (log_nu, columns)}
-    if init is not None:
-        vectors |= {"init.row": (init[0], rows), "init.column": (init[1], columns)}
-    for name, (vector, target) in {**vectors, "epsilon": (epsilon, ())}.items():
+    require(not jnp.iscomplexobj(scores), "sinkhorn: found complex scores, expected real ones")
+    starts = {"init.row": (init[0], rows), "init.column": (init[1], columns)} if init else {}
+    vectors = {"log_mu": (log_mu, rows), "log_nu": (log_nu, columns), "epsilon": (epsilon, ())}
+    for name, (vector, target) in {**vectors, **starts}.items():
         require(
             _spreads(jnp.shape(vector), target),
             f"sinkhorn: {name} found of shape {jnp.shape(vector)}, expected {target} for scores of "
@@ -53,6 +53,8 @@ def check_inputs(
         )
     wide = wide_dtype(scores)
     _check("scores found with NaN or infinity, expected finite numbers", jnp.isfinite, scores)
+    for name, (vector, _) in starts.items():
+        _check(f"{name} found with NaN, expected numbers", lambda x: ~jnp.isnan(x), vector)
     for name, masses in (("log_mu", log_mu), ("log_nu", log_nu)):
         words = "found with NaN, infinity or no mass at all, expected finite numbers, or -inf for a"
         _check(f"{name} {words} mass of 0", _are_masses, masses)

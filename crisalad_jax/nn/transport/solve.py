@@ -96,11 +96,11 @@ def solve(
         The plan's logarithm, the potentials, and how well the plan meets its marginals.
 
     Raises:
-        InputError: shapes that do not fit, a tau out of range, a
+        InputError: complex scores, shapes that do not fit, a tau out of range, a
             step that returns anything but such potentials; and where values are known (outside of
-            `jit` and `grad`): scores that are not finite, masses that are NaN or infinite or all 0,
-            masses that sum to different totals, an epsilon of 0 or less or too small; or
-            `config.throw`, and a tolerance that was not met. Inside of `jit` the last
+            `jit` and `grad`): scores that are not finite, an `init` with NaN, masses that are NaN
+            or infinite or all 0, masses that sum to different totals, an epsilon of 0 or less or
+            too small; or `config.throw`, and a tolerance that was not met. Inside of `jit` the last
             is a RuntimeError of the compiled program, and only if it uses a value of the result.
 
     Example:

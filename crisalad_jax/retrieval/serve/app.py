@@ -25,6 +25,7 @@ from fastapi import Query
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, Response
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from pydantic_core import PydanticCustomError
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
@@ -33,6 +34,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from crisalad_jax.data.images import IMAGE_SUFFIXES, decode_image
 from crisalad_jax.data.positions import AXES, MOST_METRES, Positions, exif_position, utm_positions
 from crisalad_jax.data.resize import Pixels
+from crisalad_jax.data.tables import number_of
 from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.maps.map import Answer
 from crisalad_jax.retrieval.maps.query import answer_fields, position_fields
@@ -180,7 +182,15 @@ class _Asked(pydantic.BaseModel, extra="forbid"):
     """Number of answers; by default the service's, see /map."""
 
 
-_Metres = Annotated[float | None, pydantic.Field(ge=-MOST_METRES, le=MOST_METRES)]
+def _plain(text: str) -> str:
+    """Refuse what is no plain number: pydantic too reads 1_0 as 10."""
+    if math.isnan(number_of(text)):
+        raise PydanticCustomError("number", "expected a number")
+    return text
+
+
+_Number = Annotated[float | None, pydantic.BeforeValidator(_plain)]
+_Metres = Annotated[_Number, pydantic.Field(ge=-MOST_METRES, le=MOST_METRES)]
 
 
 class _NewImage(pydantic.BaseModel, extra="forbid"):
@@ -189,8 +199,8 @@ class _NewImage(pydantic.BaseModel, extra="forbid"):
     name: str
     east: _Metres = None
     north: _Metres = None
-    lat: float | None = pydantic.Field(None, ge=-90, le=90)
-    lon: float | None = pydantic.Field(None, ge=-180, le=180)
+    lat: _Number = pydantic.Field(None, ge=-90, le=90)
+    lon: _Number = pydantic.Field(None, ge=-180, le=180)
     x: _Metres = None
     y: _Metres = None
 

@@ -111,7 +111,10 @@ def metric_loss(
     ):
         require(not lacks, f"{name}: found no {what}")
     wide = descriptors.astype(jnp.promote_types(descriptors.dtype, jnp.float32))
-    valid = jnp.ones(len(labels), bool) if valid is None else valid
+    if valid is None:
+        valid = jnp.ones(len(labels), bool)
+    else:  # what takes no part may be NaN
+        wide = jnp.where(valid[:, None], wide, 0)
     every = all_pairs(labels, valid=valid) if pairs is None else pairs
     batch = LossBatch(wide, labels, valid, every, classes, dense)
     similarities = jax.lax.stop_gradient(batch.similarities)

@@ -76,6 +76,7 @@ BAD_SOLVES: dict[str, tuple[dict[str, Any], str]] = {
         {"init": (jnp.zeros(6), jnp.zeros(6))},
         r"^sinkhorn: init.column found of shape \(6,\), expected \(3,\)",
     ),
+    "complex scores": ({"scores": SCORES + 1j}, "found complex scores, expected real ones"),
     "newton, relaxed rows": (
         {"row_tau": 0.5, "config": SinkhornConfig("newton")},
         "step newton: found row_tau 0.5 and column_tau 1.0, expected 1",
@@ -124,6 +125,14 @@ def test_what_no_dustbin_takes(name: str) -> None:
     arguments, message = BAD_DUSTBINS[name]
     with pytest.raises(InputError, match=message):
         assign_with_dustbin(*arguments)
+
+
+@pytest.mark.parametrize("name", ["row", "column"])
+def test_a_start_that_is_nan_is_refused(name: str) -> None:
+    start = Potentials(MU, NU)
+    start = start._replace(**{name: getattr(start, name).at[1].set(jnp.nan)})
+    with pytest.raises(InputError, match=rf"^sinkhorn: init\.{name} found with NaN"):
+        solve_with({"init": start})
 
 
 @pytest.mark.usefixtures("_unchecked")

@@ -494,6 +494,7 @@ def test_images_are_added_for_good(own_map, params, pictures):
             ("/images?name=b.jpg&x=1&y=2", 400, "found positions in x, y, expected east, north"),
             ("/images?name=b.jpg&lat=91&lon=2", 400, "lat: found '91'"),
             ("/images?name=b.jpg&lat=1&lon=180.5", 400, "lon: found '180.5'"),
+            ("/images?name=b.jpg&lat=1_0&lon=2", 400, "lat: found '1_0', expected a number"),
             ("/images?name=b.jpg&east=1", 400, "found east, expected east and north, or lat"),
             ("/images?name=b.jpg&east=nan&north=1", 400, "east: found 'nan'"),
         ):

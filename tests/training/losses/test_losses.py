@@ -206,6 +206,8 @@ def test_images_that_are_not_valid_take_no_part_in_any_loss(config: LossConfig) 
     np.testing.assert_allclose(found.easy_anchor_fraction, alone.easy_anchor_fraction, rtol=1e-6)
     np.testing.assert_array_equal(gradient[len(x) :], 0)
     assert loss(jnp.asarray(padded), jnp.zeros(len(padded), bool))[0] == 0
+    padded[-1] = np.nan  # padding may be anything
+    np.testing.assert_allclose(loss(jnp.asarray(padded))[0], found.loss, rtol=1e-6)
 
 
 def test_a_nan_is_not_taken_for_a_perfect_batch() -> None:
