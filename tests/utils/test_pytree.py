@@ -29,6 +29,9 @@ def test_leaves_without_values_are_printed():
     jax.eval_shape(lambda pair: seen.append(repr(pair)), Pair(shape, None))
     lines = ["Pair", "  left  (1000, 500)  float32", "1 leaf, 500,000 parameters, 2.0 MB"]
     assert seen == ["\n".join(lines)]
+    for rows, size in ((750, "1.5 MB"), (200, "400.0 kB"), (10**6, "2.0 GB")):
+        text = repr(Pair(jax.ShapeDtypeStruct((rows, 500), jnp.float32), None))
+        assert text.endswith(f"1 leaf, {rows * 500:,} parameters, {size}")
     assert repr(Pair(shape, None)) == seen[0]
     assert repr(Pair(None, "label")).splitlines()[1:] == [
         "  right  str",
