@@ -185,10 +185,15 @@ class BayesFilter:
             The best place at each frame, from this frame and those before it.
 
         Raises:
-            InputError: what `start` and `step` raise.
+            InputError: `moved` of another number of frames, or what `start` and `step` raise.
         """
         state, places, probabilities = self.start(common, along), [], []
-        steps = np.ones(len(similarities)) if moved is None else moved
+        steps = np.ones(len(similarities)) if moved is None else np.asarray(moved)
+        if steps.shape != (len(similarities),):
+            raise InputError(
+                f"moved: found shape {steps.shape}, expected one of each of the "
+                f"{len(similarities)} frames"
+            )
         for row, step in zip(similarities, steps, strict=True):
             state = self.step(state, row, float(step))
             places.append(int(state.belief.argmax()))

@@ -19,6 +19,13 @@ def test_names_say_east_and_north():
     }
 
 
+@pytest.mark.parametrize(("north", "south"), [("4182401.73", False), ("5000000.25", True)])
+def test_s_is_a_band_of_the_north_or_the_south(north, south):
+    """San Francisco is in band S, which ends at 40 degrees, 4,430 km from the equator."""
+    zone = utm_positions([f"@551550.00@{north}@10@S@.jpg"]).zone
+    assert (zone.number, zone.south) == (10, south)
+
+
 @pytest.mark.parametrize("at", [(float("nan"), 0.0), (0.0, 1e200), (-2e8, 0.0)])
 def test_a_position_that_no_map_stores_is_refused(at):
     with pytest.raises(InputError, match=r"^a.jpg: found position .*, expected numbers of at most"):

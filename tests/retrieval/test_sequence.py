@@ -188,6 +188,11 @@ def test_a_step_back_is_refused(moved):
         settings.step(settings.start(np.zeros(3)), np.eye(3)[0], moved)
 
 
+def test_steps_of_other_frames_are_refused():
+    with pytest.raises(InputError, match=r"^moved: found shape \(2,\), expected one of each of the 3 frames"):
+        BayesFilter().follow(np.eye(3), np.zeros(3), moved=[1.0, 2.0])
+
+
 @pytest.mark.parametrize("common", [np.ones(0), np.array([0.5, np.nan]), np.ones((2, 2))])
 def test_no_places_and_no_numbers_are_refused(common):
     with pytest.raises(InputError, match=r"^common: found .*, expected shape \(\d,\) of finite"):
