@@ -77,6 +77,16 @@ def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
     np.testing.assert_array_equal(values, params.aggregator.score.fc1.weight)
 
 
+def test_a_changed_number_is_refused_unless_asked_for(tmp_path, shared):
+    data = bytearray((shared / "weights.safetensors").read_bytes())
+    data[-1] ^= 1
+    changed = tmp_path / "changed.safetensors"
+    changed.write_bytes(data)
+    with pytest.raises(InputError, match=r"changed\.safetensors: found other bytes than were"):
+        weights.load_weights(changed)
+    assert weights.load_weights(changed, verify=False).config == MODEL
+
+
 def test_half_precision_is_half_the_room_and_every_number_rounded(tmp_path, shared, params):
     """Read again they are float32, and of these the digest is."""
     save_weights(tmp_path / "half.safetensors", Model(params, MODEL), half=True)
