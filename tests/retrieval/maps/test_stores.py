@@ -53,6 +53,19 @@ def fill(store: Store, rows: np.ndarray, sizes: tuple[int, ...]) -> None:
     assert first == len(rows)
 
 
+def test_an_addition_is_told_to_the_disk_before_it_counts(tmp_path, monkeypatch):
+    """A map's record, which counts it, is written after it; a power failure leaves both or none."""
+    synced = []
+
+    def fsync(descriptor: int) -> None:
+        synced.append(os.path.basename(os.readlink(f"/proc/self/fd/{descriptor}")))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    opened(tmp_path, "files").add(0, unit_rows(3))
+    assert len(synced) == 2  # the file under a temporary name, then the folder that has its name
+    assert [name.endswith(".npy") for name in synced] == [True, False]
+
+
 @pytest.mark.parametrize("k", [1, 4, 12])
 def test_search_is_exact_over_all_additions(store, k):
     rows, queries = unit_rows(12), unit_rows(5, seed=1)
