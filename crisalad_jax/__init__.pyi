@@ -30,7 +30,9 @@ from .experiments.comparison import compare as compare
 from .experiments.report import show_retrievals as show_retrievals
 from .experiments.report import show_transport as show_transport
 from .experiments.train import train as train
-from .nn.adapter import AdapterConfig as AdapterConfig
+from .nn.adapters import Adapter as Adapter
+from .nn.adapters import BlockShape as BlockShape
+from .nn.adapters import register_adapter as register_adapter
 from .nn.aggregators import Aggregator as Aggregator
 from .nn.aggregators import TokenShape as TokenShape
 from .nn.aggregators import register_aggregator as register_aggregator

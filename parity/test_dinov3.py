@@ -19,7 +19,6 @@ from transformers import DINOv3ViTConfig, DINOv3ViTModel
 from crisalad_jax.checkpoints.formats import infer, to_params, to_state
 from crisalad_jax.checkpoints.public import convert, read_checkpoint, write_checkpoint
 from crisalad_jax.checkpoints.published import PUBLISHED, published_model
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.backbones import FeatureSpec
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
@@ -66,7 +65,7 @@ def hugging_face(gated: bool) -> Any:
 def expected_config(gated: bool) -> ModelConfig:
     # As published: SwiGLU's two thirds of six times the width.
     sizes: dict[str, Any] = {"ffn": "swiglu", "mlp_ratio": 6.0} if gated else {}
-    backbone = DinoV3Config(dim=128, depth=2, heads=2, adapter=AdapterConfig(kind="none"), **sizes)
+    backbone = DinoV3Config(dim=128, depth=2, heads=2, adapter="none", **sizes)
     return ModelConfig(
         backbone=backbone, aggregator=ClassTokenConfig(), cross_image=CrossImageConfig(layers=0)
     )

@@ -11,7 +11,7 @@ import numpy as np
 import optax
 import pytest
 
-import crisalad_jax.nn.adapter
+import crisalad_jax.nn.adapters.bottleneck
 import crisalad_jax.nn.backbones.vit
 import crisalad_jax.nn.torch_layers
 import parity.cases.case
@@ -82,11 +82,11 @@ def _without_layer_scale(block: Any) -> Any:
     return wrong
 
 
-def _special_tokens_once(adapter: Any) -> Any:
-    def wrong(params: Any, tokens: Any, grid: tuple[int, int], **more: Any) -> Any:
+def _special_tokens_once(mlp_update: Any) -> Any:
+    def wrong(self: Any, params: Any, tokens: Any, grid: tuple[int, int], **more: Any) -> Any:
         # Without bias, half of what counts twice is what counts once.
         special = tokens.shape[-2] - grid[0] * grid[1]
-        adapted, updated = adapter(params, tokens, grid, **more)
+        adapted, updated = mlp_update(self, params, tokens, grid, **more)
         return adapted.at[..., :special, :].multiply(0.5), updated
 
     return wrong
@@ -134,7 +134,7 @@ def _transposed_mask(encoder: Any) -> Any:
 
 
 PARTS, VIT = parity.cases.parts, crisalad_jax.nn.backbones.vit
-TORCH = crisalad_jax.nn.torch_layers
+TORCH, ADAPTERS = crisalad_jax.nn.torch_layers, crisalad_jax.nn.adapters.bottleneck
 FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
     "blocks swapped": (
         "attention",
@@ -172,7 +172,7 @@ FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
     "epsilon of batch norm": (
         "block, multi-resolution adapter",
         FORWARD,
-        replace(crisalad_jax.nn.adapter, "BATCH_NORM_EPSILON", lambda _: 1e-5),
+        replace(ADAPTERS, "BATCH_NORM_EPSILON", lambda _: 1e-5),
     ),
     "tanh GELU": (
         "MLP",
@@ -183,7 +183,7 @@ FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
     "special tokens count once": (
         "block, depthwise adapter",
         FORWARD,
-        replace(VIT, "adapter", _special_tokens_once),
+        replace(ADAPTERS.DepthwiseConfig, "mlp_update", _special_tokens_once),
     ),
     "bicubic with a = -0.5": (
         "positions: square, up",

@@ -14,7 +14,6 @@ from torch.nn import functional as F
 from crisalad_jax import describe
 from crisalad_jax.checkpoints.formats import infer, to_params, to_state
 from crisalad_jax.checkpoints.public import read_checkpoint
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.salad import FolConfig
 from crisalad_jax.nn.backbones import FeatureSpec
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -31,7 +30,7 @@ from parity.test_independent import (
     shake,
 )
 
-BACKBONE = ViTConfig(dim=128, depth=3, heads=2, position_grid=5, adapter=AdapterConfig(kind="none"))
+BACKBONE = ViTConfig(dim=128, depth=3, heads=2, position_grid=5, adapter="none")
 HEAD = FolConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=24, local_hidden=12, local=8)
 
 

@@ -19,7 +19,7 @@ import pytest
 from crisalad_jax.checkpoints.formats import to_params, to_state
 from crisalad_jax.checkpoints.formats.families import HEADS, TABLES
 from crisalad_jax.checkpoints.formats.rows import Form, Rows, expand
-from crisalad_jax.nn.adapter import AdapterConfig, adapter, init_adapter
+from crisalad_jax.nn.adapters.bottleneck import MultiResolutionConfig
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.aggregators.base import to_descriptor
 from crisalad_jax.nn.aggregators.salad import SaladConfig
@@ -138,7 +138,7 @@ def test_vit(name: str, registers: int) -> None:
         heads=3,
         registers=registers,
         position_grid=5,
-        adapter=AdapterConfig(kind="none"),
+        adapter="none",
     )
     model = ModelConfig(
         backbone=config, aggregator=ClassTokenConfig(), cross_image=CrossImageConfig(layers=0)
@@ -169,13 +169,12 @@ def test_multi_resolution_adapter() -> None:
     golden = load("multiconv_adapter")
     # The stored one narrows 24 channels to 4, not to a sixteenth: our configuration has the names
     # and the structure, not the widths.
-    config = ViTConfig(dim=48, heads=3, adapter=AdapterConfig("multi-resolution", bottleneck=1.0))
-    template = jax.eval_shape(
-        lambda key: init_adapter(key, config.dim, config.adapter), jax.random.key(0)
-    )
+    config = MultiResolutionConfig(bottleneck=1.0, alpha=1.0)
+    shape = ViTConfig(dim=48, heads=3).block_shape
+    template = jax.eval_shape(lambda key: config.init(key, shape), jax.random.key(0))
 
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        return {"tokens": adapter(params, inputs["tokens"], (5, 5))[0]}
+        return {"tokens": config.mlp_update(params, inputs["tokens"], (5, 5))[0]}
 
     names = part_names(TABLES["adapter"], template)
     check(function, golden, names, {"tokens": jnp.asarray(golden["in.tokens"])})

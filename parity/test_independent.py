@@ -34,7 +34,6 @@ from transformers import (
 from crisalad_jax.checkpoints.formats import to_state
 from crisalad_jax.checkpoints.formats.families import TABLES
 from crisalad_jax.checkpoints.public import read_checkpoint, write_checkpoint
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -118,7 +117,7 @@ def expected_config(kind: Kind) -> ModelConfig:
         ffn="swiglu" if kind.gated else "mlp",
         registers=kind.registers,
         position_grid=SIDE,
-        adapter=AdapterConfig(kind="none"),
+        adapter="none",
     )
     return ModelConfig(
         backbone=backbone,

@@ -22,7 +22,6 @@ from pytorch_metric_learning.miners import MultiSimilarityMiner
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.aggregators.gem import GemPyramidConfig
@@ -49,7 +48,7 @@ from parity.reference.vit import Features, ViT, grid_of
 
 HERE = pathlib.Path(__file__).parent
 OUTPUT_BOUND, GRADIENT_BOUND = 1e-6, 1e-5
-NO_ADAPTER = AdapterConfig(kind="none")
+NO_ADAPTER = "none"
 
 MODEL = ModelConfig(
     image_size=(42, 56),
@@ -257,7 +256,7 @@ SIZES = {"s": (384, 12, 6), "b": (768, 12, 12), "l": (1024, 24, 16), "g": (1536,
 NO_ENCODER = CrossImageConfig(layers=0)
 
 
-def dinov2(size: str, registers: int = 0, adapter: AdapterConfig = NO_ADAPTER) -> ViTConfig:
+def dinov2(size: str, registers: int = 0, adapter: str = NO_ADAPTER) -> ViTConfig:
     dim, depth, heads = SIZES[size]
     ffn = "swiglu" if size == "g" else "mlp"
     return ViTConfig(dim, depth, heads, ffn=ffn, registers=registers, adapter=adapter)
@@ -280,7 +279,7 @@ PUBLIC["dino_salad"] = (
 )
 PUBLIC["CricaVPR"] = (
     ModelConfig(
-        backbone=dinov2("b", adapter=AdapterConfig(kind="multi-resolution")),
+        backbone=dinov2("b", adapter="multi-resolution"),
         aggregator=GemPyramidConfig(),
     ),
     {"": "model_state_dict/module."},
@@ -366,7 +365,7 @@ Kind = Literal["depthwise", "multi-resolution"]
 @pytest.mark.parametrize("kind", ["depthwise", "multi-resolution"])
 def test_only_what_trains_moves(trainable: str, moving: tuple[str, ...], kind: Kind) -> None:
     torch.manual_seed(0)
-    backbone = ViTConfig(dim=32, depth=2, heads=2, position_grid=3, adapter=AdapterConfig(kind))
+    backbone = ViTConfig(dim=32, depth=2, heads=2, position_grid=3, adapter=kind)
     model = Crisalad(dataclasses.replace(MODEL, backbone=backbone))
     # From 0 no weight decay would move a parameter, nor a gradient one behind a dead ReLU.
     for parameter in model.parameters():

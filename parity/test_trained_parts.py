@@ -15,7 +15,8 @@ import torch
 
 from crisalad_jax import describe
 from crisalad_jax.checkpoints.formats import to_params, to_state
-from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.adapters import Adapter
+from crisalad_jax.nn.adapters.bottleneck import SideConfig
 from crisalad_jax.nn.aggregators.queries import BoqConfig, EdtFormerConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -31,7 +32,7 @@ BOUND = 1e-11
 SIZE = (42, 56)
 
 
-def model_of(aggregator: Any, adapter: AdapterConfig) -> ModelConfig:
+def model_of(aggregator: Any, adapter: Adapter | str) -> ModelConfig:
     return ModelConfig(
         image_size=SIZE,
         backbone=ViTConfig(dim=64, depth=2, heads=1, position_grid=3, adapter=adapter),
@@ -41,10 +42,10 @@ def model_of(aggregator: Any, adapter: AdapterConfig) -> ModelConfig:
     )
 
 
-BOQ = model_of(BoqConfig(channels=64, queries=3, layers=1, rows=5), AdapterConfig(kind="none"))
+BOQ = model_of(BoqConfig(channels=64, queries=3, layers=1, rows=5), "none")
 EDTFORMER = model_of(
     EdtFormerConfig(width=32, heads=4, queries=6, channels=10, rows=5),
-    AdapterConfig(kind="side", bottleneck=4 / 64, alpha=0.5),
+    SideConfig(bottleneck=4 / 64, alpha=0.5),
 )
 MODELS = {
     "BoQ": (BOQ, "last-1-blocks+head", lambda: Crisalad(BOQ)),

@@ -10,7 +10,6 @@ import numpy as np
 import safetensors.torch
 import torch
 
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
@@ -27,7 +26,7 @@ def bare_vit(depth: int = 2, position_grid: int = 2) -> ModelConfig:
         depth=depth,
         heads=1,
         position_grid=position_grid,
-        adapter=AdapterConfig(kind="none"),
+        adapter="none",
     )
     return ModelConfig(
         aggregator="class-token", backbone=backbone, cross_image=CrossImageConfig(layers=0)

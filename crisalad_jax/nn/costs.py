@@ -152,12 +152,15 @@ def adapter_macs(config: ModelConfig) -> int:
 def paper_adapter_macs(config: ModelConfig, macs: int) -> int:
     """Count an adapter's multiply-accumulates as the paper (Table 3: 39.223 M), each linear once.
 
+    Its linears are the layers called `down` and `up`; the paper's others are convolutions.
+
     Args:
         config: the model.
         macs: those of `adapter_macs`, which counts a linear layer at every token instead.
     """
     backbone: Any = config.backbone
-    tokens = 1 + backbone.registers + config.patches
-    adapters = 2 if backbone.adapter.kind == "serial-parallel" else 1
-    linears = adapters * 2 * backbone.dim * backbone.adapter_dim
-    return macs - (tokens - 1) * linears
+    weights = named_leaves(parameter_shapes(config).backbone.blocks.adapter).items()
+    linears = sum(
+        leaf.size for name, leaf in weights if f".{name}".endswith((".down.weight", ".up.weight"))
+    )
+    return macs - (backbone.registers + config.patches) * linears // backbone.depth

@@ -17,6 +17,8 @@ from crisalad_jax.config.part import OrName
 from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.data.augmentations import AUGMENTATIONS, Augmentation
+from crisalad_jax.nn.adapters import Adapter
+from crisalad_jax.nn.adapters.bottleneck import NoAdapter
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.trainable import EXPECTED, TRAINABLE
@@ -231,4 +233,4 @@ class TrainConfig:
 def has_adapters(model: ModelConfig) -> bool:
     """Return whether a model's backbone has adapters."""
     adapter = getattr(model.backbone, "adapter", None)
-    return adapter is not None and adapter.kind != "none"
+    return isinstance(adapter, Adapter) and not isinstance(adapter, NoAdapter)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.adapters import ADAPTERS
 from crisalad_jax.nn.aggregators import Aggregator
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
@@ -52,7 +52,7 @@ def _model(
     kind: Any = "none", *, encoder: int = 0, aggregator: str = "salad", **backbone: Any
 ) -> ModelConfig:
     # Of 64 the multi-resolution adapter's narrow convolutions have 4 channels.
-    bottleneck = 2.0 if kind == "multi-resolution" else 0.5
+    fields = {"bottleneck": 2.0} if kind == "multi-resolution" else {}
     return ModelConfig(
         image_size=SIZE,
         backbone=ViTConfig(
@@ -60,7 +60,7 @@ def _model(
             depth=2,
             heads=2,
             position_grid=4,
-            adapter=AdapterConfig(kind, bottleneck),
+            adapter=ADAPTERS.make(kind, **fields),
             **backbone,
         ),
         aggregator=AGGREGATORS[aggregator],

@@ -111,11 +111,11 @@ class MultiResolutionAdapter(MlpAdapter):
 
 
 def make_adapter(config: ViTConfig) -> MlpAdapter | None:
-    """The adapter of `config.adapter.kind`; None for "none"."""
-    dim, width = config.dim, config.adapter_dim
-    if config.adapter.kind == "depthwise":
+    """The adapter of `config.adapter.part_name`; None for "none"."""
+    dim, width = config.dim, int(config.dim * getattr(config.adapter, "bottleneck", 0))
+    if config.adapter.part_name == "depthwise":
         bias = config.adapter.bias == "convolutions"
         return DepthwiseAdapter(dim, width, config.adapter.kernel_size, bias=bias)
-    if config.adapter.kind == "multi-resolution":
+    if config.adapter.part_name == "multi-resolution":
         return MultiResolutionAdapter(dim, width)
-    return MlpAdapter(dim, width) if config.adapter.kind == "mlp" else None
+    return MlpAdapter(dim, width) if config.adapter.part_name == "mlp" else None

@@ -31,7 +31,7 @@ class SideViT(ViT):
         """An adapter for each block, none in it."""
         super().__init__(config)
         self.alpha = config.adapter.alpha
-        width = config.adapter_dim
+        width = config.adapter.width(config.dim)
         self.adapters = nn.ModuleList(SideAdapter(config.dim, width) for _ in self.blocks)
 
     def run_blocks(self, tokens: Tensor, grid: tuple[int, int]) -> Tensor:

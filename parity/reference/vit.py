@@ -87,7 +87,7 @@ class Block(nn.Module):
         """With the feed-forward network and the adapter that `config` names."""
         super().__init__()
         feed_forward = SwiGlu if config.ffn == "swiglu" else Mlp
-        self.alpha = config.adapter.alpha
+        self.alpha = getattr(config.adapter, "alpha", 0.0)
         self.norm1 = LayerNorm(config.dim, eps=NORM_EPSILON)
         self.attn = Attention(config.dim, config.heads)
         self.ls1 = LayerScale(config.dim, config.layer_scale_init)

@@ -40,7 +40,6 @@ from usual import as_users_write_it, narrowed
 import jax  # isort: skip
 import torch  # isort: skip
 
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.gem import CosPlaceConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
@@ -76,7 +75,7 @@ MODELS: Mapping[str, ModelConfig] = {
     ),
     "megaloc": ModelConfig(
         image_size=(322, 322),
-        backbone=ViTConfig(adapter=AdapterConfig(kind="none")),
+        backbone=ViTConfig(adapter="none"),
         aggregator=SaladConfig(cluster_dim=256),
         cross_image=CrossImageConfig(layers=0),
         projection=ProjectionConfig(dim=8448),

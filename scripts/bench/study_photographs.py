@@ -22,7 +22,6 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.report import RecallRow, recall_table
 from crisalad_jax.experiments.report.tables import Cell, Table, write_text
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.loop import fit
@@ -39,12 +38,12 @@ def variants() -> dict[str, TrainConfig]:
     no_encoder = dataclasses.replace(
         model, cross_image=dataclasses.replace(model.cross_image, layers=0)
     )
-    backbone = dataclasses.replace(model.backbone, adapter=AdapterConfig(kind="none"))
+    backbone = dataclasses.replace(model.backbone, adapter="none")
     no_adapter = dataclasses.replace(model, backbone=backbone)
     return {
         "whole": whole,
         "cross_image.layers 0": dataclasses.replace(whole, model=no_encoder),
-        "adapter.kind none": dataclasses.replace(whole, model=no_adapter),
+        "adapter none": dataclasses.replace(whole, model=no_adapter),
     }
 
 

@@ -15,7 +15,7 @@ from crisalad_jax.checkpoints.formats import (
     to_state,
 )
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.adapters.bottleneck import DepthwiseConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -29,7 +29,7 @@ from tests.random_checkpoints import UNDER, as_arrays, bare_vit, blank, public_l
 
 PUBLIC = sorted(path.stem for path in FOLDER.glob("*.json"))
 BARE = CrossImageConfig(layers=0)
-NO_ADAPTER = AdapterConfig(kind="none")
+NO_ADAPTER = "none"
 
 
 def inner(name: str) -> dict[str, tuple[int, ...]]:
@@ -42,7 +42,7 @@ def inner(name: str) -> dict[str, tuple[int, ...]]:
 
 def expected(name: str) -> tuple[str, ModelConfig]:
     if name == "CricaVPR":
-        adapter = AdapterConfig(kind="multi-resolution")
+        adapter = "multi-resolution"
         backbone = dataclasses.replace(PRESETS["b14"].backbone, adapter=adapter)
         floats = PreprocessingConfig(antialias=False, pixels="floats")
         return "cricavpr", ModelConfig(
@@ -73,12 +73,12 @@ BACKBONES = {
     "registers, SwiGLU, MLP adapter": {
         "registers": 3,
         "ffn": "swiglu",
-        "adapter": AdapterConfig(kind="mlp"),
+        "adapter": "mlp",
     },
-    "multi-resolution": {"adapter": AdapterConfig(kind="multi-resolution")},
-    "serial and parallel": {"adapter": AdapterConfig(kind="serial-parallel")},
-    "side": {"adapter": AdapterConfig(kind="side")},
-    "bias of the up-projection": {"adapter": AdapterConfig(bias="up")},
+    "multi-resolution": {"adapter": "multi-resolution"},
+    "serial and parallel": {"adapter": "serial-parallel"},
+    "side": {"adapter": "side"},
+    "bias of the up-projection": {"adapter": DepthwiseConfig(bias="up")},
 }
 MODELS = {
     "crisalad": MODEL,
@@ -162,7 +162,7 @@ def test_unusual_widths_are_inferred() -> None:
             heads=2,
             mlp_ratio=2.5,
             position_grid=4,
-            adapter=AdapterConfig(kernel_size=5, bottleneck=0.25),
+            adapter=DepthwiseConfig(kernel_size=5, bottleneck=0.25),
         ),
         aggregator=SaladConfig(clusters=5, cluster_dim=32, token_dim=64, hidden=48),
         cross_image=CrossImageConfig(layers=1, feedforward=40),

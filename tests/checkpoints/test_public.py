@@ -27,7 +27,6 @@ from crisalad_jax.checkpoints.public import (
 )
 from crisalad_jax.checkpoints.safetensors_io import write_safetensors
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
@@ -262,9 +261,7 @@ def test_half_precision_is_widened_exactly(tmp_path: pathlib.Path, dtype, suffix
 
 
 def fresh(adapter: str, **fields) -> tuple[ModelConfig, object]:
-    backbone = dataclasses.replace(
-        HUGGING_FACE.backbone, adapter=AdapterConfig(kind=adapter), **fields
-    )
+    backbone = dataclasses.replace(HUGGING_FACE.backbone, adapter=adapter, **fields)
     config = ModelConfig(backbone=backbone)
     return config, init_crisalad(jax.random.key(1), config).backbone
 

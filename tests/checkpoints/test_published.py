@@ -17,7 +17,6 @@ from crisalad_jax.checkpoints.formats import FORMATS, VOCABULARY, infer, public_
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.public import vocabulary_model
 from crisalad_jax.checkpoints.published import PUBLISHED, published_model
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config, rotary_periods
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
@@ -261,7 +260,7 @@ def inferred(name: str) -> tuple[str, ModelConfig]:
         return VOCABULARY, vocabulary_model(len(words), stored(model.backbone)[1], {})
     assert model.format == "dinov3"
     # The chain is the same for all sizes.
-    backbone = DinoV3Config(adapter=AdapterConfig(kind="none"))
+    backbone = DinoV3Config(adapter="none")
     alone = dataclasses.replace(bare_vit(), backbone=backbone)
     state = blank(public_shapes(alone, "dinov3"))
     periods = rotary_periods(alone.backbone.dim // alone.backbone.heads)

@@ -9,7 +9,6 @@ import torch
 import crisalad_jax as cj
 from crisalad_jax.checkpoints.formats import public_shapes
 from crisalad_jax.checkpoints.public import read_backbone
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.gem import CosPlaceConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
@@ -22,9 +21,7 @@ from tests.random_checkpoints import random_state, save
 
 Tensors = dict[str, torch.Tensor]
 SALAD = ModelConfig(
-    backbone=ViTConfig(
-        dim=64, depth=2, heads=1, position_grid=2, adapter=AdapterConfig(kind="none")
-    ),
+    backbone=ViTConfig(dim=64, depth=2, heads=1, position_grid=2, adapter="none"),
     aggregator=SaladConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16),
     cross_image=CrossImageConfig(layers=0),
 )

@@ -28,7 +28,6 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.results import to_json
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
@@ -127,7 +126,7 @@ def test_help_lists_every_command_and_flag(capfd):
                 assert POSITIONAL[command, field.name] in help_text
             elif field.name != "settings":
                 assert f"--{field.name.replace('_', '-')}" in help_text
-    for flag in ("--model.backbone.adapter.kind", "--optimiser.learning-rate"):
+    for flag in ("--model.backbone.adapter", "--optimiser.learning-rate"):
         assert flag in succeeds(capfd, "train", "--help-all")
 
 
@@ -416,9 +415,7 @@ def test_bad_weights_are_named_by_every_command(capfd, tmp_path, shared, kind):
 
 BACKBONE = ModelConfig(
     aggregator="class-token",
-    backbone=ViTConfig(
-        dim=64, depth=2, heads=1, position_grid=3, adapter=AdapterConfig(kind="none")
-    ),
+    backbone=ViTConfig(dim=64, depth=2, heads=1, position_grid=3, adapter="none"),
     cross_image=CrossImageConfig(layers=0),
 )
 
@@ -459,7 +456,7 @@ def test_convert_refuses_in_one_line(capfd, tmp_path, public):
 @pytest.mark.slow
 def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public, weights):
     model = dataclasses.replace(
-        RECIPE.model, backbone=dataclasses.replace(BACKBONE.backbone, adapter=AdapterConfig())
+        RECIPE.model, backbone=dataclasses.replace(BACKBONE.backbone, adapter="depthwise")
     )
     recipe = dataclasses.replace(RECIPE, model=model, trainable="adapters+head", epochs=1)
     write_json(tmp_path / "recipe.json", to_plain(recipe))

@@ -9,7 +9,6 @@ import torch
 from crisalad_jax.checkpoints.formats import VOCABULARY, public_shapes
 from crisalad_jax.checkpoints.public import convert, read_checkpoint, read_vocabulary
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -20,9 +19,7 @@ from tests.conftest import assert_equal
 from tests.random_checkpoints import random_state, save
 
 BARE = ModelConfig(
-    backbone=ViTConfig(
-        dim=64, depth=2, heads=1, position_grid=2, adapter=AdapterConfig(kind="none")
-    ),
+    backbone=ViTConfig(dim=64, depth=2, heads=1, position_grid=2, adapter="none"),
     aggregator="class-token",
     cross_image=CrossImageConfig(layers=0),
 )

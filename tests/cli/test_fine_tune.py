@@ -10,7 +10,7 @@ from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.cli import train
 from crisalad_jax.config.io import differences
-from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.adapters.bottleneck import MlpConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model
 from crisalad_jax.training.config import MiningConfig
@@ -90,8 +90,7 @@ LOCAL = cj.PRESETS["tiny"].preprocessing
     ("found", "expected", "count"),
     [
         (CrossImageConfig(heads=4), NO_ENCODER, 1),  # the layers alone
-        (AdapterConfig(kind="none"), AdapterConfig(kind="none", alpha=0.5, bottleneck=0.1), 0),
-        (AdapterConfig(kind="mlp", alpha=0.5), AdapterConfig(kind="mlp"), 1),
+        (MlpConfig(alpha=0.5), MlpConfig(), 1),
         (LOCAL, dataclasses.replace(LOCAL, mean=(0.0, 0.0, 0.0), deviation=(1.0, 1.0, 1.0)), 0),
         (MiningConfig(), MiningConfig(negatives=3, positive_radius=5.0), 0),
     ],

@@ -16,7 +16,7 @@ from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
-from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.adapters.bottleneck import DepthwiseConfig, MlpConfig, MultiResolutionConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
@@ -80,7 +80,7 @@ def test_the_recipes_are_their_papers():
     salad = recipe("b14", "salad")
     assert (salad.places_per_batch, salad.images_per_place, salad.epochs) == (60, 4, 4)
     assert (salad.trainable, salad.monitor) == ("last-4-blocks+head", "R@1")
-    assert (salad.model.backbone.adapter.kind, salad.model.cross_image.layers) == ("none", 0)
+    assert (salad.model.backbone.adapter.part_name, salad.model.cross_image.layers) == ("none", 0)
     optimiser = salad.optimiser
     assert optimiser == OptimiserConfig(
         kind="adamw",
@@ -93,7 +93,7 @@ def test_the_recipes_are_their_papers():
     cricavpr = recipe("b14", "cricavpr")
     assert (cricavpr.places_per_batch, cricavpr.images_per_place) == (72, 4)
     assert cricavpr.model.descriptor_dim == 10_752
-    assert cricavpr.model.backbone.adapter.kind == "multi-resolution"
+    assert cricavpr.model.backbone.adapter.part_name == "multi-resolution"
     optimiser = cricavpr.optimiser
     assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == ("adam", 1e-4, 0.0)
     assert (optimiser.schedule, optimiser.step_epochs, optimiser.step_gamma) == ("step", 3, 0.5)
@@ -212,7 +212,10 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
         assert config.model.compute_dtype == "bfloat16"
     for config in (boq, mix, vlad, image, buff):
         assert config.model.image_size == (224, 224)
-        assert (config.model.backbone.adapter.kind, config.model.cross_image.layers) == ("none", 0)
+        assert (config.model.backbone.adapter.part_name, config.model.cross_image.layers) == (
+            "none",
+            0,
+        )
         assert config.images_per_place == 4
 
 
@@ -259,7 +262,8 @@ def test_the_recipes_over_resnet_are_as_published():
     assert eigenplaces.model.compute_dtype == "bfloat16"
     edtformer = recipe("b14", "edtformer")
     assert edtformer.model.descriptor_dim == 4096
-    assert edtformer.model.backbone.adapter_dim == 4
+    backbone = edtformer.model.backbone
+    assert backbone.adapter.width(backbone.dim) == 4
     assert (edtformer.epochs, edtformer.patience, edtformer.monitor) == (15, 15, "R@5")
     assert edtformer.optimiser.step_gamma == 0.7
 
@@ -324,7 +328,7 @@ def test_an_unknown_name_lists_the_known():
         choose("colour", "", {"red": 1, "blue": 2})
 
 
-MULTI_RESOLUTION = AdapterConfig(kind="multi-resolution", bottleneck=0.25)
+MULTI_RESOLUTION = MultiResolutionConfig(bottleneck=0.25)
 NARROW = {"dim": 96, "heads": 2, "adapter": MULTI_RESOLUTION}
 LOCAL_FLOATS = {"normalisation": "local-contrast", "pixels": "floats"}
 
@@ -346,8 +350,8 @@ def test_more_patches_than_clusters(clusters, side):
 @pytest.mark.parametrize(
     ("kind", "fields", "words"),
     [
-        (AdapterConfig, {"kind": "linear"}, "AdapterConfig.kind: found 'linear', expected one of"),
-        (AdapterConfig, {"kernel_size": 4}, "AdapterConfig.kernel_size: found 4, expected an odd"),
+        (ViTConfig, {"adapter": "linear"}, "ViTConfig.adapter: found 'linear', expected one of"),
+        (DepthwiseConfig, {"kernel_size": 4}, "DepthwiseConfig.kernel_size: found 4, expected an"),
         (ViTConfig, {"heads": 7}, "ViTConfig.dim: found 768, expected a multiple of the 7 heads"),
         (ViTConfig, {"registers": -1}, "ViTConfig.registers: found -1, expected .* of at least 0"),
         (ViTConfig, {"dim": 6, "heads": 1, "position_init": "sincos"}, "dim: found 6, .* of 4"),
@@ -386,7 +390,7 @@ def test_what_does_not_fit_is_refused_in_one_line(kind, fields, words):
         (CrossImageConfig, {"layers": 1.5}, "1.5", "a whole number"),
         (CrossImageConfig, {"layers": True}, "True", "a whole number"),
         (CrossImageConfig, {"global_token": 1}, "1", "True or False"),
-        (ViTConfig, {"adapter": "mlp"}, "'mlp'", "AdapterConfig"),
+        (ViTConfig, {"adapter": MlpConfig}, "MlpConfig", "an adapter or its name"),
         (SinkhornConfig, {"tolerance": "1e-3"}, "'1e-3'", "a finite number above 0, or None"),
         (ModelConfig, {"image_size": [224, 224]}, "[224, 224]", "a tuple of 2, each a whole num"),
         (ModelConfig, {"image_size": (224, 2.5)}, "(224, 2.5)", "a tuple of 2, each a whole num"),
@@ -419,7 +423,7 @@ def test_anylocs_layer_is_its_papers_of_vit_g():
 
 
 def test_a_model_without_adapters_cannot_train_them():
-    bare = ModelConfig(backbone=ViTConfig(adapter=AdapterConfig(kind="none")))
+    bare = ModelConfig(backbone=ViTConfig(adapter="none"))
     with pytest.raises(InputError, match=r"found 'adapters\+head', expected .* without adapters"):
         TrainConfig(model=bare)
     assert TrainConfig(model=bare, trainable="last-4-blocks+head").model is bare

@@ -15,6 +15,7 @@ from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.config.short_repr import field_docs
 from crisalad_jax.evaluation.results import GroupingResult
+from crisalad_jax.nn.adapters.bottleneck import DepthwiseConfig
 from crisalad_jax.retrieval.maps.map import Answer, MapImage
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.training.recipes import RECIPES
@@ -24,7 +25,7 @@ NAMES = {
     kind.__name__: kind
     for kind in (
         *(cj.ModelConfig, cj.TrainConfig, cj.OptimiserConfig, cj.MiningConfig, cj.LossConfig),
-        *(cj.AdapterConfig, cj.CrossImageConfig, cj.ProjectionConfig, cj.PreprocessingConfig),
+        *(cj.CrossImageConfig, cj.ProjectionConfig, cj.PreprocessingConfig),
         *(cj.SinkhornConfig, ClassesConfig),
         *(type(registry.make(name)) for registry in REGISTRIES.values() for name in registry),
     )
@@ -52,8 +53,7 @@ def test_what_is_printed_makes_the_configuration_again(name):
 def test_what_is_not_in_use_is_left_out():
     alone = cj.CrossImageConfig(layers=0, heads=4, dropout=0.0)
     assert repr(alone) == "CrossImageConfig(layers=0)"
-    assert repr(cj.AdapterConfig(kind="none", alpha=0.5)) == "AdapterConfig(kind='none')"
-    assert repr(cj.AdapterConfig(alpha=0.5)) == "AdapterConfig(alpha=0.5)"
+    assert repr(DepthwiseConfig(alpha=0.5)) == "DepthwiseConfig(alpha=0.5)"
 
 
 def test_a_message_with_a_configuration_is_one_line():

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig, ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.gem import CosPlaceConfig, GemConfig, GemPyramidConfig
@@ -58,7 +57,7 @@ def macs_of(config: ModelConfig, images: int = 1) -> dict[str, int]:
     ],
 )
 def test_one_blocks_adapters_by_hand(kind: Any, macs: int, paper: int) -> None:
-    backbone = dataclasses.replace(PRESETS["b14"].backbone, adapter=AdapterConfig(kind=kind))
+    backbone = dataclasses.replace(PRESETS["b14"].backbone, adapter=kind)
     config = dataclasses.replace(PRESETS["b14"], backbone=backbone)
     assert adapter_macs(config) == macs
     assert paper_adapter_macs(config, macs) == paper
@@ -80,7 +79,7 @@ SMALL = ModelConfig(
 )
 PLAIN = dataclasses.replace(
     SMALL,
-    backbone=dataclasses.replace(SMALL.backbone, adapter=AdapterConfig(kind="none")),
+    backbone=dataclasses.replace(SMALL.backbone, adapter="none"),
     cross_image=CrossImageConfig(layers=0),
 )
 

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig, ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
@@ -40,7 +39,7 @@ from tests.nn.conftest import slow_unless
 
 SMALL = dataclasses.replace(
     MODEL,
-    backbone=dataclasses.replace(MODEL.backbone, adapter=AdapterConfig(kind="none")),
+    backbone=dataclasses.replace(MODEL.backbone, adapter="none"),
     cross_image=CrossImageConfig(layers=0),
 )
 PARTS: dict[str, Aggregator] = {

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.backbones.vit import VisionTransformer
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import describe, parameter_shapes
@@ -87,9 +86,7 @@ def test_every_model_traces_for_accelerators(name: str, chosen: Target) -> None:
 SMALL = dataclasses.replace(
     PRESETS["tiny"],
     projection=ProjectionConfig(dim=16),
-    backbone=dataclasses.replace(
-        PRESETS["tiny"].backbone, adapter=AdapterConfig("multi-resolution")
-    ),
+    backbone=dataclasses.replace(PRESETS["tiny"].backbone, adapter="multi-resolution"),
 )
 """With convolutions, SALAD's plan, an encoder and a projection."""
 PRODUCT = re.compile(r"stablehlo\.(?:dot_general|convolution).*")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.adapters.bottleneck import MultiResolutionConfig
 from crisalad_jax.nn.model import init_crisalad, tokens_and_statistics
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.step import init_train_state
@@ -23,7 +23,7 @@ from tests.training.test_step import STEP as WITHOUT_NORMS
 from tests.training.test_step import VALID, take_step
 
 # Of 64 the multi-resolution adapter's narrow convolutions have 4 channels.
-ADAPTER = AdapterConfig(kind="multi-resolution", bottleneck=2.0)
+ADAPTER = MultiResolutionConfig(bottleneck=2.0)
 MODEL = dataclasses.replace(
     WITHOUT_NORMS.model,
     backbone=dataclasses.replace(WITHOUT_NORMS.model.backbone, adapter=ADAPTER),

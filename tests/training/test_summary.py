@@ -4,16 +4,13 @@ import dataclasses
 
 import pytest
 
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.costs import part_costs
 from crisalad_jax.training.summary import model_summary
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL
 
-BARE = dataclasses.replace(
-    MODEL, backbone=dataclasses.replace(MODEL.backbone, adapter=AdapterConfig(kind="none"))
-)
+BARE = dataclasses.replace(MODEL, backbone=dataclasses.replace(MODEL.backbone, adapter="none"))
 
 
 @pytest.mark.parametrize(("config", "trainable"), [(MODEL, "adapters+head"), (BARE, "head")])

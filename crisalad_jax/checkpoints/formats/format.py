@@ -64,7 +64,7 @@ class Format:
     head_first: bool = False
     """Whether the head's first row is before the backbone's."""
     adapter: str = "none"
-    """Kind of the adapters; "any" is any."""
+    """Name of the adapter; "any" is any."""
     encoder: str = "no"
     """Whether there is a cross-image encoder: "yes", "no", or "any" where the file tells."""
     extras: Rows = ()
@@ -168,7 +168,9 @@ def parts_of(config: ModelConfig) -> dict[str, str]:
     return {
         "aggregator": config.aggregator.part_name,
         "backbone": backbone.part_name,
-        "adapter": backbone.adapter.kind if isinstance(backbone, VisionTransformer) else "none",
+        "adapter": backbone.adapter.part_name
+        if isinstance(backbone, VisionTransformer)
+        else "none",
         "encoder": "yes" if config.cross_image.layers else "no",
         "projection": "yes" if config.projection.dim else "no",
     }

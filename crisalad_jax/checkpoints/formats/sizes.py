@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from crisalad_jax.checkpoints.formats.rows import Rows, first_names
-from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.adapters import ADAPTERS, Adapter
 from crisalad_jax.nn.backbones.base import Backbone
 from crisalad_jax.nn.backbones.dinov3 import rotary_periods
 from crisalad_jax.nn.backbones.resnet import BLOCKS, STEM_SIDE, ResNetConfig
@@ -136,24 +136,24 @@ def square_side(area: int, otherwise: str) -> int:
     return length
 
 
-def _infer_adapter(read: Reader, width: int) -> AdapterConfig:
-    """Infer the kind and the sizes of the adapters; how much they weigh is as published."""
+def _infer_adapter(read: Reader, width: int) -> Adapter:
+    """Infer which adapters there are, and their sizes; how much they weigh is as published."""
     in_block = "blocks.0.adapter"
     names = {"side": "adapters.0", "serial-parallel": f"{in_block}1", "mlp": in_block}
-    has = [kind for kind, name in names.items() if read.has(f"{name}.D_fc1.weight")]
+    has = [name for name, start in names.items() if read.has(f"{start}.D_fc1.weight")]
     if not has:
-        return AdapterConfig(kind="none")
-    kind = has[0]
-    bottleneck = read.size(f"{names[kind]}.D_fc1.weight", 0) / width
-    if kind == "side":
-        return AdapterConfig(kind=kind, bottleneck=bottleneck, alpha=_SIDE_ALPHA)
-    if read.has(f"{in_block}.branch1.conv.weight"):
-        return AdapterConfig(kind="multi-resolution", bottleneck=bottleneck)
-    if not read.has(f"{in_block}.depthwise.weight"):
-        return AdapterConfig(kind=kind, bottleneck=bottleneck)  # pyright: ignore
-    kernel = read.size(f"{in_block}.depthwise.weight", 2)
-    bias = "convolutions" if read.has(f"{in_block}.depthwise.bias") else "up"
-    return AdapterConfig("depthwise", bottleneck, kernel_size=kernel, bias=bias)
+        return ADAPTERS.make("none")
+    name = has[0]
+    fields: dict[str, Any] = {"bottleneck": read.size(f"{names[name]}.D_fc1.weight", 0) / width}
+    if name == "side":
+        fields["alpha"] = _SIDE_ALPHA
+    elif read.has(f"{in_block}.branch1.conv.weight"):
+        name = "multi-resolution"
+    elif read.has(f"{in_block}.depthwise.weight"):
+        name = "depthwise"
+        fields["kernel_size"] = read.size(f"{in_block}.depthwise.weight", 2)
+        fields["bias"] = "convolutions" if read.has(f"{in_block}.depthwise.bias") else "up"
+    return ADAPTERS.make(name, **fields)
 
 
 def _infer_resnet(theirs: dict[str, str], read: Reader) -> ResNetConfig:

@@ -13,7 +13,7 @@ from crisalad_jax.checkpoints.formats.sizes import State
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.io import differences
 from crisalad_jax.config.part import with_non_semantic_fields_of
-from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.adapters.bottleneck import BottleneckAdapter
 from crisalad_jax.nn.backbones.vit import VisionTransformer
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, parameter_shapes
@@ -75,10 +75,9 @@ def _shown(config: ModelConfig) -> ModelConfig:
     if not isinstance(backbone, VisionTransformer):
         return config
     adapter = backbone.adapter
-    if adapter.kind != "none":
-        kernel = {} if adapter.kind == "depthwise" else {"kernel_size": AdapterConfig.kernel_size}
-        bottleneck = backbone.adapter_dim / backbone.dim
-        adapter = dataclasses.replace(adapter, bottleneck=bottleneck, **kernel)
+    if isinstance(adapter, BottleneckAdapter):
+        bottleneck = adapter.width(backbone.dim) / backbone.dim
+        adapter = dataclasses.replace(adapter, bottleneck=bottleneck)
     backbone = dataclasses.replace(
         backbone, mlp_ratio=backbone.hidden / backbone.dim, adapter=adapter
     )

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from crisalad_jax.experiments.comparison.methods import AdapterKind
-from crisalad_jax.nn.adapter import AdapterConfig, adapter, init_adapter
+from crisalad_jax.nn.adapters import ADAPTERS, Adapter
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.costs import adapter_macs, paper_adapter_macs
@@ -112,7 +111,7 @@ NOTES = (
 )
 
 
-_PAPER_PARAMETERS: Mapping[AdapterKind, int] = {
+_PAPER_PARAMETERS: Mapping[str, int] = {
     "mlp": 590_976,
     "multi-resolution": 761_472,
     "depthwise": 741_504,
@@ -124,11 +123,12 @@ def adapter_calls() -> dict[str, Callable[[], Callable[[], Any]]]:
     """Make what `race` takes, to time an adapter of each kind on four images."""
     key, tokens = jax.random.key(0), jnp.ones((4, 1 + 16 * 16, ViTConfig().dim), jnp.float32)
 
-    def ready(kind: AdapterKind) -> Callable[[], Any]:
-        params = init_adapter(key, tokens.shape[-1], AdapterConfig(kind=kind))
-        return lambda: jax.block_until_ready(_apply_adapter(params, tokens))
+    def ready(name: str) -> Callable[[], Any]:
+        adapter = ADAPTERS.make(name)
+        params = adapter.init(key, ViTConfig().block_shape)
+        return lambda: jax.block_until_ready(_apply_adapter(params, tokens, adapter))
 
-    return {kind: functools.partial(ready, kind) for kind in _PAPER_PARAMETERS}
+    return {name: functools.partial(ready, name) for name in _PAPER_PARAMETERS}
 
 
 def adapter_costs(seconds: Mapping[str, Sequence[float]]) -> list[AdapterCost]:
@@ -138,22 +138,21 @@ def adapter_costs(seconds: Mapping[str, Sequence[float]]) -> list[AdapterCost]:
         seconds: what `race` returns of `adapter_calls`; empty where they were not timed.
     """
     costs = []
-    for kind, paper_parameters in _PAPER_PARAMETERS.items():
-        config = AdapterConfig(kind=kind)
-        backbone = ViTConfig(adapter=config)
+    for name, paper_parameters in _PAPER_PARAMETERS.items():
+        backbone = ViTConfig(adapter=name)
         model = dataclasses.replace(PRESETS["b14"], backbone=backbone)
         true_macs = adapter_macs(model)
         macs = paper_adapter_macs(model, true_macs)
-        if kind == "mlp":  # the paper counts each weight twice here, and the biases
+        if name == "mlp":  # the paper counts each weight twice here, and the biases
             macs = 2 * macs + backbone.dim // 2 + backbone.dim
-        time = Spread.of(ratios(seconds, kind, "depthwise")) if seconds else None
-        make = functools.partial(init_adapter, dim=backbone.dim, config=config)
+        time = Spread.of(ratios(seconds, name, "depthwise")) if seconds else None
+        make = functools.partial(backbone.adapter.init, shape=backbone.block_shape)
         leaves = jax.tree.leaves(jax.eval_shape(make, jax.random.key(0)))
         parameters = sum(leaf.size for leaf in leaves)
-        costs.append(AdapterCost(kind, paper_parameters, parameters, macs, true_macs, time))
+        costs.append(AdapterCost(name, paper_parameters, parameters, macs, true_macs, time))
     return costs
 
 
-@jit
-def _apply_adapter(params: Any, tokens: jax.Array) -> jax.Array:
-    return adapter(params, tokens, (16, 16))[0]
+@functools.partial(jit, static_argnames="adapter")
+def _apply_adapter(params: Any, tokens: jax.Array, adapter: Adapter) -> Any:
+    return adapter.mlp_update(params, tokens, (16, 16))[0]

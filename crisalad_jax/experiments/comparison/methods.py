@@ -9,7 +9,6 @@ from typing import Literal, NamedTuple
 
 from crisalad_jax.config.flags import parse_changes
 from crisalad_jax.data.augmentations import Augmentation
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.recipes import (
     RECIPES,
@@ -21,8 +20,6 @@ from crisalad_jax.training.recipes import (
 )
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
-
-AdapterKind = Literal["depthwise", "multi-resolution", "mlp", "none"]
 
 
 class ComparedMethod(NamedTuple):
@@ -137,22 +134,18 @@ def method_training(name: str, preset: str, *, from_nothing: bool) -> TrainConfi
 class Ablation(NamedTuple):
     """A row of Table 2: CriSALAD with these settings."""
 
-    adapter: AdapterKind = "depthwise"
+    adapter: str = "depthwise"
     encoder: bool = True
     learning_rate: float = 6e-5
     schedule: Literal["linear", "step"] = "linear"
 
     def training(self, preset: str, *, from_nothing: bool) -> TrainConfig:
         """Make the paper's recipe with these settings, or from nothing that of `scratch`."""
-        config, rate = recipe(preset, "crisalad"), self.learning_rate
-        backbone, cross_image = config.model.backbone, config.model.cross_image
-        backbone = dataclasses.replace(backbone, adapter=AdapterConfig(kind=self.adapter))
+        config, rate = recipe(preset, f"crisalad+adapter:{self.adapter}"), self.learning_rate
         if not self.encoder:
-            cross_image = dataclasses.replace(cross_image, layers=0)
-        model = dataclasses.replace(config.model, backbone=backbone, cross_image=cross_image)
-        # The backbone stays frozen: without adapters the head alone trains.
-        trainable = "head" if self.adapter == "none" else config.trainable
-        config = dataclasses.replace(config, model=model, trainable=trainable)
+            cross_image = dataclasses.replace(config.model.cross_image, layers=0)
+            model = dataclasses.replace(config.model, cross_image=cross_image)
+            config = dataclasses.replace(config, model=model)
         if from_nothing:
             config = from_scratch(config)
             rate *= config.optimiser.learning_rate / OptimiserConfig.learning_rate

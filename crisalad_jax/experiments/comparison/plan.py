@@ -32,7 +32,6 @@ from crisalad_jax.experiments.comparison.methods import (
     method_training,
     parse_row,
 )
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import parse_groupings
 from crisalad_jax.retrieval.reranking import parse_reranking
@@ -326,11 +325,11 @@ def _check_method(name: str, wanted: ModelConfig, found: ModelConfig, path: path
     """Check that a file's model is one of a method."""
 
     def words(model: ModelConfig) -> str:
-        adapter = getattr(model.backbone, "adapter", AdapterConfig(kind="none"))
+        adapter = getattr(getattr(model.backbone, "adapter", None), "part_name", "none")
         encoder = "with" if model.cross_image.layers else "without"
         return (
             f"backbone {model.backbone.part_name}, aggregator {model.aggregator.part_name}, "
-            f"adapter {adapter.kind}, {encoder} a cross-image encoder"
+            f"adapter {adapter}, {encoder} a cross-image encoder"
         )
 
     if words(found) != words(wanted):

@@ -25,15 +25,10 @@ from crisalad_jax.config.checks import (
     require,
     require_field,
 )
-from crisalad_jax.config.part import non_semantic_field
+from crisalad_jax.config.part import OrName, non_semantic_field
+from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.nn import random_init
-from crisalad_jax.nn.adapter import (
-    Adapter,
-    AdapterConfig,
-    SerialParallelAdapter,
-    adapter,
-    init_adapter,
-)
+from crisalad_jax.nn.adapters import ADAPTERS, Adapter, BlockShape
 from crisalad_jax.nn.attention import Attention, Rotation, attention, first_token_attention
 from crisalad_jax.nn.attention_fused import padded_length
 from crisalad_jax.nn.backbones.base import (
@@ -59,7 +54,7 @@ from crisalad_jax.nn.layers import (
     linear,
     split_statistics,
 )
-from crisalad_jax.utils.pytree import pytree_dataclass
+from crisalad_jax.utils.pytree import expect_like, pytree_dataclass
 
 NORM_EPSILON = 1e-6
 _PRODUCTS = ("qkv", "attended", "hidden", "down", "mixed")
@@ -97,7 +92,8 @@ class Block:
     norm2: LayerNorm
     mlp: Mlp | SwiGlu
     ls2: Float[Array, "*stack dim"]
-    adapter: Adapter | None
+    adapter: Any
+    """Parameters of `VisionTransformer.adapter`; None where it has none."""
 
 
 @pytree_dataclass
@@ -134,13 +130,15 @@ class VisionTransformer(Backbone):
     ffn: Literal["mlp", "swiglu"] = "mlp"
     registers: NonNegativeInt = 0
     layer_scale_init: float = non_semantic_field(1.0)
-    adapter: AdapterConfig = AdapterConfig()
+    adapter: OrName[Adapter] = part_field(ADAPTERS, "depthwise")
+    """Registered adapter of every block, or its name."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
+        resolve_names(self)
         words = f"a multiple of the {self.heads} heads"
         require_field(self, "dim", self.dim % self.heads == 0, words)
-        self.adapter.width(self.dim)
+        self.adapter.check(self.block_shape)
 
     @property
     def hidden(self) -> int:
@@ -149,14 +147,17 @@ class VisionTransformer(Backbone):
         return (int(hidden * 2 / 3) + 7) // 8 * 8 if self.ffn == "swiglu" else hidden
 
     @property
-    def adapter_dim(self) -> int:
-        """Width of the adapter's bottleneck."""
-        return self.adapter.width(self.dim)
+    def block_shape(self) -> BlockShape:
+        """Sizes of a block, for its adapter."""
+        dim, hidden, swiglu = self.dim, self.hidden, self.ffn == "swiglu"
+        first, second = ("w12", "w3") if swiglu else ("fc1", "fc2")
+        mlp = {first: (dim, 2 * hidden if swiglu else hidden), second: (hidden, dim)}
+        return BlockShape(dim, {"qkv": (dim, 3 * dim), "proj": (dim, dim), **mlp})
 
     @property
     def extras(self) -> str:
-        """Registers and the kind of adapter."""
-        return f", {self.registers} registers, adapter {self.adapter.kind}"
+        """Registers and the adapter."""
+        return f", {self.registers} registers, adapter {self.adapter.part_name}"
 
     def init_positions(
         self, key: PRNGKeyArray
@@ -196,19 +197,21 @@ class VisionTransformer(Backbone):
 
     def _init_block(self, key: PRNGKeyArray) -> Block:
         qkv, proj, first, second, adapter_key = random_init.split(key, 5)
-        dim, hidden, swiglu = self.dim, self.hidden, self.ffn == "swiglu"
-        mlp_layers = (
-            init_small_linear(first, dim, 2 * hidden if swiglu else hidden),
-            init_small_linear(second, hidden, dim),
-        )
+        dim, shape = self.dim, self.block_shape
+        layers = [
+            init_small_linear(layer_key, *sizes)
+            for layer_key, sizes in zip(
+                (qkv, proj, first, second), shape.linears.values(), strict=True
+            )
+        ]
         return Block(
             norm1=init_layer_norm(dim),
-            attn=Attention(init_small_linear(qkv, dim, 3 * dim), init_small_linear(proj, dim, dim)),
+            attn=Attention(*layers[:2]),
             ls1=random_init.full((dim,), self.layer_scale_init),
             norm2=init_layer_norm(dim),
-            mlp=SwiGlu(*mlp_layers) if swiglu else Mlp(*mlp_layers),
+            mlp=SwiGlu(*layers[2:]) if self.ffn == "swiglu" else Mlp(*layers[2:]),
             ls2=random_init.full((dim,), self.layer_scale_init),
-            adapter=init_adapter(adapter_key, dim, self.adapter),
+            adapter=self.adapter.init(adapter_key, shape),
         )
 
     def apply(
@@ -380,7 +383,7 @@ def _checked_levels(request: FeatureSpec, config: VisionTransformer) -> tuple[in
         "levels or a facet": levels != (config.depth,) or request.facet != "token",
         "inserted tokens": request.inserted is not None,
         "the class token's attention": request.class_attention,
-        "adapters on a side path": config.adapter.kind == "side",
+        "adapters on a side path": config.adapter.has_side_path,
     }
     found = [name for name, is_asked in special.items() if is_asked]
     require(len(found) < 2, f"features: found {' and '.join(found)}, expected one of these alone")
@@ -463,8 +466,8 @@ def run_blocks(
 ) -> tuple[TokenBatch, list[Block]]:
     """Run stacks of blocks in turn, each with one compiled body.
 
-    Side adapters have a path of their own, from which the tokens come. After every block its
-    adapter takes the sum of both paths. Between the first and the last block the tokens are padded
+    An adapter may have a path of its own, from which the tokens then come (`Adapter.side_path`).
+    Between the first and the last block the tokens are padded
     as `attention` needs them on this platform.
 
     Args:
@@ -489,16 +492,15 @@ def run_blocks(
         tokens, side = carry
         tokens, statistics = block(layer, tokens, grid, config, length=length, valid=valid)
         if side is not None:
-            adapted: Any = layer.adapter
-            side = tokens + side
+            both = tokens + side
             with jax.named_scope("adapter"):
-                update, _ = adapter(adapted, side, grid, length=length, activation=gelu)
-                side = _residual(side, config.adapter.alpha, update)
+                side = config.adapter.side_path(layer.adapter, both, grid, length=length)
+            expect_like(f"adapter {config.adapter.part_name}", side, both)
         return (tokens, side), statistics
 
     # prevent_cse=False: inside a scan, CSE cannot undo the remat.
     body = jax.checkpoint(body, prevent_cse=False, policy=_POLICIES[remat])
-    carry = tokens, tokens if config.adapter.kind == "side" else None
+    carry = tokens, tokens if config.adapter.has_side_path else None
     statistics = []
     with jax.named_scope("blocks"):
         for stack in stacks if count is None else ():
@@ -529,7 +531,7 @@ def block(
     """Run one block (paper Eq. 2), with LayerScale on MLP plus adapter, as in CricaVPR.
 
     Args:
-        params: the block, without its side adapter if it has one.
+        params: the block.
         tokens: of a batch of images.
         grid: rows and columns of patches.
         config: the backbone's.
@@ -542,21 +544,28 @@ def block(
     normed = layer_norm(params.norm1, tokens, epsilon=config.norm_epsilon)
     attn, rotation = config.attention_of(params), config.rotation(grid)
     attended = attention(attn, normed, config.heads, length=length, rotation=rotation)
-    parallel = params.adapter
-    if isinstance(parallel, SerialParallelAdapter):
-        with jax.named_scope("adapter"):
-            attended = attended + adapter(parallel.serial, attended, grid, length=length)[0]
-        parallel = parallel.parallel
+    with jax.named_scope("adapter"):
+        extra = config.adapter.attention_update(params.adapter, attended, grid, length=length)
+        attended = _added(attended, extra, config)
     tokens = checkpoint_name(_residual(tokens, params.ls1, attended), "attended")
     normed = layer_norm(params.norm2, tokens, epsilon=config.norm_epsilon)
     update = feed_forward(params.mlp, normed)
-    if parallel is not None and config.adapter.kind != "side":
-        with jax.named_scope("adapter"):
-            adapted, updated = adapter(parallel, normed, grid, length=length, valid=valid)
-            update = update + config.adapter.alpha * adapted
-        if updated is not parallel:
-            params = dataclasses.replace(params, adapter=updated)
+    with jax.named_scope("adapter"):
+        extra, updated = config.adapter.mlp_update(
+            params.adapter, normed, grid, length=length, valid=valid
+        )
+        update = _added(update, extra, config)
+    if updated is not params.adapter:
+        params = dataclasses.replace(params, adapter=updated)
     return _residual(tokens, params.ls2, update), split_statistics(params)[0]
+
+
+def _added(x: TokenBatch, update: TokenBatch | None, config: VisionTransformer) -> TokenBatch:
+    """Add what an adapter's hook returned."""
+    if update is None:
+        return x
+    expect_like(f"adapter {config.adapter.part_name}", update, x)
+    return x + update
 
 
 def _residual(tokens: TokenBatch, gain: float | Array, update: TokenBatch) -> TokenBatch:

@@ -13,7 +13,7 @@ from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.backbones import BACKBONES
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig, has_adapters
-from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, HEAD
+from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, ALL, HEAD
 from crisalad_jax.utils.output import warn
 
 Make = Callable[[ModelConfig, str], TrainConfig]
@@ -224,7 +224,16 @@ def find_part(
     return REGISTRIES[found[0]].make(part, preset)
 
 
-_KINDS = ("aggregator", "step", "dustbin", "loss", "backbone", "augmentation", "gradient")
+_KINDS = (
+    "aggregator",
+    "adapter",
+    "step",
+    "dustbin",
+    "loss",
+    "backbone",
+    "augmentation",
+    "gradient",
+)
 
 
 def with_part(config: TrainConfig, part: Any) -> TrainConfig:
@@ -248,6 +257,17 @@ def with_part(config: TrainConfig, part: Any) -> TrainConfig:
         trainable = "head" if getattr(part, "adapter", None) is None else config.trainable
         model = dataclasses.replace(model, backbone=part)
         return dataclasses.replace(config, model=model, trainable=trainable, validation_size=None)
+    if kind == "adapter":
+        require(
+            hasattr(model.backbone, "adapter"),
+            f"recipe: found adapter {part.part_name!r} for backbone {model.backbone.part_name}, "
+            "expected a vision transformer, such as vit",
+        )
+        backbone: Any = dataclasses.replace(model.backbone, adapter=part)
+        model, trainable = dataclasses.replace(model, backbone=backbone), config.trainable
+        if trainable != ALL:
+            trainable = ADAPTERS_AND_HEAD if has_adapters(model) else HEAD
+        return dataclasses.replace(config, model=model, trainable=trainable)
     if kind == "aggregator":
         return dataclasses.replace(config, model=with_head(model, part), validation_size=None)
     # Steps and gradients are settings of the solver, and a dustbin of the aggregator itself.

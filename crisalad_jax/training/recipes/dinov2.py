@@ -9,14 +9,14 @@ from typing import Any
 
 from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
-from crisalad_jax.nn.adapter import AdapterConfig
+from crisalad_jax.nn.adapters import Adapter
+from crisalad_jax.nn.adapters.bottleneck import SideConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.config import MiningConfig, OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.losses.pairwise import SelaVprLoss
 from crisalad_jax.training.recipes.base import model_of, register_recipe, validation_size
 
-NO_ADAPTER = AdapterConfig(kind="none")
 ADAM_STEP = OptimiserConfig(kind="adam", learning_rate=5e-5, schedule="step", weight_decay=0.0)
 """Of CricaVPR's code, and of those that grew from it."""
 BOQ_TRAINING: dict[str, Any] = {
@@ -48,7 +48,7 @@ MIXVPR_OPTIMISER = OptimiserConfig(
 """That of amaralibey/MixVPR, for 120 places."""
 
 
-def _vit(model: ModelConfig, *, adapter: AdapterConfig = NO_ADAPTER, **fields: Any) -> Any:
+def _vit(model: ModelConfig, *, adapter: Adapter | str = "none", **fields: Any) -> Any:
     """Change a preset's backbone; methods other than CriSALAD have no adapter, or their own."""
     return dataclasses.replace(model.backbone, adapter=adapter, **fields)
 
@@ -99,7 +99,7 @@ def cricavpr(model: ModelConfig, preset: str) -> TrainConfig:
     epochs, fewer than its patience of 10 would ever end. The best weights are those of the best
     R@5, as in its code of today; its first version added R@1.
     """
-    backbone = _vit(model, adapter=AdapterConfig(kind="multi-resolution"))
+    backbone = _vit(model, adapter="multi-resolution")
     alone = model_of(model, preset, backbone, "gem-pyramid", antialias=False, pixels="floats")
     return TrainConfig(
         model=dataclasses.replace(alone, cross_image=model.cross_image),
@@ -119,7 +119,7 @@ def selavpr(model: ModelConfig, preset: str) -> TrainConfig:
     from the weights of MSLS, it has 5,000: `--mining.queries-per-epoch 5000`. The code validates
     with re-ranking, here without.
     """
-    backbone = _vit(model, adapter=AdapterConfig(kind="serial-parallel"))
+    backbone = _vit(model, adapter="serial-parallel")
     return TrainConfig(
         model=model_of(model, preset, backbone, "selavpr", antialias=False, pixels="floats"),
         loss=LossConfig(kind=SelaVprLoss(), miner="none"),
@@ -141,7 +141,7 @@ def edtformer(model: ModelConfig, preset: str) -> TrainConfig:
 
     It has adapters of width 4 beside the blocks, a decoder, and Adam with step decay.
     """
-    adapter = AdapterConfig(kind="side", bottleneck=4 / model.backbone.dim, alpha=0.5)
+    adapter = SideConfig(bottleneck=4 / model.backbone.dim, alpha=0.5)
     backbone = _vit(model, adapter=adapter)
     return TrainConfig(
         model=model_of(model, preset, backbone, "edtformer", pixels="floats", round_to_patch=True),

@@ -52,7 +52,7 @@ def test_rows_change_one_thing_each():
     assert rows["lr-1e-4"] == recipe("b14", "crisalad-1e-4")
     assert rows["step"] == recipe("b14", "crisalad-step")
     for name in ("multi-resolution", "mlp"):
-        assert rows[name].model.backbone.adapter.kind == name
+        assert rows[name].model.backbone.adapter.part_name == name
     assert (rows["no-adapter"].trainable, rows["no-encoder"].trainable) == ("head", "adapters+head")
     assert rows["no-encoder"].model.cross_image.layers == 0
     assert rows["no-encoder"].optimiser == base.optimiser

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.backbones.vit import NORM_EPSILON, ViTConfig, block, embed
 from crisalad_jax.nn.config import ModelConfig
@@ -17,7 +16,7 @@ from crisalad_jax.nn.model import describe
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import random_params
 
-NONE = AdapterConfig(kind="none")
+NONE = "none"
 CONFIG = ModelConfig(
     image_size=(28, 42),
     backbone=ViTConfig(dim=16, depth=3, heads=2, position_grid=2, registers=2, adapter=NONE),

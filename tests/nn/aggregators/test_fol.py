@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.salad import FolConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -20,9 +19,7 @@ from tests.conftest import random_params
 
 CONFIG = ModelConfig(
     image_size=(42, 56),
-    backbone=ViTConfig(
-        dim=32, depth=2, heads=2, position_grid=3, adapter=AdapterConfig(kind="none")
-    ),
+    backbone=ViTConfig(dim=32, depth=2, heads=2, position_grid=3, adapter="none"),
     aggregator=FolConfig(
         clusters=4, cluster_dim=8, token_dim=16, hidden=16, dropout=0.0, local_hidden=8, local=4
     ),

@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.queries import Boq, BoqConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -19,9 +18,7 @@ from tests.conftest import random_params
 
 CONFIG = ModelConfig(
     image_size=(28, 42),
-    backbone=ViTConfig(
-        dim=12, depth=1, heads=1, position_grid=2, adapter=AdapterConfig(kind="none")
-    ),
+    backbone=ViTConfig(dim=12, depth=1, heads=1, position_grid=2, adapter="none"),
     # Two heads.
     aggregator=BoqConfig(channels=128, queries=3, layers=2, rows=5),
     cross_image=CrossImageConfig(layers=0),

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.formats import check_holds, infer, public_shapes, to_params
-from crisalad_jax.nn.adapter import AdapterConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.attention import rotate
 from crisalad_jax.nn.backbones import Features, FeatureSpec
@@ -26,7 +25,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import random_params
 
-NO_ADAPTER = AdapterConfig(kind="none")
+NO_ADAPTER = "none"
 CONFIG = DinoV3Config(dim=32, depth=3, heads=2, registers=2, adapter=NO_ADAPTER)
 BARE = CrossImageConfig(layers=0)
 MODEL = ModelConfig(
@@ -103,7 +102,7 @@ def test_sides_are_multiples_of_16() -> None:
 
 def test_a_step_moves_the_last_block_and_no_bias_of_keys() -> None:
     """In a model with adapters beside its blocks."""
-    backbone = dataclasses.replace(CONFIG, adapter=AdapterConfig(kind="mlp"))
+    backbone = dataclasses.replace(CONFIG, adapter="mlp")
     model = dataclasses.replace(MODEL, backbone=backbone, remat="full", compute_dtype="bfloat16")
     optimiser = OptimiserConfig(learning_rate=1e-3, weight_decay=0.0)
     step = StepConfig(model, LossConfig(kind=MultiSimilarityConfig(base=0.5)), optimiser, 10)

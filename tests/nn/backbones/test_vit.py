@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.nn.adapter import AdapterConfig, MlpAdapter
+from crisalad_jax.nn.adapters.bottleneck import MlpAdapter, SideConfig
 from crisalad_jax.nn.attention import attention
 from crisalad_jax.nn.backbones.base import FeatureSpec
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
@@ -40,7 +40,7 @@ def test_the_published_hidden_width_of_vit_g() -> None:
 
 def test_serial_and_parallel_adapters_by_hand() -> None:
     """x' = x + ls1 * (a + S(a)) of attention a; x' + ls2 * (MLP + 0.2 P) of the normed x'."""
-    kind = AdapterConfig(kind="serial-parallel")
+    kind = "serial-parallel"
     config = dataclasses.replace(CONFIG, depth=1, layer_scale_init=0.5, adapter=kind)
     layer = jax.tree.map(lambda leaf: leaf[0], config.init(jax.random.key(0)).blocks)
     key = jax.random.key(1)
@@ -63,7 +63,8 @@ def test_serial_and_parallel_adapters_by_hand() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
 
 
-SIDE = dataclasses.replace(CONFIG, adapter=AdapterConfig(kind="side", alpha=0.5))
+BARE = dataclasses.replace(CONFIG, adapter="none")
+SIDE = dataclasses.replace(CONFIG, adapter=SideConfig(alpha=0.5))
 
 
 def test_side_adapters_take_the_sum_of_both_paths() -> None:
@@ -77,7 +78,7 @@ def test_side_adapters_take_the_sum_of_both_paths() -> None:
     trunk, beside = tokens, tokens
     for i in range(CONFIG.depth):
         layer = jax.tree.map(lambda leaf, i=i: leaf[i], params.blocks)
-        trunk, _ = block(dataclasses.replace(layer, adapter=None), trunk, (2, 3), CONFIG)
+        trunk, _ = block(dataclasses.replace(layer, adapter=None), trunk, (2, 3), BARE)
         t = jax.tree.map(lambda leaf: torch.tensor(np.asarray(leaf)), layer.adapter)
         z = torch.tensor(np.asarray(trunk + beside))
         hidden = torch.nn.functional.gelu(z @ t.down.weight + t.down.bias)
@@ -197,10 +198,7 @@ def fresh(config: VisionTransformer) -> ViT:
     ("config", "name"),
     [
         *((HALF, name) for name in REQUESTS),
-        *(
-            (dataclasses.replace(HALF, adapter=AdapterConfig(kind)), "the last tokens")
-            for kind in KINDS
-        ),
+        *((dataclasses.replace(HALF, adapter=kind), "the last tokens") for kind in KINDS),
         (dataclasses.replace(HALF, registers=3), "inserted tokens"),
         (DinoV3Config(dim=32, depth=2, heads=2), "the last tokens"),
         (DinoV3Config(dim=32, depth=2, heads=2), "keys"),

@@ -1,0 +1,122 @@
+"""Adapters of a vision transformer's blocks: their interface and registry."""
+
+import abc
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import Registry
+from crisalad_jax.nn.layers import Grid, Valid
+
+AnyTokens = Float[Array, "*batch token dim"]
+"""Tokens of an image or of a batch: the class token and registers first, the patches last."""
+
+
+class BlockShape(NamedTuple):
+    """The sizes of a block that an adapter is made for."""
+
+    dim: int
+    """Width of a token."""
+    linears: Mapping[str, tuple[int, int]]
+    """Widths of the input and the output of each linear layer: qkv and proj of the attention, and
+    fc1 and fc2 of the MLP (or w12 and w3 of SwiGLU)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Adapter(Part, abc.ABC):
+    """Small layers that are added to every block: a frozen dataclass whose fields are its settings.
+
+    `init` is required, and at least one of the hooks below it does the work. A hook returns what is
+    added to the result of a part of the block, in the shape and type of that result; None adds
+    nothing. All blocks have one shape and run in one loop (`jax.lax.scan`). A hook therefore gets
+    the parameters of one block, and does the same in every block.
+
+    Example:
+        >>> import jax
+        >>> import jax.numpy as jnp
+        >>> from crisalad_jax import register_adapter
+        >>> @register_adapter("shift")
+        ... @dataclasses.dataclass(frozen=True)
+        ... class Shift(Adapter):
+        ...     def init(self, key, shape):
+        ...         return {"shift": jnp.zeros(shape.dim)}
+        ...
+        ...     def mlp_update(self, params, tokens, grid, *, length=None, valid=None):
+        ...         return params["shift"].astype(tokens.dtype), params
+        >>> from crisalad_jax.nn.backbones.vit import ViTConfig
+        >>> jax.eval_shape(ViTConfig(adapter="shift").init, jax.random.key(0)).blocks.adapter
+        {'shift': ShapeDtypeStruct(shape=(12, 768), dtype=float32)}
+    """
+
+    @abc.abstractmethod
+    def init(self, key: PRNGKeyArray, shape: BlockShape) -> Any:
+        """Draw the parameters of one block's adapter, a pytree of arrays in float32.
+
+        An adapter that should not change a pretrained model at first returns such that it adds 0.
+        """
+
+    def check(self, shape: BlockShape) -> None:
+        """Raise InputError where the settings do not fit such a block; by default never."""
+
+    def attention_update(
+        self, params: Any, attended: AnyTokens, grid: Grid, *, length: int | None = None
+    ) -> AnyTokens | None:
+        """Return what is added to the attention's output, before LayerScale and the residual.
+
+        Args:
+            params: of `init`.
+            attended: the output of the attention.
+            grid: rows and columns of patches, the last `grid[0] * grid[1]` tokens.
+            length: number of first tokens that are not padding; None is all.
+        """
+        return None
+
+    def mlp_update(
+        self,
+        params: Any,
+        tokens: AnyTokens,
+        grid: Grid,
+        *,
+        length: int | None = None,
+        valid: Valid = None,
+    ) -> tuple[AnyTokens | None, Any]:
+        """Return what is added to the MLP's output, before LayerScale, and the parameters.
+
+        Args:
+            params: of `init`.
+            tokens: the MLP's input, normalised.
+            grid: see `attention_update`.
+            length: see `attention_update`.
+            valid: images of a training batch, whose statistics batch norms normalise by
+                (`layers.train_batch_norm`); None takes the stored ones.
+
+        Returns:
+            (update, updated): the parameters with updated running statistics, if there are any.
+        """
+        return None, params
+
+    def side_path(
+        self, params: Any, tokens: AnyTokens, grid: Grid, *, length: int | None = None
+    ) -> AnyTokens:
+        """Return the tokens of a path beside the blocks, whose last ones are the backbone's.
+
+        The path starts from the embedded image. An adapter with this method has one.
+
+        Args:
+            params: of `init`.
+            tokens: the path's tokens, plus the output of the block.
+            grid: see `attention_update`.
+            length: see `attention_update`.
+        """
+        raise NotImplementedError
+
+    @property
+    def has_side_path(self) -> bool:
+        """Whether it has a `side_path`."""
+        return type(self).side_path is not Adapter.side_path
+
+
+ADAPTERS = Registry("adapter", Adapter)

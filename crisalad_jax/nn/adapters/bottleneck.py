@@ -1,0 +1,331 @@
+"""Bottleneck adapters: the paper's (section 3.2), two others of its Table 2, and more.
+
+All project the tokens down, act on them, and project them up again. The up-projection starts at 0,
+so that an untrained adapter adds nothing.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, ClassVar, Literal
+
+import jax
+import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import PositiveFloat, PositiveInt, require_field
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.adapters.base import ADAPTERS, Adapter, AnyTokens, BlockShape
+from crisalad_jax.nn.convolutions import ConvNorm, Map, conv_norm
+from crisalad_jax.nn.layers import (
+    Conv,
+    DepthwiseConv,
+    Grid,
+    Linear,
+    Valid,
+    at_least_float32,
+    depthwise_conv,
+    gelu,
+    init_batch_norm,
+    init_depthwise_conv,
+    init_linear,
+    linear,
+)
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+BATCH_NORM_EPSILON = 1e-3
+CONV_INIT = 1e-5
+"""Initial value of all weights and biases of CricaVPR's convolutions."""
+
+
+@pytree_dataclass
+class DepthwiseAdapter:
+    """The paper's adapter, whose down-projection has no bias: 741,504 parameters (Table 3)."""
+
+    down: Linear
+    depthwise: DepthwiseConv
+    pointwise: Linear
+    up: Linear
+
+
+@pytree_dataclass
+class MultiResolutionAdapter:
+    """CricaVPR's adapter: parallel 1 x 1, 3 x 3 and 5 x 5 convolutions, the last two reduced."""
+
+    down: Linear
+    branch1: ConvNorm
+    branch2: tuple[ConvNorm, ConvNorm]
+    branch3: tuple[ConvNorm, ConvNorm]
+    up: Linear
+
+
+@pytree_dataclass
+class MlpAdapter:
+    """A plain MLP, which acts on every token alone; EDTformer's has GELU (Jin et al. 2025)."""
+
+    down: Linear
+    up: Linear
+
+
+@pytree_dataclass
+class SerialParallelAdapter:
+    """SelaVPR's adapters (Lu et al. 2024): after the attention with a skip, parallel to the MLP."""
+
+    serial: MlpAdapter
+    parallel: MlpAdapter
+
+
+@ADAPTERS.register("none")
+@dataclasses.dataclass(frozen=True)
+class NoAdapter(Adapter):
+    """No adapter: the plain backbone."""
+
+    def init(self, key: PRNGKeyArray, shape: BlockShape) -> None:
+        """Return None: there are no parameters."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BottleneckAdapter(Adapter):
+    """What bottleneck adapters share."""
+
+    width_factor: ClassVar[int] = 1
+    """Number that the width of the bottleneck must be a multiple of."""
+    bottleneck: PositiveFloat = 0.5
+    """Width of the adapter over the width of the backbone."""
+    alpha: float = 0.2
+    """Weight of the adapter's output (paper Eq. 2)."""
+
+    def check(self, shape: BlockShape) -> None:
+        """Require a width of at least 1 that divides into the adapter's branches."""
+        width, factor = self.width(shape.dim), self.width_factor
+        words = (
+            f"a width for dim {shape.dim}, {width}, that is at least 1 and a multiple of {factor}"
+        )
+        require_field(self, "bottleneck", width >= 1 and width % factor == 0, words)
+
+    def width(self, dim: int) -> int:
+        """Return the width of the bottleneck in a backbone of width `dim`."""
+        return int(dim * self.bottleneck)
+
+
+@ADAPTERS.register("depthwise")
+@dataclasses.dataclass(frozen=True)
+class DepthwiseConfig(BottleneckAdapter):
+    """The paper's depthwise-separable convolution, parallel to the MLP (section 3.2)."""
+
+    kernel_size: PositiveInt = 3
+    """Side of the depthwise filter."""
+    bias: Literal["convolutions", "up"] = "convolutions"
+    """Layers that have biases: the two convolutions, or the up-projection. The paper prints the
+    count of parameters alone (Table 3), which is 741,504 in both readings."""
+
+    def __post_init__(self) -> None:
+        """Check the side of the filter."""
+        require_field(self, "kernel_size", self.kernel_size % 2 == 1, "an odd number")
+
+    def init(self, key: PRNGKeyArray, shape: BlockShape) -> DepthwiseAdapter:
+        """Draw parameters as torch's layers start, and an up-projection of 0."""
+        width, convolutions = self.width(shape.dim), self.bias == "convolutions"
+        down, first, second = random_init.split(key, 3)
+        return DepthwiseAdapter(
+            down=init_linear(down, shape.dim, width, bias=False),
+            depthwise=init_depthwise_conv(first, self.kernel_size, width, bias=convolutions),
+            pointwise=init_linear(second, width, width, bias=convolutions),
+            up=_init_up(width, shape.dim, bias=not convolutions),
+        )
+
+    def mlp_update(
+        self,
+        params: DepthwiseAdapter,
+        tokens: AnyTokens,
+        grid: Grid,
+        *,
+        length: int | None = None,
+        valid: Valid = None,
+    ) -> tuple[AnyTokens, DepthwiseAdapter]:
+        """Project down, ReLU, convolve the patches, add the skip, project up (paper Eq. 2)."""
+        hidden = _project_down(params.down, tokens)
+        mixed, _ = _on_patches(lambda x: (_separable(params, x), None), hidden, grid, length)
+        return self.alpha * linear(params.up, mixed + hidden), params
+
+
+@ADAPTERS.register("multi-resolution")
+@dataclasses.dataclass(frozen=True)
+class MultiResolutionConfig(BottleneckAdapter):
+    """CricaVPR's multi-resolution convolutions, parallel to the MLP (Lu et al., CVPR 2024)."""
+
+    width_factor: ClassVar[int] = 16  # the branches take 1/2, 1/4 and 1/16 of the width
+
+    def init(self, key: PRNGKeyArray, shape: BlockShape) -> MultiResolutionAdapter:
+        """Draw parameters as CricaVPR's public code: its convolutions start at 1e-5."""
+        width = self.width(shape.dim)
+        half, quarter, narrow = width // 2, width // 4, width // 16
+        return MultiResolutionAdapter(
+            down=init_linear(random_init.split(key, 3)[0], shape.dim, width),
+            branch1=_init_conv_norm(1, width, half),
+            branch2=(_init_conv_norm(1, width, narrow), _init_conv_norm(3, narrow, quarter)),
+            branch3=(_init_conv_norm(1, width, narrow), _init_conv_norm(5, narrow, quarter)),
+            up=_init_up(width, shape.dim),
+        )
+
+    def mlp_update(
+        self,
+        params: MultiResolutionAdapter,
+        tokens: AnyTokens,
+        grid: Grid,
+        *,
+        length: int | None = None,
+        valid: Valid = None,
+    ) -> tuple[AnyTokens, MultiResolutionAdapter]:
+        """Project down, ReLU, convolve the patches, add the skip, project up."""
+        hidden = _project_down(params.down, tokens)
+        mix = functools.partial(_multi_resolution, params, valid=valid)
+        mixed, updated = _on_patches(mix, hidden, grid, length)
+        return self.alpha * linear(params.up, mixed + hidden), updated
+
+
+@ADAPTERS.register("mlp")
+@dataclasses.dataclass(frozen=True)
+class MlpConfig(BottleneckAdapter):
+    """A plain MLP with ReLU, parallel to the block's (AdaptFormer: Chen et al., NeurIPS 2022)."""
+
+    def init(self, key: PRNGKeyArray, shape: BlockShape) -> MlpAdapter:
+        """Draw a down-projection as torch's, and an up-projection of 0."""
+        return _init_mlp(key, shape.dim, self.width(shape.dim))
+
+    def mlp_update(
+        self,
+        params: MlpAdapter,
+        tokens: AnyTokens,
+        grid: Grid,
+        *,
+        length: int | None = None,
+        valid: Valid = None,
+    ) -> tuple[AnyTokens, MlpAdapter]:
+        """Return the MLP's output, of every token by itself."""
+        return self.alpha * _mlp(params, tokens), params
+
+
+@ADAPTERS.register("serial-parallel")
+@dataclasses.dataclass(frozen=True)
+class SerialParallelConfig(BottleneckAdapter):
+    """SelaVPR's MLPs: one after the attention, of weight 1, one parallel to the MLP (ICLR 2024)."""
+
+    def init(self, key: PRNGKeyArray, shape: BlockShape) -> SerialParallelAdapter:
+        """Draw both as `MlpConfig` does."""
+        dim, width = shape.dim, self.width(shape.dim)
+        return SerialParallelAdapter(*(_init_mlp(k, dim, width) for k in random_init.split(key)))
+
+    def attention_update(
+        self,
+        params: SerialParallelAdapter,
+        attended: AnyTokens,
+        grid: Grid,
+        *,
+        length: int | None = None,
+    ) -> AnyTokens:
+        """Return the serial MLP's output; the addition is its skip."""
+        return _mlp(params.serial, attended)
+
+    def mlp_update(
+        self,
+        params: SerialParallelAdapter,
+        tokens: AnyTokens,
+        grid: Grid,
+        *,
+        length: int | None = None,
+        valid: Valid = None,
+    ) -> tuple[AnyTokens, SerialParallelAdapter]:
+        """Return the parallel MLP's output."""
+        return self.alpha * _mlp(params.parallel, tokens), params
+
+
+@ADAPTERS.register("side")
+@dataclasses.dataclass(frozen=True)
+class SideConfig(BottleneckAdapter):
+    """EDTformer's MLPs with GELU, on a path beside all blocks (Jin et al. 2025).
+
+    After every block the path's tokens are s + alpha MLP(s), where s is the sum of its tokens and
+    of the block's output. No gradient runs through the blocks.
+    """
+
+    def init(self, key: PRNGKeyArray, shape: BlockShape) -> MlpAdapter:
+        """Draw parameters as `MlpConfig` does."""
+        return _init_mlp(key, shape.dim, self.width(shape.dim))
+
+    def side_path(
+        self, params: MlpAdapter, tokens: AnyTokens, grid: Grid, *, length: int | None = None
+    ) -> AnyTokens:
+        """Add the MLP's output."""
+        update = _mlp(params, tokens, gelu)
+        total = at_least_float32(tokens) + self.alpha * at_least_float32(update)
+        return total.astype(tokens.dtype)
+
+
+def _init_mlp(key: PRNGKeyArray, dim: int, width: int) -> MlpAdapter:
+    return MlpAdapter(init_linear(random_init.split(key)[0], dim, width), _init_up(width, dim))
+
+
+def _init_up(width: int, dim: int, *, bias: bool = True) -> Linear:
+    return Linear(random_init.zeros(width, dim), random_init.zeros(dim) if bias else None)
+
+
+def _init_conv_norm(kernel_size: int, d_in: int, d_out: int) -> ConvNorm:
+    weight = random_init.full((kernel_size, kernel_size, d_in, d_out), CONV_INIT)
+    return ConvNorm(Conv(weight, random_init.full((d_out,), CONV_INIT)), init_batch_norm(d_out))
+
+
+def _project_down(
+    params: Linear, tokens: AnyTokens, activation: Callable[[Array], Array] = jax.nn.relu
+) -> Float[Array, "*batch token width"]:
+    return activation(checkpoint_name(linear(params, tokens), "down"))
+
+
+def _mlp(
+    params: MlpAdapter, tokens: AnyTokens, activation: Callable[[Array], Array] = jax.nn.relu
+) -> AnyTokens:
+    return linear(params.up, _project_down(params.down, tokens, activation))
+
+
+def _on_patches(
+    mix: Callable[[Map], tuple[Map, Any]], hidden: AnyTokens, grid: Grid, length: int | None
+) -> tuple[AnyTokens, Any]:
+    """Apply a convolution to the patches; return the tokens and what else it returned.
+
+    It is the identity on the class and register tokens before the patches, and on padding. With
+    the skip that follows, these tokens therefore count twice, as in CricaVPR.
+    """
+    *batch, count, width = hidden.shape
+    last = count if length is None else length
+    special = last - grid[0] * grid[1]
+    patches = hidden[..., special:last, :].reshape(-1, *grid, width)
+    mixed, more = mix(patches)
+    mixed = mixed.reshape(*batch, grid[0] * grid[1], width)
+    parts = [hidden[..., :special, :], mixed]
+    if last < count:
+        parts.append(hidden[..., last:, :])
+    return jnp.concatenate(parts, axis=-2), more
+
+
+def _separable(params: DepthwiseAdapter, x: Map) -> Map:
+    # No activation between the two convolutions, as in Xception.
+    filtered = jax.vmap(functools.partial(depthwise_conv, params.depthwise))(x)
+    return jax.nn.relu(checkpoint_name(linear(params.pointwise, filtered), "mixed"))
+
+
+def _multi_resolution(
+    params: MultiResolutionAdapter, x: Map, *, valid: Valid
+) -> tuple[Map, MultiResolutionAdapter]:
+    outputs, updated = [], []
+    for branch in ((params.branch1,), params.branch2, params.branch3):
+        y, layers = x, []
+        for layer in branch:
+            y, layer = conv_norm(layer, y, valid, epsilon=BATCH_NORM_EPSILON)
+            y = jax.nn.relu(y)
+            layers.append(layer)
+        outputs.append(y)
+        updated.append(tuple(layers))
+    (first,), second, third = updated
+    params = dataclasses.replace(params, branch1=first, branch2=second, branch3=third)
+    return jnp.concatenate(outputs, axis=-1), params
