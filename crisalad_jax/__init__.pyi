@@ -52,6 +52,7 @@ from .nn.model import describe as describe
 from .nn.model import extract_features as extract_features
 from .nn.model import extract_tokens as extract_tokens
 from .nn.model import init_crisalad as init_crisalad
+from .nn.model import merge_adapters as merge_adapters
 from .nn.model import self_mask as self_mask
 from .nn.model import valid_mask as valid_mask
 from .nn.projection import ProjectionConfig as ProjectionConfig

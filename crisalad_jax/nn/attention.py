@@ -14,7 +14,16 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.nn import attention_fused, random_init
-from crisalad_jax.nn.layers import Linear, at_least_float32, columns, init_linear, linear
+from crisalad_jax.nn.layers import (
+    Linear,
+    LinearUpdate,
+    adapted_linear,
+    at_least_float32,
+    columns,
+    init_linear,
+    linear,
+    no_update,
+)
 from crisalad_jax.nn.products import product_precision, rule_precision
 from crisalad_jax.utils.pytree import pytree_dataclass
 from crisalad_jax.utils.target import target
@@ -54,6 +63,7 @@ def attention(
     *,
     length: int | None = None,
     rotation: Rotation | None = None,
+    update: LinearUpdate = no_update,
 ) -> Float[Array, "*batch token dim"]:
     """Apply scaled dot-product self-attention (Vaswani et al. 2017) to a sequence or a batch.
 
@@ -64,13 +74,15 @@ def attention(
         length: number of first tokens that are not padding, to which alone tokens attend; None is
             all. See `attention_fused.padded_length`.
         rotation: turns queries and keys by their tokens' angles.
+        update: what an adapter adds to the outputs of the projections.
 
     Returns:
         The tokens' updates. Scores and softmax are float32 for every type of `x`.
     """
     tokens = x.shape[-2]
     length = tokens if length is None else length
-    qkv = split_heads(checkpoint_name(linear(params.qkv, x), "qkv"), 3 * heads)
+    projected = adapted_linear("qkv", params.qkv, x, update)
+    qkv = split_heads(checkpoint_name(projected, "qkv"), 3 * heads)
     parts = jnp.split(qkv, 3, axis=-2)
     if rotation is not None:
         parts[:2] = (rotate(part, rotation, length=length) for part in parts[:2])
@@ -80,7 +92,7 @@ def attention(
         padding = jnp.arange(tokens) < length
         mask = jnp.broadcast_to(padding, (tokens, tokens)) if length < tokens else None
         mixed = dot_product_attention(*parts, mask=mask)
-    return linear(params.proj, mixed.reshape(x.shape))
+    return adapted_linear("proj", params.proj, mixed.reshape(x.shape), update)
 
 
 def split_heads(x: Float[Array, "*batch dim"], heads: int) -> Float[Array, "*batch head _"]:
@@ -130,19 +142,32 @@ def first_token_attention(
     heads: int,
     *,
     rotation: Rotation | None = None,
+    update: LinearUpdate = no_update,
 ) -> Float[Array, "*batch head token"]:
     """Compute how much of each token the first token's `attention` takes, in float32 at least.
 
     A head's shares sum to 1. `rotation` turns keys; the first token has no angle.
     """
     dim = x.shape[-1]
-    query = linear(columns(params.qkv, 0, dim), x[..., 0, :]) / math.sqrt(dim // heads)
+    query = part_of_qkv(params, 0, x[..., :1, :], update)[..., 0, :] / math.sqrt(dim // heads)
     query = split_heads(query, heads)
-    keys = split_heads(linear(columns(params.qkv, dim, 2 * dim), x), heads)
+    keys = split_heads(part_of_qkv(params, 1, x, update), heads)
     if rotation is not None:
         keys = rotate(keys, rotation)
     scores = _product("...hd,...jhd->...hj", query, keys, product_precision(x.dtype))
     return jax.nn.softmax(scores, axis=-1)
+
+
+def part_of_qkv(
+    params: Attention,
+    number: int,
+    x: Float[Array, "*batch token dim"],
+    update: LinearUpdate = no_update,
+) -> Float[Array, "*batch token dim"]:
+    """Compute queries (0), keys (1) or values (2) alone, with heads side by side."""
+    here = slice(number * x.shape[-1], (number + 1) * x.shape[-1])
+    y, extra = linear(columns(params.qkv, here.start, here.stop), x), update("qkv", x)
+    return y if extra is None else y + extra[..., here]
 
 
 class _Axes(NamedTuple):

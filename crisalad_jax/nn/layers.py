@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -145,6 +146,22 @@ def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*bat
     y = matmul(x.reshape(-1, x.shape[-1]), params.weight)
     y = (y if params.bias is None else at_least_float32(y) + params.bias).astype(x.dtype)
     return y.reshape(*x.shape[:-1], y.shape[-1])
+
+
+LinearUpdate = Callable[[str, Array], Array | None]
+"""Returns what an adapter adds to the output of the linear layer of this name, for its input."""
+
+
+def no_update(name: str, x: Array) -> None:
+    """Add nothing to any layer."""
+
+
+def adapted_linear(
+    name: str, params: Linear, x: Float[Array, "*batch d_in"], update: LinearUpdate
+) -> Float[Array, "*batch d_out"]:
+    """Map the last axis by `linear`, and add an adapter's update."""
+    y, extra = linear(params, x), update(name, x)
+    return y if extra is None else y + extra
 
 
 def columns(params: Linear, start: int, stop: int) -> Linear:

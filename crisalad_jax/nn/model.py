@@ -192,6 +192,39 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
     return jax.tree_util.tree_map_with_path(cast, params)
 
 
+@takes(model=Model)
+def merge_adapters(model: Model) -> Model:
+    """Merge adapters into the weights that they update, for inference at the cost of the backbone.
+
+    The descriptors are the same up to rounding. LoRA can be merged (W + alpha / rank B A, Hu et al.
+    2021, section 4.1); adapters that act elsewhere than on a weight cannot.
+
+    Args:
+        model: a model with adapters.
+
+    Returns:
+        A model whose adapter is "none", with new weights.
+
+    Raises:
+        InputError: the backbone has no adapters, or they cannot be merged.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import init_crisalad, recipe
+        >>> config = recipe("tiny", "crisalad+lora").model
+        >>> merged = merge_adapters(Model(init_crisalad(jax.random.key(0), config), config))
+        >>> merged.config.backbone.adapter.part_name, merged.params.backbone.blocks.adapter
+        ('none', None)
+    """
+    params, config = model
+    check_params(params, config)
+    with compiler.number_types():
+        backbone, merged = config.backbone.merge_adapters(params.backbone)
+    return Model(
+        dataclasses.replace(params, backbone=merged), dataclasses.replace(config, backbone=backbone)
+    )
+
+
 def _of_images(function: _F) -> _F:
     """Make a compiled function of images know the devices that they are on.
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.registry import Registry
-from crisalad_jax.nn.layers import Grid, Valid
+from crisalad_jax.nn.layers import Grid, Linear, Valid
 
 AnyTokens = Float[Array, "*batch token dim"]
 """Tokens of an image or of a batch: the class token and registers first, the patches last."""
@@ -60,6 +60,30 @@ class Adapter(Part, abc.ABC):
 
     def check(self, shape: BlockShape) -> None:
         """Raise InputError where the settings do not fit such a block; by default never."""
+
+    def linear_update(
+        self, params: Any, name: str, x: Float[Array, "*batch d_in"]
+    ) -> Float[Array, "*batch d_out"] | None:
+        """Return what is added to the output of a linear layer of the block.
+
+        Args:
+            params: of `init`.
+            name: the layer, one of `BlockShape.linears`.
+            x: the input of the layer.
+        """
+        return None
+
+    def merge(self, params: Any, name: str, layer: Linear) -> Linear:
+        """Return a linear layer whose output has the `linear_update` added (`merge_adapters`).
+
+        An adapter with this method has no other effect on a block.
+
+        Args:
+            params: of `init`.
+            name: see `linear_update`.
+            layer: the layer.
+        """
+        raise NotImplementedError
 
     def attention_update(
         self, params: Any, attended: AnyTokens, grid: Grid, *, length: int | None = None
@@ -112,6 +136,11 @@ class Adapter(Part, abc.ABC):
             length: see `attention_update`.
         """
         raise NotImplementedError
+
+    @property
+    def can_merge(self) -> bool:
+        """Whether it has a `merge`."""
+        return type(self).merge is not Adapter.merge
 
     @property
     def has_side_path(self) -> bool:

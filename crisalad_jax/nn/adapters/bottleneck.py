@@ -84,6 +84,10 @@ class NoAdapter(Adapter):
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> None:
         """Return None: there are no parameters."""
 
+    def merge(self, params: None, name: str, layer: Linear) -> Linear:
+        """Return the layer."""
+        return layer
+
 
 @dataclasses.dataclass(frozen=True)
 class BottleneckAdapter(Adapter):

@@ -147,6 +147,16 @@ class Backbone(Part, abc.ABC):
         """Undo `split_blocks`."""
         return params
 
+    def merge_adapters(self, params: Any) -> tuple[Any, Any]:
+        """Return (backbone, params) without adapters that compute the same; see `merge_adapters`.
+
+        Raises:
+            InputError: this backbone has no adapters, or they cannot be merged.
+        """
+        raise InputError(
+            f"merge_adapters: found backbone {self.part_name}, expected one with adapters, as vit"
+        )
+
     def adapt_checkpoint(self, config: Any, params: Any, fresh: Any) -> tuple[Any, Any]:
         """Return another's configuration and parameters, changed as far as this one can do with.
 

@@ -29,7 +29,13 @@ from crisalad_jax.config.part import OrName, non_semantic_field
 from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.adapters import ADAPTERS, Adapter, BlockShape
-from crisalad_jax.nn.attention import Attention, Rotation, attention, first_token_attention
+from crisalad_jax.nn.attention import (
+    Attention,
+    Rotation,
+    attention,
+    first_token_attention,
+    part_of_qkv,
+)
 from crisalad_jax.nn.attention_fused import padded_length
 from crisalad_jax.nn.backbones.base import (
     BACKBONES,
@@ -45,13 +51,15 @@ from crisalad_jax.nn.backbones.base import (
 from crisalad_jax.nn.layers import (
     LayerNorm,
     Linear,
+    LinearUpdate,
+    adapted_linear,
     at_least_float32,
-    columns,
     gelu,
     init_layer_norm,
     init_small_linear,
     layer_norm,
     linear,
+    no_update,
     split_statistics,
 )
 from crisalad_jax.utils.pytree import expect_like, pytree_dataclass
@@ -304,6 +312,30 @@ class VisionTransformer(Backbone):
         changed = dataclasses.replace(config, adapter=self.adapter)
         return changed, dataclasses.replace(params, blocks=blocks)
 
+    def merge_adapters(self, params: ViT) -> tuple[Any, ViT]:
+        """Merge the adapters into the linear layers that they update."""
+        adapter = self.adapter
+        require(
+            adapter.can_merge,
+            f"merge_adapters: found adapter {adapter.part_name}, expected one of weights, as lora",
+        )
+
+        def merged(layer: Block) -> Block:
+            def each(part: Any) -> Any:
+                layers = {
+                    field.name: adapter.merge(layer.adapter, field.name, getattr(part, field.name))
+                    for field in dataclasses.fields(part)
+                }
+                return dataclasses.replace(part, **layers)
+
+            return dataclasses.replace(
+                layer, attn=each(layer.attn), mlp=each(layer.mlp), adapter=None
+            )
+
+        blocks = jax.vmap(merged)(_one_stack(params))
+        plain = dataclasses.replace(self, adapter="none")
+        return plain, dataclasses.replace(params, blocks=blocks)
+
     def join_blocks(self, params: ViT) -> ViT:
         """Join the stacks of blocks into one."""
         if isinstance(params.blocks, Block):
@@ -419,9 +451,9 @@ def _facet(layer: Block, tokens: TokenBatch, config: VisionTransformer, name: st
 
     Heads are side by side, and not rotated.
     """
-    here = ("query", "key", "value").index(name) * config.dim
-    part = columns(config.attention_of(layer).qkv, here, here + config.dim)
-    return linear(part, layer_norm(layer.norm1, tokens, epsilon=config.norm_epsilon))
+    number = ("query", "key", "value").index(name)
+    normed = layer_norm(layer.norm1, tokens, epsilon=config.norm_epsilon)
+    return part_of_qkv(config.attention_of(layer), number, normed, _update_of(layer, config))
 
 
 def _class_attention(
@@ -434,7 +466,10 @@ def _class_attention(
     with jax.named_scope("blocks"):
         normed = layer_norm(layer.norm1, tokens, epsilon=config.norm_epsilon)
         attn, rotation = config.attention_of(layer), config.rotation(grid)
-        shares = first_token_attention(attn, normed, config.heads, rotation=rotation).sum(axis=-2)
+        update = _update_of(layer, config)
+        shares = first_token_attention(
+            attn, normed, config.heads, rotation=rotation, update=update
+        ).sum(axis=-2)
     return shares[:, 1 + config.registers :]
 
 
@@ -543,13 +578,16 @@ def block(
     """
     normed = layer_norm(params.norm1, tokens, epsilon=config.norm_epsilon)
     attn, rotation = config.attention_of(params), config.rotation(grid)
-    attended = attention(attn, normed, config.heads, length=length, rotation=rotation)
+    linear_update = _update_of(params, config)
+    attended = attention(
+        attn, normed, config.heads, length=length, rotation=rotation, update=linear_update
+    )
     with jax.named_scope("adapter"):
         extra = config.adapter.attention_update(params.adapter, attended, grid, length=length)
         attended = _added(attended, extra, config)
     tokens = checkpoint_name(_residual(tokens, params.ls1, attended), "attended")
     normed = layer_norm(params.norm2, tokens, epsilon=config.norm_epsilon)
-    update = feed_forward(params.mlp, normed)
+    update = feed_forward(params.mlp, normed, linear_update)
     with jax.named_scope("adapter"):
         extra, updated = config.adapter.mlp_update(
             params.adapter, normed, grid, length=length, valid=valid
@@ -558,6 +596,21 @@ def block(
     if updated is not params.adapter:
         params = dataclasses.replace(params, adapter=updated)
     return _residual(tokens, params.ls2, update), split_statistics(params)[0]
+
+
+def _update_of(layer: Block, config: VisionTransformer) -> LinearUpdate:
+    """Return what a block's adapter adds to its linear layers."""
+    sizes, where = config.block_shape.linears, f"adapter {config.adapter.part_name}"
+
+    def update(name: str, x: Array) -> Array | None:
+        with jax.named_scope("adapter"):
+            extra = config.adapter.linear_update(layer.adapter, name, x)
+        if extra is not None:
+            wanted = jax.ShapeDtypeStruct((*x.shape[:-1], sizes[name][1]), x.dtype)
+            expect_like(where, extra, wanted)
+        return extra
+
+    return update
 
 
 def _added(x: TokenBatch, update: TokenBatch | None, config: VisionTransformer) -> TokenBatch:
@@ -573,17 +626,21 @@ def _residual(tokens: TokenBatch, gain: float | Array, update: TokenBatch) -> To
     return total.astype(tokens.dtype)
 
 
-def feed_forward(params: Mlp | SwiGlu, x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
+def feed_forward(
+    params: Mlp | SwiGlu, x: Float[Array, "*batch dim"], update: LinearUpdate = no_update
+) -> Float[Array, "*batch dim"]:
     """Apply the feed-forward network: GELU, or SwiGLU (Shazeer 2020) if `params` are its.
 
     All tokens are rows of one matrix, so that XLA can write GELU over the product in place.
     """
     rows = x.reshape(-1, x.shape[-1])
     if isinstance(params, Mlp):
-        y = linear(params.fc2, gelu(checkpoint_name(linear(params.fc1, rows), "hidden")))
+        hidden = checkpoint_name(adapted_linear("fc1", params.fc1, rows, update), "hidden")
+        y = adapted_linear("fc2", params.fc2, gelu(hidden), update)
     else:
-        gate, value = jnp.split(checkpoint_name(linear(params.w12, rows), "hidden"), 2, axis=-1)
-        y = linear(params.w3, jax.nn.silu(gate) * value)
+        hidden = checkpoint_name(adapted_linear("w12", params.w12, rows, update), "hidden")
+        gate, value = jnp.split(hidden, 2, axis=-1)
+        y = adapted_linear("w3", params.w3, jax.nn.silu(gate) * value, update)
     return y.reshape(x.shape)
 
 

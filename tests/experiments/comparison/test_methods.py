@@ -83,7 +83,7 @@ def test_variants_of_parts(settings):
     ("given", "words"),
     [
         (("--methods", "step:newtons"), "--methods: found 'step:newtons', expected one"),
-        (("--methods", "kind:newton"), "kind of aggregator, step, dustbin, loss"),
+        (("--methods", "kind:newton"), "kind of aggregator, adapter, step, dust"),
         (("--reference", "salad"), "--reference: found salad, expected one of those compared, cri"),
     ],
 )

@@ -1,0 +1,70 @@
+"""LoRA: linear layers with an update of low rank (Hu et al. 2021)."""
+
+import dataclasses
+from typing import Literal
+
+import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import PositiveFloat, PositiveInt, require_field
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.adapters.base import ADAPTERS, Adapter, BlockShape
+from crisalad_jax.nn.layers import Linear, init_linear, linear
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+
+@pytree_dataclass
+class LowRank:
+    """The factors of an update: `down` is the paper's A transposed, `up` its B transposed."""
+
+    down: Linear
+    up: Linear
+
+
+@ADAPTERS.register("lora")
+@dataclasses.dataclass(frozen=True)
+class LoraConfig(Adapter):
+    """Updates of low rank to linear layers, W x + alpha / rank B A x (LoRA: Hu et al. 2021).
+
+    There is no dropout. `merge_adapters` adds the products to the weights for inference.
+    """
+
+    rank: PositiveInt = 8
+    """Rank of the updates."""
+    alpha: PositiveFloat = 8.0
+    """Weight of the updates times the rank."""
+    layers: tuple[Literal["qkv", "proj", "fc1", "fc2", "w12", "w3"], ...] = ("qkv", "proj")
+    """Layers with an update: qkv and proj of the attention, fc1 and fc2 of the MLP, w12 and w3 of a
+    SwiGLU."""
+
+    def check(self, shape: BlockShape) -> None:
+        """Require layers that the block has, each once."""
+        layers = ", ".join(shape.linears)
+        fits = 0 < len(self.layers) == len({*self.layers} & {*shape.linears})
+        require_field(self, "layers", fits, f"some of {layers}, each once")
+
+    def init(self, key: PRNGKeyArray, shape: BlockShape) -> dict[str, LowRank]:
+        """Draw A as torch's linear layers (as the authors' code does), and start B at 0."""
+        keys = zip(self.layers, random_init.split(key, len(self.layers)), strict=True)
+        return {name: self._init_layer(each, *shape.linears[name]) for name, each in keys}
+
+    def _init_layer(self, key: PRNGKeyArray, d_in: int, d_out: int) -> LowRank:
+        up = Linear(random_init.zeros(self.rank, d_out), None)
+        return LowRank(init_linear(key, d_in, self.rank, bias=False), up)
+
+    def linear_update(
+        self, params: dict[str, LowRank], name: str, x: Float[Array, "*batch d_in"]
+    ) -> Float[Array, "*batch d_out"] | None:
+        """Return x A B, scaled: neither A B nor a gradient of its size is computed."""
+        if name not in params:
+            return None
+        hidden = checkpoint_name(linear(params[name].down, x), "down")
+        return self.alpha / self.rank * linear(params[name].up, hidden)
+
+    def merge(self, params: dict[str, LowRank], name: str, layer: Linear) -> Linear:
+        """Add the scaled product A B to the weight."""
+        if name not in params:
+            return layer
+        product = jnp.matmul(params[name].down.weight, params[name].up.weight, precision="highest")
+        return dataclasses.replace(layer, weight=layer.weight + self.alpha / self.rank * product)
