@@ -34,6 +34,8 @@ from crisalad_jax.nn.transport.dustbin import TokenDustbin as TokenDustbin
 from crisalad_jax.nn.transport.dustbin import append_dustbin as append_dustbin
 from crisalad_jax.nn.transport.dustbin import log_marginals as log_marginals
 from crisalad_jax.nn.transport.iterate import iterate as iterate
+from crisalad_jax.nn.transport.partial import PartialDustbin as PartialDustbin
+from crisalad_jax.nn.transport.partial import PartialStep as PartialStep
 from crisalad_jax.nn.transport.problem import SCALING_RANGE as SCALING_RANGE
 from crisalad_jax.nn.transport.problem import Potentials as Potentials
 from crisalad_jax.nn.transport.problem import Problem as Problem

@@ -157,7 +157,8 @@ class Optimistix(Gradient):
                     problem, at, config.step.init(problem, params), jnp.zeros((), jnp.int32)
                 )
                 # Centre the potentials to make the fixed point unique.
-                moved = centred(problem, moved) if problem.balanced else moved
+                if problem.balanced and not config.step.capacities:
+                    moved = centred(problem, moved)
                 # 0 for what has no mass: a solver may multiply, and the floor would overflow.
                 return problem.masked(moved, 0.0)
 

@@ -71,7 +71,7 @@ class Dustbin(Part):
 DUSTBINS = Registry("dustbin", Dustbin)
 
 
-def _score(params: Any, *shape: int) -> Array:
+def check_params(params: Any, *shape: int) -> Array:
     """Return a dustbin's parameters, an array of this shape."""
     found = jnp.shape(params) if params is not None else None
     require(found == shape, f"dustbin: found parameters of shape {found}, expected {shape}")
@@ -103,7 +103,7 @@ class ColumnDustbin(Dustbin):
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Append a column of the score."""
-        return _with_column(scores, _score(params))
+        return _with_column(scores, check_params(params))
 
 
 @DUSTBINS.register("row and column")
@@ -118,7 +118,7 @@ class RowAndColumnDustbin(Dustbin):
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Append the column, then the row."""
         rows, clusters = scores.shape[-2:]
-        score = _score(params).astype(scores.dtype)
+        score = check_params(params).astype(scores.dtype)
         full = append_dustbin(scores, score)
         last = jnp.broadcast_to(score, (*full.shape[:-2], 1, clusters + 1))
         log_mu = jnp.append(jnp.zeros(rows, full.dtype), math.log(clusters))
@@ -138,7 +138,7 @@ class TokenDustbin(Dustbin):
         """Use each patch's last score as the dustbin's, or `params` of one score a patch."""
         if params is None:
             scores, params = scores[..., :-1], scores[..., -1]
-        return _with_column(scores, _score(params, *scores.shape[:-1]))
+        return _with_column(scores, check_params(params, *scores.shape[:-1]))
 
 
 @DUSTBINS.register("mass")
@@ -153,7 +153,7 @@ class MassDustbin(Dustbin):
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Append a column of zero scores."""
         rows, clusters = scores.shape[-2:]
-        logit = _score(params)
+        logit = check_params(params)
         share = jax.nn.log_sigmoid(jnp.stack([-logit, logit])).astype(scores.dtype) + math.log(rows)
         log_nu = jnp.append(jnp.broadcast_to(share[0] - math.log(clusters), clusters), share[1])
         full = append_dustbin(scores, jnp.zeros_like(logit))

@@ -206,6 +206,8 @@ def marginal_error(
     log_plan: Matrix,
     log_mu: Float[Array, "*#batch rows"],
     log_nu: Float[Array, "*#batch columns"],
+    *,
+    capacities: bool = False,
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
     """Compute the largest relative error of the row masses and of the column masses of a plan.
 
@@ -213,6 +215,7 @@ def marginal_error(
         log_plan: logarithms of the masses.
         log_mu: logarithms of the rows' marginals.
         log_nu: logarithms of the columns' marginals.
+        capacities: whether columns may have less than their marginals.
 
     Returns:
         The largest |mass / marginal - 1| of the rows, and of the columns. Where a marginal is 0,
@@ -225,12 +228,13 @@ def marginal_error(
         >>> float(rows), float(columns)
         (0.0, 1.0)
     """
-    rows = _relative_error(jax.nn.logsumexp(log_plan, axis=-1), log_mu)
-    columns = _relative_error(jax.nn.logsumexp(log_plan, axis=-2), log_nu)
-    return rows.max(axis=-1), columns.max(axis=-1)
+    rows = _excess(jax.nn.logsumexp(log_plan, axis=-1), log_mu)
+    columns = _excess(jax.nn.logsumexp(log_plan, axis=-2), log_nu)
+    columns = jnp.maximum(columns, 0) if capacities else jnp.abs(columns)
+    return jnp.abs(rows).max(axis=-1), columns.max(axis=-1)
 
 
-def _relative_error(log_mass: Array, log_marginal: Array) -> Array:
+def _excess(log_mass: Array, log_marginal: Array) -> Array:
     empty = log_marginal < LOG_ZERO
-    error = jnp.abs(jnp.expm1(log_mass - jnp.where(empty, 0, log_marginal)))
+    error = jnp.expm1(log_mass - jnp.where(empty, 0, log_marginal))
     return jnp.where(empty, jnp.where(log_mass < LOG_ZERO, 0, jnp.inf), error)

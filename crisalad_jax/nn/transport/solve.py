@@ -166,7 +166,7 @@ def _solve(
     expect_like(f"gradient {config.gradient.part_name}", solution, wanted)
     potentials = problem.masked(solution.potentials)
     log_plan = step.log_plan(problem, potentials)
-    errors = marginal_error(log_plan, problem.log_mu, problem.log_nu)
+    errors = marginal_error(log_plan, problem.log_mu, problem.log_nu, capacities=step.capacities)
     finite = jnp.isfinite(jnp.concatenate(potentials, axis=-1)).all(axis=-1)
     converged = jax.lax.stop_gradient(solution.met) & finite
     if meets_both and config.tolerance is not None:

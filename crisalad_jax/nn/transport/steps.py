@@ -45,6 +45,9 @@ class Step(Part, abc.ABC):
     entropic: ClassVar[bool] = False
     """Whether the fixed point is the entropic plan of the problem. The closed-form gradient
     requires it, and such a step counts as converged only if its marginals are met."""
+    capacities: ClassVar[bool] = False
+    """Whether columns may take less than their marginals. No constant of the potentials is then
+    free, and a result's `column_error` is the largest excess."""
 
     def init_params(self, key: PRNGKeyArray) -> Any:
         """Return the step's initial parameters, a pytree of arrays; by default None."""
@@ -75,7 +78,7 @@ class Step(Part, abc.ABC):
         rest is, to first order, the relative marginal error that the step corrected.
         """
         row, column = new.row - old.row, new.column - old.column
-        if problem.balanced:
+        if problem.balanced and not self.capacities:
             # Weight by masses: where the rows are met, this constant is 0 to first order.
             shift = (jax.nn.softmax(problem.log_nu) * column).sum(axis=-1, keepdims=True)
             row, column = row + shift, column - shift
@@ -197,17 +200,14 @@ class NewtonStep(Step):
         Raises:
             InputError: the problem's marginals are relaxed.
         """
-        require(
-            problem.balanced,
-            f"step newton: found row_tau {problem.row_tau} and column_tau {problem.column_tau}, "
-            "expected 1: it is for balanced problems",
-        )
+        check_balanced(problem, "newton")
         temperature = jax.lax.stop_gradient(state)
         temperature = _temperature(problem, potentials.column, temperature, iteration == 0)
-        tempered, column = _tempered(problem, potentials.column, temperature)
-        row = problem.log_mu - tempered.lse_columns(column)
-        log_plan = tempered.log_plan(Potentials(row, column))
-        log_masses = tempered.lse_rows(row) + column
+        smooth = tempered(problem, temperature)
+        column = _scaled(problem, potentials.column, temperature)
+        row = problem.log_mu - smooth.lse_columns(column)
+        log_plan = smooth.log_plan(Potentials(row, column))
+        log_masses = smooth.lse_rows(row) + column
         shares = jnp.exp(log_plan - problem.log_mu[..., None])
         newton = _newton_change(problem, jnp.exp(log_plan), shares, log_masses)
         change = _best_change(problem, shares, newton, problem.log_nu - log_masses)
@@ -294,9 +294,9 @@ def _temperature(problem: Problem, column: Array, current: Array, is_first: Arra
     problem, column = jax.lax.stop_gradient((problem, column))
 
     def too_far(temperature: Array) -> Array:
-        tempered, scaled = _tempered(problem, column, temperature)
-        row = problem.log_mu - tempered.lse_columns(scaled)
-        error = _marginal_error(tempered, Potentials(row, scaled))
+        smooth, scaled = tempered(problem, temperature), _scaled(problem, column, temperature)
+        row = problem.log_mu - smooth.lse_columns(scaled)
+        error = _marginal_error(smooth, Potentials(row, scaled))
         return is_first & (error > FAR) & (temperature < HOTTEST)
 
     def hotter(temperature: Array) -> Array:
@@ -305,18 +305,30 @@ def _temperature(problem: Problem, column: Array, current: Array, is_first: Arra
     return jax.lax.while_loop(lambda at: too_far(at).any(), hotter, current)
 
 
-def _tempered(problem: Problem, column: Array, temperature: Array) -> tuple[Problem, Array]:
-    """Return the problem at a multiple of its epsilon, and columns' potentials for it.
+def check_balanced(problem: Problem, name: str) -> None:
+    """Check that a problem has no relaxed marginals, for a step of balanced problems."""
+    require(
+        problem.balanced,
+        f"step {name}: found relaxed marginals, expected row_tau 1 and column_tau 1: it is for "
+        "balanced problems",
+    )
 
-    Potentials are measured from the columns' masses: in the limit of an infinite temperature the
-    plan is the product of the marginals, which meets them.
-    """
+
+def tempered(problem: Problem, temperature: Float[Array, "*batch"]) -> Problem:
+    """Return a balanced problem at a multiple of its epsilon, in the same domain."""
     by = temperature[..., None]
     clusters, last = problem.clusters / by[..., None], problem.last / by
-    tempered = Problem(clusters, last, problem.log_mu, problem.log_nu)
-    if isinstance(problem, ScalingProblem):
-        tempered = ScalingProblem.scaled(tempered)
-    return tempered, problem.log_nu + (column - problem.log_nu) / by
+    smooth = Problem(clusters, last, problem.log_mu, problem.log_nu)
+    return ScalingProblem.scaled(smooth) if isinstance(problem, ScalingProblem) else smooth
+
+
+def _scaled(problem: Problem, column: Array, temperature: Array) -> Array:
+    """Return potentials for a multiple of epsilon, measured from the columns' masses.
+
+    In the limit of an infinite temperature the plan is the product of the marginals, which meets
+    them.
+    """
+    return problem.log_nu + (column - problem.log_nu) / temperature[..., None]
 
 
 def _marginal_error(problem: Problem, potentials: Potentials) -> Float[Array, "*batch"]:

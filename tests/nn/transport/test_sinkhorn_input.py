@@ -79,7 +79,7 @@ BAD_SOLVES: dict[str, tuple[dict[str, Any], str]] = {
     "complex scores": ({"scores": SCORES + 1j}, "found complex scores, expected real ones"),
     "newton, relaxed rows": (
         {"row_tau": 0.5, "config": SinkhornConfig("newton")},
-        "step newton: found row_tau 0.5 and column_tau 1.0, expected 1",
+        "step newton: found relaxed marginals, expected row_tau 1 and column_tau 1",
     ),
     "a step's tuple": (
         {"config": SinkhornConfig("test-input-tuple")},
