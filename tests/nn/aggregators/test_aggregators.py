@@ -20,7 +20,9 @@ from crisalad_jax.nn.aggregators.gem import (
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.errors import InputError
 
 KEY, VIT = jax.random.key(0), ViTConfig()
 
@@ -63,6 +65,20 @@ def test_means_start_at_the_published_exponent(config: Aggregator) -> None:
         assert 0.7 * bound < jnp.abs(params.fc.weight).max() <= bound
         assert params.fc.bias is not None
         assert params.fc.bias.any()  # EigenPlaces and CosPlace alike have a bias
+
+
+@pytest.mark.parametrize("config", [GemConfig(), GemPyramidConfig(), ClassTokenConfig()])
+def test_tokens_have_the_shape_that_is_allocated_for_them(config: Aggregator) -> None:
+    features, params = Features(jnp.ones(6), jnp.ones((12, 6))), config.init(KEY, VIT, (3, 4))
+    tokens = config.apply(params, features, (3, 4), key=None)
+    shape = tokens.global_token.shape[-1], tokens.local.shape[-2]
+    assert tuple(config.token_shape(6))[:2] == shape
+
+
+def test_a_class_token_is_asked_for() -> None:
+    words = "found resnet for aggregator gem-pyramid, expected one with a class token"
+    with pytest.raises(InputError, match=words):
+        ModelConfig(backbone="resnet", aggregator="gem-pyramid")
 
 
 def test_negative_numbers_count_as_the_floor() -> None:

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.special
 
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.vlad import (
@@ -15,6 +16,7 @@ from crisalad_jax.nn.aggregators.vlad import (
     AnyLocConfig,
     NetVlad,
     NetVladConfig,
+    SuperVlad,
     SuperVladConfig,
     VladBuff,
     VladBuffConfig,
@@ -26,7 +28,7 @@ from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
-from crisalad_jax.nn.layers import init_linear, l2_normalise
+from crisalad_jax.nn.layers import Linear, init_linear, l2_normalise
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import random_params
 
@@ -76,6 +78,19 @@ def test_hard_vlad_takes_the_nearest_word_alone(assignment: Any, far: Any) -> No
             sums[nearest] += patch - words[nearest]
         assert not sums[4].any()
         expected = [row if not row.any() else unit(row) for row in sums]
+        np.testing.assert_allclose(clusters, expected, atol=1e-6)
+
+
+def test_supervlad_sums_patches_by_their_shares_without_ghosts() -> None:
+    """In numpy: a softmax with the ghost, sums of four clusters, each normalised, then all."""
+    config = SuperVladConfig(clusters=4, ghosts=1)
+    weight = np.random.default_rng(2).normal(size=(6, 5)).astype(np.float32)
+    found = sums_of(config, SuperVlad(Linear(jnp.asarray(weight), None)), jnp.asarray(PATCHES))
+    for image, clusters in zip(PATCHES.astype(np.float64), found, strict=True):
+        rows = np.stack([unit(patch) for patch in image])
+        parts = scipy.special.softmax(rows @ weight, axis=1)[:, :4]
+        expected = unit(np.stack([unit(row) for row in parts.T @ rows]))
+        # Sums of nine unit patches in float32, of numbers below 1.
         np.testing.assert_allclose(clusters, expected, atol=1e-6)
 
 
