@@ -303,7 +303,9 @@ def test_every_query_has_its_turn_in_an_epoch():
     first, second = queries_of(miner, range(3)), queries_of(miner, range(3, 6))
     assert len(set(itertools.chain(*first))) == len(set(itertools.chain(*second))) == 6
     assert first != second
-    drawn = queries_of(miner_of(dataclasses.replace(turns, queries_per_epoch=30), street), range(5))
+    drawn = queries_of(
+        miner_of(dataclasses.replace(turns, queries_per_epoch=90), street), range(25)
+    )
     assert all(len(set(each)) == len(each) for each in drawn)
     assert len({tuple(each) for each in drawn}) > 1
 
@@ -317,6 +319,7 @@ def test_rounds_of_pitts30k_are_the_codes():
     assert (selavpr.steps_per_epoch, selavpr.steps_per_round) == (30 * 250, 250)
     with pytest.raises(InputError, match="street: found rounds of 2 queries, of 2 with"):
         Miner(recipe("b14", "netvlad"), STREET)
+    assert miner_of(MiningConfig(kind="whole"), batch=2).steps_per_epoch == 1  # both queries
 
 
 def test_recipes_are_the_codes():

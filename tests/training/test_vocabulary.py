@@ -26,7 +26,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, Model, unit_features
 from crisalad_jax.training.trainable import split_params
-from crisalad_jax.training.vocabulary import with_vocabulary
+from crisalad_jax.training.vocabulary import build_vocabulary, with_vocabulary
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.output import Note
@@ -128,6 +128,14 @@ def test_a_seed_draws_images_and_centroids(fresh, paths, built) -> None:
     for i, j in ((0, 1), (0, 2), (1, 2)):
         assert not np.array_equal(some[i], some[j])
     assert_equal(dataclasses.replace(built, aggregator=fresh.aggregator), fresh)
+
+
+def test_a_file_has_the_vocabulary_of_so_many_images(fresh, paths, tmp_path) -> None:
+    out, model = tmp_path / "anyloc.safetensors", Model(fresh, ANYLOC)
+    found = build_vocabulary(model, paths, out, max_images=4, batch_size=BATCH, quiet=True)
+    expected = with_vocabulary(model, paths, images=4, batch_size=BATCH, quiet=True)
+    np.testing.assert_array_equal(centroids_of(load_weights(out).params), centroids_of(expected))
+    assert (found.words, found.images) == (4, 4)
 
 
 def test_what_does_not_fit_is_said_before_images_are_read(fresh, tmp_path) -> None:
