@@ -171,7 +171,8 @@ class Registry(Generic[P]):
         is_part = isinstance(value, self.base)
         if not is_part or "part_name" not in vars(type(value)):
             found = f"{in_one_line(value)}{', which is not registered' if is_part else ''}"
-            raise InputError(f"{where}: found {found}, expected a {self.kind} or its name")
+            article = "an" if self.kind[0] in "aeiou" else "a"
+            raise InputError(f"{where}: found {found}, expected {article} {self.kind} or its name")
         return value
 
 

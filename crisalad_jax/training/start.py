@@ -167,7 +167,8 @@ def read_start(
         fresh = init_crisalad(jax.random.key(config.seed), config.model)
         params = with_backbone_of(fresh, config.model, backbone)
         before, after = named_leaves(fresh), named_leaves(params)
-        frozen = [name for name in frozen if np.array_equal(before[name], after[name])]
+        if any(not np.array_equal(before[name], after[name]) for name in frozen):
+            frozen = []  # the file has trained ones
     require(
         not frozen,
         f"--trainable: found {config.trainable}, which leaves adapters out that start untrained "

@@ -9,12 +9,14 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.registry import Registry
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.layers import Grid, Linear, Valid
 
 AnyTokens = Float[Array, "*batch token dim"]
 """Tokens of an image or of a batch: the class token and registers first, the patches last."""
 
 
+@brief
 class BlockShape(NamedTuple):
     """The sizes of a block that an adapter is made for."""
 

@@ -1,6 +1,7 @@
 """LoRA against torch: a block with W x + alpha / rank B A x, its gradients, and the merge."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -59,7 +60,7 @@ def test_a_block_and_its_gradients_equal_torchs() -> None:
         y, _ = block(dataclasses.replace(params, adapter=adapter), tokens, (2, 3), config)
         return (y * weights).sum(), y
 
-    grads, found = jax.grad(loss, argnums=(0, 1), has_aux=True)(params.adapter, tokens)
+    grads, found = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))(params.adapter, tokens)
 
     t = jax.tree.map(lambda leaf: torch.tensor(np.array(leaf), requires_grad=True), params)
     x = torch.tensor(np.array(tokens), requires_grad=True)
@@ -95,7 +96,10 @@ GATED = ("qkv", "w12", "w3")
     "backbone",
     [
         dataclasses.replace(MODEL.backbone, adapter=LORA),
-        DinoV3Config(dim=32, depth=2, heads=2, ffn="swiglu", adapter=LoraConfig(layers=GATED)),
+        pytest.param(
+            DinoV3Config(dim=32, depth=2, heads=2, ffn="swiglu", adapter=LoraConfig(layers=GATED)),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["vit", "dinov3"],
 )
@@ -121,7 +125,9 @@ def test_a_merged_model_has_the_same_descriptors(backbone: VisionTransformer) ->
         FeatureSpec(class_attention=True),
     ):
         inside, expected = (
-            each.config.backbone.apply(each.params.backbone, pixels, request)[0]
+            jax.jit(functools.partial(each.config.backbone.apply, request=request))(
+                each.params.backbone, pixels
+            )[0]
             for each in (model, merged)
         )
         # Tokens of order 1, and shares of at most 2 heads.
@@ -161,7 +167,6 @@ def test_no_gradient_has_the_size_of_a_weight() -> None:
         (("w12",), r"found \('w12',\), expected some of qkv, proj, fc1, fc2, each once"),
         (("qkv", "qkv"), "each once"),
         ((), "each once"),
-        (("key",), "each one of fc1, fc2, proj, qkv, w12, w3"),
     ],
 )
 def test_layers_that_a_block_lacks_are_refused(layers: Any, words: str) -> None:
