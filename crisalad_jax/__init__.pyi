@@ -43,7 +43,9 @@ from .nn.backbones import register_backbone as register_backbone
 from .nn.config import PRESETS as PRESETS
 from .nn.config import ModelConfig as ModelConfig
 from .nn.config import with_aggregator as with_aggregator
+from .nn.cross_image import CrossImage as CrossImage
 from .nn.cross_image import CrossImageConfig as CrossImageConfig
+from .nn.cross_image import register_cross_image as register_cross_image
 from .nn.model import Crisalad as Crisalad
 from .nn.model import Model as Model
 from .nn.model import attend_across_images as attend_across_images

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 import crisalad_jax as cj
-from crisalad_jax.nn.cross_image import cross_image_encoder, init_cross_image
+from crisalad_jax.nn.cross_image import cross_image_encoder
 
 NAMES = {
     "attn.qkv.weight": "self_attn.in_proj_weight",
@@ -35,7 +35,7 @@ def to_torch(tree):
 def main():
     """Compare the outputs and the gradients of a sum of squares, largest difference of each."""
     config = cj.CrossImageConfig(layers=1, heads=4, feedforward=64, dropout=0.0)
-    params = init_cross_image(jax.random.key(0), 32, config)
+    params = config.init(jax.random.key(0), 32)
     tokens = jax.random.normal(jax.random.key(1), (6, 5, 32))  # images, tokens, width
 
     theirs = torch.nn.TransformerEncoderLayer(32, 4, 64, dropout=0.0, activation="gelu")

@@ -22,7 +22,6 @@ from crisalad_jax.nn.backbones.base import Backbone
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, attend_across_images, tokens_and_statistics
 from parity.cases.case import LAYOUT, build, convert
 
@@ -51,7 +50,7 @@ def test_descriptors_and_gradients(backbone: Backbone, aggregator: Aggregator) -
         image_size=SIZE,
         backbone=backbone,
         aggregator=aggregator,
-        cross_image=CrossImageConfig(layers=0),
+        cross_image="none",
     )
     rng = np.random.default_rng(0)
     model = build(config, "float64", rng)
@@ -84,7 +83,7 @@ def test_a_training_batch_is_normalised_as_torch_does() -> None:
         image_size=SIZE,
         backbone=ResNetConfig(layers=18, stages=2),
         aggregator=CosPlaceConfig(dim=20),
-        cross_image=CrossImageConfig(layers=0),
+        cross_image="none",
     )
     rng = np.random.default_rng(0)
     model = build(config, "float64", rng).train()

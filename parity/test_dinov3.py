@@ -23,7 +23,6 @@ from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.backbones import FeatureSpec
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, parameter_shapes
 from parity.test_goldens import GRADIENT_BOUND, OUTPUT_BOUND, golden_loss, relative_error
 from parity.test_independent import (
@@ -66,9 +65,7 @@ def expected_config(gated: bool) -> ModelConfig:
     # As published: SwiGLU's two thirds of six times the width.
     sizes: dict[str, Any] = {"ffn": "swiglu", "mlp_ratio": 6.0} if gated else {}
     backbone = DinoV3Config(dim=128, depth=2, heads=2, adapter="none", **sizes)
-    return ModelConfig(
-        backbone=backbone, aggregator=ClassTokenConfig(), cross_image=CrossImageConfig(layers=0)
-    )
+    return ModelConfig(backbone=backbone, aggregator=ClassTokenConfig(), cross_image="none")
 
 
 def pixels(grid: tuple[int, int]) -> np.ndarray:

@@ -31,7 +31,7 @@ from crisalad_jax.nn.backbones.vit import (
     run_blocks,
 )
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig, cross_image_encoder, init_cross_image
+from crisalad_jax.nn.cross_image import CrossImageConfig, cross_image_encoder
 from crisalad_jax.nn.layers import layer_norm
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.sinkhorn import SinkhornConfig, assign_with_dustbin
@@ -140,9 +140,7 @@ def test_vit(name: str, registers: int) -> None:
         position_grid=5,
         adapter="none",
     )
-    model = ModelConfig(
-        backbone=config, aggregator=ClassTokenConfig(), cross_image=CrossImageConfig(layers=0)
-    )
+    model = ModelConfig(backbone=config, aggregator=ClassTokenConfig(), cross_image="none")
 
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
         images = inputs["image"].transpose(0, 2, 3, 1)
@@ -183,7 +181,7 @@ def test_multi_resolution_adapter() -> None:
 def test_salad() -> None:
     golden = load("salad")
     config = SaladConfig(clusters=6, cluster_dim=8, token_dim=16, hidden=512)
-    model = ModelConfig(aggregator=config, cross_image=CrossImageConfig(layers=0))
+    model = ModelConfig(aggregator=config, cross_image="none")
 
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
         batch, channels = inputs["features"].shape[:2]
@@ -245,6 +243,6 @@ def test_cross_image_encoder() -> None:
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
         return {"tokens": cross_image_encoder(params, inputs["tokens"], config, key=None)}
 
-    template = jax.eval_shape(lambda key: init_cross_image(key, 16, config), jax.random.key(0))
+    template = jax.eval_shape(lambda key: config.init(key, 16), jax.random.key(0))
     names = part_names(TABLES["encoder"], template, "cross_image.", "encoder.")
     check(function, golden, names, {"tokens": jnp.asarray(golden["in.tokens"])})

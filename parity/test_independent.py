@@ -37,7 +37,7 @@ from crisalad_jax.checkpoints.public import read_checkpoint, write_checkpoint
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig, cross_image_encoder, init_cross_image
+from crisalad_jax.nn.cross_image import CrossImageConfig, cross_image_encoder
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.training.losses import LossConfig
@@ -122,7 +122,7 @@ def expected_config(kind: Kind) -> ModelConfig:
     return ModelConfig(
         backbone=backbone,
         aggregator=ClassTokenConfig(),
-        cross_image=CrossImageConfig(layers=0),
+        cross_image="none",
     )
 
 
@@ -349,7 +349,7 @@ def test_masked_encoder_is_torchs() -> None:
     layer = nn.TransformerEncoderLayer(16, 4, 24, activation="gelu")
     encoder = nn.TransformerEncoder(layer, 2, enable_nested_tensor=False).eval()
     shake(encoder)
-    template = jax.eval_shape(lambda key: init_cross_image(key, 16, config), jax.random.key(0))
+    template = jax.eval_shape(lambda key: config.init(key, 16), jax.random.key(0))
     names = part_names(TABLES["encoder"], template, "cross_image.", "encoder.")
     params = names.ours({name: x.numpy() for name, x in encoder.state_dict().items()})
     mask = np.tri(5, dtype=bool)

@@ -159,7 +159,7 @@ def test_salad() -> None:
             image_size=(56, 84),
             backbone=ViTConfig(dim=48, depth=1, heads=3, position_grid=5, adapter=NO_ADAPTER),
             aggregator=config,
-            cross_image=CrossImageConfig(layers=0),
+            cross_image="none",
         )
     )
     # A constant added to a cluster's scores is absorbed by the cluster's potential: the dustbin's
@@ -253,7 +253,7 @@ def test_pyramid_of_the_published_grid() -> None:
 
 
 SIZES = {"s": (384, 12, 6), "b": (768, 12, 12), "l": (1024, 24, 16), "g": (1536, 40, 24)}
-NO_ENCODER = CrossImageConfig(layers=0)
+NO_ENCODER = "none"
 
 
 def dinov2(size: str, registers: int = 0, adapter: str = NO_ADAPTER) -> ViTConfig:

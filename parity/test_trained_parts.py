@@ -20,7 +20,6 @@ from crisalad_jax.nn.adapters.bottleneck import SideConfig
 from crisalad_jax.nn.aggregators.queries import BoqConfig, EdtFormerConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.training.trainable import merge_params, split_params
 from parity.cases.case import LAYOUT
 from parity.cases.weights import random_state
@@ -37,7 +36,7 @@ def model_of(aggregator: Any, adapter: Adapter | str) -> ModelConfig:
         image_size=SIZE,
         backbone=ViTConfig(dim=64, depth=2, heads=1, position_grid=3, adapter=adapter),
         aggregator=aggregator,
-        cross_image=CrossImageConfig(layers=0),
+        cross_image="none",
         compute_dtype="float64",
     )
 

@@ -12,7 +12,6 @@ import torch
 
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 
 LAYOUTS = pathlib.Path(__file__).parents[1] / "parity" / "layouts"
 UNDER = "model_state_dict/"
@@ -28,9 +27,7 @@ def bare_vit(depth: int = 2, position_grid: int = 2) -> ModelConfig:
         position_grid=position_grid,
         adapter="none",
     )
-    return ModelConfig(
-        aggregator="class-token", backbone=backbone, cross_image=CrossImageConfig(layers=0)
-    )
+    return ModelConfig(aggregator="class-token", backbone=backbone, cross_image="none")
 
 
 def public_layout(name: str) -> dict[str, tuple[int, ...]]:

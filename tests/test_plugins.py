@@ -32,9 +32,7 @@ from tests.conftest import BATCH, MODEL, RECIPE, random_params, write_city, writ
 
 ROOT = pathlib.Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
-WITHOUT_ENCODER = dataclasses.replace(
-    MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=0)
-)
+WITHOUT_ENCODER = dataclasses.replace(MODEL, cross_image="none")
 
 
 pytestmark = pytest.mark.usefixtures("own_parts")

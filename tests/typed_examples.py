@@ -33,7 +33,7 @@ def parts_by_name(preset: cj.ModelConfig) -> None:
     training = cj.TrainConfig(model=preset, augmentation="none", trainable="head")
     assert_type(training.augmentation, cj.Augmentation)
     assert_type(dataclasses.replace(training, augmentation="light"), cj.TrainConfig)
-    encoder = cj.CrossImageConfig(layers=0)
+    encoder = "none"
     assert_type(cj.with_aggregator(preset, "gem", "tiny", cross_image=encoder), cj.ModelConfig)
     assert_type(cj.recipe("tiny", "crisalad+gem"), cj.TrainConfig)
     assert_type(cj.from_scratch(training), cj.TrainConfig)

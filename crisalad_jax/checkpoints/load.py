@@ -165,7 +165,7 @@ def open_model(
     config = changed(read_model(file))
     if config.compute_dtype == "float64":
         raise InputError(f"--runtime: found {engine} with a model of float64, expected jax")
-    attends = bool(config.cross_image.layers)
+    attends = config.cross_image.attends
     model = open_runtime(
         file,
         engine,

@@ -51,7 +51,7 @@ from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLoc, AnyLocConfig
 from crisalad_jax.nn.backbones import Backbone
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.cross_image import NoCrossImage
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.utils.errors import InputError
@@ -167,7 +167,7 @@ def vocabulary_model(words: int, model: ModelConfig, fields: Mapping[str, Any]) 
         model,
         preprocessing=PreprocessingConfig(size_rule="native", pixels="floats"),
         aggregator=AnyLocConfig(clusters=words, **fields),
-        cross_image=CrossImageConfig(layers=0),
+        cross_image=NoCrossImage(),
         projection=ProjectionConfig(),
     )
 

@@ -89,7 +89,7 @@ class Runtime:
         Raises:
             InputError: it is for images that are described alone, or for a whole call's together.
         """
-        if not self.model["cross_image"]["layers"] or self.grouping == "any":
+        if self.model["cross_image"]["name"] == "none" or self.grouping == "any":
             return
         wanted = {kind for grouping in groupings for kind in grouping.split("/")}
         if self.grouping == "batch" or wanted != {"single"}:

@@ -50,9 +50,8 @@ def load_plugin(plugin: str) -> None:
         ... ]
         >>> _ = (folder / "mean.py").write_text("\n".join(lines))
         >>> load_plugin(str(folder / "mean.py"))
-        >>> from crisalad_jax import CrossImageConfig, ModelConfig
-        >>> alone = CrossImageConfig(layers=0)
-        >>> ModelConfig(aggregator="patch-mean", cross_image=alone).descriptor_dim
+        >>> from crisalad_jax import ModelConfig
+        >>> ModelConfig(aggregator="patch-mean", cross_image="none").descriptor_dim
         768
     """
     spec = _spec_of(plugin)

@@ -88,8 +88,8 @@ def concise_repr(value: Any) -> str:
 
     Example:
         >>> from crisalad_jax import CrossImageConfig, ModelConfig
-        >>> print(ModelConfig(aggregator="gem", cross_image=CrossImageConfig(layers=0, heads=4)))
-        ModelConfig(backbone='vit', aggregator='gem', cross_image=CrossImageConfig(layers=0))
+        >>> print(ModelConfig(aggregator="gem", cross_image=CrossImageConfig(heads=4, layers=2)))
+        ModelConfig(backbone='vit', aggregator='gem', cross_image=CrossImageConfig(heads=4))
     """
     return _write(value, _WIDTH)
 
@@ -178,9 +178,9 @@ def fields_in_use(config: Any) -> list[dataclasses.Field[Any]]:
     """List a configuration's fields without those that its switch puts out of use.
 
     Example:
-        >>> from crisalad_jax import CrossImageConfig
-        >>> [field.name for field in fields_in_use(CrossImageConfig(layers=0))]
-        ['layers']
+        >>> from crisalad_jax import ProjectionConfig
+        >>> [field.name for field in fields_in_use(ProjectionConfig(dim=0))]
+        ['dim']
     """
     fields, switch = list(dataclasses.fields(config)), _style_of(config).switch
     if not switch or getattr(config, switch[0]) != switch[1]:

@@ -126,10 +126,10 @@ def evaluate(
             )
         k = min(max(*KS, rerank.top if rerank else 0), len(benchmark.database))
         results = []
-        for grouping in parsed if config.cross_image.layers else [Grouping("single", "single")]:
+        for grouping in parsed if config.cross_image.attends else [Grouping("single", "single")]:
             is_random = "shuffled" in (grouping.queries, grouping.database)
             drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
-            name = str(grouping) if config.cross_image.layers else ANY
+            name = str(grouping) if config.cross_image.attends else ANY
             observer = observe and functools.partial(observe, name)
             ranked = _rank(sides, grouping, drawn, k, observer, is_unit=is_unit)
             rankings, (database_share, query_share) = ranked

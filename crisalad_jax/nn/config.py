@@ -13,7 +13,7 @@ from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.backbones import BACKBONES, Backbone
 from crisalad_jax.nn.backbones.vit import ViTConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.cross_image import CROSS_IMAGE, CrossImage, CrossImageConfig
 from crisalad_jax.nn.projection import ProjectionConfig
 
 MOST_PIXELS = 4096
@@ -29,7 +29,7 @@ class ModelConfig:
     pyramid. DINOv2 by itself gives its class token. See docs/methods.md for all methods.
 
     Example:
-        >>> model = ModelConfig(aggregator="gem", cross_image=CrossImageConfig(layers=0))
+        >>> model = ModelConfig(aggregator="gem", cross_image="none")
         >>> model.descriptor_dim
         768
     """
@@ -43,8 +43,8 @@ class ModelConfig:
     """Registered backbone, or its name; it turns pixels into features."""
     aggregator: OrName[Aggregator] = part_field(AGGREGATORS, "salad")
     """Registered aggregator, or its name; it turns features into tokens."""
-    cross_image: CrossImageConfig = CrossImageConfig()
-    """Encoder whose attention runs across the images of a batch."""
+    cross_image: OrName[CrossImage] = part_field(CROSS_IMAGE, "transformer")
+    """Registered encoder, or its name; it relates the images of a batch."""
     projection: ProjectionConfig = ProjectionConfig()
     """Linear layer over the whole descriptor; by default none."""
     compute_dtype: Literal["float32", "bfloat16", "float64"] = non_semantic_field("float32")
@@ -82,16 +82,20 @@ class ModelConfig:
         require_field(self.preprocessing, "size_rule", fits, words)
         self.check_image_size(self.input_size)
         encoder, (global_dim, tokens, dim) = self.cross_image, self.token_shape
-        if not encoder.layers:
+        if not encoder.attends:
             return
+        require(
+            self.aggregator.trainable,
+            f"cross_image: found {encoder.part_name} for {aggregator}, with which nothing trains, "
+            "expected none",
+        )
         whole, rest = encoder.global_token, global_dim % dim
-        for name, fits, expected in (
-            ("layers", self.aggregator.trainable, f"0 for {aggregator}, with which nothing trains"),
-            ("heads", dim % encoder.heads == 0, f"a divisor of the {dim} numbers of a token"),
-            ("global_token", not whole or not rest, f"False: its width is no multiple of {dim}"),
-            ("global_token", whole or tokens > 0, "True, or layers 0: it is the only token"),
+        for fits, expected in (
+            (not whole or not rest, f"False: its width is no multiple of {dim}"),
+            (whole or tokens > 0, "True, or no encoder: it is the only token"),
         ):
-            require_field(encoder, name, fits, expected)
+            require_field(encoder, "global_token", fits, expected)
+        encoder.check(dim)
 
     @property
     def token_shape(self) -> TokenShape:
@@ -257,8 +261,7 @@ def with_aggregator(model: ModelConfig, name: str, preset: str, **changes: Any) 
         InputError: no such aggregator, or it does not fit the model.
 
     Example:
-        >>> alone = CrossImageConfig(layers=0)
-        >>> with_aggregator(PRESETS["tiny"], "gem", "tiny", cross_image=alone).descriptor_dim
+        >>> with_aggregator(PRESETS["tiny"], "gem", "tiny", cross_image="none").descriptor_dim
         128
     """
     return dataclasses.replace(model, aggregator=AGGREGATORS.make(name, preset), **changes)

@@ -1,46 +1,105 @@
-"""The cross-image encoder (paper section 3.4): transformer layers across a batch's images.
+"""Cross-image encoders, which relate the images of a batch: the paper's (section 3.4), and others.
 
-Layers are torch's `nn.TransformerEncoderLayer` as CricaVPR uses it: post-norm, exact GELU.
+Layers of the paper's are torch's `nn.TransformerEncoderLayer` as CricaVPR uses it: post-norm, exact
+GELU.
 """
 
+import abc
 import dataclasses
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import Fraction, NonNegativeInt, PositiveInt, check_types
-from crisalad_jax.config.part import non_semantic_field
-from crisalad_jax.config.short_repr import short_repr
+from crisalad_jax.config.checks import Fraction, PositiveInt, require_field
+from crisalad_jax.config.part import Part, non_semantic_field
+from crisalad_jax.config.registry import Registry
+from crisalad_jax.nn import random_init
 from crisalad_jax.nn.attention import Attention, dot_product_attention
 from crisalad_jax.nn.layers import at_least_float32, dropout, gelu, linear, split_key
 from crisalad_jax.nn.torch_layers import EncoderLayer, encoder_layer, init_encoder_layer
 from crisalad_jax.utils.devices import IMAGE, image_mesh
 from crisalad_jax.utils.pytree import pytree_dataclass
 
+Sequences = Float[Array, "image token dim"]
+"""The tokens of each image of a batch."""
+Mask = Bool[Array, "image image"] | None
+"""`mask[i, j]` allows image i to attend to image j; None allows all."""
 
-@short_repr(switch=("layers", 0))
+
 @dataclasses.dataclass(frozen=True)
-class CrossImageConfig:
-    """The transformer encoder that attends across the images of a batch (paper section 3.4).
+class CrossImage(Part, abc.ABC):
+    """A network that relates the images of a batch: a frozen dataclass with its settings as fields.
+
+    `init` and `apply` are required.
 
     Example:
-        >>> CrossImageConfig(layers=0).layers
-        0
+        >>> import jax
+        >>> from crisalad_jax import ModelConfig, register_cross_image
+        >>> @register_cross_image("mean")
+        ... @dataclasses.dataclass(frozen=True)
+        ... class Mean(CrossImage):
+        ...     share: float = 0.5
+        ...
+        ...     def init(self, key, dim):
+        ...         return None
+        ...
+        ...     def apply(self, params, tokens, *, mask, key):
+        ...         weights = jnp.ones(2 * tokens.shape[:1]) if mask is None else mask * 1.0
+        ...         weights = weights / weights.sum(axis=1, keepdims=True)
+        ...         mean = jnp.einsum("ij,jtd->itd", weights.astype(tokens.dtype), tokens)
+        ...         return (1 - self.share) * tokens + self.share * mean
+        >>> ModelConfig(cross_image=Mean(share=0.1)).descriptor_dim
+        8448
     """
 
-    layers: NonNegativeInt = 2
-    """Number of layers. 0 leaves the encoder out, so that descriptors depend on no other image."""
-    heads: PositiveInt = 16
-    feedforward: PositiveInt = 2048
-    dropout: Fraction = non_semantic_field(0.1)
-    global_token: bool = True
-    """Whether the global token takes part too, cut into tokens of the clusters' width."""
+    attends: ClassVar[bool] = True
+    """Whether a descriptor depends on the other images of its batch."""
+    global_token = True  # without a type, so that a class may make it a field
+    """Whether the global token takes part, cut into tokens of the local ones' width."""
 
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        check_types(self)
+    def check(self, dim: int) -> None:
+        """Raise InputError where it does not fit tokens of this width; by default never."""
+
+    @abc.abstractmethod
+    def init(self, key: PRNGKeyArray, dim: int) -> Any:
+        """Draw random parameters, a pytree of arrays in float32, for tokens of width `dim`."""
+
+    @abc.abstractmethod
+    def apply(
+        self, params: Any, tokens: Sequences, *, mask: Mask, key: PRNGKeyArray | None
+    ) -> Sequences:
+        """Return the images' tokens, in the shape and type in which they come.
+
+        Args:
+            params: of `init`.
+            tokens: of every image, in the type to compute in.
+            mask: which images attend to which, every image to at least one; None is all to all.
+            key: draws dropout; None means inference.
+        """
+
+
+CROSS_IMAGE = Registry("cross_image", CrossImage)
+register_cross_image = CROSS_IMAGE.register
+
+
+@CROSS_IMAGE.register("none")
+@dataclasses.dataclass(frozen=True)
+class NoCrossImage(CrossImage):
+    """No encoder: a descriptor depends on no other image."""
+
+    attends: ClassVar[bool] = False
+
+    def init(self, key: PRNGKeyArray, dim: int) -> None:
+        """Return None: there are no parameters."""
+
+    def apply(
+        self, params: None, tokens: Sequences, *, mask: Mask, key: PRNGKeyArray | None
+    ) -> Sequences:
+        """Return the tokens."""
+        return tokens
 
 
 @pytree_dataclass
@@ -50,14 +109,74 @@ class CrossImageEncoder:
     layers: tuple[EncoderLayer, ...]
 
 
-def init_cross_image(key: PRNGKeyArray, dim: int, config: CrossImageConfig) -> CrossImageEncoder:
-    """Draw parameters as torch does: Glorot-uniform attention, zero biases, default linears.
+@CROSS_IMAGE.register("transformer", tiny={"heads": 4, "feedforward": 128, "dropout": 0.0})
+@dataclasses.dataclass(frozen=True)
+class CrossImageConfig(CrossImage):
+    """The transformer encoder that attends across the images of a batch (paper section 3.4).
 
-    All layers start equal, for torch's `nn.TransformerEncoder` copies the one that it is given.
+    Example:
+        >>> CrossImageConfig(layers=1).layers
+        1
     """
-    # Drawn anew: a training step that donates its buffers must not find one twice.
-    layers = (init_encoder_layer(key, dim, config.feedforward) for _ in range(config.layers))
-    return CrossImageEncoder(tuple(layers))
+
+    layers: PositiveInt = 2
+    """Number of layers."""
+    heads: PositiveInt = 16
+    feedforward: PositiveInt = 2048
+    dropout: Fraction = non_semantic_field(0.1)
+    global_token: bool = True
+    """Whether the global token takes part too, cut into tokens of the clusters' width."""
+
+    def check(self, dim: int) -> None:
+        """Require heads that divide a token."""
+        words = f"a divisor of the {dim} numbers of a token"
+        require_field(self, "heads", dim % self.heads == 0, words)
+
+    def init(self, key: PRNGKeyArray, dim: int) -> Any:
+        """Draw parameters as torch does: Glorot-uniform attention, zero biases, default linears.
+
+        All layers start equal, for torch's `nn.TransformerEncoder` copies the one that it is given.
+        """
+        # Drawn anew: a training step that donates its buffers must not find one twice.
+        layers = (init_encoder_layer(key, dim, self.feedforward) for _ in range(self.layers))
+        return CrossImageEncoder(tuple(layers))
+
+    def apply(
+        self, params: Any, tokens: Sequences, *, mask: Mask, key: PRNGKeyArray | None
+    ) -> Sequences:
+        """Attend from each token to the same token of all images."""
+        return cross_image_encoder(params, tokens, self, mask=mask, key=key)
+
+
+@pytree_dataclass
+class GatedEncoder:
+    """A gate, and what is behind it."""
+
+    gate: Float[Array, ""]
+    encoder: CrossImageEncoder
+
+
+@CROSS_IMAGE.register("gated", tiny={"heads": 4, "feedforward": 128, "dropout": 0.0})
+@dataclasses.dataclass(frozen=True)
+class GatedCrossImageConfig(CrossImageConfig):
+    """The paper's encoder behind a learnt gate: y = x + tanh(g) (f(x) - x).
+
+    x are an image's tokens, f is the encoder of "transformer", and the number g starts at 0. An
+    untrained encoder therefore leaves descriptors as they are (in bfloat16 up to rounding). The
+    gate is that of Flamingo's layers (Alayrac et al. 2022), here on what the encoder adds.
+    """
+
+    def init(self, key: PRNGKeyArray, dim: int) -> GatedEncoder:
+        """Draw the encoder, and a gate of 0."""
+        return GatedEncoder(random_init.zeros(), super().init(key, dim))
+
+    def apply(
+        self, params: GatedEncoder, tokens: Sequences, *, mask: Mask, key: PRNGKeyArray | None
+    ) -> Sequences:
+        """Add what the encoder adds, times the gate's hyperbolic tangent."""
+        attended = super().apply(params.encoder, tokens, mask=mask, key=key)
+        before, after = at_least_float32(tokens), at_least_float32(attended)
+        return (before + jnp.tanh(params.gate) * (after - before)).astype(tokens.dtype)
 
 
 def cross_image_encoder(

@@ -22,7 +22,6 @@ from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import check_tokens, to_descriptor
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageEncoder, cross_image_encoder, init_cross_image
 from crisalad_jax.nn.diff_trees import diff_trees, not_finite
 from crisalad_jax.nn.layers import (
     Keys,
@@ -40,7 +39,7 @@ from crisalad_jax.nn.tokens import Tokens, as_sequence, from_sequence
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import IMAGE, image_mesh, over_images
 from crisalad_jax.utils.errors import few
-from crisalad_jax.utils.pytree import check_drawn, named_leaves, pytree_dataclass
+from crisalad_jax.utils.pytree import check_drawn, expect_like, named_leaves, pytree_dataclass
 
 _ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
 """Names of linear layers' weights, which `layers.linear` casts to the type of its input."""
@@ -57,8 +56,8 @@ class Crisalad:
     """Parameters of `ModelConfig.backbone`."""
     aggregator: Any
     """Parameters of `ModelConfig.aggregator`; None where it has none."""
-    cross_image: CrossImageEncoder | None
-    """Parameters of the cross-image encoder; None without one."""
+    cross_image: Any
+    """Parameters of `ModelConfig.cross_image`; None where it has none."""
     projection: Linear | None = None
     """Parameters of `ModelConfig.projection`; None without one."""
 
@@ -98,10 +97,9 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
         check_drawn(backbone, f"backbone {config.backbone.part_name}")
         aggregator = config.aggregator.init(keys[1], config.backbone, config.grid)
         check_drawn(aggregator, f"aggregator {config.aggregator.part_name}")
-        cross_image = projection = None
-        if config.cross_image.layers:
-            dim = config.token_shape.token_dim
-            cross_image = init_cross_image(keys[2], dim, config.cross_image)
+        cross_image = config.cross_image.init(keys[2], config.token_shape.token_dim)
+        check_drawn(cross_image, f"cross_image {config.cross_image.part_name}")
+        projection = None
         if config.projection.dim:
             dims = config.unprojected_dim, config.projection.dim
             projection = init_linear(jax.random.fold_in(key, 3), *dims)
@@ -569,7 +567,8 @@ def attend_across_images(
         f"tokens: found a global token of shape {found[0]} and local tokens of {found[1]}, "
         f"expected {expected[0]} and {expected[1]}",
     )
-    if params.cross_image is not None:
+    encoder = config.cross_image
+    if encoder.attends:
         if mask is not None:
             require(
                 mask.shape == (count, count),
@@ -577,13 +576,13 @@ def attend_across_images(
                 "for each image",
             )
             mask = jnp.asarray(mask) | (self_mask(count) & ~mask.any(axis=1, keepdims=True))
-        options, whole = config.cross_image, config.cross_image.global_token
         with jax.named_scope("cross_image"):
-            sequence = as_sequence(tokens, global_token=whole).astype(config.compute_dtype)
-            sequence = cross_image_encoder(
-                params.cross_image, sequence, options, mask=mask, key=key
-            ).astype(tokens.local.dtype)
-        tokens = from_sequence(sequence, tokens, global_token=whole)
+            sequence = as_sequence(tokens, global_token=encoder.global_token)
+            sequence = sequence.astype(config.compute_dtype)
+            found = encoder.apply(params.cross_image, sequence, mask=mask, key=key)
+            expect_like(f"cross_image {encoder.part_name}", found, sequence)
+            sequence = found.astype(tokens.local.dtype)
+        tokens = from_sequence(sequence, tokens, global_token=encoder.global_token)
     descriptors = to_descriptor(tokens, config.aggregator)
     if params.projection is None:
         return descriptors

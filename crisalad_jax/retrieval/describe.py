@@ -375,9 +375,9 @@ def check_window(config: "ModelConfig", window: int) -> None:
     Raises:
         InputError: it is below 1, or above with a model whose images do not attend to each other.
     """
-    if window < 1 or (window > 1 and not config.cross_image.layers):
+    if window < 1 or (window > 1 and not config.cross_image.attends):
         expected = "at least 1"
-        if not config.cross_image.layers:
+        if not config.cross_image.attends:
             expected = "1 of a model without a cross-image encoder"
         raise InputError(f"window: found {window}, expected {expected}")
 

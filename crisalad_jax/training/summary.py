@@ -107,8 +107,8 @@ def model_words(config: ModelConfig) -> str:
     projection = "projected " if config.projection.dim else ""
     return (
         f"backbone of width {backbone.dim}, {backbone.depth} blocks{backbone.extras}; "
-        f"aggregator {config.aggregator.part_name}; {config.cross_image.layers} cross-image "
-        f"layers; {projection}descriptor of {config.descriptor_dim} numbers"
+        f"aggregator {config.aggregator.part_name}; cross-image encoder "
+        f"{config.cross_image.part_name}; {projection}descriptor of {config.descriptor_dim} numbers"
     )
 
 

@@ -205,9 +205,8 @@ def build_vocabulary(
 
     Example:
         >>> import jax
-        >>> from crisalad_jax import PRESETS, CrossImageConfig, init_crisalad, with_aggregator
-        >>> alone = CrossImageConfig(layers=0)
-        >>> config = with_aggregator(PRESETS["tiny"], "anyloc", "tiny", cross_image=alone)
+        >>> from crisalad_jax import PRESETS, init_crisalad, with_aggregator
+        >>> config = with_aggregator(PRESETS["tiny"], "anyloc", "tiny", cross_image="none")
         >>> model = Model(init_crisalad(jax.random.key(0), config), config)
         >>> out = folder / "anyloc.safetensors"
         >>> built = build_vocabulary(model, pictures, out, quiet=True)

@@ -64,7 +64,9 @@ def _model(
             **backbone,
         ),
         aggregator=AGGREGATORS[aggregator],
-        cross_image=CrossImageConfig(layers=encoder, heads=4, feedforward=24, dropout=0.0),
+        cross_image=CrossImageConfig(encoder, heads=4, feedforward=24, dropout=0.0)
+        if encoder
+        else "none",
     )
 
 

@@ -76,7 +76,7 @@ class Crisalad(nn.Module):
         self.aggregation = _aggregation(config)
         self.encoder = (
             CrossImageEncoder(config.token_shape.token_dim, config.cross_image)
-            if config.cross_image.layers
+            if config.cross_image.attends
             else None
         )
         dim = config.projection.dim

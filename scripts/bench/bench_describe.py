@@ -46,7 +46,6 @@ from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.costs import part_costs
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, describe
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.utils.devices import devices_for
@@ -65,19 +64,19 @@ MODELS: Mapping[str, ModelConfig] = {
         image_size=(480, 640),
         backbone=ResNetConfig(),
         aggregator=CosPlaceConfig(dim=2048),
-        cross_image=CrossImageConfig(layers=0),
+        cross_image="none",
     ),
     "resnet50": ModelConfig(
         image_size=(224, 224),
         backbone=ResNetConfig(),
         aggregator=CosPlaceConfig(dim=2048),
-        cross_image=CrossImageConfig(layers=0),
+        cross_image="none",
     ),
     "megaloc": ModelConfig(
         image_size=(322, 322),
         backbone=ViTConfig(adapter="none"),
         aggregator=SaladConfig(cluster_dim=256),
-        cross_image=CrossImageConfig(layers=0),
+        cross_image="none",
         projection=ProjectionConfig(dim=8448),
     ),
 }

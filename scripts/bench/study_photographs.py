@@ -35,14 +35,12 @@ def variants() -> dict[str, TrainConfig]:
     """The whole model, and two with one field changed."""
     whole = recipe("tiny")
     model = whole.model
-    no_encoder = dataclasses.replace(
-        model, cross_image=dataclasses.replace(model.cross_image, layers=0)
-    )
+    no_encoder = dataclasses.replace(model, cross_image="none")
     backbone = dataclasses.replace(model.backbone, adapter="none")
     no_adapter = dataclasses.replace(model, backbone=backbone)
     return {
         "whole": whole,
-        "cross_image.layers 0": dataclasses.replace(whole, model=no_encoder),
+        "cross_image none": dataclasses.replace(whole, model=no_encoder),
         "adapter none": dataclasses.replace(whole, model=no_adapter),
     }
 

@@ -29,7 +29,7 @@ from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.cross_image import CrossImage
 from crisalad_jax.nn.model import Model
 from crisalad_jax.synthetic import SCENERIES, VARIATIONS, WorldConfig, write_world
 from crisalad_jax.training.config import TrainConfig
@@ -73,14 +73,14 @@ def small_vit() -> TrainConfig:
         start.model,
         image_size=(70, 98),
         backbone=dataclasses.replace(backbone, dim=64, depth=3, heads=2),
-        cross_image=dataclasses.replace(start.model.cross_image, layers=0),
+        cross_image="none",
     )
     return dataclasses.replace(start, model=model, epochs=3, batch_order="shuffled", **BATCH)
 
 
 def with_encoder(config: TrainConfig) -> TrainConfig:
     """The same with the encoder of `tiny`."""
-    encoder: CrossImageConfig = recipe("tiny").model.cross_image
+    encoder: CrossImage = recipe("tiny").model.cross_image
     model = dataclasses.replace(config.model, cross_image=encoder)
     return dataclasses.replace(config, model=model)
 
@@ -163,7 +163,7 @@ def run(arm: Arm, seed: int, asked: Mapping[str, Asked], runs: pathlib.Path) -> 
     write_world(root, arm.world)
     places = read_places(root / "train", min_images=config.min_images)
     params = fit(config, places, folder, quiet=True).params
-    alone = config.model.cross_image.layers == 0
+    alone = not config.model.cross_image.attends
     groupings = ("single",) if alone else ("single", "shuffled", "sequential")
     for name, one in left.items():
         results = evaluate(

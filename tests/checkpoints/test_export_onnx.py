@@ -22,7 +22,6 @@ from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.utils.errors import InputError
@@ -40,7 +39,7 @@ from tests.conftest import BATCH, MODEL
 
 pytestmark = pytest.mark.usefixtures("symbolic_shapes")
 
-ALONE = CrossImageConfig(layers=0)
+ALONE = "none"
 # Operators that TensorRT's parser has had since version 8.4, of those that programs here may use:
 # github.com/onnx/onnx-tensorrt, docs/operators.md.
 TENSORRT = """

@@ -28,7 +28,7 @@ from tests.random_checkpoints import LAYOUTS as FOLDER
 from tests.random_checkpoints import UNDER, as_arrays, bare_vit, blank, public_layout, random_state
 
 PUBLIC = sorted(path.stem for path in FOLDER.glob("*.json"))
-BARE = CrossImageConfig(layers=0)
+BARE = "none"
 NO_ADAPTER = "none"
 
 

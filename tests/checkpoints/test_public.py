@@ -29,7 +29,6 @@ from crisalad_jax.checkpoints.safetensors_io import write_safetensors
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, describe, init_crisalad, self_mask
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
@@ -211,9 +210,7 @@ def test_what_no_description_depends_on_comes_back(tmp_path: pathlib.Path, layou
 
 
 def test_a_vocabulary_comes_back_with_its_backbones_digest(tmp_path: pathlib.Path) -> None:
-    config = dataclasses.replace(
-        MODEL, aggregator=AnyLocConfig(layer=0), cross_image=CrossImageConfig(layers=0)
-    )
+    config = dataclasses.replace(MODEL, aggregator=AnyLocConfig(layer=0), cross_image="none")
     params = random_params(config)
     bound = config.aggregator.attach_backbone_hash(params.aggregator, params.backbone)
     params = dataclasses.replace(params, aggregator=bound)

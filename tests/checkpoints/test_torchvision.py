@@ -14,7 +14,6 @@ from crisalad_jax.checkpoints.public import convert, read_backbone, read_checkpo
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.utils.errors import InputError
 from parity.reference.model import Crisalad
 from tests.random_checkpoints import blank
@@ -26,7 +25,7 @@ MODEL = ModelConfig(
     image_size=(64, 96),
     backbone=ResNetConfig(layers=18),
     aggregator="gem",
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 
 

@@ -31,7 +31,7 @@ def put(config: Any, name: str, value: Any) -> Any:
     return dataclasses.replace(config, **{head: inner})
 
 
-WITHOUT_ENCODER = put(MODEL, "cross_image.layers", 0)
+WITHOUT_ENCODER = put(MODEL, "cross_image", "none")
 REGISTERS = dataclasses.replace(
     MODEL, backbone=dataclasses.replace(MODEL.backbone, registers=4, ffn="swiglu")
 )

@@ -14,7 +14,6 @@ from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.utils.errors import InputError
 from tests.cli.test_cli import fails, succeeds
 from tests.random_checkpoints import random_state, save
@@ -23,7 +22,7 @@ Tensors = dict[str, torch.Tensor]
 SALAD = ModelConfig(
     backbone=ViTConfig(dim=64, depth=2, heads=1, position_grid=2, adapter="none"),
     aggregator=SaladConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16),
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 WIDE = dataclasses.replace(SALAD, backbone=dataclasses.replace(SALAD.backbone, dim=128, heads=2))
 

@@ -30,7 +30,6 @@ from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.results import to_json
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, describe
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.utils.files import write_json
@@ -416,7 +415,7 @@ def test_bad_weights_are_named_by_every_command(capfd, tmp_path, shared, kind):
 BACKBONE = ModelConfig(
     aggregator="class-token",
     backbone=ViTConfig(dim=64, depth=2, heads=1, position_grid=3, adapter="none"),
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 
 

@@ -12,7 +12,6 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.utils.errors import InputError
 from tests.cli.test_cli import fails, succeeds
 from tests.conftest import assert_equal
@@ -21,7 +20,7 @@ from tests.random_checkpoints import random_state, save
 BARE = ModelConfig(
     backbone=ViTConfig(dim=64, depth=2, heads=1, position_grid=2, adapter="none"),
     aggregator="class-token",
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 
 

@@ -11,8 +11,8 @@ from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.cli import train
 from crisalad_jax.config.io import differences
 from crisalad_jax.nn.adapters.bottleneck import MlpConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model
+from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.training.config import MiningConfig
 from crisalad_jax.utils.output import Note
 from tests.cli.test_cli import fails
@@ -82,14 +82,13 @@ def test_several_processes_do_not_download(monkeypatch):
     assert train.prepare(("--weights", "megaloc", "--help")) == ("--weights", "megaloc", "--help")
 
 
-NO_ENCODER = CrossImageConfig(layers=0)
 LOCAL = cj.PRESETS["tiny"].preprocessing
 
 
 @pytest.mark.parametrize(
     ("found", "expected", "count"),
     [
-        (CrossImageConfig(heads=4), NO_ENCODER, 1),  # the layers alone
+        (ProjectionConfig(dim=4), ProjectionConfig(renormalise=False), 1),  # the width alone
         (MlpConfig(alpha=0.5), MlpConfig(), 1),
         (LOCAL, dataclasses.replace(LOCAL, mean=(0.0, 0.0, 0.0), deviation=(1.0, 1.0, 1.0)), 0),
         (MiningConfig(), MiningConfig(negatives=3, positive_radius=5.0), 0),
@@ -103,7 +102,7 @@ def test_fields_that_nothing_uses_are_not_checked():
     dataclasses.replace(LOCAL, deviation=(0.0, 0.0, 0.0))
 
 
-def test_weights_without_an_encoder_fit_whatever_its_heads_would_be():
-    heads = dataclasses.replace(STARTER, cross_image=CrossImageConfig(layers=0, heads=7))
-    _, config = load_weights(find_weights("starter"), expected=heads)
+def test_weights_without_a_projection_fit_whatever_it_would_renormalise():
+    other = dataclasses.replace(STARTER, projection=ProjectionConfig(renormalise=False))
+    _, config = load_weights(find_weights("starter"), expected=other)
     assert config == STARTER

@@ -4,7 +4,6 @@ import dataclasses
 
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model
 from tests.cli.test_cli import fails
 from tests.conftest import MODEL, random_params
@@ -12,7 +11,7 @@ from tests.conftest import MODEL, random_params
 CONFIG = dataclasses.replace(
     MODEL,
     aggregator=MixVprConfig(channels=8, rows=2, depth=1),
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 
 

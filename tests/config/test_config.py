@@ -16,7 +16,11 @@ from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.data.augmentations.colour_crop import ColourCropConfig
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
-from crisalad_jax.nn.adapters.bottleneck import DepthwiseConfig, MlpConfig, MultiResolutionConfig
+from crisalad_jax.nn.adapters.bottleneck import (
+    DepthwiseConfig,
+    MultiResolutionConfig,
+    NoAdapter,
+)
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
@@ -27,7 +31,7 @@ from crisalad_jax.nn.aggregators.vlad import AnyLocConfig, VladBuffConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig, NoCrossImage
 from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig
@@ -80,7 +84,7 @@ def test_the_recipes_are_their_papers():
     salad = recipe("b14", "salad")
     assert (salad.places_per_batch, salad.images_per_place, salad.epochs) == (60, 4, 4)
     assert (salad.trainable, salad.monitor) == ("last-4-blocks+head", "R@1")
-    assert (salad.model.backbone.adapter.part_name, salad.model.cross_image.layers) == ("none", 0)
+    assert (salad.model.backbone.adapter, salad.model.cross_image) == (NoAdapter(), NoCrossImage())
     optimiser = salad.optimiser
     assert optimiser == OptimiserConfig(
         kind="adamw",
@@ -127,7 +131,7 @@ def test_classification_is_as_published():
     """gmberton/CosPlace and gmberton/EigenPlaces: their papers' constants and their code's."""
     cosplace = recipe("b14", "cosplace-vit")
     assert cosplace.model.aggregator.part_name == "cosplace"
-    assert cosplace.model.cross_image.layers == 0
+    assert cosplace.model.cross_image == NoCrossImage()
     assert cosplace.model.descriptor_dim == 512
     optimiser = cosplace.optimiser
     assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == ("adam", 1e-5, 0.0)
@@ -212,10 +216,8 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
         assert config.model.compute_dtype == "bfloat16"
     for config in (boq, mix, vlad, image, buff):
         assert config.model.image_size == (224, 224)
-        assert (config.model.backbone.adapter.part_name, config.model.cross_image.layers) == (
-            "none",
-            0,
-        )
+        assert config.model.backbone.adapter == NoAdapter()
+        assert config.model.cross_image == NoCrossImage()
         assert config.images_per_place == 4
 
 
@@ -295,7 +297,7 @@ def test_methods_to_compare_differ_in_the_aggregator_alone(name, width):
     found, paper = recipe("b14", f"crisalad+{name}"), recipe("b14")
     assert found.model.aggregator == AGGREGATORS.find(name)()
     assert found.model.descriptor_dim == width
-    assert found.model.cross_image.layers == 0
+    assert found.model.cross_image == NoCrossImage()
     as_paper = dataclasses.replace(
         found.model, aggregator="salad", cross_image=paper.model.cross_image
     )
@@ -306,7 +308,7 @@ def test_the_recipe_of_starter_is_that_of_its_last_run():
     """But for an encoder of no layers, whose fields say nothing."""
     run = read_config(TrainConfig, ROOT / "docs" / "starter" / "config.json")
     found = recipe("b14", "starter")
-    assert found.model.cross_image.layers == run.model.cross_image.layers == 0
+    assert found.model.cross_image == run.model.cross_image == NoCrossImage()
     model = dataclasses.replace(found.model, cross_image=run.model.cross_image)
     assert dataclasses.replace(found, model=model) == run
     # The file in the package is for larger images than it was trained on.
@@ -357,7 +359,7 @@ def test_more_patches_than_clusters(clusters, side):
         (ViTConfig, {"dim": 6, "heads": 1, "position_init": "sincos"}, "dim: found 6, .* of 4"),
         (ViTConfig, NARROW, "found 0.25, expected a width for dim 96, 24, .* of 16"),
         (ModelConfig, {"aggregator": "gem-pyramid", "image_size": (28, 56)}, "at least 42 x 42, a"),
-        (ModelConfig, {"aggregator": "anyloc"}, "found 2, expected 0 for aggregator anyloc, wi"),
+        (ModelConfig, {"aggregator": "anyloc"}, "for aggregator anyloc, with which nothing trains"),
         (ModelConfig, {"aggregator": ConvApConfig(side=3), "image_size": (28, 56)}, "42 x 42, a p"),
         (ModelConfig, {"aggregator": SaladConfig(token_dim=200)}, "token: found True, expected F"),
         (BoqConfig, {"channels": 200}, "found 200, expected a multiple of its 3 heads, one for"),
@@ -390,7 +392,7 @@ def test_what_does_not_fit_is_refused_in_one_line(kind, fields, words):
         (CrossImageConfig, {"layers": 1.5}, "1.5", "a whole number"),
         (CrossImageConfig, {"layers": True}, "True", "a whole number"),
         (CrossImageConfig, {"global_token": 1}, "1", "True or False"),
-        (ViTConfig, {"adapter": MlpConfig}, "MlpConfig", "an adapter or its name"),
+        (ViTConfig, {"adapter": 0.5}, "0.5", "an adapter or its name"),
         (SinkhornConfig, {"tolerance": "1e-3"}, "'1e-3'", "a finite number above 0, or None"),
         (ModelConfig, {"image_size": [224, 224]}, "[224, 224]", "a tuple of 2, each a whole num"),
         (ModelConfig, {"image_size": (224, 2.5)}, "(224, 2.5)", "a tuple of 2, each a whole num"),
@@ -430,7 +432,6 @@ def test_a_model_without_adapters_cannot_train_them():
 
 
 def test_without_an_encoder_its_widths_need_not_fit():
-    config = ModelConfig(cross_image=CrossImageConfig(layers=0, heads=7))
-    assert config.descriptor_dim == 8448
+    assert ModelConfig(aggregator=SaladConfig(cluster_dim=100), cross_image="none").descriptor_dim
     with pytest.raises(InputError, match=r"CrossImageConfig\.heads: found 7"):
-        dataclasses.replace(config, cross_image=CrossImageConfig(heads=7))
+        ModelConfig(cross_image=CrossImageConfig(heads=7))

@@ -8,7 +8,6 @@ from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL
 
@@ -78,7 +77,7 @@ def test_a_backbone_of_any_size_is_not_rounded():
         preprocessing=PreprocessingConfig(size_rule="shorter-side"),
         backbone=ResNetConfig(layers=18),
         aggregator="gem",
-        cross_image=CrossImageConfig(layers=0),
+        cross_image="none",
     )
     assert config.images_in_words == "shorter side 500, bilinear, antialiased, on bytes"
     for each in (config, config.resized(None, ["round"])):
@@ -101,7 +100,7 @@ def test_parameters_for_every_patch_need_a_fixed_size():
     config = dataclasses.replace(
         MODEL,
         aggregator=MixVprConfig(channels=8, rows=2, depth=1),
-        cross_image=CrossImageConfig(layers=0),
+        cross_image="none",
     )
     with pytest.raises(InputError, match=r"size_rule: found .native., expected fixed: .* mixvpr"):
         config.resized(None, ["native"])

@@ -51,8 +51,7 @@ def test_what_is_printed_makes_the_configuration_again(name):
 
 
 def test_what_is_not_in_use_is_left_out():
-    alone = cj.CrossImageConfig(layers=0, heads=4, dropout=0.0)
-    assert repr(alone) == "CrossImageConfig(layers=0)"
+    assert repr(cj.ProjectionConfig(dim=0, renormalise=False)) == "ProjectionConfig()"
     assert repr(DepthwiseConfig(alpha=0.5)) == "DepthwiseConfig(alpha=0.5)"
 
 
@@ -107,7 +106,7 @@ def test_an_answer_of_a_map_prints_in_short_lines():
     ]
 
 
-ABSTRACT = {cj.Aggregator, cj.Augmentation, cj.Backbone, cj.Loss}
+ABSTRACT = {cj.Adapter, cj.Aggregator, cj.Augmentation, cj.Backbone, cj.CrossImage, cj.Loss}
 PUBLIC = [value for name in cj.__all__ if inspect.isclass(value := getattr(cj, name))]
 TEXTS = [kind for kind in (*NAMES.values(), *PUBLIC) if fields_of(kind) and kind not in ABSTRACT]
 

@@ -26,9 +26,7 @@ TOLERANCE = 2e-6
 VISIBLE = 1e-3
 
 READING = Reading(batch_size=BATCH, quiet=True)
-WITHOUT_ENCODER = dataclasses.replace(
-    MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=0)
-)
+WITHOUT_ENCODER = dataclasses.replace(MODEL, cross_image="none")
 
 
 def pictures(paths) -> np.ndarray:

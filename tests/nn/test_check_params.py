@@ -19,7 +19,6 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.aggregators.vlad import AnyLoc
 from crisalad_jax.nn.config import ModelConfig, with_aggregator
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import (
     Crisalad,
     Model,
@@ -125,7 +124,7 @@ DIFFERENCES: dict[str, tuple[Any, ModelConfig, str]] = {
     ),
     "one encoder too many": (
         PARAMS,
-        dataclasses.replace(MODEL, cross_image=CrossImageConfig(layers=0)),
+        dataclasses.replace(MODEL, cross_image="none"),
         "cross_image.layers.0.attn.qkv.weight unknown; ",
     ),
     "half precision": (
@@ -190,7 +189,7 @@ def test_trees_of_another_model_are_not_merged() -> None:
 
 
 def test_a_vocabularys_backbone_makes_no_misfit() -> None:
-    alone = CrossImageConfig(layers=0)
+    alone = "none"
     config = with_aggregator(MODEL, "anyloc", "tiny", cross_image=alone)
     params = init_crisalad(jax.random.key(0), config)
     check_params(

@@ -80,7 +80,7 @@ SMALL = ModelConfig(
 PLAIN = dataclasses.replace(
     SMALL,
     backbone=dataclasses.replace(SMALL.backbone, adapter="none"),
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 
 

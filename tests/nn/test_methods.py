@@ -24,7 +24,7 @@ from crisalad_jax.nn.aggregators.vlad import (
     VladBuffConfig,
 )
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig, init_cross_image
+from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import (
     Crisalad,
     attend_across_images,
@@ -40,7 +40,7 @@ from tests.nn.conftest import slow_unless
 SMALL = dataclasses.replace(
     MODEL,
     backbone=dataclasses.replace(MODEL.backbone, adapter="none"),
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 PARTS: dict[str, Aggregator] = {
     "salad": MODEL.aggregator,
@@ -115,7 +115,7 @@ def test_with_the_encoder_images_look_at_each_other(aggregator: str) -> None:
     config = dataclasses.replace(config, cross_image=RELATED)
     generator = np.random.default_rng(0)
     shape = config.token_shape
-    encoder = init_cross_image(jax.random.key(0), shape.token_dim, RELATED)
+    encoder = RELATED.init(jax.random.key(0), shape.token_dim)
     params = dataclasses.replace(params, cross_image=encoder)
     tokens = jax.tree.map(
         lambda leaf: jnp.asarray(generator.normal(size=(3, *leaf.shape[1:])), jnp.float32),
@@ -141,7 +141,7 @@ def test_tokens_that_do_not_fit_the_encoder(part: Aggregator, width: int) -> Non
     words = f"^CrossImageConfig.heads: found 16, expected a divisor of the {width} numbers"
     with pytest.raises(InputError, match=words):
         ModelConfig(aggregator=part)
-    bare = ModelConfig(aggregator=part, cross_image=CrossImageConfig(layers=0))
+    bare = ModelConfig(aggregator=part, cross_image="none")
     assert bare.aggregator is part
 
 

@@ -12,7 +12,6 @@ from crisalad_jax import describe, init_crisalad
 from crisalad_jax.checkpoints.formats import check_holds
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.costs import part_costs
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.training.trainable import split_params
 from crisalad_jax.utils.errors import InputError
@@ -59,7 +58,7 @@ def test_it_counts_and_trains_with_the_head() -> None:
 
 def test_layouts_without_a_place_for_it_refuse_it() -> None:
     backbone = dataclasses.replace(CONFIG.backbone, adapter="none")
-    config = dataclasses.replace(CONFIG, backbone=backbone, cross_image=CrossImageConfig(layers=0))
+    config = dataclasses.replace(CONFIG, backbone=backbone, cross_image="none")
     with pytest.raises(InputError, match="found a model of projection yes, expected no"):
         check_holds(config, "dino-salad")
 

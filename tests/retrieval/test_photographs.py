@@ -16,7 +16,6 @@ from crisalad_jax.data.loader import ImageCache
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.aggregators.vlad import NetVladConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, describe
 from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.describer import describer_of
@@ -35,7 +34,7 @@ ALONE = dataclasses.replace(
     MODEL,
     backbone=ViTConfig(dim=32, depth=1, heads=2, position_grid=3),
     aggregator="gem",
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 NATIVE = ALONE.resized(None, ["native"])
 

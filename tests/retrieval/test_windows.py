@@ -8,7 +8,6 @@ import pytest
 
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.describe import (
     FrameDescriber,
@@ -76,7 +75,7 @@ def test_one_by_one(town):
 def test_windows_that_mean_nothing_are_refused():
     with pytest.raises(InputError, match="window: found 0, expected at least 1"):
         check_window(MODEL, 0)
-    alone = dataclasses.replace(MODEL, cross_image=CrossImageConfig(layers=0))
+    alone = dataclasses.replace(MODEL, cross_image="none")
     with pytest.raises(InputError, match="window: found 2, expected 1 of a model without a cross"):
         check_window(alone, 2)
     check_window(alone, 1)

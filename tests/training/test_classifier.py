@@ -37,7 +37,7 @@ CONFIG = dataclasses.replace(
     model=dataclasses.replace(
         MODEL,
         aggregator="class-token",
-        cross_image=dataclasses.replace(MODEL.cross_image, layers=0),
+        cross_image="none",
     ),
     loss=LossConfig(kind=LargeMarginCosineConfig(classes=ClassesConfig(groups=2, steps=2))),
     epochs=4,

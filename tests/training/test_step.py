@@ -112,7 +112,7 @@ def test_blocks_are_counted_from_the_end(params) -> None:
 def test_a_norm_that_the_aggregator_leaves_out_stays_frozen() -> None:
     """It has no gradient: weight decay alone would move it."""
     boq = BoqConfig(channels=16, queries=3, rows=2)
-    cross_image = dataclasses.replace(MODEL.cross_image, layers=0)
+    cross_image = "none"
     model = dataclasses.replace(MODEL, aggregator=boq, cross_image=cross_image)
     shapes = parameter_shapes(model)
     for last_norm in (False, True):

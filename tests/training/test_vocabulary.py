@@ -23,7 +23,6 @@ from crisalad_jax.nn.aggregators.vlad import (
     VladBuffConfig,
 )
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, Model, unit_features
 from crisalad_jax.training.trainable import split_params
 from crisalad_jax.training.vocabulary import build_vocabulary, with_vocabulary
@@ -36,7 +35,7 @@ from tests.conftest import BATCH, MODEL, RECIPE, assert_equal, random_params
 ANYLOC = dataclasses.replace(
     MODEL,
     aggregator=AnyLocConfig(clusters=4, layer=0, facet="key"),
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 NETVLAD = dataclasses.replace(ANYLOC, aggregator=NetVladConfig(clusters=4))
 IMAGE = dataclasses.replace(

@@ -22,7 +22,6 @@ from crisalad_jax.checkpoints.weights import load_weights, model_hash, read_weig
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.aggregators.base import TokenShape
 from crisalad_jax.nn.config import PRESETS, ModelConfig, with_aggregator
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, check_params, describe, init_crisalad
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.training.losses import LOSSES, LossConfig, metric_loss
@@ -47,7 +46,7 @@ def in_both_modes(make: Callable[[], Any]) -> Any:
 
 @pytest.mark.parametrize("name", list(AGGREGATORS))
 def test_parameters_are_float32_and_the_same(name: str) -> None:
-    alone = CrossImageConfig(layers=0)
+    alone = "none"
     config = with_aggregator(PRESETS["tiny"], name, "tiny", cross_image=alone)
     params = in_both_modes(lambda: init_crisalad(jax.random.key(2), config))
     assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {jnp.dtype("float32")}
@@ -87,7 +86,7 @@ def test_so_are_those_and_the_descriptors_of_a_plug_in() -> None:
         image_size=MODEL.image_size,
         backbone=MODEL.backbone,
         aggregator=Shifted(),
-        cross_image=CrossImageConfig(layers=0),
+        cross_image="none",
     )
     params = in_both_modes(lambda: init_crisalad(jax.random.key(2), config))
     in_both_modes(lambda: describe(params, IMAGES, config))

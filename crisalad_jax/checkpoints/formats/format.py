@@ -12,7 +12,6 @@ from crisalad_jax.nn.aggregators import Aggregator
 from crisalad_jax.nn.backbones.base import Backbone
 from crisalad_jax.nn.backbones.vit import VisionTransformer
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.projection import ProjectionConfig
 
 
@@ -65,8 +64,8 @@ class Format:
     """Whether the head's first row is before the backbone's."""
     adapter: str = "none"
     """Name of the adapter; "any" is any."""
-    encoder: str = "no"
-    """Whether there is a cross-image encoder: "yes", "no", or "any" where the file tells."""
+    encoder: str = "none"
+    """Name of the cross-image encoder; "any" where the file tells whether there is one."""
     extras: Rows = ()
     """What their files have and no descriptor needs."""
     settings: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
@@ -142,9 +141,7 @@ class Format:
             preprocessing=self.preprocessing,
             backbone=infer_backbone(backbone.kinds, backbone.rows, Reader(state, backbone.prefix)),
             aggregator=self.head.infer(state),
-            cross_image=CrossImageConfig(layers=0)
-            if self.encoder == "no"
-            else infer_encoder(state),
+            cross_image="none" if self.encoder == "none" else infer_encoder(state),
             projection=ProjectionConfig(dim=self._projection_dim(state)),
         )
         parts = {
@@ -171,6 +168,6 @@ def parts_of(config: ModelConfig) -> dict[str, str]:
         "adapter": backbone.adapter.part_name
         if isinstance(backbone, VisionTransformer)
         else "none",
-        "encoder": "yes" if config.cross_image.layers else "no",
+        "encoder": config.cross_image.part_name,
         "projection": "yes" if config.projection.dim else "no",
     }

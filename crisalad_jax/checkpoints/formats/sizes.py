@@ -15,7 +15,7 @@ from crisalad_jax.nn.backbones.resnet import BLOCKS, STEM_SIDE, ResNetConfig
 from crisalad_jax.nn.backbones.transvpr import TransVprNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.backbones.vit import VisionTransformer
-from crisalad_jax.nn.cross_image import CrossImageConfig
+from crisalad_jax.nn.cross_image import CrossImage, CrossImageConfig, NoCrossImage
 from crisalad_jax.utils.errors import InputError
 
 _V = TypeVar("_V", bound=VisionTransformer)
@@ -182,9 +182,11 @@ def _infer_transvpr(read: Reader) -> TransVprNetConfig:
     )
 
 
-def infer_encoder(state: State) -> CrossImageConfig:
-    """Infer the encoder's sizes; the number of heads is the published one."""
+def infer_encoder(state: State) -> CrossImage:
+    """Infer the encoder and its sizes; the number of heads is the published one."""
     read = Reader(state)
-    first = "encoder.layers.0.linear1.weight"
-    feedforward = read.size(first, 0, CrossImageConfig.feedforward)
-    return CrossImageConfig(read.count("encoder.layers."), _ENCODER_HEADS, feedforward)
+    layers = read.count("encoder.layers.")
+    if not layers:
+        return NoCrossImage()
+    feedforward = read.size("encoder.layers.0.linear1.weight", 0)
+    return CrossImageConfig(layers=layers, heads=_ENCODER_HEADS, feedforward=feedforward)

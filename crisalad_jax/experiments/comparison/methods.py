@@ -143,8 +143,7 @@ class Ablation(NamedTuple):
         """Make the paper's recipe with these settings, or from nothing that of `scratch`."""
         config, rate = recipe(preset, f"crisalad+adapter:{self.adapter}"), self.learning_rate
         if not self.encoder:
-            cross_image = dataclasses.replace(config.model.cross_image, layers=0)
-            model = dataclasses.replace(config.model, cross_image=cross_image)
+            model = dataclasses.replace(config.model, cross_image="none")
             config = dataclasses.replace(config, model=model)
         if from_nothing:
             config = from_scratch(config)

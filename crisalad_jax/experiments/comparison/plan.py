@@ -326,10 +326,9 @@ def _check_method(name: str, wanted: ModelConfig, found: ModelConfig, path: path
 
     def words(model: ModelConfig) -> str:
         adapter = getattr(getattr(model.backbone, "adapter", None), "part_name", "none")
-        encoder = "with" if model.cross_image.layers else "without"
         return (
             f"backbone {model.backbone.part_name}, aggregator {model.aggregator.part_name}, "
-            f"adapter {adapter}, {encoder} a cross-image encoder"
+            f"adapter {adapter}, cross-image encoder {model.cross_image.part_name}"
         )
 
     if words(found) != words(wanted):

@@ -52,10 +52,9 @@ class AggregationTokensConfig(Aggregator):
     """ImAge's learnt tokens, which run through the backbone's last blocks (Lu et al., 2025).
 
     Example:
-        >>> from crisalad_jax import CrossImageConfig, ModelConfig
-        >>> alone = CrossImageConfig(layers=0)
+        >>> from crisalad_jax import ModelConfig
         >>> part = AggregationTokensConfig(tokens=8)
-        >>> ModelConfig(aggregator=part, cross_image=alone).descriptor_dim
+        >>> ModelConfig(aggregator=part, cross_image="none").descriptor_dim
         6144
     """
 

@@ -166,9 +166,8 @@ class EdtFormerConfig(Aggregator):
     """EDTformer's decoder (Jin et al., 2025).
 
     Example:
-        >>> from crisalad_jax import CrossImageConfig, ModelConfig
-        >>> alone = CrossImageConfig(layers=0)
-        >>> ModelConfig(aggregator="edtformer", cross_image=alone).descriptor_dim
+        >>> from crisalad_jax import ModelConfig
+        >>> ModelConfig(aggregator="edtformer", cross_image="none").descriptor_dim
         4096
     """
 

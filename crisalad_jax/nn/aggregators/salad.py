@@ -204,9 +204,8 @@ class FolConfig(SaladConfig):
     Written from the paper, with the constants of the public model.
 
     Example:
-        >>> from crisalad_jax import CrossImageConfig, ModelConfig
-        >>> alone = CrossImageConfig(layers=0)
-        >>> ModelConfig(aggregator="fol", cross_image=alone).descriptor_dim
+        >>> from crisalad_jax import ModelConfig
+        >>> ModelConfig(aggregator="fol", cross_image="none").descriptor_dim
         8448
     """
 

@@ -120,9 +120,9 @@ class SuperVladConfig(VladConfig):
     """SuperVLAD (Lu et al., NeurIPS 2024).
 
     Example:
-        >>> from crisalad_jax import CrossImageConfig, ModelConfig
+        >>> from crisalad_jax import ModelConfig
         >>> one = SuperVladConfig(clusters=1, ghosts=2)
-        >>> ModelConfig(aggregator=one, cross_image=CrossImageConfig(layers=0)).descriptor_dim
+        >>> ModelConfig(aggregator=one, cross_image="none").descriptor_dim
         768
     """
 
@@ -176,9 +176,8 @@ class VladBuffConfig(VladConfig):
     """VLAD-BuFF (Khaliq et al., ECCV 2024).
 
     Example:
-        >>> from crisalad_jax import CrossImageConfig, ModelConfig
-        >>> alone = CrossImageConfig(layers=0)
-        >>> ModelConfig(aggregator="vlad-buff", cross_image=alone).descriptor_dim
+        >>> from crisalad_jax import ModelConfig
+        >>> ModelConfig(aggregator="vlad-buff", cross_image="none").descriptor_dim
         12288
     """
 

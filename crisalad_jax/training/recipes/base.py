@@ -153,7 +153,7 @@ def model_of(
         preprocessing=dataclasses.replace(chain, **preprocessing),
         backbone=backbone,
         aggregator=part,
-        cross_image=dataclasses.replace(model.cross_image, layers=0),
+        cross_image="none",
         compute_dtype=compute_dtype,
     )
 
@@ -225,14 +225,8 @@ def find_part(
 
 
 _KINDS = (
-    "aggregator",
-    "adapter",
-    "step",
-    "dustbin",
-    "loss",
-    "backbone",
-    "augmentation",
-    "gradient",
+    *("aggregator", "adapter", "cross_image", "step", "dustbin", "loss", "backbone"),
+    *("augmentation", "gradient"),
 )
 
 
@@ -268,6 +262,8 @@ def with_part(config: TrainConfig, part: Any) -> TrainConfig:
         if trainable != ALL:
             trainable = ADAPTERS_AND_HEAD if has_adapters(model) else HEAD
         return dataclasses.replace(config, model=model, trainable=trainable)
+    if kind == "cross_image":
+        return dataclasses.replace(config, model=dataclasses.replace(model, cross_image=part))
     if kind == "aggregator":
         return dataclasses.replace(config, model=with_head(model, part), validation_size=None)
     # Steps and gradients are settings of the solver, and a dustbin of the aggregator itself.
@@ -285,8 +281,7 @@ def with_part(config: TrainConfig, part: Any) -> TrainConfig:
 
 def with_head(model: ModelConfig, aggregator: Any) -> ModelConfig:
     """Return a model with this aggregator, and no cross-image encoder."""
-    cross_image = dataclasses.replace(model.cross_image, layers=0)
-    return dataclasses.replace(model, aggregator=aggregator, cross_image=cross_image)
+    return dataclasses.replace(model, aggregator=aggregator, cross_image="none")
 
 
 @takes(config=TrainConfig)

@@ -28,7 +28,6 @@ from crisalad_jax.experiments.comparison import (
 from crisalad_jax.experiments.comparison.results import runs_of
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Model, init_crisalad
 from crisalad_jax.training import start
 from crisalad_jax.utils import locks, temporaries
@@ -218,7 +217,7 @@ def test_models_of_any_family_are_lines_of_their_own(shared, benchmark, settings
     _, model = load_weights(shared / "weights.safetensors")
     small = ResNetConfig(layers=18, stages=1)
     native = PreprocessingConfig(size_rule="native")
-    plain = {"aggregator": "gem", "cross_image": CrossImageConfig(layers=0)}
+    plain = {"aggregator": "gem", "cross_image": "none"}
     models = {
         "ours": dataclasses.replace(model, **plain),
         "netvlad": ModelConfig(model.image_size, native, small, **plain),

@@ -21,7 +21,6 @@ from crisalad_jax.experiments.report import write_report
 from crisalad_jax.experiments.report.charts import outcomes_of
 from crisalad_jax.experiments.report.page import Subject, page_rows, query_results
 from crisalad_jax.experiments.report.tables import write_csv
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad, Model
 from crisalad_jax.retrieval.neighbours import Neighbours
 from tests.conftest import MODEL
@@ -198,7 +197,7 @@ def test_words_from_outside_are_no_markup(
     )
     found = [GroupingResult("any", {1: 1.0}, NEIGHBOURS)]
     plain = dataclasses.replace(params, aggregator=None, cross_image=None)
-    encoder = CrossImageConfig(layers=0)
+    encoder = "none"
     config = dataclasses.replace(MODEL, aggregator="class-token", cross_image=encoder)
     path = write(tmp_path / "out", some, found, plain, config)
     page = Page(path.read_text(encoding="utf-8"))

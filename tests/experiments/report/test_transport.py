@@ -128,7 +128,7 @@ def test_transport_shows_picture_dustbin_and_clusters(params, benchmark, tmp_pat
 
 
 def test_a_model_without_a_transport_is_refused(benchmark):
-    alone = cj.CrossImageConfig(layers=0)
+    alone = "none"
     model = dataclasses.replace(MODEL, aggregator="gem", cross_image=alone)
     other = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), parameter_shapes(model))
     with pytest.raises(cj.InputError, match="found gem, expected one that transports"):

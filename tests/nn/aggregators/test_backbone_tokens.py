@@ -10,7 +10,6 @@ import pytest
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.backbones.vit import NORM_EPSILON, ViTConfig, block, embed
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.layers import l2_normalise, layer_norm
 from crisalad_jax.nn.model import describe
 from crisalad_jax.utils.errors import InputError
@@ -21,7 +20,7 @@ CONFIG = ModelConfig(
     image_size=(28, 42),
     backbone=ViTConfig(dim=16, depth=3, heads=2, position_grid=2, registers=2, adapter=NONE),
     aggregator=AggregationTokensConfig(tokens=3, insertion=-2),
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 
 

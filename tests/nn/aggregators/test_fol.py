@@ -12,7 +12,6 @@ from crisalad_jax.nn.aggregators.salad import FolConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import describe, extract_features
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import random_params
@@ -23,7 +22,7 @@ CONFIG = ModelConfig(
     aggregator=FolConfig(
         clusters=4, cluster_dim=8, token_dim=16, hidden=16, dropout=0.0, local_hidden=8, local=4
     ),
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 IMAGES = np.random.default_rng(0).integers(0, 256, (2, 42, 56, 3), np.uint8)
 

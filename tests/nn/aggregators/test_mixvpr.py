@@ -7,12 +7,11 @@ import numpy as np
 from crisalad_jax.nn.aggregators.mixvpr import MixVpr, MixVprConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import parameter_shapes
 
 
 def test_it_starts_as_published() -> None:
-    config = ModelConfig(aggregator="mixvpr", cross_image=CrossImageConfig(layers=0))
+    config = ModelConfig(aggregator="mixvpr", cross_image="none")
     assert config.descriptor_dim == 4096
     params = parameter_shapes(config).aggregator
     assert len(params.mix) == 4

@@ -12,7 +12,6 @@ from torch.nn import functional as F
 from crisalad_jax.nn.aggregators.queries import Boq, BoqConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import extract_features
 from tests.conftest import random_params
 
@@ -21,14 +20,12 @@ CONFIG = ModelConfig(
     backbone=ViTConfig(dim=12, depth=1, heads=1, position_grid=2, adapter="none"),
     # Two heads.
     aggregator=BoqConfig(channels=128, queries=3, layers=2, rows=5),
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 
 
 def test_the_published_model_has_12288_numbers() -> None:
-    config = ModelConfig(
-        image_size=(322, 322), aggregator="boq", cross_image=CrossImageConfig(layers=0)
-    )
+    config = ModelConfig(image_size=(322, 322), aggregator="boq", cross_image="none")
     assert config.descriptor_dim == 12_288
     assert config.aggregator.heads == 6
 

@@ -10,7 +10,6 @@ import pytest
 from crisalad_jax.nn.aggregators.transvpr import TransVpr, TransVprConfig, key_features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.layers import Linear
 from crisalad_jax.nn.model import describe, extract_features
 from crisalad_jax.utils.errors import InputError
@@ -20,7 +19,7 @@ CONFIG = ModelConfig(
     image_size=(42, 56),
     backbone=ViTConfig(dim=16, depth=3, heads=2, position_grid=3),
     aggregator=TransVprConfig(levels=3, dim=8),
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 
 

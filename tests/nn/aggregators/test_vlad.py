@@ -27,7 +27,6 @@ from crisalad_jax.nn.aggregators.vlad import (
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.layers import Linear, init_linear, l2_normalise
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import random_params
@@ -39,7 +38,7 @@ MODEL = ModelConfig(
     image_size=(42, 56),
     backbone=VIT,
     aggregator=NetVladConfig(clusters=3),
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 
 

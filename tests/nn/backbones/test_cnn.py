@@ -24,14 +24,13 @@ from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.convolutions import ConvNorm, conv_norm, init_he_conv, max_pool
 from crisalad_jax.nn.costs import count_macs
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.layers import BatchNorm, Conv
 from crisalad_jax.nn.model import check_params, describe
 from crisalad_jax.training.trainable import count_trainable, merge_params, split_params
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import random_params
 
-BARE = CrossImageConfig(layers=0)
+BARE = "none"
 SMALL = ModelConfig(
     image_size=(37, 52),
     backbone=ResNetConfig(layers=18, stages=2),

@@ -15,7 +15,6 @@ from crisalad_jax.nn.backbones import Features, FeatureSpec
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
 from crisalad_jax.nn.backbones.vit import ViT
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
@@ -27,7 +26,7 @@ from tests.conftest import random_params
 
 NO_ADAPTER = "none"
 CONFIG = DinoV3Config(dim=32, depth=3, heads=2, registers=2, adapter=NO_ADAPTER)
-BARE = CrossImageConfig(layers=0)
+BARE = "none"
 MODEL = ModelConfig(
     image_size=(48, 64),
     backbone=CONFIG,

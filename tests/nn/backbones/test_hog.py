@@ -26,7 +26,7 @@ CONFIG = cj.ModelConfig(
     preprocessing=cj.PreprocessingConfig(mean=(0.0, 0.0, 0.0), deviation=(1 / 255,) * 3),
     backbone="hog",
     aggregator="class-token",
-    cross_image=cj.CrossImageConfig(layers=0),
+    cross_image="none",
 )
 
 

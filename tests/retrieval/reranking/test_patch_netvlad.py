@@ -11,7 +11,6 @@ import pytest
 from crisalad_jax.nn.aggregators.vlad import NetVlad, NetVladConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.layers import linear
 from crisalad_jax.nn.model import describe, unit_features
 from crisalad_jax.nn.projection import ProjectionConfig
@@ -24,7 +23,7 @@ CONFIG = ModelConfig(
     image_size=(84, 98),
     backbone=ViTConfig(dim=16, depth=1, heads=2, position_grid=4),
     aggregator=NetVladConfig(clusters=3),
-    cross_image=CrossImageConfig(layers=0),
+    cross_image="none",
 )
 
 

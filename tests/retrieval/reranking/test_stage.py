@@ -24,7 +24,7 @@ from tests.conftest import BATCH, MODEL, random_params
 
 QUIET = Reading(batch_size=BATCH, quiet=True)
 
-PLAIN = dataclasses.replace(MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=0))
+PLAIN = dataclasses.replace(MODEL, cross_image="none")
 TRANSVPR = dataclasses.replace(PLAIN, aggregator=TransVprConfig(levels=2, dim=16))
 SELAVPR = dataclasses.replace(PLAIN, aggregator=SelaVprConfig(hidden=16, local=8))
 NETVLAD = dataclasses.replace(
