@@ -15,6 +15,8 @@ A step, a dustbin or a gradient of your own is registered as the built-in ones a
     solve(scores, log_mu, log_nu, config=SinkhornConfig(step="capacity"))
 """
 
+from crisalad_jax.nn.transport.annealing import AnnealingStep as AnnealingStep
+from crisalad_jax.nn.transport.capacities import CapacityStep as CapacityStep
 from crisalad_jax.nn.transport.config import GRADIENTS as GRADIENTS
 from crisalad_jax.nn.transport.config import Gradient as Gradient
 from crisalad_jax.nn.transport.config import SinkhornConfig as SinkhornConfig
@@ -34,6 +36,7 @@ from crisalad_jax.nn.transport.dustbin import TokenDustbin as TokenDustbin
 from crisalad_jax.nn.transport.dustbin import append_dustbin as append_dustbin
 from crisalad_jax.nn.transport.dustbin import log_marginals as log_marginals
 from crisalad_jax.nn.transport.iterate import iterate as iterate
+from crisalad_jax.nn.transport.nesterov import NesterovStep as NesterovStep
 from crisalad_jax.nn.transport.partial import PartialDustbin as PartialDustbin
 from crisalad_jax.nn.transport.partial import PartialStep as PartialStep
 from crisalad_jax.nn.transport.problem import SCALING_RANGE as SCALING_RANGE
@@ -43,6 +46,8 @@ from crisalad_jax.nn.transport.problem import marginal_error as marginal_error
 from crisalad_jax.nn.transport.solve import SinkhornResult as SinkhornResult
 from crisalad_jax.nn.transport.solve import assign_with_dustbin as assign_with_dustbin
 from crisalad_jax.nn.transport.solve import solve as solve
+from crisalad_jax.nn.transport.sparse import QuadraticStep as QuadraticStep
+from crisalad_jax.nn.transport.sparse import TopKStep as TopKStep
 from crisalad_jax.nn.transport.steps import STEPS as STEPS
 from crisalad_jax.nn.transport.steps import DualSoftmaxStep as DualSoftmaxStep
 from crisalad_jax.nn.transport.steps import NewtonStep as NewtonStep

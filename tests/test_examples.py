@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from crisalad_jax.config import plugins
-from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -163,13 +162,9 @@ def problem_of(epsilon: float = 1.0) -> tuple[Any, Any, Any]:
     return scores, jnp.zeros(12), jnp.log(jnp.array([1.0, 2, 2, 3, 4]))
 
 
-@pytest.mark.parametrize(
-    ("name", "fields"), [("annealing", {"start": 1.0}), ("momentum", {"weight": 1.0})]
-)
 @pytest.mark.parametrize("domain", ["scaling", "log"])
-def test_without_its_own_way_a_step_is_sinkhorns(name: str, fields: Any, domain: Any) -> None:
-    example(f"plugins/{name}")
-    step = REGISTRIES["step"].make(name, **fields)
+def test_without_momentum_a_step_is_sinkhorns(domain: Any) -> None:
+    step = example("plugins/momentum").Momentum(1.0)
     scores, *masses = problem_of()
     weights = jax.random.normal(jax.random.key(4), scores.shape)
 
@@ -207,64 +202,6 @@ def test_momentum_arrives_where_sinkhorn_does() -> None:
     )
     # Ten times the tolerance, relative.
     np.testing.assert_allclose(plan_of(found), plan_of(expected), rtol=1e-5)
-
-
-def test_annealing_uses_the_iterations_number() -> None:
-    """Its schedule by hand, in float64; at its end it is at epsilon itself."""
-    module = example("plugins/annealing")
-    scores, log_mu, log_nu = (np.asarray(each, np.float64) for each in problem_of())
-    row = np.zeros((2, 12))
-
-    def lse(values: np.ndarray, axis: int) -> np.ndarray:
-        return np.log(np.exp(values).sum(axis=axis))
-
-    for epsilon in (8.0, 4.0, 2.0, 1.0):
-        column = epsilon * (log_nu - lse((scores + row[..., None]) / epsilon, -2))
-        row = epsilon * (log_mu - lse((scores + column[:, None]) / epsilon, -1))
-    expected = np.exp(scores + row[..., None] + column[:, None])
-    step = module.Annealing(start=8.0, iterations=3)
-    found = solve(*problem_of(), config=SinkhornConfig(step=step, iterations=4))
-    np.testing.assert_allclose(plan_of(found), expected, rtol=1e-5)  # float32, four iterations
-    cut = solve(*problem_of(), config=SinkhornConfig(step=step, iterations=1))
-    # `finish` meets the rows wherever the schedule is left; to float32's rounding.
-    np.testing.assert_allclose(plan_of(cut).sum(axis=-1), 1, rtol=1e-6)
-
-
-def project(values: np.ndarray, mass: float) -> np.ndarray:
-    """The nearest point with numbers from 0 on that sum to `mass`: by bisection of the shift."""
-    low, high = values.min() - mass, values.max()
-    for _ in range(100):
-        middle = (low + high) / 2
-        low, high = (middle, high) if np.maximum(values - middle, 0).sum() > mass else (low, middle)
-    return np.maximum(values - high, 0)
-
-
-def test_a_row_of_quadratic_transport_is_a_sparsemax() -> None:
-    offset = example("plugins/quadratic").offset
-    scores = 2 * np.random.default_rng(2).normal(size=(20, 6))
-    mass = np.linspace(0.5, 3, 20)
-    expected = np.stack([project(row, each) for row, each in zip(scores, mass, strict=True)])
-    shift = offset(jnp.asarray(scores, jnp.float32), jnp.asarray(mass, jnp.float32))
-    found = np.maximum(scores + np.asarray(shift)[:, None], 0)
-    np.testing.assert_allclose(found, expected, atol=2e-6)  # sums of six numbers up to 6, float32
-    assert (expected == 0).mean() > 0.3
-
-
-def test_quadratic_transport_is_optimal_and_sparse() -> None:
-    """Its conditions, which are enough: the positive part of a sum, with the masses asked for."""
-    example("plugins/quadratic")
-    config = SinkhornConfig(step="quadratic", iterations=200)
-    scores, log_mu, log_nu = problem_of()
-    result = solve(scores, log_mu, log_nu, config=config)
-    plan = plan_of(result)
-    np.testing.assert_allclose(plan.sum(axis=-1), 1, rtol=1e-6)  # met last, to float32's rounding
-    # Two hundred projections in turn, which converge linearly.
-    np.testing.assert_allclose(plan.sum(axis=-2), np.exp(log_nu)[None].repeat(2, 0), rtol=1e-4)
-    row, column = result.potentials
-    kept = np.maximum(scores + row[..., None] + column[:, None], 0)
-    np.testing.assert_allclose(plan, kept, atol=1e-6)  # a logarithm and back
-    assert (plan == 0).mean() > 0.3
-    assert result.finite.all()
 
 
 def test_a_learnt_epsilon_is_epsilon() -> None:
@@ -321,12 +258,7 @@ def test_a_dustbin_network_of_zeros_is_a_constant() -> None:
 
 
 @pytest.mark.parametrize(
-    ("step", "dustbin"),
-    [
-        ("learnt-epsilon", "network"),
-        ("momentum", "column"),
-        pytest.param("quadratic", "column", marks=pytest.mark.slow),
-    ],
+    ("step", "dustbin"), [("learnt-epsilon", "network"), ("momentum", "column")]
 )
 def test_gradients_are_finite_in_a_model(step: str, dustbin: str) -> None:
     """Of all that SALAD learns; what a plug-in learns has a gradient, too."""
@@ -359,21 +291,6 @@ def test_gradients_are_finite_in_a_model(step: str, dustbin: str) -> None:
     assert len(learnt) == (2 if dustbin == "network" else 0)
     assert all(abs(leaf).max() > 1e-4 for leaf in learnt)
     assert abs(gradient.score.fc2.weight).max() > 1e-3
-
-
-@pytest.mark.parametrize("name", ["annealing", "quadratic"])
-def test_steps_of_balanced_problems_refuse_others(name: str) -> None:
-    example(f"plugins/{name}")
-    with pytest.raises(InputError, match=f"^step {name}: found a tau below 1, expected 1"):
-        solve(*problem_of(), row_tau=0.5, config=SinkhornConfig(step=name))
-
-
-def test_annealing_that_never_cools_is_told() -> None:
-    """A fixed point by optimistix takes every step for the first."""
-    example("plugins/annealing")
-    how = {"gradient": "optimistix", "tolerance": 1e-4, "iterations": 100}
-    result = solve(*problem_of(), config=SinkhornConfig(step="annealing", **how))
-    assert not result.converged.any()
 
 
 def test_a_step_that_learns_asks_for_its_parameters() -> None:

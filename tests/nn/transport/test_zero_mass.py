@@ -13,11 +13,13 @@ import optimistix
 import pytest
 
 from crisalad_jax.sinkhorn import (
+    CapacityStep,
     Potentials,
     Problem,
     SinkhornConfig,
     SinkhornStep,
     Step,
+    TopKStep,
     marginal_error,
     register_step,
     solve,
@@ -77,12 +79,20 @@ WAYS: dict[str, Way] = {
     "optimistix, solver": Way(
         to_rest(gradient="optimistix"), solver=optimistix.Newton(rtol=TIGHT, atol=TIGHT)
     ),
+    "unrolled, nesterov": Way(SinkhornConfig(step="nesterov", iterations=6)),
+    "implicit, nesterov": Way(to_rest(step="nesterov")),
+    "unrolled, annealing": Way(SinkhornConfig(step="annealing", iterations=6)),
+    "unrolled, quadratic": Way(SinkhornConfig(step="quadratic")),
+    "unrolled, top-k": Way(SinkhornConfig(step=TopKStep(k=2))),
+    "unrolled, capacities": Way(SinkhornConfig(step=CapacityStep(free_last=False))),
     "stop, fixed": Way(SinkhornConfig(gradient="stop")),
 }
 QUICK = {
     "published",
     "published, log",
     "unrolled, newton",
+    "unrolled, nesterov",
+    "unrolled, quadratic",
     "unrolled, softmax",
     "unrolled, tau, relaxation",
     "implicit",

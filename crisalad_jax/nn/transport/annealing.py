@@ -1,0 +1,53 @@
+"""Sinkhorn's iteration at an epsilon that falls (Schmitzer, SIAM J. Sci. Comput. 2019)."""
+
+import dataclasses
+import math
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from crisalad_jax.config.checks import PositiveInt, require_field
+from crisalad_jax.nn.transport.problem import Potentials, Problem
+from crisalad_jax.nn.transport.steps import STEPS, Step, check_balanced, tempered
+
+
+@STEPS.register("annealing")
+@dataclasses.dataclass(frozen=True)
+class AnnealingStep(Step):
+    """Take Sinkhorn's step at `start` times epsilon first, and at epsilon after `cooling` steps.
+
+    In between epsilon falls by the same factor each time. Problems must be balanced. The
+    iteration's number sets epsilon, so a warm start is heated again, and the gradient "optimistix"
+    never cools.
+    """
+
+    entropic: ClassVar[bool] = True
+    start: float = 8.0
+    """Multiple of epsilon in the first iteration, at least 1."""
+    cooling: PositiveInt = 3
+    """Number of iterations until epsilon is reached; give the solver at least one more."""
+
+    def __post_init__(self) -> None:
+        """Check the range."""
+        require_field(self, "start", 1 <= self.start < math.inf, "at least 1")
+
+    def step(
+        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
+    ) -> tuple[Potentials, Any]:
+        """Take the two half steps of the smoother problem.
+
+        Raises:
+            InputError: the problem's marginals are relaxed.
+        """
+        check_balanced(problem, "annealing")  # what tau stands for changes with epsilon
+        left = jnp.maximum(1 - iteration / self.cooling, 0)
+        times = jnp.asarray(self.start**left, problem.log_mu.dtype)
+        smooth = tempered(problem, jnp.broadcast_to(times, problem.log_mu.shape[:-1]))
+        column = times * (problem.log_nu - smooth.lse_rows(potentials.row / times))
+        row = times * (problem.log_mu - smooth.lse_columns(column / times))
+        return Potentials(row, column), state
+
+    def finish(self, problem: Problem, potentials: Potentials) -> Potentials:
+        """Meet the rows' marginals at epsilon itself, wherever the schedule was left."""
+        return potentials._replace(row=problem.log_mu - problem.lse_columns(potentials.column))

@@ -1,0 +1,42 @@
+"""Transport to columns that take at most their marginals (Benamou et al., 2015)."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from crisalad_jax.nn.transport.problem import Potentials, Problem
+from crisalad_jax.nn.transport.steps import STEPS, Step
+
+
+@STEPS.register("capacities")
+@dataclasses.dataclass(frozen=True)
+class CapacityStep(Step):
+    """Treat the columns' marginals as capacities: lower full columns, leave the others.
+
+    The plan maximises <P, S> + epsilon * entropy(P) over plans that meet the rows' marginals and
+    exceed no column's (Benamou et al., SIAM J. Sci. Comput. 2015). A potential of the columns is
+    at most 0, and is 0 where a column is not full. The rows are met last.
+
+    Example:
+        >>> from crisalad_jax.sinkhorn import SinkhornConfig, assign_with_dustbin
+        >>> config = SinkhornConfig(step="capacities", iterations=20)
+        >>> result = assign_with_dustbin(jnp.eye(8, 2), 9.0, config=config)
+        >>> jnp.exp(result.log_plan).sum(axis=0).round(3).tolist()  # the dustbin scores 9
+        [0.0, 0.0, 8.0]
+    """
+
+    capacities: ClassVar[bool] = True
+    free_last: bool = True
+    """Whether the last column, the dustbin, takes whatever is left, without a capacity."""
+
+    def step(
+        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
+    ) -> tuple[Potentials, Any]:
+        """Lower the columns that are above their marginals, then meet the rows'."""
+        column = problem.log_nu - problem.lse_rows(potentials.row)
+        column = jnp.where(column < 0, column, 0)
+        if self.free_last:
+            column = column.at[..., -1].set(0)
+        return Potentials(problem.log_mu - problem.lse_columns(column), column), state
