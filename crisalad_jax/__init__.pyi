@@ -9,6 +9,7 @@ from .checkpoints.public import read_backbone as read_backbone
 from .checkpoints.weights import save_weights as save_weights
 from .config.plugins import load_plugin as load_plugin
 from .config.preprocessing import PreprocessingConfig as PreprocessingConfig
+from .config.registry import make_part as make_part
 from .data.augmentations import Augmentation as Augmentation
 from .data.augmentations import register_augmentation as register_augmentation
 from .data.benchmarks import Benchmark as Benchmark
@@ -89,9 +90,14 @@ from .training.losses import metric_loss as metric_loss
 from .training.losses import register_loss as register_loss
 from .training.losses import tuple_labels as tuple_labels
 from .training.losses import tuple_pairs as tuple_pairs
+from .training.optimisers import Optimiser as Optimiser
+from .training.optimisers import register_optimiser as register_optimiser
 from .training.recipes import from_scratch as from_scratch
 from .training.recipes import recipe as recipe
 from .training.recipes import register_recipe as register_recipe
+from .training.schedules import RunSteps as RunSteps
+from .training.schedules import Schedule as Schedule
+from .training.schedules import register_schedule as register_schedule
 from .training.step import Metrics as Metrics
 from .training.step import TrainState as TrainState
 from .training.step import init_train_state as init_train_state

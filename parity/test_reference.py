@@ -33,6 +33,7 @@ from crisalad_jax.sinkhorn import SinkhornConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
+from crisalad_jax.training.schedules import LinearSchedule
 from crisalad_jax.utils.errors import InputError
 from parity.reference.adapter import ConvNorm, MultiResolutionAdapter
 from parity.reference.cross_image import CrossImageEncoder
@@ -407,7 +408,7 @@ def test_clipping_makes_the_norm_what_is_asked() -> None:
 
 
 def test_schedule() -> None:
-    plain = OptimiserConfig(end_lr_fraction=0.2)
+    plain = OptimiserConfig(schedule=LinearSchedule(0.2))
     assert [learning_rate_factor(plain, step, 4) for step in (0, 2, 4, 9)] == pytest.approx(
         [1, 0.6, 0.2, 0.2]
     )

@@ -46,8 +46,9 @@ def flags_of(config: Any, arguments: Sequence[str], preset: str, path: str = "")
         chosen = find_flag(arguments, f"--{path}")
         if chosen is not None and registry.find(chosen) is not type(config):
             config = registry.make(chosen, preset)
-        help_text = f"Which {registry.kind}; its own settings follow."
-        names = Literal[tuple(registry)]  # pyright: ignore
+        others = f", or {registry.others}" if registry.others else ""
+        help_text = f"Which {registry.kind}{others}; its own settings follow."
+        names = Literal[tuple({*registry, config.part_name})]  # pyright: ignore
         hint = Annotated[names, tyro.conf.arg(name="", help=help_text)]
         fields.append(("part_name", hint, config.part_name))
     kind = type(config)

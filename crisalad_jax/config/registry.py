@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Generic, TypeVar, cast
 
-from crisalad_jax.config.checks import REGISTRY, check_types, require
+from crisalad_jax.config.checks import REGISTRY, check_types, choose, require
 from crisalad_jax.config.io import PLUGIN, from_plain, to_plain
 from crisalad_jax.config.part import NAME, P, Part
 from crisalad_jax.config.plugins import load_entry_points
@@ -28,6 +28,8 @@ class Registry(Generic[P]):
         base: type[P],
         *,
         of_function: Callable[[Callable[..., Any]], Mapping[str, Any]] | None = None,
+        find_other: Callable[[str], type[P] | None] = lambda name: None,
+        others: str = "",
     ) -> None:
         """Make the registry of a kind, and set `base.registry` to it.
 
@@ -36,8 +38,12 @@ class Registry(Generic[P]):
             base: the class that all parts of this kind inherit from.
             of_function: for kinds whose parts may be plain functions, returns the methods of the
                 part that wraps a function.
+            find_other: makes the class of a part that has a name but is not registered, or returns
+                None.
+            others: such names, for messages and help.
         """
         self.kind, self.base, self._of_function = kind, base, of_function
+        self._find_other, self.others = find_other, others
         self._parts: dict[str, type[P]] = {}
         self._presets: dict[str, Mapping[str, Mapping[str, Any]]] = {}
         base.registry = self
@@ -125,6 +131,12 @@ class Registry(Generic[P]):
         """Iterate over the names of all parts, in order."""
         return iter(sorted(self._parts))
 
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is a part with this name."""
+        if not isinstance(name, str):
+            return False
+        return name in self._parts or self._find_other(name) is not None
+
     def find(self, name: str, plugin: str | None = None, *, where: str | None = None) -> type[P]:
         """Return the class of the part with this name; if needed, load installed plug-ins first.
 
@@ -142,10 +154,11 @@ class Registry(Generic[P]):
             hint = "is a plug-in missing? --plugin FILE.py or MODULE, or load_plugin"
             if plugin is not None:
                 hint = f"the plug-in {plugin} had it: --plugin {plugin}, or load_plugin"
+            names = ", ".join([*self, *([self.others] if self.others else [])])
             raise InputError(
-                f"{where or self.kind}: found {name!r}, expected one of {', '.join(self)} ({hint})"
+                f"{where or self.kind}: found {name!r}, expected one of {names} ({hint})"
             )
-        return self._parts[name]
+        return self._parts.get(name) or cast(type[P], self._find_other(name))
 
     def make(self, name: str, preset: str | None = None, **fields: Any) -> P:
         """Make the part with this name, with the settings of the preset of model sizes.
@@ -154,7 +167,7 @@ class Registry(Generic[P]):
             InputError: what `find` raises, or a field is out of range.
         """
         part = self.find(name)
-        return part(**{**self._presets[name].get(preset or "", {}), **fields})
+        return part(**{**self._presets.get(name, {}).get(preset or "", {}), **fields})
 
     def resolve(self, value: Any, where: str) -> P:
         """Return a part as it is, and make one that is given by its name.
@@ -174,6 +187,38 @@ class Registry(Generic[P]):
             article = "an" if self.kind[0] in "aeiou" else "a"
             raise InputError(f"{where}: found {found}, expected {article} {self.kind} or its name")
         return value
+
+
+def make_part(kind: str, name: str, **settings: Any) -> Any:
+    """Make a registered part by its kind and name, with settings.
+
+    Args:
+        kind: such as "aggregator", "loss" or "optimiser".
+        name: what configurations and flags call the part.
+        **settings: its fields that are not at their defaults.
+
+    Returns:
+        The part, for the configuration's field of that kind.
+
+    Raises:
+        InputError: no such kind, part or setting, or a value that does not fit.
+
+    Example:
+        >>> from crisalad_jax import OptimiserConfig
+        >>> muon = make_part("optimiser", "optax.contrib.muon", ns_steps=3)
+        >>> OptimiserConfig(kind=muon, schedule=make_part("schedule", "cosine", end_fraction=0.1))
+        OptimiserConfig(
+            kind=optax.contrib.muon(ns_steps=3),
+            schedule=CosineSchedule(end_fraction=0.1),
+        )
+    """
+    registry = choose("kind", kind, REGISTRIES)
+    part = registry.find(name)
+    names = [field.name for field in dataclasses.fields(part)]
+    unknown = ", ".join(sorted(settings.keys() - set(names)))
+    expected = f"one of {', '.join(names)}" if names else "none: it has no settings"
+    require(not unknown, f"{kind} {name}: found a setting {unknown}, expected {expected}")
+    return registry.make(name, **settings)
 
 
 def _home(part: type[Part]) -> str:

@@ -2,12 +2,10 @@
 
 import dataclasses
 import math
-from itertools import pairwise
 from typing import Literal
 
 from crisalad_jax.config.checks import (
     check_seed,
-    check_types,
     require_field,
     require_fraction,
     require_positive,
@@ -21,46 +19,35 @@ from crisalad_jax.nn.adapters import Adapter
 from crisalad_jax.nn.adapters.bottleneck import NoAdapter
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.losses import LossConfig
+from crisalad_jax.training.optimisers import OPTIMISERS, Optimiser
+from crisalad_jax.training.schedules import SCHEDULES, LinearSchedule, Schedule
 from crisalad_jax.training.trainable import EXPECTED, TRAINABLE
 
 
 @short_repr()
 @dataclasses.dataclass(frozen=True)
 class OptimiserConfig:
-    """An optimiser of torch, with an optional warm-up and a learning rate that falls.
+    """An optimiser, with an optional warm-up and a schedule of the learning rate.
 
     Example:
-        >>> OptimiserConfig(learning_rate=1e-3, warmup_steps=100).kind
-        'adamw'
+        >>> OptimiserConfig(kind="sgd", schedule="cosine", learning_rate=1e-3, warmup_steps=100)
+        OptimiserConfig(kind='sgd', learning_rate=0.001, schedule='cosine', warmup_steps=100)
     """
 
-    kind: Literal["adamw", "adam", "sgd"] = "adamw"
-    """In Adam and SGD the weight decay is part of the gradient."""
+    kind: OrName[Optimiser] = part_field(OPTIMISERS, "adamw")
+    """A registered optimiser or its name, or one of optax by its dotted name, such as
+    optax.contrib.muon."""
     learning_rate: float = 6e-5
     """Learning rate at its highest: after the warm-up, before it falls."""
-    schedule: Literal["linear", "step", "milestones"] = "linear"
-    """Linear decay step by step, or a step down: one every few epochs, or one after each of
-    `milestones`."""
-    end_lr_fraction: float = 0.0
-    """Share of the learning rate that is left at the end of a linear decay."""
-    decay_steps: int | None = None
-    """Length of a linear decay, after which the learning rate stays; None is the whole run."""
-    step_epochs: int = 3
-    """Epochs from one step down to the next (CricaVPR's)."""
-    step_gamma: float = 0.5
-    """What a step down multiplies the learning rate by (CricaVPR's)."""
-    milestones: tuple[int, ...] = ()
-    """Numbers of epochs after which the learning rate steps down, counted from the start."""
+    schedule: OrName[Schedule] = part_field(SCHEDULES, "linear")
+    """How the learning rate changes after the warm-up; a registered schedule, or its name."""
     warmup_steps: int = 0
     """Steps of a linear warm-up, of which the last is at the learning rate."""
     warmup_epochs: int = 0
     """The same in epochs, in place of `warmup_steps`."""
     weight_decay: float = 0.01
-    """Torch's default for AdamW; the paper names none."""
-    b1: float = 0.9
-    b2: float = 0.999
-    momentum: float = 0.9
-    """Of SGD."""
+    """Torch's default for AdamW; the paper names none. An optimiser without a weight decay of its
+    own gets it through its gradient, as torch's Adam and SGD."""
     clip_norm: float | None = None
     """Largest norm of the whole gradient."""
     clip_value: float | None = None
@@ -69,18 +56,16 @@ class OptimiserConfig:
     """Number of batches whose gradients are averaged for one step of the optimiser. The steps above
     are these. As in Lightning, the last batch of an epoch steps too; the sum of the gradients that
     are left is divided by the same number."""
+    ema: float | None = None
+    """Decay of an exponential moving average of the weights, such as 0.999, in a step of the
+    optimiser; validations and saved weights are of the average. None has no average."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
-        check_types(self)
-        require_positive(self, "learning_rate", "step_epochs", "step_gamma", "accumulate")
-        require_positive(self, "decay_steps", "clip_norm", "clip_value")
-        names = "end_lr_fraction", "warmup_steps", "warmup_epochs", "weight_decay"
-        require_range(self, 0, math.inf, *names)
-        require_fraction(self, "b1", "b2", "momentum")
-        rises = bool(self.milestones) and all(a < b for a, b in pairwise((0, *self.milestones)))
-        fits = rises or self.schedule != "milestones"
-        require_field(self, "milestones", fits, "numbers of epochs that rise")
+        resolve_names(self)
+        require_positive(self, "learning_rate", "accumulate", "clip_norm", "clip_value")
+        require_range(self, 0, math.inf, "warmup_steps", "warmup_epochs", "weight_decay")
+        require_fraction(self, "ema")
         one, steps = not (self.warmup_steps and self.warmup_epochs), self.warmup_steps
         require_field(self, "warmup_epochs", one, f"0 with warmup_steps {steps}")
 
@@ -142,7 +127,9 @@ class TrainConfig:
 
     model: ModelConfig = ModelConfig()
     loss: LossConfig = LossConfig()
-    optimiser: OptimiserConfig = OptimiserConfig(end_lr_fraction=0.2, decay_steps=4000)
+    optimiser: OptimiserConfig = OptimiserConfig(
+        schedule=LinearSchedule(end_fraction=0.2, decay_steps=4000)
+    )
     """By default AdamW as in the paper, whose decay is "as adopted in SALAD": to 0.2 in 4,000
     steps."""
     trainable: str = "adapters+head"

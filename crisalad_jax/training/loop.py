@@ -278,7 +278,7 @@ class _Loop:
         """Log the recalls, save the best weights, and decide on an early stop."""
         record = self.files.record
         epoch = record.step // self.data.steps_per_epoch
-        trainable = self.trainer.gather(self.trainer.state.trainable)
+        trainable = self.trainer.gather(self.trainer.state.averaged)
 
         def validate() -> tuple[str, dict[str, Any]]:
             params = self.trainer.params(trainable)
@@ -313,7 +313,7 @@ class _Loop:
 
         def save() -> None:
             state = self.trainer.gather(self.trainer.state)
-            params = functools.partial(self.trainer.params, state.trainable)
+            params = functools.partial(self.trainer.params, state.averaged)
             self.files.save(RunState(state, self.data.mined), params)
 
         distributed.raise_together(save)

@@ -1,14 +1,17 @@
-"""The optimiser and its learning rate, equal to torch's."""
+"""The optimiser of a run: warm-up, schedule, clipping, shared steps, and an average of weights."""
 
 import dataclasses
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 import optax
 from jax.typing import ArrayLike
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.training.config import OptimiserConfig
+from crisalad_jax.training.schedules import RunSteps
 from crisalad_jax.utils.output import warn
 
 WARMUP_SHARE = 4
@@ -55,12 +58,7 @@ def warmup_length(config: OptimiserConfig, steps_per_epoch: int) -> int:
 def learning_rate_schedule(
     config: OptimiserConfig, steps: int, steps_per_epoch: int = 1
 ) -> optax.Schedule:
-    """Make a linear warm-up, followed by the decay that `config.schedule` names.
-
-    Linear decay reaches `end_lr_fraction` after `config.decay_steps`, or after the last of `steps`.
-    Step decay multiplies by `step_gamma` every `step_epochs`, counted from the end of the warm-up.
-    Milestones count from the start of the run. One that comes before the end of the warm-up is
-    without effect, as in GSV-Cities' code, in which the warm-up sets the learning rate anew.
+    """Make a linear warm-up, followed by `config.schedule`.
 
     Args:
         config: the optimiser.
@@ -69,31 +67,32 @@ def learning_rate_schedule(
 
     Returns:
         A function of the number of steps that the optimiser has taken (`count_steps`).
+
+    Raises:
+        InputError: while tracing, for a schedule that returns no number.
     """
-    peak, end = config.learning_rate, config.learning_rate * config.end_lr_fraction
+    peak = config.learning_rate
     warmup_steps = warmup_length(config, steps_per_epoch)
     steps, steps_per_epoch = (
         count_steps(config, batches, steps_per_epoch) for batches in (steps, steps_per_epoch)
     )
-    if config.schedule == "linear":
-        length = config.decay_steps or max(steps - warmup_steps, 1)
-        decay = optax.linear_schedule(peak, end, length)
-    elif config.schedule == "milestones":
-        after = [epoch * steps_per_epoch - warmup_steps for epoch in config.milestones]
-        decay = optax.piecewise_constant_schedule(
-            peak, {step: config.step_gamma for step in after if step >= 0}
-        )
-    else:
-        decay = optax.exponential_decay(
-            peak, config.step_epochs * steps_per_epoch, config.step_gamma, staircase=True
-        )
+    run = RunSteps(max(steps - warmup_steps, 1), steps_per_epoch, warmup_steps)
+
+    def decay(step: ArrayLike) -> Array:
+        rate = jnp.asarray(config.schedule.apply(step, peak, run), float)
+        name, shape = config.schedule.part_name, rate.shape
+        require(not shape, f"schedule {name}: found to return shape {shape}, expected a number")
+        return rate
+
     if warmup_steps:
         # A warm-up of n steps starts at 1 / n of the peak: its first step would otherwise be 0.
-        decay = optax.join_schedules(
+        schedule = optax.join_schedules(
             [lambda count: peak * (count + 1) / warmup_steps, decay], [warmup_steps]
         )
+    else:
+        schedule = decay
     # Optax divides its int32 count in float32, also in JAX's 64-bit mode: the count is cast here.
-    return lambda count: decay(jnp.asarray(count, float))
+    return lambda count: schedule(jnp.asarray(count, float))
 
 
 def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) -> OptimiserConfig:
@@ -135,30 +134,33 @@ def warn_of_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: in
 def make_optimiser(
     config: OptimiserConfig, steps: int, steps_per_epoch: int = 1
 ) -> optax.GradientTransformation:
-    """Make torch's AdamW (Loshchilov and Hutter 2019), Adam (Kingma and Ba 2015) or SGD.
+    """Make the optimiser of a run, of `config.kind`.
 
-    All decay every parameter: AdamW the parameter itself, the others through its gradient. SGD has
-    torch's momentum, without dampening. With `config.clip_norm` or `config.clip_value` the gradient
-    is clipped first, where several batches share a step the mean of theirs.
+    With `config.clip_norm` or `config.clip_value` the gradient is clipped first, where several
+    batches share a step the mean of theirs. The average of `config.ema` comes last.
 
     Args:
         config: the optimiser.
         steps: number of batches of the run.
         steps_per_epoch: number of batches of an epoch.
+
+    Raises:
+        InputError: the optimiser is no transformation of optax.
     """
-    schedule = learning_rate_schedule(config, steps, steps_per_epoch)
-    b1, b2, parts = config.b1, config.b2, []
+    schedule, parts = learning_rate_schedule(config, steps, steps_per_epoch), []
     if config.clip_norm is not None:
         parts.append(optax.clip_by_global_norm(config.clip_norm))
     if config.clip_value is not None:
         parts.append(optax.clip(config.clip_value))
-    if config.kind == "adamw":
-        parts.append(optax.adamw(schedule, b1, b2, weight_decay=config.weight_decay))
-    else:
-        parts.append(optax.add_decayed_weights(config.weight_decay))
-        is_adam = config.kind == "adam"
-        descent = optax.adam(schedule, b1, b2) if is_adam else optax.sgd(schedule, config.momentum)
-        parts.append(descent)
+    made, name = config.kind.make(schedule, config.weight_decay), config.kind.part_name
+    require(
+        isinstance(made, optax.GradientTransformation),
+        f"optimiser {name}: found to return {type(made).__name__}, expected a transformation of "
+        "optax, such as optax.sgd(learning_rate)",
+    )
+    parts.append(_with_plain_keys(made))
+    if config.ema is not None:
+        parts.append(_averaging(config.ema))
     optimiser = optax.chain(*parts)
     if config.accumulate == 1:
         return optimiser
@@ -181,3 +183,72 @@ def _accumulated(
         of_mean, count_batches, use_grad_mean=False, accumulator_dtype=jnp.dtype(float)
     )
     return several.gradient_transformation()
+
+
+def _with_plain_keys(optimiser: optax.GradientTransformation) -> optax.GradientTransformation:
+    """Keep random keys in the state as numbers, which a checkpoint can hold."""
+
+    def is_key(leaf: Any) -> bool:
+        return jnp.issubdtype(getattr(leaf, "dtype", None), jax.dtypes.prng_key)
+
+    def plain(state: PyTree) -> PyTree:
+        return jax.tree.map(lambda leaf: jax.random.key_data(leaf) if is_key(leaf) else leaf, state)
+
+    def init(params: PyTree) -> PyTree:
+        return plain(optimiser.init(params))
+
+    def update(updates: PyTree, state: PyTree, params: PyTree = None) -> tuple[PyTree, PyTree]:
+        own = jax.tree.map(
+            lambda like, leaf: jax.random.wrap_key_data(leaf) if is_key(like) else leaf,
+            jax.eval_shape(optimiser.init, updates if params is None else params),
+            state,
+        )
+        updates, state = optimiser.update(updates, own, params)
+        return updates, plain(state)
+
+    return optax.GradientTransformation(init, update)
+
+
+class WeightAverage(NamedTuple):
+    """The part of an optimiser's state that averages the weights."""
+
+    weights: PyTree
+
+
+def _averaging(decay: float) -> optax.GradientTransformation:
+    """Average the weights after each step, beginning with the first ones."""
+
+    def init(params: PyTree) -> WeightAverage:
+        return WeightAverage(jax.tree.map(jnp.copy, params))  # both are donated to a step
+
+    def update(
+        updates: PyTree, state: WeightAverage, params: PyTree = None
+    ) -> tuple[PyTree, WeightAverage]:
+        after = optax.apply_updates(params, updates)
+        return updates, WeightAverage(
+            optax.incremental_update(after, state.weights, step_size=1 - decay)
+        )
+
+    return optax.GradientTransformation(init, update)
+
+
+def averaged_weights(state: PyTree, weights: PyTree) -> PyTree:
+    """Return the weights to validate and save: an average, where the optimiser has one.
+
+    It is that of `OptimiserConfig.ema`, or of schedule-free optimisers (Defazio et al. 2024).
+
+    Args:
+        state: the optimiser's.
+        weights: those that its last step made.
+    """
+    from optax.contrib import ScheduleFreeState, schedule_free_eval_params
+
+    for kind, average in (
+        (WeightAverage, lambda found: found.weights),
+        (ScheduleFreeState, lambda found: schedule_free_eval_params(found, weights)),
+    ):
+        leaves = jax.tree.leaves(state, is_leaf=lambda each, kind=kind: isinstance(each, kind))
+        for found in leaves:
+            if isinstance(found, kind):
+                return average(found)
+    return weights

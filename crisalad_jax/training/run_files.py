@@ -219,12 +219,11 @@ def extend_run(out: pathlib.Path, config: TrainConfig, record: RunRecord) -> Non
     known = [each for each in known if each["epochs"] != before]
     write_json(history, {"before": [*known, {"epochs": before, "step": record.step}]})
     write_json(path, to_plain(config))
-    falls = config.optimiser.schedule == "linear" and config.optimiser.decay_steps is None
-    if falls and record.step and not record.stopped_early:
+    if config.optimiser.schedule.spans_run and record.step and not record.stopped_early:
         warn(
             f"{out}: the learning rate falls over the whole run, so that it jumps at step "
             f"{record.step}: this is not the run of {config.epochs} epochs at once; "
-            "--optimiser.decay-steps keeps a fall's length"
+            "--optimiser.schedule.decay-steps keeps a fall's length"
         )
 
 

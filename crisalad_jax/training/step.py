@@ -26,6 +26,7 @@ from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig, LossResult, metric_loss, tuple_pairs
 from crisalad_jax.training.losses.base import GivenLoss
 from crisalad_jax.training.optimiser import (
+    averaged_weights,
     count_steps,
     learning_rate_schedule,
     make_optimiser,
@@ -53,6 +54,12 @@ class TrainState(NamedTuple):
     optimiser: PyTree
     classifiers: Classifiers | None = None
     """Parameters of the loss, if it has any."""
+
+    @property
+    def averaged(self) -> PyTree:
+        """`trainable` to validate and save, with the optimiser's average where it keeps one."""
+        statistics, learnt = split_statistics(self.trainable)
+        return eqx.combine(averaged_weights(self.optimiser, learnt), statistics)
 
 
 @brief

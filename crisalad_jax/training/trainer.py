@@ -153,7 +153,7 @@ class Trainer:
     def params(self, trainable: PyTree = None) -> Crisalad:
         """Join the whole model in float32, with what trains as it was gathered; None gathers it."""
         if trainable is None:
-            trainable = self.gather(self.state.trainable)
+            trainable = self.gather(self.state.averaged)
         return merge_params(trainable, jax.tree.map(jnp.asarray, self._frozen), self._config.model)
 
     def _batch(self, *parts: np.ndarray) -> Batch:

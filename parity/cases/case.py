@@ -363,7 +363,7 @@ def _their_step(start: Arrays, gradients: Arrays) -> dict[str, np.ndarray]:
     torch.optim.AdamW(
         leaves.values(),
         lr=ONE_STEP.learning_rate,
-        betas=(ONE_STEP.b1, ONE_STEP.b2),
+        betas=(ONE_STEP.kind.b1, ONE_STEP.kind.b2),
         weight_decay=ONE_STEP.weight_decay,
     ).step()
     return split({name: as_double(leaf) for name, leaf in leaves.items()})

@@ -48,12 +48,12 @@ def freeze(model: Crisalad, trainable: str) -> list[nn.Parameter]:
 def learning_rate_factor(config: OptimiserConfig, step: int, steps: int) -> float:
     """Share of the peak at `step`: 1 / n to 1 in a warm-up of n steps, then linearly down.
 
-    `config.end_lr_fraction` is reached after the last of `steps`, counted from 0.
+    The schedule's `end_fraction` is reached after the last of `steps`, counted from 0.
     """
     if step < config.warmup_steps:
         return (step + 1) / config.warmup_steps
     done = (step - config.warmup_steps) / max(steps - config.warmup_steps, 1)
-    return 1 - (1 - config.end_lr_fraction) * min(done, 1.0)
+    return 1 - (1 - config.schedule.end_fraction) * min(done, 1.0)
 
 
 def train(
@@ -78,7 +78,7 @@ def train(
     optimiser = torch.optim.AdamW(
         parameters,
         lr=config.optimiser.learning_rate,
-        betas=(config.optimiser.b1, config.optimiser.b2),
+        betas=(config.optimiser.kind.b1, config.optimiser.kind.b2),
         weight_decay=config.optimiser.weight_decay,
     )
     schedule = torch.optim.lr_scheduler.LambdaLR(

@@ -39,7 +39,14 @@ from crisalad_jax.training.losses.large_margin_cosine import LargeMarginCosineCo
 from crisalad_jax.training.losses.pairwise import (
     ContrastiveConfig,
 )
+from crisalad_jax.training.optimisers import Adam, AdamW, Sgd
 from crisalad_jax.training.recipes import recipe
+from crisalad_jax.training.schedules import (
+    ConstantSchedule,
+    LinearSchedule,
+    MilestonesSchedule,
+    StepSchedule,
+)
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 
@@ -68,8 +75,8 @@ def test_the_recipe_is_the_papers():
     # "Linear, as adopted in SALAD", whose code decays to a fifth in 4,000 steps.
     for name in ("crisalad", "crisalad-1e-4"):
         optimiser = recipe("b14", name).optimiser
-        assert optimiser.schedule == "linear"
-        assert (optimiser.end_lr_fraction, optimiser.decay_steps) == (0.2, 4000)
+        assert optimiser.kind == AdamW(b1=0.9, b2=0.999)
+        assert optimiser.schedule == LinearSchedule(end_fraction=0.2, decay_steps=4000)
     assert (config.places_per_batch, config.images_per_place) == (48, 4)
     assert config.trainable == "adapters+head"
     assert config.model.image_size == (224, 224)
@@ -89,9 +96,7 @@ def test_the_recipes_are_their_papers():
     assert optimiser == OptimiserConfig(
         kind="adamw",
         learning_rate=6e-5,
-        schedule="linear",
-        end_lr_fraction=0.2,
-        decay_steps=4000,
+        schedule=LinearSchedule(end_fraction=0.2, decay_steps=4000),
         weight_decay=9.5e-9,
     )
     cricavpr = recipe("b14", "cricavpr")
@@ -99,13 +104,13 @@ def test_the_recipes_are_their_papers():
     assert cricavpr.model.descriptor_dim == 10_752
     assert cricavpr.model.backbone.adapter.part_name == "multi-resolution"
     optimiser = cricavpr.optimiser
-    assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == ("adam", 1e-4, 0.0)
-    assert (optimiser.schedule, optimiser.step_epochs, optimiser.step_gamma) == ("step", 3, 0.5)
+    assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == (Adam(), 1e-4, 0.0)
+    assert optimiser.schedule == StepSchedule(epochs=3, gamma=0.5)
     assert (cricavpr.epochs, cricavpr.patience, cricavpr.monitor) == (10, 10, "R@5")
     paper = recipe("b14")
     for name, change in (
         ("crisalad-1e-4", {"learning_rate": 1e-4}),
-        ("crisalad-step", {"schedule": "step"}),
+        ("crisalad-step", {"schedule": StepSchedule(epochs=3, gamma=0.5)}),
     ):
         varied = dataclasses.replace(paper.optimiser, **change)
         assert recipe("b14", name) == dataclasses.replace(paper, optimiser=varied)
@@ -134,8 +139,8 @@ def test_classification_is_as_published():
     assert cosplace.model.cross_image == NoCrossImage()
     assert cosplace.model.descriptor_dim == 512
     optimiser = cosplace.optimiser
-    assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == ("adam", 1e-5, 0.0)
-    assert optimiser.end_lr_fraction == 1.0
+    assert (optimiser.kind, optimiser.learning_rate, optimiser.weight_decay) == (Adam(), 1e-5, 0.0)
+    assert optimiser.schedule == ConstantSchedule()
     assert (cosplace.places_per_batch, cosplace.images_per_place) == (32, 1)
     assert (cosplace.epochs, cosplace.patience) == (50, None)
     loss = cosplace.loss.kind
@@ -168,9 +173,7 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
     assert boq.optimiser == OptimiserConfig(
         kind="adamw",
         learning_rate=1e-4,
-        schedule="milestones",
-        milestones=(10, 20),
-        step_gamma=0.1,
+        schedule=MilestonesSchedule(epochs=(10, 20), gamma=0.1),
         warmup_epochs=10,
         weight_decay=1e-4,
     )
@@ -179,14 +182,11 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
     assert (mix.places_per_batch, mix.epochs, mix.monitor) == (80, 60, "R@1")
     assert mix.trainable == "last-4-blocks+positions+head"
     assert mix.optimiser == OptimiserConfig(
-        kind="sgd",
+        kind=Sgd(momentum=0.9),
         learning_rate=0.005,
-        schedule="milestones",
-        milestones=(5, 10, 15, 25, 45),
-        step_gamma=0.3,
+        schedule=MilestonesSchedule(epochs=(5, 10, 15, 25, 45), gamma=0.3),
         warmup_steps=650,
         weight_decay=1e-3,
-        momentum=0.9,
         clip_value=0.5,
         accumulate=4,
     )
@@ -198,9 +198,7 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
     assert vlad.optimiser == OptimiserConfig(
         kind="adam",
         learning_rate=5e-5,
-        schedule="step",
-        step_epochs=3,
-        step_gamma=0.5,
+        schedule=StepSchedule(epochs=3, gamma=0.5),
         weight_decay=0.0,
     )
     image = recipe("b14", "image")
@@ -238,9 +236,7 @@ def test_the_recipes_over_resnet_are_as_published():
     assert conv.optimiser == OptimiserConfig(
         kind="adamw",
         learning_rate=2e-4,
-        schedule="milestones",
-        milestones=(5, 10, 15, 25),
-        step_gamma=0.3,
+        schedule=MilestonesSchedule(epochs=(5, 10, 15, 25), gamma=0.3),
         warmup_steps=600,
         weight_decay=0.0,
     )
@@ -267,7 +263,7 @@ def test_the_recipes_over_resnet_are_as_published():
     backbone = edtformer.model.backbone
     assert backbone.adapter.width(backbone.dim) == 4
     assert (edtformer.epochs, edtformer.patience, edtformer.monitor) == (15, 15, "R@5")
-    assert edtformer.optimiser.step_gamma == 0.7
+    assert edtformer.optimiser.schedule == StepSchedule(epochs=3, gamma=0.7)
 
 
 def test_a_part_alone_is_told():
@@ -372,7 +368,7 @@ def test_more_patches_than_clusters(clusters, side):
         (LargeMarginCosineConfig, {"margin": 1.0}, "LargeMarginCosineConfig.margin: found 1.0"),
         (ClassesConfig, {"groups": 0}, "ClassesConfig.groups: found 0"),
         (ClassesConfig, {"sector": 50.0}, "found 2 sectors of 50 degrees, expected a divisor of"),
-        (OptimiserConfig, {"b2": 1.0}, "OptimiserConfig.b2: found 1.0"),
+        (AdamW, {"b2": 1.0}, "AdamW.b2: found 1.0"),
         (TrainConfig, {"images_per_place": 1}, "TrainConfig.images_per_place: found 1"),
         (TrainConfig, {"min_images": 3}, "TrainConfig.min_images: found 3, expected at least 4"),
         (TrainConfig, {"trainable": "tail"}, "TrainConfig.trainable: found 'tail', expected head"),

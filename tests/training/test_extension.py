@@ -10,6 +10,7 @@ import pytest
 from crisalad_jax.config.io import read_config
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.loop import fit
+from crisalad_jax.training.schedules import LinearSchedule
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.conftest import RECIPE
@@ -18,7 +19,7 @@ from tests.training.test_loop import Interrupted, assert_same_run, fail_at
 # Three epochs of two steps, whose learning rate falls in four steps and then stays.
 LONG = dataclasses.replace(
     RECIPE,
-    optimiser=OptimiserConfig(learning_rate=1e-3, end_lr_fraction=0.2, decay_steps=4),
+    optimiser=OptimiserConfig(learning_rate=1e-3, schedule=LinearSchedule(0.2, decay_steps=4)),
     patience=None,
 )
 

@@ -25,7 +25,9 @@ from crisalad_jax.training.loop import fit
 from crisalad_jax.training.losses import LossConfig, Role, metric_loss, tuple_labels, tuple_pairs
 from crisalad_jax.training.losses.pairwise import SelaVprLoss, TripletConfig
 from crisalad_jax.training.mining import Mined, Miner
+from crisalad_jax.training.optimisers import Adam, Sgd
 from crisalad_jax.training.run_files import checksum_of_places
+from crisalad_jax.training.schedules import ConstantSchedule
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import RECIPE, assert_equal
 from tests.data.test_query_set import write_street
@@ -332,8 +334,8 @@ def test_recipes_are_the_codes():
         assert config.model.image_size == (480, 640)
         assert config.loss == LossConfig(kind=TripletConfig(0.1**0.5, "all"), miner="none")
         sgd = config.optimiser
-        found = sgd.kind, sgd.learning_rate, sgd.momentum, sgd.weight_decay
-        assert found == ("sgd", 1e-4, 0.9, 1e-3)
+        found = sgd.kind, sgd.learning_rate, sgd.weight_decay
+        assert found == (Sgd(momentum=0.9), 1e-4, 1e-3)
         # Both stop after more than 10 epochs without gain.
         assert (config.epochs, config.patience, config.monitor) == (30, 11, "R@5")
         assert (config.places_per_batch, config.trainable) == (4, "last-1-blocks+head")
@@ -347,8 +349,8 @@ def test_recipes_are_the_codes():
     assert (selavpr.places_per_batch, selavpr.images_per_place) == (4, 4)
     assert (selavpr.model.descriptor_dim, selavpr.model.image_size) == (1024, (224, 224))
     adam = selavpr.optimiser
-    found = adam.kind, adam.learning_rate, adam.weight_decay, adam.end_lr_fraction
-    assert found == ("adam", 1e-5, 0, 1)
+    found = adam.kind, adam.learning_rate, adam.weight_decay, adam.schedule
+    assert found == (Adam(), 1e-5, 0, ConstantSchedule())
     assert (selavpr.epochs, selavpr.patience, selavpr.monitor) == (50, 3, "R@5")
     assert selavpr.trainable == "adapters+head"
 

@@ -20,6 +20,7 @@ from crisalad_jax.training.optimiser import (
     with_short_warmup,
 )
 from crisalad_jax.training.recipes import recipe
+from crisalad_jax.training.schedules import CosineSchedule, LinearSchedule, MilestonesSchedule
 from crisalad_jax.training.step import StepConfig, init_train_state
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
@@ -88,9 +89,7 @@ def warmed_up(count: int, lengths: list[int], gamma: float) -> tuple[OptimiserCo
     warm-up sets anew before each of its steps."""
     ours = OptimiserConfig(
         learning_rate=0.05,
-        schedule="milestones",
-        milestones=tuple(lengths),
-        step_gamma=gamma,
+        schedule=MilestonesSchedule(tuple(lengths), gamma),
         warmup_steps=count,
     )
     optimiser = torch.optim.SGD([torch.zeros(1)], lr=0.05)
@@ -127,8 +126,13 @@ SCHEDULES = {
     "BoQ": lambda: warmed_up(10 * EPOCH, [10, 20], 0.1),
     "no warm-up": lambda: warmed_up(0, [5, 10], 0.3),
     "SALAD": lambda: stepped(
-        OptimiserConfig(learning_rate=6e-5, end_lr_fraction=0.2, decay_steps=200),
+        OptimiserConfig(learning_rate=6e-5, schedule=LinearSchedule(0.2, decay_steps=200)),
         lambda each: torch.optim.lr_scheduler.LinearLR(each, 1.0, 0.2, total_iters=200),
+    ),
+    "a cosine": lambda: stepped(
+        OptimiserConfig(learning_rate=1e-3, schedule=CosineSchedule(0.1, decay_steps=250)),
+        lambda each: torch.optim.lr_scheduler.CosineAnnealingLR(each, 250, eta_min=1e-4),
+        steps=250,
     ),
     "CricaVPR": lambda: stepped(
         OptimiserConfig(learning_rate=1e-4, schedule="step"),
@@ -195,12 +199,16 @@ def test_several_batches_share_a_step_and_its_learning_rate(epoch: int) -> None:
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"schedule": "milestones"}, r"OptimiserConfig\.milestones: found \(\), expected numbers"),
-        ({"schedule": "milestones", "milestones": (5, 5)}, r"milestones: found \(5, 5\), expected"),
+        ({"schedule": "cosin"}, r"OptimiserConfig\.schedule: found 'cosin', expected one of const"),
+        ({"kind": "muon"}, r"OptimiserConfig\.kind: found 'muon', expected .*, sgd, .*optax\.NAME"),
+        ({"kind": "optax.no"}, r"found 'optax\.no', expected a function of optax that takes a le"),
+        ({"kind": "optax.contrib"}, "found 'optax.contrib', expected a function of optax"),
+        ({"kind": "optax.contrib.jax.jit"}, "expected a function of optax that takes a learning"),
+        ({"kind": "optax.lbfgs"}, "optimiser optax.lbfgs: cannot step by a gradient and a sched"),
         ({"warmup_steps": 3, "warmup_epochs": 2}, "warmup_epochs: found 2, expected 0 with"),
         ({"accumulate": 0}, r"OptimiserConfig\.accumulate: found 0, expected more than 0"),
         ({"clip_value": 0.0}, r"OptimiserConfig\.clip_value: found 0\.0, expected more than 0"),
-        ({"momentum": 1.0}, r"OptimiserConfig\.momentum: found 1\.0"),
+        ({"ema": 1.0}, r"OptimiserConfig\.ema: found 1\.0, expected at least 0 and less than 1"),
     ],
 )
 def test_optimisers_that_do_not_fit_are_refused(fields, words) -> None:

@@ -25,6 +25,8 @@ from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig, metric_loss
 from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.training.optimiser import learning_rate_schedule, make_optimiser
+from crisalad_jax.training.optimisers import AdamW
+from crisalad_jax.training.schedules import LinearSchedule, MilestonesSchedule, StepSchedule
 from crisalad_jax.training.step import (
     Metrics,
     StepConfig,
@@ -194,7 +196,11 @@ OPTIMISERS = {
     # Linear decay of an epoch a step, clipped.
     "adamw": (
         OptimiserConfig(
-            learning_rate=0.1, end_lr_fraction=0.2, weight_decay=0.05, b2=0.9, clip_norm=1.0
+            kind=AdamW(b2=0.9),
+            learning_rate=0.1,
+            schedule=LinearSchedule(0.2),
+            weight_decay=0.05,
+            clip_norm=1.0,
         ),
         lambda each: torch.optim.AdamW([each], lr=0.1, betas=(0.9, 0.9), weight_decay=0.05),
         lambda each: torch.optim.lr_scheduler.LinearLR(each, 1.0, 0.2, total_iters=9),
@@ -202,7 +208,7 @@ OPTIMISERS = {
     # CricaVPR's, down to a half every three epochs, with decay.
     "adam": (
         OptimiserConfig(
-            kind="adam", learning_rate=0.1, schedule="step", step_epochs=3, weight_decay=0.1
+            kind="adam", learning_rate=0.1, schedule=StepSchedule(epochs=3), weight_decay=0.1
         ),
         lambda each: torch.optim.Adam([each], lr=0.1, weight_decay=0.1),
         lambda each: torch.optim.lr_scheduler.StepLR(each, step_size=3, gamma=0.5),
@@ -216,7 +222,7 @@ def test_steps_of_an_optimiser_equal_torchs(name: str) -> None:
     """Nine steps on given gradients, of two an epoch but under linear decay."""
     config, make, schedule = OPTIMISERS[name]
     start, *gradients = np.random.default_rng(0).standard_normal((10, 7))
-    per_epoch = 1 if config.schedule == "linear" else 2
+    per_epoch = 1 if config.schedule == LinearSchedule(0.2) else 2
     tensor = torch.tensor(start, requires_grad=True)
     theirs = make(tensor)
     down = schedule(theirs)
@@ -241,9 +247,7 @@ def test_gradients_of_several_batches_equal_torchs(kind: Literal["sgd", "adamw"]
     config = OptimiserConfig(
         kind=kind,
         learning_rate=0.1,
-        schedule="milestones",
-        milestones=(2,),
-        step_gamma=0.3,
+        schedule=MilestonesSchedule((2,), gamma=0.3),
         warmup_steps=3,
         weight_decay=1e-3,
         clip_value=0.5,
@@ -297,7 +301,7 @@ def optimised(
 
 def test_schedule_by_hand() -> None:
     schedule = learning_rate_schedule(
-        OptimiserConfig(learning_rate=1.0, end_lr_fraction=0.1, warmup_steps=4), 14
+        OptimiserConfig(learning_rate=1.0, schedule=LinearSchedule(0.1), warmup_steps=4), 14
     )
     found = [float(schedule(step)) for step in (0, 1, 3, 4, 9, 14)]
     np.testing.assert_allclose(found, [0.25, 0.5, 1.0, 1.0, 0.55, 0.1], atol=1e-6)

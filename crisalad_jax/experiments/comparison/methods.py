@@ -148,8 +148,9 @@ class Ablation(NamedTuple):
         if from_nothing:
             config = from_scratch(config)
             rate *= config.optimiser.learning_rate / OptimiserConfig.learning_rate
-        changes = {"learning_rate": rate, "schedule": self.schedule}
-        optimiser = dataclasses.replace(config.optimiser, **changes)
+        optimiser = dataclasses.replace(config.optimiser, learning_rate=rate)
+        if self.schedule == "step":
+            optimiser = dataclasses.replace(optimiser, schedule=self.schedule)
         return dataclasses.replace(config, optimiser=optimiser)
 
     def words(self, training: TrainConfig) -> str:

@@ -13,6 +13,8 @@ from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.backbones import BACKBONES
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig, has_adapters
+from crisalad_jax.training.optimisers import AdamW
+from crisalad_jax.training.schedules import LinearSchedule
 from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, ALL, HEAD
 from crisalad_jax.utils.output import warn
 
@@ -226,7 +228,7 @@ def find_part(
 
 _KINDS = (
     *("aggregator", "adapter", "cross_image", "step", "dustbin", "loss", "backbone"),
-    *("augmentation", "gradient"),
+    *("augmentation", "gradient", "optimiser", "schedule"),
 )
 
 
@@ -243,6 +245,10 @@ def with_part(config: TrainConfig, part: Any) -> TrainConfig:
     kind, model = part.registry.kind, config.model
     if kind == "augmentation":
         return dataclasses.replace(config, augmentation=part)
+    if kind in ("optimiser", "schedule"):
+        field = {"optimiser": "kind"}.get(kind, kind)
+        optimiser = dataclasses.replace(config.optimiser, **{field: part})
+        return dataclasses.replace(config, optimiser=optimiser)
     if kind == "loss":
         miner = "none" if part.ranks_all else config.loss.miner
         loss = dataclasses.replace(config.loss, kind=part, miner=miner)
@@ -312,11 +318,11 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
         model=dataclasses.replace(config.model, compute_dtype="float32"),
         loss=dataclasses.replace(config.loss, kind=config.loss.kind.from_scratch()),
         optimiser=OptimiserConfig(
+            kind=AdamW(b2=0.99),
             learning_rate=1e-3,
-            end_lr_fraction=0.02,
+            schedule=LinearSchedule(end_fraction=0.02),
             warmup_steps=30,
             weight_decay=0.05,
-            b2=0.99,
             clip_norm=1.0,
         ),
         trainable="all",

@@ -28,7 +28,7 @@ def _classified(model: ModelConfig, loss: LargeMarginCosineConfig, **fields: Any
         model=model,
         loss=LossConfig(kind=loss),
         optimiser=OptimiserConfig(
-            kind="adam", learning_rate=1e-5, end_lr_fraction=1.0, weight_decay=0.0
+            kind="adam", learning_rate=1e-5, schedule="constant", weight_decay=0.0
         ),
         places_per_batch=32,
         images_per_place=1,

@@ -16,6 +16,7 @@ from crisalad_jax.training.recipes.base import (
     validation_size,
 )
 from crisalad_jax.training.recipes.dinov2 import BOQ_TRAINING, MIXVPR_OPTIMISER
+from crisalad_jax.training.schedules import MilestonesSchedule
 
 
 @register_recipe("mixvpr")
@@ -52,9 +53,7 @@ def conv_ap(model: ModelConfig, preset: str) -> TrainConfig:
         ),
         optimiser=OptimiserConfig(
             learning_rate=2e-4,
-            schedule="milestones",
-            milestones=(5, 10, 15, 25),
-            step_gamma=0.3,
+            schedule=MilestonesSchedule((5, 10, 15, 25), gamma=0.3),
             warmup_steps=600,
             weight_decay=0.0,
         ),

@@ -16,15 +16,14 @@ from crisalad_jax.training.config import MiningConfig, OptimiserConfig, TrainCon
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.losses.pairwise import SelaVprLoss
 from crisalad_jax.training.recipes.base import model_of, register_recipe, validation_size
+from crisalad_jax.training.schedules import MilestonesSchedule, StepSchedule
 
 ADAM_STEP = OptimiserConfig(kind="adam", learning_rate=5e-5, schedule="step", weight_decay=0.0)
 """Of CricaVPR's code, and of those that grew from it."""
 BOQ_TRAINING: dict[str, Any] = {
     "optimiser": OptimiserConfig(
         learning_rate=1e-4,
-        schedule="milestones",
-        milestones=(10, 20),
-        step_gamma=0.1,
+        schedule=MilestonesSchedule((10, 20), gamma=0.1),
         warmup_epochs=10,
         weight_decay=1e-4,
     ),
@@ -39,9 +38,7 @@ BOQ_TRAINING: dict[str, Any] = {
 MIXVPR_OPTIMISER = OptimiserConfig(
     kind="sgd",
     learning_rate=0.05,
-    schedule="milestones",
-    milestones=(5, 10, 15, 25, 45),
-    step_gamma=0.3,
+    schedule=MilestonesSchedule((5, 10, 15, 25, 45), gamma=0.3),
     warmup_steps=650,
     weight_decay=1e-3,
 )
@@ -70,7 +67,7 @@ def salad(model: ModelConfig, preset: str) -> TrainConfig:
     """
     return TrainConfig(
         model=model_of(model, preset, _vit(model), None, compute_dtype="bfloat16"),
-        optimiser=OptimiserConfig(weight_decay=9.5e-9, end_lr_fraction=0.2, decay_steps=4000),
+        optimiser=dataclasses.replace(TrainConfig.optimiser, weight_decay=9.5e-9),
         trainable="last-4-blocks+head",
         places_per_batch=60,
         epochs=4,
@@ -124,7 +121,7 @@ def selavpr(model: ModelConfig, preset: str) -> TrainConfig:
         model=model_of(model, preset, backbone, "selavpr", antialias=False, pixels="floats"),
         loss=LossConfig(kind=SelaVprLoss(), miner="none"),
         optimiser=OptimiserConfig(
-            kind="adam", learning_rate=1e-5, end_lr_fraction=1.0, weight_decay=0.0
+            kind="adam", learning_rate=1e-5, schedule="constant", weight_decay=0.0
         ),
         augmentation=NoAugmentation(),
         mining=MiningConfig(kind="sample", negatives=2, queries_per_epoch=30_000),
@@ -145,7 +142,9 @@ def edtformer(model: ModelConfig, preset: str) -> TrainConfig:
     backbone = _vit(model, adapter=adapter)
     return TrainConfig(
         model=model_of(model, preset, backbone, "edtformer", pixels="floats", round_to_patch=True),
-        optimiser=dataclasses.replace(ADAM_STEP, learning_rate=1e-4, step_gamma=0.7),
+        optimiser=dataclasses.replace(
+            ADAM_STEP, learning_rate=1e-4, schedule=StepSchedule(gamma=0.7)
+        ),
         places_per_batch=72,
         epochs=15,
         patience=15,

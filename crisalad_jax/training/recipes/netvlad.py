@@ -10,11 +10,12 @@ from crisalad_jax.training.config import MiningConfig, OptimiserConfig, TrainCon
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.losses.pairwise import TripletConfig
 from crisalad_jax.training.recipes.base import model_of, register_recipe
+from crisalad_jax.training.schedules import MilestonesSchedule, StepSchedule
 
 MARGIN = 0.1**0.5
 """The code squares distances in its mind: the root of 0.1 is the margin of Euclidean ones."""
 _SGD = OptimiserConfig(
-    kind="sgd", learning_rate=1e-4, schedule="step", step_epochs=5, weight_decay=1e-3
+    kind="sgd", learning_rate=1e-4, schedule=StepSchedule(epochs=5), weight_decay=1e-3
 )
 
 
@@ -40,7 +41,7 @@ def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
         model=_model(model, preset),
         loss=LossConfig(kind=TripletConfig(margin=MARGIN, average="all"), miner="none"),
         optimiser=dataclasses.replace(
-            _SGD, schedule="milestones", milestones=(4, 9, 14, 19, 24, 29), step_gamma=0.5
+            _SGD, schedule=MilestonesSchedule((4, 9, 14, 19, 24, 29), gamma=0.5)
         ),
         trainable="last-1-blocks+head",
         augmentation=NoAugmentation(),

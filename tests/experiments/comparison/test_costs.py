@@ -65,7 +65,7 @@ def test_from_nothing_rates_are_in_the_papers_proportion():
     assert rows["crisalad"] == scratch == recipe("tiny")
     rate = scratch.optimiser.learning_rate
     assert rows["lr-1e-4"].optimiser.learning_rate == pytest.approx(rate * 10 / 6, rel=1e-12)
-    assert rows["step"].optimiser.schedule == "step"
+    assert rows["step"].optimiser.schedule.part_name == "step"
     assert {row.trainable for row in rows.values()} == {"all"}
 
 

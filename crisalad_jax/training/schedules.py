@@ -1,0 +1,190 @@
+"""Schedules of the learning rate: the interface of a new one, and the built-in ones.
+
+The warm-up comes before them and is the same for all (`optimiser.learning_rate_schedule`).
+"""
+
+import abc
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+from crisalad_jax.config.checks import PositiveFloat, PositiveInt, require_field, require_range
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import Registry, count_arguments
+from crisalad_jax.config.short_repr import brief
+
+
+@brief
+class RunSteps(NamedTuple):
+    """Numbers of steps of the optimiser, by which a schedule is laid out."""
+
+    after_warmup: int
+    """Steps of the run after the warm-up, at least 1."""
+    per_epoch: int
+    """Steps of an epoch."""
+    warmup: int
+    """Steps of the warm-up."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule(Part, abc.ABC):
+    """A learning rate that changes: a frozen dataclass whose fields are its settings.
+
+    A plain function of (step, steps) that returns a share of the learning rate is a schedule
+    without settings: of the step after the warm-up, from 0, and of the number of these steps.
+
+    Example:
+        >>> from crisalad_jax import OptimiserConfig, register_schedule
+        >>> @register_schedule("quadratic")
+        ... def quadratic(step, steps):
+        ...     return (1 - step / steps) ** 2
+        >>> OptimiserConfig(schedule="quadratic").schedule.part_name
+        'quadratic'
+    """
+
+    @property
+    def spans_run(self) -> bool:
+        """Whether a longer run has other learning rates from the start; by default True."""
+        return True
+
+    @abc.abstractmethod
+    def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
+        """Return the learning rate of a step, a traced number.
+
+        Args:
+            step: number of steps of the optimiser after the warm-up, from 0; a traced float.
+            learning_rate: the highest, at which the warm-up ends.
+            run: numbers of steps.
+        """
+
+
+def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
+    """Return the methods of a schedule that is a plain function of (step, steps)."""
+    count = count_arguments(function, "step", "steps")
+
+    def apply(self: Any, step: Any, learning_rate: float, run: RunSteps) -> Any:
+        return learning_rate * function(*(step, run.after_warmup)[:count])
+
+    return {"apply": apply}
+
+
+SCHEDULES = Registry("schedule", Schedule, of_function=_of_function)
+register_schedule = SCHEDULES.register
+
+
+@SCHEDULES.register("constant")
+@dataclasses.dataclass(frozen=True)
+class ConstantSchedule(Schedule):
+    """The same learning rate for the whole run."""
+
+    @property
+    def spans_run(self) -> bool:
+        """Return False."""
+        return False
+
+    def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
+        """Return the learning rate itself."""
+        return learning_rate
+
+
+@dataclasses.dataclass(frozen=True)
+class _Decay(Schedule):
+    """A decay to a share of the learning rate."""
+
+    end_fraction: float = 0.0
+    """Share of the learning rate that is left at the end."""
+    decay_steps: PositiveInt | None = None
+    """Length of the decay, after which the learning rate stays; None is the whole run."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_range(self, 0, math.inf, "end_fraction")
+
+    @property
+    def spans_run(self) -> bool:
+        """Return whether the decay is as long as the run."""
+        return self.decay_steps is None
+
+
+@SCHEDULES.register("linear")
+@dataclasses.dataclass(frozen=True)
+class LinearSchedule(_Decay):
+    """Linear decay, step by step (SALAD's code, `LinearLR` of torch)."""
+
+    def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
+        """Return a number on the line."""
+        import optax  # by those who train alone: a configuration does without
+
+        end, length = learning_rate * self.end_fraction, self.decay_steps or run.after_warmup
+        return optax.linear_schedule(learning_rate, end, length)(step)
+
+
+@SCHEDULES.register("cosine")
+@dataclasses.dataclass(frozen=True)
+class CosineSchedule(_Decay):
+    """Half a period of a cosine (Loshchilov and Hutter 2017, without restarts)."""
+
+    def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
+        """Return a number on the cosine."""
+        import optax
+
+        length = self.decay_steps or run.after_warmup
+        return optax.cosine_decay_schedule(learning_rate, length, alpha=self.end_fraction)(step)
+
+
+@SCHEDULES.register("step")
+@dataclasses.dataclass(frozen=True)
+class StepSchedule(Schedule):
+    """A step down every few epochs after the warm-up; the defaults are CricaVPR's."""
+
+    epochs: PositiveInt = 3
+    """Epochs from one step down to the next."""
+    gamma: PositiveFloat = 0.5
+    """What a step down multiplies the learning rate by."""
+
+    @property
+    def spans_run(self) -> bool:
+        """Return False."""
+        return False
+
+    def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
+        """Return the learning rate after the steps down so far."""
+        import optax
+
+        length = self.epochs * run.per_epoch
+        return optax.exponential_decay(learning_rate, length, self.gamma, staircase=True)(step)
+
+
+@SCHEDULES.register("milestones")
+@dataclasses.dataclass(frozen=True)
+class MilestonesSchedule(Schedule):
+    """A step down after each of some epochs, counted from the start; the defaults are MixVPR's.
+
+    One that comes before the end of the warm-up is without effect, as in GSV-Cities' code, in which
+    the warm-up sets the learning rate anew.
+    """
+
+    epochs: tuple[int, ...] = (5, 10, 15, 25, 45)
+    """Numbers of epochs after which the learning rate steps down."""
+    gamma: PositiveFloat = 0.3
+    """What a step down multiplies the learning rate by."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        rises = bool(self.epochs) and all(a < b for a, b in pairwise((0, *self.epochs)))
+        require_field(self, "epochs", rises, "numbers of epochs that rise")
+
+    @property
+    def spans_run(self) -> bool:
+        """Return False."""
+        return False
+
+    def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
+        """Return the learning rate after the steps down so far."""
+        import optax
+
+        after = [epoch * run.per_epoch - run.warmup for epoch in self.epochs]
+        downs = {count: self.gamma for count in after if count >= 0}
+        return optax.piecewise_constant_schedule(learning_rate, downs)(step)
