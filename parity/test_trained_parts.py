@@ -47,16 +47,16 @@ EDTFORMER = model_of(
     SideConfig(bottleneck=4 / 64, alpha=0.5),
 )
 MODELS = {
-    "BoQ": (BOQ, "last-1-blocks+head", lambda: Crisalad(BOQ)),
+    "BoQ": (BOQ, "last-1-blocks,norm,head", lambda: Crisalad(BOQ)),
     "EDTformer": (
         EDTFORMER,
-        "adapters+head",
+        "adapters,head",
         lambda: EdtFormer(EDTFORMER.backbone, EDTFORMER.aggregator),
     ),
 }
 TRAINED = {
-    "last-1-blocks+head": ("backbone.norm.", "backbone.blocks.1."),
-    "adapters+head": ("backbone.adapters.",),
+    "last-1-blocks,norm,head": ("backbone.norm.", "backbone.blocks.1."),
+    "adapters,head": ("backbone.adapters.",),
 }
 """The part of the backbone that trains. Of BoQ the last norm has no gradient: it is not used."""
 

@@ -23,7 +23,7 @@ def main() -> None:
 
     config = cj.recipe("tiny").model
     params = cj.init_crisalad(jax.random.key(0), config)
-    trainable, frozen = cj.split_params(params, config, "head")
+    trainable, frozen = cj.split_params(params, config, "head,-adapters")
     images = jnp.asarray(generator.integers(0, 256, (4, *config.image_size, 3), np.uint8))
     labels = jnp.array([0, 0, 1, 1])
 

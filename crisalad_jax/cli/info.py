@@ -27,8 +27,8 @@ class Info(SizeFlags, PluginFlag, JsonFlag):
     verify: bool = False
     """Read all of the map's descriptors, and compare them with their digests."""
     trainable: str | None = None
-    """head, adapters+head, last-N-blocks+head or all; by default the recipe's, of
-    a file adapters+head, or head where it has no adapter."""
+    """What trains, as `train` takes it: words such as all or adapters,head, or patterns of names;
+    by default the recipe's, of a file adapters,head, or head where it has no adapter."""
     batch_size: int = 16
     """Images that attend to each other in the cross-image encoder."""
 

@@ -15,13 +15,11 @@ from crisalad_jax.config.part import OrName
 from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.data.augmentations import AUGMENTATIONS, Augmentation
-from crisalad_jax.nn.adapters import Adapter
-from crisalad_jax.nn.adapters.bottleneck import NoAdapter
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.optimisers import OPTIMISERS, Optimiser
 from crisalad_jax.training.schedules import SCHEDULES, LinearSchedule, Schedule
-from crisalad_jax.training.trainable import EXPECTED, TRAINABLE
+from crisalad_jax.training.trainable import ADAPTERS, ADAPTERS_AND_HEAD, terms_of
 
 
 @short_repr()
@@ -132,9 +130,10 @@ class TrainConfig:
     )
     """By default AdamW as in the paper, whose decay is "as adopted in SALAD": to 0.2 in 4,000
     steps."""
-    trainable: str = "adapters+head"
-    """What is not frozen: adapters+head (the paper), last-N-blocks+head (SALAD), head, or all; see
-    `split_params`."""
+    trainable: str = ADAPTERS_AND_HEAD
+    """What is not frozen, a comma list: adapters,head (the paper); last-N-blocks,norm,head (SALAD);
+    all; or patterns of names, as in adapters,head,backbone.blocks.1[01]. With - before it a word or
+    pattern is frozen, as in head,-adapters; see `split_params`."""
     batch_norm: Literal["batch", "stored"] = "batch"
     """Statistics of the backbone's batch norms. "batch" normalises by those of the batch and
     updates the running ones (torch's `train()`, of frozen layers too). "stored" leaves the running
@@ -185,8 +184,8 @@ class TrainConfig:
         is_tuple = images == size or not self.mines
         micro_batch = batch if self.micro_batch is None else self.micro_batch
         divides = micro_batch > 0 and batch % micro_batch == 0
-        classifies, known = loss.grouping is not None, TRAINABLE.fullmatch(self.trainable)
-        adapts = self.trainable != "adapters+head" or has_adapters(self.model)
+        classifies, terms = loss.grouping is not None, terms_of(self.trainable)
+        adapts = ADAPTERS not in terms or has_adapters(self.model)
         classified = f"for loss {loss.part_name}, which classifies"
         tuples = f"'whole' or 'sample' for loss {loss.part_name}, which takes mined tuples"
         for config, name, fits, expected in (
@@ -197,8 +196,8 @@ class TrainConfig:
             (self.mining, "kind", self.mines or not loss.of_tuples, tuples),
             (self, "images_per_place", is_tuple, f"{size} with mined tuples"),
             (self, "min_images", self.min_images >= images or self.mines, f"at least {images}"),
-            (self, "trainable", known is not None, EXPECTED),
-            (self, "trainable", adapts, "head, last-N-blocks+head or all without adapters"),
+            (self, "trainable", all(terms), "words and patterns with commas between them"),
+            (self, "trainable", adapts, "head, last-N-blocks,norm,head or all without adapters"),
         ):
             require_field(config, name, fits, expected)
         if self.validation_size is not None:
@@ -218,6 +217,5 @@ class TrainConfig:
 
 
 def has_adapters(model: ModelConfig) -> bool:
-    """Return whether a model's backbone has adapters."""
-    adapter = getattr(model.backbone, "adapter", None)
-    return isinstance(adapter, Adapter) and not isinstance(adapter, NoAdapter)
+    """Return whether a model's backbone has adapters, or what else it says is to be trained."""
+    return bool(model.backbone.trains)

@@ -2,11 +2,9 @@
 
 import os
 import pathlib
-import re
 from typing import Any
 
 import jax
-import numpy as np
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.public import with_backbone_of
@@ -16,16 +14,13 @@ from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.data.query_set import QuerySet, read_query_set
-from crisalad_jax.nn.layers import STATISTICS
-from crisalad_jax.nn.model import Crisalad, Model, init_crisalad, parameter_shapes
+from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.training import distributed
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.run_files import check_run
-from crisalad_jax.training.trainable import split_params
+from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.training.vocabulary import with_vocabulary
-from crisalad_jax.utils.errors import few
 from crisalad_jax.utils.output import warn
-from crisalad_jax.utils.pytree import named_leaves
 
 Path = str | os.PathLike[str]
 
@@ -85,6 +80,7 @@ def read_inputs(
         how: Any = {"images": validation_images, "on_bad_image": on_bad_image}
         return places, open_benchmark(validation, **how), initial
 
+    count_trainable(config.model, config.trainable)  # refuses a wrong name before anything is read
     distributed.run_on_primary(lambda: check_run(pathlib.Path(out), config))
     places, benchmark, initial = distributed.raise_together(read)
     if weights is None and config.model.aggregator.trainable:
@@ -145,8 +141,7 @@ def read_start(
         All parameters; None for random ones, with neither file.
 
     Raises:
-        InputError: both are given, or a file cannot be read or does not fit the model; or adapters
-            that start untrained would stay so.
+        InputError: both are given, or a file cannot be read or does not fit the model.
     """
     both = weights is not None and backbone is not None
     require(not both, "--backbone: found beside --weights, expected only one of the two")
@@ -159,35 +154,11 @@ def read_start(
                 f"and is saved with {config.model.images_in_words}"
             )
         return params
-    frozen = _frozen_adapters(config)
     if backbone is None:
-        params = None
-    else:
-        backbone = find_weights(backbone, quiet=quiet)
-        fresh = init_crisalad(jax.random.key(config.seed), config.model)
-        params = with_backbone_of(fresh, config.model, backbone)
-        before, after = named_leaves(fresh), named_leaves(params)
-        if any(not np.array_equal(before[name], after[name]) for name in frozen):
-            frozen = []  # the file has trained ones
-    require(
-        not frozen,
-        f"--trainable: found {config.trainable}, which leaves adapters out that start untrained "
-        f"({few(frozen)}), expected adapters+head or all, or --model.backbone.adapter none",
-    )
-    return params
-
-
-def _frozen_adapters(config: TrainConfig) -> list[str]:
-    """Return the names of adapters' parameters of which some do not train."""
-    _, frozen = jax.eval_shape(
-        lambda params: split_params(params, config.model, config.trainable),
-        parameter_shapes(config.model),
-    )
-    # A stack of blocks may be cut in two.
-    names = (re.sub(r"\.blocks\.\d+\.", ".blocks.", name) for name in named_leaves(frozen))
-    adapters = (name for name in names if name.startswith("backbone.blocks.adapter."))
-    learnt = (name for name in adapters if name.rpartition(".")[2] not in STATISTICS)
-    return list(dict.fromkeys(learnt))
+        return None
+    backbone = find_weights(backbone, quiet=quiet)
+    fresh = init_crisalad(jax.random.key(config.seed), config.model)
+    return with_backbone_of(fresh, config.model, backbone)
 
 
 def with_vocabulary_of(

@@ -264,7 +264,7 @@ def make_train_step(config: StepConfig) -> Callable[..., tuple[TrainState, Metri
         >>> static = step_config(config, steps=10, optimiser=optax.sgd(0.1))
         >>> step = make_train_step(static)
         >>> params = init_crisalad(jax.random.key(0), config.model)
-        >>> state, frozen = init_train_state(params, "head", static)
+        >>> state, frozen = init_train_state(params, "head,-adapters", static)
         >>> images, labels = np.zeros((4, 98, 98, 3), np.uint8), np.array([0, 0, 1, 1])
         >>> state, metrics = step(state, frozen, images, labels, jax.random.key(1))
         >>> int(state.step), metrics.loss.shape

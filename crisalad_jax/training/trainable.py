@@ -1,26 +1,39 @@
 """Which parameters train, and the split of a model into these and the frozen ones."""
 
 import dataclasses
+import difflib
+import itertools
 import re
+from collections.abc import Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
 
 import equinox as eqx
 import jax
 from jaxtyping import PyTree
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import STATISTICS
 from crisalad_jax.nn.model import Crisalad, check_params, parameter_shapes
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.target import target
 
-HEAD, ADAPTERS_AND_HEAD, ALL = "head", "adapters+head", "all"
-_LAST_BLOCKS = re.compile(r"last-(\d+)-blocks(\+positions)?(\+no-norm)?\+head")
-TRAINABLE = re.compile(f"{HEAD}|{re.escape(ADAPTERS_AND_HEAD)}|{ALL}|{_LAST_BLOCKS.pattern}")
-"""Names of what trains, as `split_params` takes them."""
-EXPECTED = (
-    f"{HEAD}, {ADAPTERS_AND_HEAD}, last-N-blocks+head (or +positions+head, +no-norm+head) or {ALL}"
-)
+HEAD, ADAPTERS, ALL = "head", "adapters", "all"
+ADAPTERS_AND_HEAD = f"{ADAPTERS},{HEAD}"
+_WORDS = (ALL, HEAD, ADAPTERS, "norm", "positions", "last-N-blocks")
+_HEAD = ("aggregator", "cross_image", "projection")
+_BLOCKS = "backbone.blocks."
+_LAST_BLOCKS = re.compile(r"last-(\d+)-blocks")
+
+
+def terms_of(trainable: str) -> list[str]:
+    """Split what trains into its words and patterns.
+
+    Example:
+        >>> terms_of("adapters, head")
+        ['adapters', 'head']
+    """
+    return [term.strip() for term in trainable.split(",")]
 
 
 def shards_batch(trainable: str) -> bool:
@@ -36,73 +49,148 @@ def shards_batch(trainable: str) -> bool:
 def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple[PyTree, PyTree]:
     """Split parameters into those that train and those that are frozen.
 
-    If some of the blocks train, the backbone's stack is cut in two, and `merge_params` joins it. So
-    no gradient is computed in the frozen blocks before the last N, nor in the whole first block if
-    only its adapter trains. Batch-norm statistics have no gradient and count as frozen, though a
-    step may update them. So does an aggregator that learns nothing (AnyLoc's vocabulary).
+    What trains is a comma list of words and patterns:
+
+    - `all`; `head` (aggregator, cross-image encoder and projection); `adapters` (what the backbone
+      says is there to be trained, `Backbone.trains`); `last-N-blocks`; `norm` (the last layer norm,
+      if the aggregator asks for it); `positions` (class token and position embeddings).
+    - A pattern of dotted names, as file names are matched: `*` is any text, `[01]` one of two
+      characters. It names parameters, or all that is below them. Blocks are numbered from 0:
+      `backbone.blocks.1[01]`, or in all of them `backbone.blocks.attn`.
+    - With `-` before it, a word or pattern stays frozen.
+
+    The paper trains "adapters,head", SALAD "last-4-blocks,norm,head".
+
+    If blocks differ in what trains, the backbone's stack is cut, and `merge_params` joins it. So no
+    gradient is computed in frozen blocks before the first that trains, nor in the whole of this one
+    if only a part of it trains. Batch-norm statistics have no gradient and count as frozen, though
+    a step may update them. So does an aggregator that learns nothing (AnyLoc's vocabulary).
 
     Args:
         params: the whole model.
         config: the model's.
-        trainable: "adapters+head" (the paper: adapters, aggregator, cross-image encoder), "head"
-            (the last two alone), "all", or "last-N-blocks+head" (SALAD: the last N blocks, the
-            final layer norm if the aggregator asks for it, and the head). Of the last,
-            "last-N-blocks+positions+head" also trains the class token and the positions (DINO-Mix),
-            and "last-N-blocks+no-norm+head" freezes the layer norm (SuperVLAD).
+        trainable: what trains.
 
     Returns:
         (trainable, frozen): two trees of the model's structure, None for the other's leaves.
 
     Raises:
-        InputError: parameters of another model, an unknown name, more blocks than there are, or a
-            backbone without blocks.
+        InputError: parameters of another model; a word or pattern that matches nothing; or adapters
+            or a part of the head are left out without a `-`, and would stay as they were drawn.
 
     Example:
         >>> import jax
         >>> from crisalad_jax import PRESETS, init_crisalad
         >>> params = init_crisalad(jax.random.key(0), PRESETS["tiny"])
-        >>> trainable, frozen = split_params(params, PRESETS["tiny"], "head")
+        >>> trainable, frozen = split_params(params, PRESETS["tiny"], "head,-adapters")
         >>> trainable.backbone.cls_token is None, frozen.aggregator.dust_bin is None
         (True, True)
     """
     check_params(params, config)
-    head = ("aggregator.", "cross_image.", "projection.")
-    match = _LAST_BLOCKS.fullmatch(trainable)
-    if trainable == ALL:
-        prefixes: tuple[str, ...] = ("",)
-    elif trainable == HEAD:
-        prefixes = head
-    elif trainable == ADAPTERS_AND_HEAD:
-        params = _cut_blocks(params, config, 1)
-        prefixes = (*head, "backbone.blocks.0.adapter.", "backbone.blocks.1.adapter.")
-    elif match:
-        last, depth = int(match[1]), config.backbone.depth
-        if last > depth:
-            raise InputError(f"trainable: found the last {last} blocks, expected at most {depth}")
-        params = _cut_blocks(params, config, depth - last)
-        prefixes = (*head, "backbone.blocks.1.")
-        # Without a gradient a weight decay alone would move the norm.
-        if not match[3] and config.aggregator.features(depth).norm:
-            prefixes += ("backbone.norm.",)
-        if match[2]:
-            prefixes += ("backbone.cls_token", "backbone.pos_embed")
-    else:
-        raise InputError(f"trainable: found {trainable!r}, expected {EXPECTED}")
-    constant = () if config.aggregator.trainable else ("aggregator.",)
-    names = iter(named_leaves(params))
+    chosen = _choose(params, config, trainable)
+    # For each block, whether it trains each of the parameters of a block that can.
+    in_blocks = [f for n, f in chosen.items() if len(f) > 1 and not _is_fixed(n, config)]
+    rows = list(zip(*in_blocks, strict=True))
+    cuts = {number for number in range(1, len(rows)) if rows[number] != rows[number - 1]}
+    first = next((number for number, row in enumerate(rows) if any(row)), len(rows))
+    if first + 1 < len(rows) and not all(rows[first]):
+        cuts.add(first + 1)
+    starts = [0, *sorted(cuts)]
+    if cuts:
+        backbone = config.backbone.split_blocks(params.backbone, starts[1:])
+        params = dataclasses.replace(params, backbone=backbone)
 
     def learns(name: str) -> bool:
-        measured = name.rpartition(".")[2] in STATISTICS
-        fixed = measured or (constant and name.startswith(constant))
-        return name.startswith(prefixes) and not fixed
+        if not cuts or not name.startswith(_BLOCKS):
+            return any(chosen[name])
+        part, _, rest = name.removeprefix(_BLOCKS).partition(".")
+        return chosen[_BLOCKS + rest][starts[int(part)]]
 
-    chosen = jax.tree.map(lambda _: learns(next(names)), params)
-    return eqx.partition(params, chosen)
+    names = iter(named_leaves(params))
+    return eqx.partition(params, jax.tree.map(lambda _: learns(next(names)), params))
 
 
-def _cut_blocks(params: Crisalad, config: ModelConfig, first: int) -> Crisalad:
-    backbone = config.backbone.split_blocks(params.backbone, first)
-    return dataclasses.replace(params, backbone=backbone)
+def _choose(params: Crisalad, config: ModelConfig, trainable: str) -> dict[str, tuple[bool, ...]]:
+    """Return whether each parameter trains, of a stack of blocks for each block."""
+    backbone, depth = config.backbone, config.backbone.depth
+    names: dict[str, list[str]] = {}
+    for leaf, value in named_leaves(params).items():
+        rest = leaf.removeprefix(_BLOCKS)
+        is_stack = rest != leaf and not rest.partition(".")[0].isdecimal()
+        is_stack = is_stack and value.ndim > 0 and len(value) == depth
+        names[leaf] = [f"{_BLOCKS}{i}.{rest}" for i in range(depth)] if is_stack else [leaf]
+
+    def matched(*patterns: str) -> set[tuple[str, int]]:
+        return {
+            (leaf, number)
+            for leaf, numbered in names.items()
+            for number, name in enumerate(numbered)
+            if any(_matches(each, pattern) for each in (name, leaf) for pattern in patterns)
+        }
+
+    found: dict[bool, set[tuple[str, int]]] = {True: set(), False: set()}
+    for term in terms_of(trainable):
+        word = term.removeprefix("-")
+        own = matched(*_patterns_of(word, config))
+        # A norm that the aggregator leaves out has no gradient: weight decay alone would move it.
+        may_lack = word == "norm" or term == f"-{ADAPTERS}"
+        require(bool(own) or may_lack, f"trainable: {_unmatched(word, config, names)}")
+        found[word == term] |= own
+    fixed = {(leaf, 0) for leaf in names if _is_fixed(leaf, config)}
+    due = {f"backbone.{pattern}": ADAPTERS for pattern in backbone.trains}
+    for pattern, word in (due | dict(zip(_HEAD, _HEAD, strict=True))).items():
+        own = {each for each in matched(pattern) if (each[0], 0) not in fixed}
+        require(
+            not own or bool(own & (found[True] | found[False])),
+            f"trainable: found {trainable!r}, which leaves {pattern} as it was at the start, "
+            f"expected {word} too, or -{word} to freeze it",
+        )
+    chosen = found[True] - found[False]
+    return {
+        leaf: tuple((leaf, 0) not in fixed and (leaf, i) in chosen for i in range(len(numbered)))
+        for leaf, numbered in names.items()
+    }
+
+
+def _matches(name: str, pattern: str) -> bool:
+    return fnmatchcase(name, pattern) or fnmatchcase(name, f"{pattern}.*")
+
+
+def _is_fixed(leaf: str, config: ModelConfig) -> bool:
+    """Return whether a parameter never has a gradient."""
+    constant = not config.aggregator.trainable and _matches(leaf, "aggregator")
+    return constant or leaf.rpartition(".")[2] in STATISTICS
+
+
+def _patterns_of(word: str, config: ModelConfig) -> Sequence[str]:
+    """Return the patterns that a word stands for; any other text is a pattern itself."""
+    depth, last = config.backbone.depth, _LAST_BLOCKS.fullmatch(word)
+    if last is not None:
+        fits = 1 <= int(last[1]) <= depth
+        require(fits, f"trainable: found {word}, expected 1 to the backbone's {depth} blocks")
+        return [f"{_BLOCKS}{number}" for number in range(depth - int(last[1]), depth)]
+    words: Mapping[str, Sequence[str]] = {
+        ALL: ["*"],
+        HEAD: _HEAD,
+        ADAPTERS: [f"backbone.{pattern}" for pattern in config.backbone.trains],
+        "norm": ["backbone.norm"] if config.aggregator.features(depth).norm else [],
+        "positions": ["backbone.cls_token", "backbone.pos_embed*"],
+    }
+    return words.get(word, [word])
+
+
+def _unmatched(word: str, config: ModelConfig, names: Mapping[str, Iterable[str]]) -> str:
+    """Say that a word or pattern matches nothing, and which names are near."""
+    known: dict[str, None] = dict.fromkeys(_WORDS)
+    for name in itertools.chain(names, *names.values()):
+        known |= dict.fromkeys(itertools.accumulate(name.split("."), "{}.{}".format))
+    near = difflib.get_close_matches(word, known, n=3)
+    hint = f" (near: {', '.join(near)})" if near and word not in _WORDS else ""
+    return (
+        f"found {word!r}, which matches no parameter of backbone {config.backbone.part_name} with "
+        f"aggregator {config.aggregator.part_name}, expected {', '.join(_WORDS)}, or a pattern of "
+        f"names{hint}"
+    )
 
 
 def merge_params(trainable: PyTree, frozen: PyTree, config: ModelConfig) -> Crisalad:
@@ -124,7 +212,7 @@ def merge_params(trainable: PyTree, frozen: PyTree, config: ModelConfig) -> Cris
         >>> from crisalad_jax import PRESETS, init_crisalad
         >>> config = PRESETS["tiny"]
         >>> params = init_crisalad(jax.random.key(0), config)
-        >>> merged = merge_params(*split_params(params, config, "adapters+head"), config)
+        >>> merged = merge_params(*split_params(params, config, "adapters,head"), config)
         >>> jax.tree.structure(merged) == jax.tree.structure(params)
         True
     """

@@ -295,10 +295,10 @@ CASES: tuple[Case, ...] = (
 )
 
 RUNS: tuple[Run, ...] = (
-    Run("training CriSALAD's adapters and head", CRISALAD, "adapters+head"),
-    Run("training CriSALAD's last block and head", CRISALAD, "last-1-blocks+head"),
+    Run("training CriSALAD's adapters and head", CRISALAD, "adapters,head"),
+    Run("training CriSALAD's last block and head", CRISALAD, "last-1-blocks,norm,head"),
     Run("training all of CriSALAD", CRISALAD, "all"),
-    Run("training CricaVPR's adapters and head", CRICAVPR, "adapters+head"),
+    Run("training CricaVPR's adapters and head", CRICAVPR, "adapters,head"),
 )
 
 

@@ -17,28 +17,29 @@ HEAD = ("aggregator.", "aggregation.", "encoder.")
 def freeze(model: Crisalad, trainable: str) -> list[nn.Parameter]:
     """Let gradients flow to the parameters that `trainable` names alone, and return those.
 
-    "head" (aggregator and cross-image encoder), "adapters+head" (the paper), "last-N-blocks+head"
-    (SALAD: the last N blocks, the final layer norm, and the head), or "all". Batch-norm statistics
-    are buffers: they have no gradient, and in training mode every forward pass updates them.
+    "head,-adapters" (aggregator and cross-image encoder), "adapters,head" (the paper),
+    "last-N-blocks,norm,head" (SALAD: the last N blocks, the final layer norm, and the head), or
+    "all". Batch-norm statistics are buffers: they have no gradient, and in training mode every
+    forward pass updates them.
 
     Raises:
         InputError: an unknown name, or more blocks than there are.
     """
     depth = len(model.backbone.blocks)
-    match = re.fullmatch(r"last-(\d+)-blocks\+head", trainable)
+    match = re.fullmatch(r"last-(\d+)-blocks,norm,head", trainable)
     if trainable == "all":
         prefixes: tuple[str, ...] = ("",)
-    elif trainable == "head":
+    elif trainable == "head,-adapters":
         prefixes = HEAD
-    elif trainable == "adapters+head":
+    elif trainable == "adapters,head":
         prefixes = (*HEAD, *(f"backbone.blocks.{i}.adapter." for i in range(depth)))
     elif match and int(match[1]) <= depth:
         last = range(depth - int(match[1]), depth)
         prefixes = (*HEAD, "backbone.norm.", *(f"backbone.blocks.{i}." for i in last))
     else:
         raise InputError(
-            f"trainable: found {trainable!r}, expected head, adapters+head, last-N-blocks+head "
-            f"with N at most {depth}, or all"
+            f"trainable: found {trainable!r}, expected head,-adapters, adapters,head or "
+            f"last-N-blocks,norm,head with N at most {depth}, or all"
         )
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(name.startswith(prefixes))

@@ -16,7 +16,7 @@ from tests.conftest import MODEL, RECIPE, assert_equal
 @pytest.fixture
 def state(params):
     step = StepConfig(MODEL, RECIPE.loss, RECIPE.optimiser, 6)
-    return init_train_state(params, "adapters+head", step)[0]
+    return init_train_state(params, "adapters,head", step)[0]
 
 
 def test_a_state_survives_bit_for_bit_and_the_last_ones_stay(tmp_path, state):

@@ -174,7 +174,10 @@ def test_no_command_prints_the_usage(capfd):
         ("extract --weights w --images d --out f.txt", r"f\.txt: suffix.*\.h5, \.npy"),
         ("info --verify", "--verify: found without --map"),
         ("info --image-size 112 98", "56 patches for 64 clusters"),
-        ("info --trainable last-13-blocks+head", "last 13 blocks, expected at most 12"),
+        (
+            "info --trainable last-13-blocks,head",
+            "found last-13-blocks, expected 1 to the b",
+        ),
         ("demo --seed -1 --out o", "seed: found -1"),
     ],
 )
@@ -457,7 +460,7 @@ def test_a_run_starts_from_a_public_backbone(capfd, tmp_path, shared, public, we
     model = dataclasses.replace(
         RECIPE.model, backbone=dataclasses.replace(BACKBONE.backbone, adapter="depthwise")
     )
-    recipe = dataclasses.replace(RECIPE, model=model, trainable="adapters+head", epochs=1)
+    recipe = dataclasses.replace(RECIPE, model=model, trainable="adapters,head", epochs=1)
     write_json(tmp_path / "recipe.json", to_plain(recipe))
     arguments = (
         *("train", "--config", tmp_path / "recipe.json", "--backbone", public),

@@ -32,7 +32,7 @@ def _settings(*flags):
         ((), "head", 6e-5),  # the paper's, whose adapters it has not
         (("--recipe", "starter"), "all", 7e-4),
         (("--preset", "tiny"), "all", 1e-3),
-        (("--recipe", "salad"), "last-4-blocks+head", 6e-5),
+        (("--recipe", "salad"), "last-4-blocks,norm,head", 6e-5),
     ],
 )
 def test_the_model_is_the_files_and_the_training_the_recipes(flags, trainable, learning_rate):

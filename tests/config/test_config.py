@@ -78,7 +78,7 @@ def test_the_recipe_is_the_papers():
         assert optimiser.kind == AdamW(b1=0.9, b2=0.999)
         assert optimiser.schedule == LinearSchedule(end_fraction=0.2, decay_steps=4000)
     assert (config.places_per_batch, config.images_per_place) == (48, 4)
-    assert config.trainable == "adapters+head"
+    assert config.trainable == "adapters,head"
     assert config.model.image_size == (224, 224)
     loss, similar = config.loss, "multi-similarity"
     assert (loss.kind.part_name, loss.miner, loss.miner_margin) == (similar, similar, 0.1)
@@ -90,7 +90,7 @@ def test_the_recipes_are_their_papers():
     """serizba/salad and Lu-Feng/CricaVPR as published; Table 2's rows."""
     salad = recipe("b14", "salad")
     assert (salad.places_per_batch, salad.images_per_place, salad.epochs) == (60, 4, 4)
-    assert (salad.trainable, salad.monitor) == ("last-4-blocks+head", "R@1")
+    assert (salad.trainable, salad.monitor) == ("last-4-blocks,norm,head", "R@1")
     assert (salad.model.backbone.adapter, salad.model.cross_image) == (NoAdapter(), NoCrossImage())
     optimiser = salad.optimiser
     assert optimiser == OptimiserConfig(
@@ -168,7 +168,7 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
     boq = recipe("b14", "boq")
     assert boq.model.descriptor_dim == 12_288
     assert boq.model.preprocessing.filter == "bicubic"
-    assert (boq.trainable, boq.places_per_batch, boq.epochs) == ("last-2-blocks+head", 128, 40)
+    assert (boq.trainable, boq.places_per_batch, boq.epochs) == ("last-2-blocks,norm,head", 128, 40)
     assert (boq.augmentation, boq.monitor) == (RandAugmentConfig(3, 15), "R@1")
     assert boq.optimiser == OptimiserConfig(
         kind="adamw",
@@ -180,7 +180,7 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
     mix = recipe("b14", "dino-mix")
     assert mix.model.aggregator == MixVprConfig(channels=1024, rows=4, depth=2, last_norm=False)
     assert (mix.places_per_batch, mix.epochs, mix.monitor) == (80, 60, "R@1")
-    assert mix.trainable == "last-4-blocks+positions+head"
+    assert mix.trainable == "last-4-blocks,norm,positions,head"
     assert mix.optimiser == OptimiserConfig(
         kind=Sgd(momentum=0.9),
         learning_rate=0.005,
@@ -192,7 +192,7 @@ def test_the_recipes_of_other_heads_over_dinov2_are_as_published():
     )
     vlad = recipe("b14", "supervlad")
     assert vlad.model.descriptor_dim == 4 * 768
-    assert vlad.trainable == "last-4-blocks+no-norm+head"
+    assert vlad.trainable == "last-4-blocks,head"
     assert (vlad.places_per_batch, vlad.epochs, vlad.patience) == (120, 20, 3)
     assert vlad.monitor == "R@1+R@5"
     assert vlad.optimiser == OptimiserConfig(
@@ -225,14 +225,18 @@ def test_the_recipes_over_resnet_are_as_published():
     assert mix.model.backbone == ResNetConfig(layers=50, stages=3)
     assert mix.model.aggregator == MixVprConfig(channels=1024, rows=4, depth=4)
     assert (mix.model.image_size, mix.model.descriptor_dim) == ((320, 320), 4096)
-    assert (mix.trainable, mix.places_per_batch, mix.epochs) == ("last-1-blocks+head", 120, 80)
+    assert (mix.trainable, mix.places_per_batch, mix.epochs) == ("last-1-blocks,head", 120, 80)
     assert mix.optimiser == dataclasses.replace(
         recipe("b14", "dino-mix").optimiser, learning_rate=0.05, accumulate=1, clip_value=None
     )
     conv = recipe("b14", "conv-ap")
     assert conv.model.backbone == ResNetConfig(layers=50, stages=4)
     assert (conv.model.image_size, conv.model.descriptor_dim) == ((320, 320), 4096)
-    assert (conv.trainable, conv.places_per_batch, conv.epochs) == ("last-2-blocks+head", 100, 30)
+    assert (conv.trainable, conv.places_per_batch, conv.epochs) == (
+        "last-2-blocks,head",
+        100,
+        30,
+    )
     assert conv.optimiser == OptimiserConfig(
         kind="adamw",
         learning_rate=2e-4,
@@ -243,14 +247,14 @@ def test_the_recipes_over_resnet_are_as_published():
     boq = recipe("b14", "boq-resnet50")
     assert boq.model.backbone == ResNetConfig(layers=50, stages=3)
     assert (boq.model.image_size, boq.model.descriptor_dim) == ((320, 320), 16_384)
-    assert boq.trainable == "last-2-blocks+head"
+    assert boq.trainable == "last-2-blocks,norm,head"
     assert boq.optimiser == recipe("b14", "boq").optimiser
     for config in (mix, conv, boq):
         assert (config.batch_norm, config.monitor) == ("batch", "R@1")
     cosplace = recipe("b14", "cosplace")
     assert cosplace.model.backbone == ResNetConfig(layers=18, stages=4)
     assert (cosplace.model.image_size, cosplace.model.descriptor_dim) == ((512, 512), 512)
-    assert (cosplace.trainable, cosplace.monitor) == ("last-2-blocks+head", "R@1")
+    assert (cosplace.trainable, cosplace.monitor) == ("last-2-blocks,head", "R@1")
     assert cosplace.augmentation == ColourCropConfig(0.7, 0.7, 0.7, 0.5, 0.5)
     classes = cosplace.loss.kind.classes
     assert (classes.kind, classes.groups, cosplace.min_images) == ("cells", 8, 10)
@@ -371,7 +375,11 @@ def test_more_patches_than_clusters(clusters, side):
         (AdamW, {"b2": 1.0}, "AdamW.b2: found 1.0"),
         (TrainConfig, {"images_per_place": 1}, "TrainConfig.images_per_place: found 1"),
         (TrainConfig, {"min_images": 3}, "TrainConfig.min_images: found 3, expected at least 4"),
-        (TrainConfig, {"trainable": "tail"}, "TrainConfig.trainable: found 'tail', expected head"),
+        (
+            TrainConfig,
+            {"trainable": "head,"},
+            "TrainConfig.trainable: found 'head,', expected words and pat",
+        ),
         (TrainConfig, {"validation_size": (320, 322)}, "image size: found 320 x 322, expected"),
     ],
 )
@@ -422,9 +430,9 @@ def test_anylocs_layer_is_its_papers_of_vit_g():
 
 def test_a_model_without_adapters_cannot_train_them():
     bare = ModelConfig(backbone=ViTConfig(adapter="none"))
-    with pytest.raises(InputError, match=r"found 'adapters\+head', expected .* without adapters"):
+    with pytest.raises(InputError, match=r"found 'adapters,head', expected .* without adapters"):
         TrainConfig(model=bare)
-    assert TrainConfig(model=bare, trainable="last-4-blocks+head").model is bare
+    assert TrainConfig(model=bare, trainable="last-4-blocks,norm,head").model is bare
 
 
 def test_without_an_encoder_its_widths_need_not_fit():

@@ -72,7 +72,7 @@ class At(NamedTuple):
 
 def a_step(at: At) -> None:
     """A state of MODEL in a step of the other configuration."""
-    state, frozen = init_train_state(PARAMS, "head", step_config(RECIPE, steps=2))
+    state, frozen = init_train_state(PARAMS, "head,-adapters", step_config(RECIPE, steps=2))
     state = state._replace(trainable=at.params)
     step = make_train_step(step_config(at.recipe, steps=2))
     step(state, jax.tree.map(lambda _: None, frozen), IMAGES, LABELS, jax.random.key(0))
@@ -96,7 +96,7 @@ DOORS: dict[str, Callable[[At], Any]] = {
     ),
     "describe, jitted": lambda at: jax.jit(lambda x: describe(x, IMAGES, at.config))(at.params),
     "init_train_state": lambda at: init_train_state(
-        at.params, "head", step_config(at.recipe, steps=2)
+        at.params, "head,-adapters", step_config(at.recipe, steps=2)
     ),
     "a step": a_step,
     "fit": a_run,
@@ -132,7 +132,11 @@ DIFFERENCES: dict[str, tuple[Any, ModelConfig, str]] = {
         MODEL,
         "found bfloat16 (",
     ),
-    "half a model": (split_params(PARAMS, MODEL, "head")[0], MODEL, "patch_embed.weight missing"),
+    "half a model": (
+        split_params(PARAMS, MODEL, "head,-adapters")[0],
+        MODEL,
+        "patch_embed.weight missing",
+    ),
     "no Crisalad": ((PARAMS, MODEL), MODEL, "params: found tuple, expected Crisalad"),
 }
 
@@ -166,7 +170,9 @@ def test_numpy_arrays_and_free_fields_make_no_misfit() -> None:
     np.testing.assert_array_equal(describe(PARAMS, IMAGES, other), expected)
 
 
-@pytest.mark.parametrize("trainable", ["head", "adapters+head", "last-1-blocks+head"])
+@pytest.mark.parametrize(
+    "trainable", ["head,-adapters", "adapters,head", "last-1-blocks,norm,head"]
+)
 def test_what_training_has_cast_and_cut_still_fits(trainable: str) -> None:
     config = dataclasses.replace(MODEL, compute_dtype="bfloat16")
     chosen, frozen = split_params(PARAMS, config, trainable)
@@ -182,7 +188,7 @@ def test_what_training_has_cast_and_cut_still_fits(trainable: str) -> None:
 
 
 def test_trees_of_another_model_are_not_merged() -> None:
-    chosen, frozen = split_params(PARAMS, MODEL, "head")
+    chosen, frozen = split_params(PARAMS, MODEL, "head,-adapters")
     other = dataclasses.replace(MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=1))
     with pytest.raises(InputError, match=r"params: not of this configuration: cross_image\."):
         merge_params(chosen, frozen, other)
@@ -245,7 +251,7 @@ def test_every_door_refuses_images_of_another_kind(door: Callable[..., Any], kin
 @pytest.mark.usefixtures("_unchecked")
 def test_a_step_refuses_pixels_as_floats() -> None:
     static = step_config(RECIPE, steps=2)
-    state, frozen = init_train_state(PARAMS, "head", static)
+    state, frozen = init_train_state(PARAMS, "head,-adapters", static)
     with pytest.raises(InputError, match=r"^images: found float64 from 0 to 1, which"):
         make_train_step(static)(state, frozen, IMAGES / 255, LABELS, jax.random.key(0))
 

@@ -52,7 +52,7 @@ def test_it_counts_and_trains_with_the_head() -> None:
     (row,) = (row for row in part_costs(CONFIG) if row.part == "projection")
     assert (row.parameters, row.macs) == (576 * 24 + 24, 576 * 24)
     assert part_costs(CONFIG)[:-1] == part_costs(PLAIN)
-    trainable, _ = split_params(PARAMS, CONFIG, "head")
+    trainable, _ = split_params(PARAMS, CONFIG, "head,-adapters")
     assert trainable.projection.weight is not None
 
 

@@ -190,7 +190,7 @@ def test_only_what_no_program_hides_is_waited_for(
 def test_operations_of_a_step_are_those_of_what_trains(scripts: Any) -> None:
     """Of all three times the forward's; of adapters and head little more than twice."""
     bench, tiny, paper = scripts("bench_train"), recipe("tiny"), recipe("b14")
-    assert (tiny.trainable, paper.trainable) == ("all", "adapters+head")
+    assert (tiny.trainable, paper.trainable) == ("all", "adapters,head")
 
     def forward(recipe: Any) -> float:
         return 2 * 8 * sum(cost.macs for cost in part_costs(recipe.model, images=8))

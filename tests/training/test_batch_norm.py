@@ -47,30 +47,30 @@ def assert_close(found, expected) -> None:
 
 
 def stepped(config=STEP, valid=VALID):
-    state, frozen = init_train_state(PARAMS, "adapters+head", config)
+    state, frozen = init_train_state(PARAMS, "adapters,head", config)
     state, metrics = take_step(state, frozen, valid=valid, config=config)
     return merge_params(state.trainable, frozen, config.model), metrics
 
 
 def test_the_state_holds_the_statistics_and_no_moments_of_them() -> None:
-    state, frozen = init_train_state(PARAMS, "adapters+head", STEP)
+    state, frozen = init_train_state(PARAMS, "adapters,head", STEP)
     assert statistics(state.trainable)
     assert not statistics(frozen)
     assert not statistics(state.optimiser)
-    for trainable in ("adapters+head", "last-1-blocks+head", "all"):
+    for trainable in ("adapters,head", "last-1-blocks,norm,head", "all"):
         chosen, _ = split_params(PARAMS, MODEL, trainable)
         assert not statistics(chosen)
         assert any(".adapter.branch1.norm.weight" in name for name in named_leaves(chosen))
     # What counts as trained are the parameters that a gradient moves.
     sizes = sum(x.size for x in jax.tree.leaves(state.trainable))
     measured = sum(x.size for x in statistics(state.trainable).values())
-    assert count_trainable(MODEL, "adapters+head") == sizes - measured
+    assert count_trainable(MODEL, "adapters,head") == sizes - measured
 
 
 @pytest.mark.slow
 def test_stored_statistics_stay_and_serve_the_step() -> None:
     config = dataclasses.replace(STEP, batch_norm="stored")
-    state, _ = init_train_state(PARAMS, "adapters+head", config)
+    state, _ = init_train_state(PARAMS, "adapters,head", config)
     assert not statistics(state.trainable)
     params, metrics = stepped(config)
     for name, array in statistics(params).items():
@@ -110,7 +110,7 @@ def test_micro_batches_are_forward_passes_in_turn() -> None:
 def test_runs_keep_and_resume_the_statistics(places, tmp_path, monkeypatch) -> None:
     """The weight file holds them, and a resumed run ends with the same bits."""
     config = dataclasses.replace(
-        RECIPE, model=MODEL, trainable="adapters+head", epochs=2, patience=None
+        RECIPE, model=MODEL, trainable="adapters,head", epochs=2, patience=None
     )
     whole = fit(config, places, tmp_path / "whole", quiet=True).params
     written, _ = load_weights(tmp_path / "whole" / "last.safetensors")
@@ -131,7 +131,7 @@ from tests.training.test_step import LABELS
 
 devices = devices_for(6)
 assert devices.mesh.size == 2
-state, frozen = init_train_state(PARAMS, "adapters+head", STEP)
+state, frozen = init_train_state(PARAMS, "adapters,head", STEP)
 state, frozen = devices.replicate((state, frozen))
 images, labels, valid = (devices.shard_batch(np.asarray(x)) for x in (pictures(6), LABELS, VALID))
 batch = {"images": images, "labels": labels, "valid": valid}

@@ -172,7 +172,7 @@ module.fit(SPREAD, places, out / "split", quiet=True, shard_state=True)
 SPREAD = dataclasses.replace(
     CONFIG,
     model=with_aggregator(CONFIG.model, "gem-pyramid", "tiny"),
-    trainable="adapters+head",
+    trainable="adapters,head",
 )
 
 

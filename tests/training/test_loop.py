@@ -341,7 +341,7 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_good_state(
     tmp_path, places, params, monkeypatch
 ):
     """The step after it has begun when its loss is read, and must change nothing."""
-    config = dataclasses.replace(RECIPE, trainable="adapters+head")
+    config = dataclasses.replace(RECIPE, trainable="adapters,head")
     good = []
 
     def step(state, frozen, *args):
@@ -445,7 +445,7 @@ def test_unreadable_images_are_counted_each_time_they_come_up(tmp_path, city, pa
 @pytest.mark.parametrize(
     ("change", "arguments", "words"),
     [
-        ({"trainable": "last-3-blocks+head"}, {}, "last 3 blocks"),
+        ({"trainable": "last-3-blocks,norm,head"}, {}, "found last-3-blocks, expected 1 to"),
         ({}, {"num_threads": -1}, "num_threads: found -1, expected at least 0"),
         ({}, {"shard_state": True}, "shard_state: found one device"),
     ],

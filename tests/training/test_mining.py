@@ -338,7 +338,7 @@ def test_recipes_are_the_codes():
         assert found == (Sgd(momentum=0.9), 1e-4, 1e-3)
         # Both stop after more than 10 epochs without gain.
         assert (config.epochs, config.patience, config.monitor) == (30, 11, "R@5")
-        assert (config.places_per_batch, config.trainable) == (4, "last-1-blocks+head")
+        assert (config.places_per_batch, config.trainable) == (4, "last-1-blocks,head")
     assert netvlad.mining == MiningConfig("whole", 10, 1000, 1000, None, 10.0, 25.0, 0.1**0.5)
     assert patches.mining == MiningConfig("sample", 5, 1000, 1000, None, 10.0, 25.0, None)
     assert (netvlad.images_per_place, patches.images_per_place) == (12, 7)
@@ -352,7 +352,7 @@ def test_recipes_are_the_codes():
     found = adam.kind, adam.learning_rate, adam.weight_decay, adam.schedule
     assert found == (Adam(), 1e-5, 0, ConstantSchedule())
     assert (selavpr.epochs, selavpr.patience, selavpr.monitor) == (50, 3, "R@5")
-    assert selavpr.trainable == "adapters+head"
+    assert selavpr.trainable == "adapters,head"
 
 
 @pytest.fixture(scope="module")

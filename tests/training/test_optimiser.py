@@ -33,7 +33,7 @@ def told(params, optimiser: OptimiserConfig, steps: int, steps_per_epoch: int) -
     config = StepConfig(MODEL, RECIPE.loss, optimiser, steps, steps_per_epoch=steps_per_epoch)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        init_train_state(params, "head", config)
+        init_train_state(params, "head,-adapters", config)
     return [str(each.message) for each in caught if each.category is Note]
 
 

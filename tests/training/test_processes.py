@@ -26,7 +26,7 @@ from tests.training.programs import COMPILED_SOON, ROOT, run_on_devices
 
 # Eight images a step, two steps an epoch: ten steps.
 CONFIG = dataclasses.replace(
-    RECIPE, trainable="adapters+head", places_per_batch=4, epochs=5, patience=None
+    RECIPE, trainable="adapters,head", places_per_batch=4, epochs=5, patience=None
 )
 DEVICES = """
 import dataclasses, pathlib, sys

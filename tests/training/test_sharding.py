@@ -29,7 +29,7 @@ key = jax.random.key(1)
 def step(model, shared=None, lowered=False, **options):
     config = StepConfig(model, RECIPE.loss, SGD, 10, **options)
     params = init_crisalad(jax.random.key(0), model)
-    state, frozen = init_train_state(params, "adapters+head", config)
+    state, frozen = init_train_state(params, "adapters,head", config)
     batch = images, LABELS, valid
     if shared is not None:
         batch = [shared.shard_batch(x) for x in batch]
@@ -92,7 +92,7 @@ agree(
     describe(params, images, MODEL),
 )
 # Six images for eight devices: six take them, and a note says so.
-few = dataclasses.replace(RECIPE, trainable="adapters+head")
+few = dataclasses.replace(RECIPE, trainable="adapters,head")
 with warnings.catch_warnings(record=True) as notes:
     warnings.simplefilter("always")
     assert trainer._choose_devices(few).mesh.size == 6

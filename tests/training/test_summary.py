@@ -13,7 +13,7 @@ from tests.conftest import MODEL
 BARE = dataclasses.replace(MODEL, backbone=dataclasses.replace(MODEL.backbone, adapter="none"))
 
 
-@pytest.mark.parametrize(("config", "trainable"), [(MODEL, "adapters+head"), (BARE, "head")])
+@pytest.mark.parametrize(("config", "trainable"), [(MODEL, "adapters,head"), (BARE, "head")])
 def test_what_trains_by_default(config, trainable):
     summary = model_summary(config, images=4)
     assert (summary.trainable, summary.image_size) == (trainable, (42, 56))

@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, NamedTuple
 
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -130,17 +131,28 @@ class Backbone(Part, abc.ABC):
         """Settings that one line about a model names, each after a comma; by default none."""
         return ""
 
-    def split_blocks(self, params: Any, first: int) -> Any:
-        """Return parameters whose `params.blocks` is cut in two, after the first `first` blocks.
+    @property
+    def trains(self) -> tuple[str, ...]:
+        """Names, or patterns of names, of parameters that are there to be trained; by default none.
 
-        Training uses it so that no gradient runs through frozen blocks. `apply` accepts both forms.
+        They are those of adapters, in the names of `init`, such as "blocks.*.adapter" or "lora". A
+        run that trains none of them is refused, unless it says so (`--trainable head,-adapters`).
+        """
+        return ()
+
+    def split_blocks(self, params: Any, cuts: Sequence[int]) -> Any:
+        """Return parameters whose stack `params.blocks` is cut before the blocks of these numbers.
+
+        It is needed where leaves of `params.blocks` have a leading axis of `depth` blocks: training
+        cuts it so that some blocks train and no gradient runs through frozen ones before them. The
+        parts are a tuple, and `apply` accepts both forms.
 
         Raises:
             InputError: this backbone has no blocks to cut.
         """
         raise InputError(
-            f"trainable: found backbone {self.part_name}, which cannot be cut into blocks, "
-            "expected head or all"
+            f"trainable: found a part of the blocks of backbone {self.part_name}, which cannot be "
+            "cut, expected the same parameters of each block"
         )
 
     def join_blocks(self, params: Any) -> Any:

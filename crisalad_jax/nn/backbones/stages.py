@@ -24,19 +24,12 @@ class Stage:
     layers: tuple[Any, ...]
 
 
-Blocks = tuple[Stage, ...] | tuple[tuple[Stage, ...], ...]
-"""Stages, or two parts of them."""
-
-
 @pytree_dataclass
 class Stages:
-    """A convolutional backbone: what comes before its stages, if anything, and the stages.
-
-    Training cuts `blocks` in two, a tuple of tuples of stages, where only the last ones train.
-    """
+    """A convolutional backbone: what comes before its stages, if anything, and the stages."""
 
     stem: Any
-    blocks: Blocks
+    blocks: tuple[Stage, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,9 +85,8 @@ class StagedBackbone(Backbone):
         self, params: Stages, images: Map, remat: str, valid: Valid
     ) -> tuple[Float[Array, "image patch dim"], Stages]:
         x, stem = self.run_stem(params.stem, images, valid)
-        stages, structure = jax.tree.flatten(params.blocks, is_leaf=_is_stage)
         updated = []
-        for number, stage in enumerate(stages):
+        for number, stage in enumerate(params.blocks):
 
             def run(stage: Stage, x: Map, number: int = number) -> tuple[Map, Stage]:
                 return self.run_stage(number, stage, x, valid)
@@ -102,18 +94,4 @@ class StagedBackbone(Backbone):
             with jax.named_scope("blocks"):
                 x, stage = jax.checkpoint(run)(stage, x) if remat == "full" else run(stage, x)
             updated.append(stage)
-        blocks = structure.unflatten(updated)
-        return x.reshape(x.shape[0], -1, x.shape[-1]), Stages(stem, blocks)
-
-    def split_blocks(self, params: Stages, first: int) -> Stages:
-        """Cut the stages in two."""
-        return dataclasses.replace(params, blocks=(params.blocks[:first], params.blocks[first:]))
-
-    def join_blocks(self, params: Stages) -> Stages:
-        """Join the stages into one tuple."""
-        stages = jax.tree.leaves(params.blocks, is_leaf=_is_stage)
-        return dataclasses.replace(params, blocks=tuple(stages))
-
-
-def _is_stage(tree: Any) -> bool:
-    return isinstance(tree, Stage)
+        return x.reshape(x.shape[0], -1, x.shape[-1]), Stages(stem, tuple(updated))

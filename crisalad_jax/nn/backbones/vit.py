@@ -29,6 +29,7 @@ from crisalad_jax.config.part import OrName, non_semantic_field
 from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.adapters import ADAPTERS, Adapter, BlockShape
+from crisalad_jax.nn.adapters.bottleneck import NoAdapter
 from crisalad_jax.nn.attention import (
     Attention,
     Rotation,
@@ -298,11 +299,15 @@ class VisionTransformer(Backbone):
         )
         return features, params if valid is None else _statistics(params, measured)
 
-    def split_blocks(self, params: ViT, first: int) -> ViT:
-        """Cut the stack of blocks in two."""
-        stack = _one_stack(params)
-        parts = _cut(stack, 0, first), _cut(stack, first, self.depth)
-        return dataclasses.replace(params, blocks=parts)
+    @property
+    def trains(self) -> tuple[str, ...]:
+        """Return the adapters' name."""
+        return () if isinstance(self.adapter, NoAdapter) else ("blocks.*.adapter",)
+
+    def split_blocks(self, params: ViT, cuts: Sequence[int]) -> ViT:
+        """Cut the stack of blocks."""
+        stack, ends = _one_stack(params), itertools.pairwise((0, *cuts, self.depth))
+        return dataclasses.replace(params, blocks=tuple(_cut(stack, *pair) for pair in ends))
 
     def adapt_checkpoint(self, config: Any, params: ViT, fresh: ViT) -> tuple[Any, ViT]:
         """Take the fresh adapters where the other's are of another kind or size."""

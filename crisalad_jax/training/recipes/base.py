@@ -15,7 +15,7 @@ from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig, has_adapters
 from crisalad_jax.training.optimisers import AdamW
 from crisalad_jax.training.schedules import LinearSchedule
-from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD, ALL, HEAD
+from crisalad_jax.training.trainable import ADAPTERS, ADAPTERS_AND_HEAD, ALL, HEAD, terms_of
 from crisalad_jax.utils.output import warn
 
 Make = Callable[[ModelConfig, str], TrainConfig]
@@ -103,7 +103,7 @@ def _of_model(config: TrainConfig, model: ModelConfig | None) -> TrainConfig:
     """Return a recipe for another model than its own, if there is one."""
     if model is None:
         return config
-    fits = config.trainable != ADAPTERS_AND_HEAD or has_adapters(model)
+    fits = ADAPTERS not in terms_of(config.trainable) or has_adapters(model)
     trainable = config.trainable if fits else HEAD
     return dataclasses.replace(config, model=model, trainable=trainable, validation_size=None)
 
@@ -254,8 +254,8 @@ def with_part(config: TrainConfig, part: Any) -> TrainConfig:
         loss = dataclasses.replace(config.loss, kind=part, miner=miner)
         return dataclasses.replace(config, loss=loss)
     if kind == "backbone":
-        trainable = "head" if getattr(part, "adapter", None) is None else config.trainable
         model = dataclasses.replace(model, backbone=part)
+        trainable = config.trainable if has_adapters(model) else HEAD
         return dataclasses.replace(config, model=model, trainable=trainable, validation_size=None)
     if kind == "adapter":
         require(

@@ -50,7 +50,7 @@ def _over_resnet(
             size_rule="native",
         ),
         loss,
-        trainable="last-2-blocks+head",
+        trainable="last-2-blocks,head",
         augmentation=ColourCropConfig(),
         monitor="R@1",
         **fields,

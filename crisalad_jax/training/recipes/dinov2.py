@@ -27,7 +27,7 @@ BOQ_TRAINING: dict[str, Any] = {
         warmup_epochs=10,
         weight_decay=1e-4,
     ),
-    "trainable": "last-2-blocks+head",
+    "trainable": "last-2-blocks,norm,head",
     "augmentation": RandAugmentConfig(magnitude=15),
     "places_per_batch": 128,
     "epochs": 40,
@@ -68,7 +68,7 @@ def salad(model: ModelConfig, preset: str) -> TrainConfig:
     return TrainConfig(
         model=model_of(model, preset, _vit(model), None, compute_dtype="bfloat16"),
         optimiser=dataclasses.replace(TrainConfig.optimiser, weight_decay=9.5e-9),
-        trainable="last-4-blocks+head",
+        trainable="last-4-blocks,norm,head",
         places_per_batch=60,
         epochs=4,
         monitor="R@1",
@@ -165,7 +165,7 @@ def supervlad(model: ModelConfig, preset: str) -> TrainConfig:
             model, preset, _vit(model), "supervlad", pixels="floats", round_to_patch=True
         ),
         optimiser=ADAM_STEP,
-        trainable="last-4-blocks+no-norm+head",
+        trainable="last-4-blocks,head",
         places_per_batch=120,
         epochs=20,
         monitor="R@1+R@5",
@@ -194,7 +194,7 @@ def image(model: ModelConfig, preset: str) -> TrainConfig:
     return dataclasses.replace(
         supervlad(model, preset),
         model=config,
-        trainable=f"last-{-tokens.insertion}-blocks+no-norm+head",
+        trainable=f"last-{-tokens.insertion}-blocks,head",
         patience=20,
     )
 
@@ -237,7 +237,7 @@ def dino_mix(model: ModelConfig, preset: str) -> TrainConfig:
         optimiser=dataclasses.replace(
             MIXVPR_OPTIMISER, learning_rate=0.005, accumulate=4, clip_value=0.5
         ),
-        trainable="last-4-blocks+positions+head",
+        trainable="last-4-blocks,norm,positions,head",
         places_per_batch=80,
         epochs=60,
         monitor="R@1",

@@ -43,7 +43,7 @@ def netvlad(model: ModelConfig, preset: str) -> TrainConfig:
         optimiser=dataclasses.replace(
             _SGD, schedule=MilestonesSchedule((4, 9, 14, 19, 24, 29), gamma=0.5)
         ),
-        trainable="last-1-blocks+head",
+        trainable="last-1-blocks,head",
         augmentation=NoAugmentation(),
         mining=MiningConfig(kind="whole", negatives=10, margin=MARGIN),
         places_per_batch=4,
@@ -83,7 +83,7 @@ def netvlad_gsv(model: ModelConfig, preset: str) -> TrainConfig:
     return TrainConfig(
         model=_model(model, preset),
         optimiser=_SGD,
-        trainable="last-1-blocks+head",
+        trainable="last-1-blocks,head",
         epochs=30,
         patience=10,
     )

@@ -53,7 +53,7 @@ def test_rows_change_one_thing_each():
     assert rows["step"] == recipe("b14", "crisalad-step")
     for name in ("multi-resolution", "mlp"):
         assert rows[name].model.backbone.adapter.part_name == name
-    assert (rows["no-adapter"].trainable, rows["no-encoder"].trainable) == ("head", "adapters+head")
+    assert (rows["no-adapter"].trainable, rows["no-encoder"].trainable) == ("head", "adapters,head")
     assert rows["no-encoder"].model.cross_image.part_name == "none"
     assert rows["no-encoder"].optimiser == base.optimiser
     assert rows["no-encoder-step"].optimiser == rows["step"].optimiser

@@ -43,7 +43,7 @@ def test_the_tokens_run_through_the_last_blocks_by_hand() -> None:
 
     # As training cuts the blocks, before the tokens come or after.
     for first in (1, 2):
-        cut = dataclasses.replace(params, backbone=backbone.split_blocks(params.backbone, first))
+        cut = dataclasses.replace(params, backbone=backbone.split_blocks(params.backbone, [first]))
         np.testing.assert_allclose(describe(cut, image[None], CONFIG), found, atol=1e-6)
 
 

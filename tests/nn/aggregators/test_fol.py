@@ -95,5 +95,5 @@ def test_a_cut_stack_of_blocks_gives_the_same() -> None:
     """As training cuts it: before the last block, or at it."""
     params = random_params(CONFIG)
     whole = describe(params, IMAGES, CONFIG)
-    cut = dataclasses.replace(params, backbone=CONFIG.backbone.split_blocks(params.backbone, 1))
+    cut = dataclasses.replace(params, backbone=CONFIG.backbone.split_blocks(params.backbone, [1]))
     np.testing.assert_allclose(describe(cut, IMAGES, CONFIG), whole, atol=1e-6)  # two programs

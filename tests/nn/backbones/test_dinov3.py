@@ -106,7 +106,7 @@ def test_a_step_moves_the_last_block_and_no_bias_of_keys() -> None:
     optimiser = OptimiserConfig(learning_rate=1e-3, weight_decay=0.0)
     step = StepConfig(model, LossConfig(kind=MultiSimilarityConfig(base=0.5)), optimiser, 10)
     before = random_params(model)
-    state, frozen = init_train_state(before, "last-1-blocks+head", step)
+    state, frozen = init_train_state(before, "last-1-blocks,norm,head", step)
     pictures = np.random.default_rng(0).integers(0, 256, (4, 48, 64, 3), np.uint8)
     batch = pictures, jnp.array([0, 0, 1, 1]), np.ones(4, bool)
     state, metrics = train_step(state, frozen, *batch, jax.random.key(0), step)

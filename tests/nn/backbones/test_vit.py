@@ -86,7 +86,7 @@ def test_side_adapters_take_the_sum_of_both_paths() -> None:
     found, _ = run_blocks([params.blocks], tokens, (2, 3), SIDE)
     # Sums of up to 16 numbers of order 10, three blocks deep.
     np.testing.assert_allclose(found, beside, rtol=1e-5, atol=2e-5)
-    cut = SIDE.split_blocks(params, 1).blocks
+    cut = SIDE.split_blocks(params, [1, 2]).blocks
     np.testing.assert_array_equal(run_blocks(cut, tokens, (2, 3), SIDE)[0], found)
 
 
