@@ -77,6 +77,9 @@ from .sinkhorn import SinkhornConfig as SinkhornConfig
 from .sinkhorn import register_dustbin as register_dustbin
 from .sinkhorn import register_gradient as register_gradient
 from .sinkhorn import register_step as register_step
+from .training.callbacks import Callback as Callback
+from .training.callbacks import StopTraining as StopTraining
+from .training.callbacks import register_callback as register_callback
 from .training.config import MiningConfig as MiningConfig
 from .training.config import OptimiserConfig as OptimiserConfig
 from .training.config import TrainConfig as TrainConfig

@@ -94,6 +94,9 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     shard_state: bool = False
     """Keep what trains and its moments in shards, one a device, not whole on each: for --trainable
     all of a large model."""
+    callback: tuple[str, ...] = ()
+    """Also write the numbers of steps and validations elsewhere: csv (steps.csv and validations.csv
+    in OUT), wandb, mlflow, or a registered callback's name."""
     num_threads: int | None = None
     """Threads that read the training images; by default one for each core that this process may
     use."""
@@ -186,6 +189,7 @@ def run(arguments: Train) -> dict[str, Any] | None:
         validation_images=arguments.val_images,
         **pick(arguments, "place_radius", "place_frames", "positions", "fps"),
         **pick(arguments, "weights", "backbone", "on_bad_image", "num_threads", "shard_state"),
+        callbacks=arguments.callback,
         quiet=arguments.quiet,
         say=lambda line: console.print(line, soft_wrap=True),
     )

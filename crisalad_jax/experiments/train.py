@@ -2,12 +2,13 @@
 
 import os
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.experiments.report import save, training_curves
+from crisalad_jax.training.callbacks import Callback
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.distributed import is_primary
 from crisalad_jax.training.log import read_metrics
@@ -35,6 +36,7 @@ def train(
     on_bad_image: OnBadImage = "stop",
     num_threads: int | None = None,
     shard_state: bool = False,
+    callbacks: Sequence[Callback | str] = (),
     quiet: bool = False,
     say: Callable[[str], None] = lambda line: None,
 ) -> FitResult:
@@ -59,6 +61,7 @@ def train(
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
         num_threads: number of threads that read the training images; None for one a usable core.
         shard_state: keep what trains and its moments in shards, one a device.
+        callbacks: see `fit`.
         quiet: no progress bars.
         say: called with each line to print.
 
@@ -113,6 +116,7 @@ def train(
         on_bad_image=on_bad_image,
         num_threads=num_threads,
         shard_state=shard_state,
+        callbacks=callbacks,
         quiet=quiet,
     )
     if is_primary():

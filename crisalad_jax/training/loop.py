@@ -8,7 +8,7 @@ import os
 import pathlib
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -26,6 +26,7 @@ from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad, init_crisalad
 from crisalad_jax.training import distributed
 from crisalad_jax.training.batches import PlaceBatches
+from crisalad_jax.training.callbacks import Callback, Callbacks
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.mining import Miner
 from crisalad_jax.training.run_files import (
@@ -57,6 +58,7 @@ class FitResult(NamedTuple):
     best_recall: float | None
     """Best recall of a validation, a fraction, by `TrainConfig.monitor`; None without one."""
     stopped_early: bool
+    """Whether it ended before its last epoch, by `TrainConfig.patience` or by a callback."""
     skipped_images: int
     """Number of unreadable images that were masked out, counted each time they came up."""
 
@@ -72,6 +74,7 @@ def fit(
     on_bad_image: OnBadImage = "stop",
     num_threads: int | None = None,
     shard_state: bool = False,
+    callbacks: Sequence[Callback | str] = (),
     quiet: bool = False,
 ) -> FitResult:
     """Train, or resume the run that `out` holds, and leave its files there.
@@ -97,6 +100,9 @@ def fit(
             leave them out.
         num_threads: number of those threads; None is one for each core that this process may use.
         shard_state: keep what trains and its moments in shards, one a device, not whole on each.
+        callbacks: called with the numbers of each step and validation, in the primary process; or
+            names of registered ones. `StopTraining` of one ends the run, and the same call resumes
+            it.
         quiet: no progress bar.
 
     Returns:
@@ -124,6 +130,7 @@ def fit(
     )
     threads = THREADS if num_threads is None else num_threads
     require(threads >= 0, f"num_threads: found {threads}, expected at least 0")
+    called = Callbacks(callbacks)
     if initial is None:
         initial = init_crisalad(run_keys(config.seed)[0], config.model)
     checksums = {
@@ -153,17 +160,19 @@ def fit(
         data.mined = jax.tree.map(np.asarray, state.mined)
         del state  # whose arrays the trainer has copied
         steps, done = data.steps_per_epoch * config.epochs, files.record.step
+        called.call("on_start", files.out, config, done)
         silent = quiet or not distributed.is_primary()
         bar = progress_bar("training", steps, "steps", quiet=silent, done=done)
         with defer_signals() as signals, bar as bar:
-            loop = _Loop(config, data, trainer, validator, files, signals, bar)
+            loop = _Loop(config, data, trainer, validator, files, signals, bar, called)
             loop.train(steps)
         loop.save()
     record = files.record
     best = record.best[0][0] if record.best else None
-    return FitResult(
-        trainer.params(), record.step, best, record.stopped_early, record.skipped_images
-    )
+    stopped = record.stopped_early or (called.stopped and record.step < steps)
+    result = FitResult(trainer.params(), record.step, best, stopped, record.skipped_images)
+    called.call("on_end", result)
+    return result
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,6 +186,7 @@ class _Loop:
     files: RunFiles
     signals: SignalState
     bar: Bar
+    callbacks: Callbacks
 
     def train(self, steps: int) -> None:
         """Take the steps that are left of so many; at an interruption, save the state."""
@@ -204,7 +214,7 @@ class _Loop:
             if self.validator.is_due(record.step, self.data.steps_per_epoch, last=record.validated):
                 record = self._validate()
                 self.save()
-            if record.step == steps or record.stopped_early:
+            if record.step == steps or record.stopped_early or self.callbacks.stopped:
                 return
             if isinstance(self.data, Miner) and self.data.is_due(record.step):
                 self._mine(self.data)
@@ -238,6 +248,8 @@ class _Loop:
                 waited = time.monotonic() - began
                 if number % every == 0:
                     self._exchange_status(error)
+                    if self.callbacks.stopped:
+                        return
                 self.signals.watch()
                 self.trainer.start_step(batch, waited)
                 self.signals.has_work = True  # before it, XLA compiles the step
@@ -248,14 +260,15 @@ class _Loop:
     def _exchange_status(self, error: Exception | None) -> None:
         """Act on what any process knows: raise an error or a signal, or save."""
         own = 0 if error is None else 1 if isinstance(error, LossNotFiniteError) else 2
-        failed, number, save_is_due = distributed.all_max(
-            own, self.signals.number, self.files.save_is_due()
+        failed, number, save_is_due, stopped = distributed.all_max(
+            own, self.signals.number, self.files.save_is_due(), self.callbacks.stopped
         )
         if failed:
             # Where all have found that the loss is not finite, all raise that, and save together.
             another = InputError(distributed.ANOTHER_FAILED)
             raise error if error is not None and own == failed else another
-        if number or save_is_due:
+        self.callbacks.stopped = bool(stopped)
+        if number or save_is_due or stopped:
             distributed.raise_together(self._log_steps)
         if number:
             raise Interrupted(number)
@@ -269,7 +282,9 @@ class _Loop:
             epoch = record.step // self.data.steps_per_epoch + 1
             record.step += 1
             record.skipped_images += int(values["skipped_images"])
-            self.files.log({"step": record.step, "epoch": epoch, **values})
+            line = {"step": record.step, "epoch": epoch, **values}
+            self.files.log(line)
+            self.callbacks.call("on_step", line)
             name = "accuracy" if "accuracy" in values else "easy_anchor_fraction"
             note = f"loss {values['loss']:.3f}  {name.split('_')[0]} {values[name]:.2f}"
             self.bar.advance(1, note=f"{note}  {values['images_per_second']:.0f} images/s")
@@ -280,7 +295,7 @@ class _Loop:
         epoch = record.step // self.data.steps_per_epoch
         trainable = self.trainer.gather(self.trainer.state.averaged)
 
-        def validate() -> tuple[str, dict[str, Any]]:
+        def validate() -> tuple[str, dict[str, Any], bool]:
             params = self.trainer.params(trainable)
             with self.signals.at_once():
                 found = self.validator.validate(params)
@@ -288,9 +303,10 @@ class _Loop:
             self.files.log(line, of=self.validator.name)
             record.add_validation(found.monitored, self.config)
             self.files.save_if_best(params)
-            return found.words, dataclasses.asdict(record)
+            self.callbacks.call("on_validation", line)
+            return found.words, dataclasses.asdict(record), self.callbacks.stopped
 
-        words, values = distributed.run_on_primary(validate)
+        words, values, self.callbacks.stopped = distributed.run_on_primary(validate)
         self.files.record = RunRecord(**values)
         self.bar.say(f"epoch {epoch}, step {record.step}: {words}")
         return self.files.record

@@ -72,6 +72,10 @@ class Aggregator(Part, abc.ABC):
     centroid_images: ClassVar[int] = 500
     """Number of training images, at most, whose features' centroids training starts from."""
 
+    def numbers(self, params: Any) -> Mapping[str, Any]:
+        """Return numbers of the parameters that validations log by name; by default none."""
+        return {}
+
     @abc.abstractmethod
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of an image's tokens for features of width `dim`."""

@@ -1,0 +1,251 @@
+"""Callbacks: what is called with the numbers of a run, and may stop it."""
+
+import csv
+import importlib
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.plugins import load_entry_points
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.distributed import is_primary
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import atomic_path, wrap_os_errors
+
+if TYPE_CHECKING:
+    from crisalad_jax.training.loop import FitResult
+
+Numbers = Mapping[str, int | float]
+
+
+class StopTraining(Exception):
+    """Raised by a callback to end a run: it is saved, and the same call resumes it.
+
+    Example:
+        >>> class FirstStep(Callback):
+        ...     def on_step(self, numbers):
+        ...         raise StopTraining
+    """
+
+
+class Callback:
+    """A class whose methods are called while a run goes on; by default they do nothing.
+
+    Where a run was killed, the steps and validations after its last saved state come again.
+
+    Example:
+        >>> class Print(Callback):
+        ...     def on_step(self, numbers):
+        ...         print(numbers["step"], numbers["loss"])
+    """
+
+    def on_start(self, out: pathlib.Path, config: TrainConfig, step: int) -> None:
+        """Take what the run is.
+
+        Args:
+            out: its folder.
+            config: its configuration.
+            step: number of steps that it has; not 0 where it resumes.
+        """
+
+    def on_step(self, numbers: Numbers) -> None:
+        """Take the numbers of a step, those of its line in metrics.jsonl: step, epoch, loss, ..."""
+
+    def on_validation(self, numbers: Numbers) -> None:
+        """Take the numbers of a validation, those of its line: step, epoch, R@1, ..."""
+
+    def on_end(self, result: "FitResult") -> None:
+        """Take how the run ended; not called where it ended by an error or a signal."""
+
+
+CALLBACKS: dict[str, type[Callback]] = {}
+"""Registered callbacks by name."""
+_C = TypeVar("_C", bound=type[Callback])
+
+
+def register_callback(name: str) -> Callable[[_C], _C]:
+    """Make a decorator that registers a class of callbacks.
+
+    Args:
+        name: what `--callback` calls it.
+
+    Returns:
+        The decorator, for a class that inherits from `Callback` and is made without arguments.
+
+    Raises:
+        InputError: when it decorates: the name is taken, or it is no such class.
+
+    Example:
+        >>> @register_callback("print-recall")
+        ... class PrintRecall(Callback):
+        ...     def on_validation(self, numbers):
+        ...         print(numbers["R@1"])
+        >>> make_callback("print-recall")  # doctest: +ELLIPSIS
+        <...PrintRecall object at ...>
+    """
+
+    def decorate(kind: _C) -> _C:
+        is_kind = isinstance(kind, type) and issubclass(kind, Callback)
+        require(is_kind, f"register_callback {name!r}: found {kind!r}, expected a Callback class")
+        taken = CALLBACKS.get(name, kind).__module__
+        require(
+            taken == kind.__module__,
+            f"register_callback {name!r}: found the name taken by {taken}, expected another",
+        )
+        CALLBACKS[name] = kind
+        return kind
+
+    return decorate
+
+
+def make_callback(callback: Callback | str) -> Callback:
+    """Return a callback as it is, and make one that is given by its name.
+
+    Raises:
+        InputError: no such callback, or it needs a package that is not installed.
+    """
+    if isinstance(callback, Callback):
+        return callback
+    if callback not in CALLBACKS:
+        load_entry_points()
+    known = isinstance(callback, str) and callback in CALLBACKS
+    names = ", ".join(sorted(CALLBACKS))
+    require(known, f"callback: found {callback!r}, expected a Callback object or one of {names}")
+    return CALLBACKS[callback]()
+
+
+class Callbacks:
+    """The callbacks of a run, which the primary process alone calls."""
+
+    def __init__(self, callbacks: Sequence[Callback | str]) -> None:
+        """Make those that are given by name; raise as `make_callback`."""
+        made = [make_callback(each) for each in callbacks]
+        self._each = made if is_primary() else []
+        self.stopped = False
+        """Whether one has asked to stop."""
+
+    def call(self, method: str, *arguments: Any) -> None:
+        """Call a method of each, in their order."""
+        for each in self._each:
+            try:
+                getattr(each, method)(*arguments)
+            except StopTraining:
+                self.stopped = True
+
+
+@register_callback("csv")
+class CsvCallback(Callback):
+    """Tables `steps.csv` and `validations.csv` in the run's folder."""
+
+    def on_start(self, out: pathlib.Path, config: TrainConfig, step: int) -> None:
+        """Drop the lines that will come again."""
+        self._out = out
+        for name in ("steps", "validations"):
+            path = self._path(name)
+            if path.exists():
+                with path.open(encoding="utf-8", newline="") as file:
+                    rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
+                with atomic_path(path) as temporary:
+                    _write_rows(temporary, rows)
+
+    def on_step(self, numbers: Numbers) -> None:
+        """Append a line to `steps.csv`."""
+        _write_rows(self._path("steps"), [numbers])
+
+    def on_validation(self, numbers: Numbers) -> None:
+        """Append a line to `validations.csv`."""
+        _write_rows(self._path("validations"), [numbers])
+
+    def _path(self, name: str) -> pathlib.Path:
+        return self._out / f"{name}.csv"
+
+
+def _write_rows(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Append rows, with the columns that the file has, or in a new one those of the first row."""
+    columns = []
+    if path.exists() and path.stat().st_size:
+        with path.open(encoding="utf-8", newline="") as file:
+            columns = next(csv.reader(file))
+    with wrap_os_errors(path), path.open("a", encoding="utf-8", newline="") as file:
+        for row in rows:
+            writer = csv.DictWriter(file, columns or [*row], extrasaction="ignore")
+            if not columns:
+                writer.writeheader()
+                columns = [*row]
+            writer.writerow(row)
+
+
+@register_callback("wandb")
+class WandbCallback(Callback):
+    """A run of Weights & Biases, named like the folder; its variables WANDB_... say where.
+
+    A run that resumes is the same there.
+    """
+
+    def __init__(self) -> None:
+        """Import the package."""
+        self._wandb = _imported("wandb")
+
+    def on_start(self, out: pathlib.Path, config: TrainConfig, step: int) -> None:
+        """Start the run, or go on with that of this folder."""
+        identity = out / "wandb-run"
+        if not identity.exists():
+            identity.write_text(self._wandb.util.generate_id(), encoding="utf-8")
+        options = {"dir": str(out), "id": identity.read_text(encoding="utf-8"), "resume": "allow"}
+        self._wandb.init(name=out.absolute().name, config=to_plain(config), **options)
+
+    def on_step(self, numbers: Numbers) -> None:
+        """Log the numbers."""
+        self._wandb.log(dict(numbers), step=numbers["step"])
+
+    on_validation = on_step
+
+    def on_end(self, result: "FitResult") -> None:
+        """End the run."""
+        self._wandb.finish()
+
+
+@register_callback("mlflow")
+class MlflowCallback(Callback):
+    """A run of MLflow, named like the folder; its variables MLFLOW_... say where."""
+
+    def __init__(self) -> None:
+        """Import the package."""
+        self._mlflow = _imported("mlflow")
+
+    def on_start(self, out: pathlib.Path, config: TrainConfig, step: int) -> None:
+        """Start the run, or go on with that of this folder, and log the configuration."""
+        identity = out / "mlflow-run"
+        if identity.exists():
+            self._mlflow.start_run(run_id=identity.read_text(encoding="utf-8"))
+            return
+        run = self._mlflow.start_run(run_name=out.absolute().name)
+        identity.write_text(run.info.run_id, encoding="utf-8")
+        self._mlflow.log_dict(to_plain(config), "config.json")
+
+    def on_step(self, numbers: Numbers) -> None:
+        """Log the numbers, under the tags that TensorBoard has."""
+        metrics = {name.replace("@", ""): value for name, value in numbers.items()}
+        self._mlflow.log_metrics(metrics, step=int(numbers["step"]))
+
+    on_validation = on_step
+
+    def on_end(self, result: "FitResult") -> None:
+        """End the run."""
+        self._mlflow.end_run()
+
+
+def _imported(package: str) -> Any:
+    """Import a package that no extra brings.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return importlib.import_module(package)
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"callback {package}: found no module {error.name}, expected it: pip install {package}"
+        ) from error

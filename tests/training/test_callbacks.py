@@ -1,0 +1,146 @@
+"""Callbacks: the numbers that they get, a run that one stops, and what they write elsewhere."""
+
+import csv
+import sys
+import types
+from typing import Any
+from unittest import mock
+
+import pytest
+
+import crisalad_jax as cj
+from crisalad_jax.cli import train as train_command
+from crisalad_jax.training import callbacks as module
+from crisalad_jax.training.callbacks import CALLBACKS, Callback, Callbacks, make_callback
+from crisalad_jax.training.log import read_metrics
+from crisalad_jax.training.loop import fit
+from crisalad_jax.utils.errors import InputError
+from tests.training.test_loop import ENDLESS, assert_same_run
+
+
+class Recorder(Callback):
+    """Keeps what it gets, and stops the run at some steps and validations."""
+
+    def __init__(self, *stops: tuple[str, int]) -> None:
+        self.stops, self.got = stops, []
+
+    def take(self, kind: str, numbers: Any) -> None:
+        self.got.append((kind, dict(numbers)))
+        if (kind, numbers["step"]) in self.stops:
+            raise cj.StopTraining
+
+    def on_start(self, out, config, step) -> None:
+        self.got.append(("start", {"step": step}))
+
+    def on_step(self, numbers) -> None:
+        self.take("step", numbers)
+
+    def on_validation(self, numbers) -> None:
+        self.take("validation", numbers)
+
+    def on_end(self, result) -> None:
+        self.got.append(("end", {"step": result.steps, "stopped": result.stopped_early}))
+
+
+def test_a_run_that_callbacks_stop_resumes_to_the_same_bits(
+    places, params, benchmark, run, tmp_path
+) -> None:
+    """First within an epoch, then after a validation; `run` was not stopped."""
+    out, tables = tmp_path / "run", []
+    arguments = ENDLESS, places, out
+    options = {"validation": benchmark, "initial": params, "quiet": True}
+    # The step after the one that is logged is under way, and is finished.
+    for stop, taken in ((("step", 2), 3), (("validation", 4), 4), (None, 6)):
+        recorder = Recorder(*([stop] if stop else []))
+        result = fit(*arguments, **options, callbacks=[recorder, "csv"])
+        assert (result.steps, result.stopped_early) == (taken, stop is not None)
+        assert recorder.got[-1] == ("end", {"step": taken, "stopped": stop is not None})
+        tables.append(recorder)
+    assert_same_run(out, run)
+    starts = [recorder.got[0] for recorder in tables]
+    assert starts == [("start", {"step": step}) for step in (0, 3, 4)]
+    # All of its lines, each once, in their order.
+    found = [each for recorder in tables for each in recorder.got[1:-1]]
+    lines = read_metrics(out / "metrics.jsonl")
+    assert found == [("step" if "loss" in line else "validation", line) for line in lines]
+    for name, kind in (("steps", "step"), ("validations", "validation")):
+        with (out / f"{name}.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        expected = [numbers for each, numbers in found if each == kind]
+        assert rows == [{key: str(value) for key, value in each.items()} for each in expected]
+
+
+def test_a_table_drops_what_comes_again(tmp_path) -> None:
+    table = make_callback("csv")
+    table.on_start(tmp_path, ENDLESS, 0)
+    for step in (1, 2, 3):
+        table.on_step({"step": step, "loss": 0.5, "accuracy": step})
+    again = make_callback("csv")
+    again.on_start(tmp_path, ENDLESS, 2)
+    again.on_step({"step": 3, "accuracy": 7})  # a loss that is not logged leaves its cell empty
+    assert (tmp_path / "steps.csv").read_text().split() == [
+        *("step,loss,accuracy", "1,0.5,1", "2,0.5,2", "3,,7")
+    ]
+
+
+def test_other_processes_than_the_primary_call_none(monkeypatch) -> None:
+    monkeypatch.setattr(module, "is_primary", lambda: False)
+    recorder = Recorder(("step", 1))
+    others = Callbacks([recorder])
+    others.call("on_step", {"step": 1})
+    assert (recorder.got, others.stopped) == ([], False)
+
+
+def test_weights_and_biases_gets_the_numbers(monkeypatch, tmp_path) -> None:
+    fake: Any = mock.MagicMock(__spec__=None)
+    fake.util.generate_id.side_effect = ["first", "second"]
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    for step in (0, 4):
+        each = make_callback("wandb")
+        each.on_start(tmp_path / "run" if step is None else tmp_path, ENDLESS, step)
+    each.on_step({"step": 5, "loss": 0.5})
+    each.on_validation({"step": 5, "R@1": 0.25})
+    each.on_end(None)
+    # A run that resumes is the same one.
+    assert [call.kwargs["id"] for call in fake.init.call_args_list] == ["first", "first"]
+    assert fake.init.call_args.kwargs["resume"] == "allow"
+    assert fake.init.call_args.kwargs["config"]["epochs"] == ENDLESS.epochs
+    logged = [(call.args[0], call.kwargs["step"]) for call in fake.log.call_args_list]
+    assert logged == [({"step": 5, "loss": 0.5}, 5), ({"step": 5, "R@1": 0.25}, 5)]
+    fake.finish.assert_called_once_with()
+
+
+def test_mlflow_gets_the_numbers(monkeypatch, tmp_path) -> None:
+    fake: Any = mock.MagicMock(__spec__=None)
+    fake.start_run.return_value = types.SimpleNamespace(info=types.SimpleNamespace(run_id="7"))
+    monkeypatch.setitem(sys.modules, "mlflow", fake)
+    for step in (0, 4):
+        each = make_callback("mlflow")
+        each.on_start(tmp_path, ENDLESS, step)
+    each.on_validation({"step": 5, "R@1": 0.25})
+    each.on_end(None)
+    runs = [call.kwargs for call in fake.start_run.call_args_list]
+    assert runs == [{"run_name": tmp_path.name}, {"run_id": "7"}]
+    # No name of a metric may have an @.
+    fake.log_metrics.assert_called_once_with({"step": 5, "R1": 0.25}, step=5)
+    fake.end_run.assert_called_once_with()
+
+
+def test_callbacks_that_do_not_fit_are_refused(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(InputError, match=r"^callback wandb: found no module wandb, .* pip install"):
+        make_callback("wandb")
+    with pytest.raises(InputError, match=r"^callback: found 'x', expected .* one of csv, mlflow"):
+        make_callback("x")
+    with pytest.raises(InputError, match=r"^callback: found 3, expected a Callback object or one"):
+        make_callback(3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match=r"name taken by crisalad_jax.training.callbacks"):
+        cj.register_callback("csv")(Recorder)
+    with pytest.raises(InputError, match=r"register_callback 'mine': found 3, expected a Callback"):
+        cj.register_callback("mine")(3)  # pyright: ignore[reportArgumentType]
+    assert "mine" not in CALLBACKS
+
+
+def test_flags_name_callbacks() -> None:
+    given = ["--data", "d", "--out", "o", "--callback", "csv", "wandb"]
+    assert train_command.parse("train", given).callback == ("csv", "wandb")
