@@ -298,3 +298,18 @@ def test_a_step_that_learns_asks_for_its_parameters() -> None:
     words = "^step learnt-epsilon: found no step_params, expected those of its init_params"
     with pytest.raises(InputError, match=words):
         solve(*problem_of(), config=SinkhornConfig(step="learnt-epsilon"))
+
+
+def test_the_search_says_what_it_needs(monkeypatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    assert example("prune").main() is None
+    assert capsys.readouterr().out == "optuna is not installed: pip install optuna\n"
+
+
+@pytest.mark.slow
+def test_the_search_prunes_runs_that_fall_behind() -> None:
+    optuna = pytest.importorskip("optuna")
+    study = example("prune").main()
+    first, *others = (trial.state for trial in study.trials)
+    assert first == optuna.trial.TrialState.COMPLETE  # there is nothing to compare it with
+    assert optuna.trial.TrialState.PRUNED in others
