@@ -189,7 +189,7 @@ def _with_plain_keys(optimiser: optax.GradientTransformation) -> optax.GradientT
     """Keep random keys in the state as numbers, which a checkpoint can hold."""
 
     def is_key(leaf: Any) -> bool:
-        return jnp.issubdtype(getattr(leaf, "dtype", None), jax.dtypes.prng_key)
+        return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
     def plain(state: PyTree) -> PyTree:
         return jax.tree.map(lambda leaf: jax.random.key_data(leaf) if is_key(leaf) else leaf, state)
@@ -221,13 +221,10 @@ def _averaging(decay: float) -> optax.GradientTransformation:
     def init(params: PyTree) -> WeightAverage:
         return WeightAverage(jax.tree.map(jnp.copy, params))  # both are donated to a step
 
-    def update(
-        updates: PyTree, state: WeightAverage, params: PyTree = None
-    ) -> tuple[PyTree, WeightAverage]:
+    def update(updates: PyTree, state: PyTree, params: PyTree = None) -> tuple[PyTree, PyTree]:
         after = optax.apply_updates(params, updates)
-        return updates, WeightAverage(
-            optax.incremental_update(after, state.weights, step_size=1 - decay)
-        )
+        average = optax.incremental_update(after, state.weights, step_size=1 - decay)
+        return updates, WeightAverage(average)
 
     return optax.GradientTransformation(init, update)
 

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 from crisalad_jax.config.flags import parse_changes
 from crisalad_jax.data.augmentations import Augmentation
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.optimisers import Optimiser
 from crisalad_jax.training.recipes import (
     RECIPES,
     find_part,
@@ -17,7 +18,9 @@ from crisalad_jax.training.recipes import (
     mines_tuples,
     recipe,
     split_name,
+    with_part,
 )
+from crisalad_jax.training.schedules import Schedule
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 
@@ -125,10 +128,10 @@ def method_training(name: str, preset: str, *, from_nothing: bool) -> TrainConfi
     if not from_nothing:
         return config
     scratch = from_scratch(config)
-    if name not in RECIPES and isinstance(find_part(split_name(name)[1], preset), Augmentation):
-        # It is what is compared, and `from_scratch` has set its own.
-        scratch = dataclasses.replace(scratch, augmentation=config.augmentation)
-    return scratch
+    part = None if name in RECIPES else find_part(split_name(name)[1], preset)
+    # It is what is compared, and `from_scratch` has set its own.
+    is_replaced = isinstance(part, Augmentation | Optimiser | Schedule)
+    return with_part(scratch, part) if is_replaced else scratch
 
 
 class Ablation(NamedTuple):

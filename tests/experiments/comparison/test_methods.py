@@ -69,6 +69,16 @@ def test_an_augmentation_that_is_compared_stays(name):
     assert dataclasses.replace(found, augmentation=base.augmentation) == base
 
 
+@pytest.mark.parametrize("name", ["optax.lion", "schedule:cosine"])
+def test_an_optimiser_or_schedule_that_is_compared_stays(name):
+    """From nothing all else is that of `scratch`."""
+    base, found = row_training("crisalad"), row_training(f"crisalad+{name}")
+    assert found != base
+    change = {"kind": name} if name == "optax.lion" else {"schedule": "cosine"}
+    optimiser = dataclasses.replace(base.optimiser, **change)
+    assert found == dataclasses.replace(base, optimiser=optimiser)
+
+
 def test_variants_of_parts(settings):
     names = ("crisalad", "step:newton", "anyloc")
     prepared = prepare(ComparisonConfig(**settings | {"names": names}))
