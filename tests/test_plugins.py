@@ -24,6 +24,7 @@ from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.nn.model import Model, describe
 from crisalad_jax.sinkhorn import SinkhornConfig, solve
 from crisalad_jax.training.losses import LossConfig, metric_loss
+from crisalad_jax.training.trainer import run_keys
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.pytree import named_leaves
@@ -442,6 +443,54 @@ def test_a_step_a_dustbin_and_a_loss_are_trained_saved_and_told(
         f"crisalad: note: {weights}: found another source of aggregator.sinkhorn.step "
         "learnt-epsilon than these weights were written with; descriptors may differ\n"
     )
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_unchecked")  # types are not checked for any number of images
+def test_an_adapter_and_an_encoder_of_the_manual_are_trained_saved_and_exported(
+    tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture, scripts
+) -> None:
+    """Each is one file, a block of its page."""
+    files = []
+    for page, name in (("add-an-adapter", "my_lora"), ("add-a-cross-image-encoder", "gate")):
+        text = (ROOT / "docs" / "how-to" / f"{page}.md").read_text()
+        code = re.search(rf"<!-- run: {name}\.py -->\n```python\n(.*?)```", text, re.DOTALL)
+        assert code is not None
+        files.append(tmp_path / f"{name}.py")
+        files[-1].write_text(code[1])
+    plug = ("--plugin", *files)
+    succeeds(
+        *(capfd, "train", "--data", shared / "city", "--out", tmp_path / "run", "--quiet", *plug),
+        *("--config", shared / "recipe.json", "--epochs", 1, "--trainable", "adapters+head"),
+        *("--model.backbone.adapter", "my-lora", "--model.backbone.adapter.rank", 2),
+        *("--model.cross-image", "gated-mean", "--loss.kind.base", 0.5),
+    )
+    weights = tmp_path / "run" / "last.safetensors"
+    params, config = cj.load(weights)
+    assert config.backbone.adapter.rank == 2
+    start = cj.init_crisalad(run_keys(RECIPE.seed)[0], config).backbone.blocks
+    blocks = params.backbone.blocks
+    # Two steps of AdamW at 1e-3 and less; both start at 0. The layer is frozen.
+    for learnt in (blocks.adapter["up"][0], blocks.adapter["up"][1], params.cross_image["gate"]):
+        assert 1e-4 < abs(learnt).max() < 3e-3
+    np.testing.assert_array_equal(blocks.attn.qkv.weight, start.attn.qkv.weight)
+    town = ("--data", shared / "town", "--weights", weights, "--batch-size", BATCH, "--quiet")
+    assert "sequential" in succeeds(capfd, "evaluate", *town, "--grouping", "sequential", *plug)
+    images = cj.image_batches(
+        sorted((shared / "town").rglob("*.jpg"))[:3], image_size=config.input_size, batch_size=3
+    )
+    (batch,) = images
+    expected = cj.describe(params, batch.images, config)
+    merged, plain = cj.merge_adapters(cj.Model(params, config))
+    found = cj.describe(merged, batch.images, plain)
+    np.testing.assert_allclose(found, expected, atol=1e-6)  # unit vectors in float32
+    succeeds(
+        *(capfd, "export", "--weights", weights, "--out", tmp_path / "program", *plug),
+        *("--platforms", "cpu", "--grouping", "batch"),
+    )
+    manifest = json.loads((tmp_path / "program" / "manifest.json").read_text())
+    program = scripts("run_exported").load(tmp_path / "program", manifest)
+    np.testing.assert_allclose(program(batch.images), expected, atol=1e-5)
 
 
 @pytest.mark.slow

@@ -63,6 +63,14 @@ class Adapter(Part, abc.ABC):
     def check(self, shape: BlockShape) -> None:
         """Raise InputError where the settings do not fit such a block; by default never."""
 
+    def prompts(self, params: Any) -> Float[Array, "prompt dim"] | None:
+        """Return tokens that a block puts in front of an image's, in place of the last block's.
+
+        Args:
+            params: of `init`.
+        """
+        return None
+
     def linear_update(
         self, params: Any, name: str, x: Float[Array, "*batch d_in"]
     ) -> Float[Array, "*batch d_out"] | None:
@@ -138,6 +146,11 @@ class Adapter(Part, abc.ABC):
             length: see `attention_update`.
         """
         raise NotImplementedError
+
+    @property
+    def has_prompts(self) -> bool:
+        """Whether it has `prompts`."""
+        return type(self).prompts is not Adapter.prompts
 
     @property
     def can_merge(self) -> bool:

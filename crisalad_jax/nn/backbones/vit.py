@@ -422,6 +422,8 @@ def _checked_levels(request: FeatureSpec, config: VisionTransformer) -> tuple[in
         "the class token's attention": request.class_attention,
         "adapters on a side path": config.adapter.has_side_path,
     }
+    if request.class_attention:
+        special["adapters with prompts"] = config.adapter.has_prompts
     found = [name for name, is_asked in special.items() if is_asked]
     require(len(found) < 2, f"features: found {' and '.join(found)}, expected one of these alone")
     return levels
@@ -506,7 +508,8 @@ def run_blocks(
 ) -> tuple[TokenBatch, list[Block]]:
     """Run stacks of blocks in turn, each with one compiled body.
 
-    An adapter may have a path of its own, from which the tokens then come (`Adapter.side_path`).
+    An adapter may have a path of its own, from which the tokens then come (`Adapter.side_path`), or
+    put prompts in front, which are dropped in the end.
     Between the first and the last block the tokens are padded
     as `attention` needs them on this platform.
 
@@ -523,6 +526,13 @@ def run_blocks(
     Returns:
         (tokens, statistics): the second has a stack of running statistics for each of `stacks`.
     """
+    front = 0
+    if config.adapter.has_prompts:
+        prompts: Any = jax.eval_shape(lambda: config.adapter.prompts(_block_at(stacks, 0).adapter))
+        wanted = jax.ShapeDtypeStruct((prompts.shape[0], config.dim), jnp.float32)
+        expect_like(f"adapter {config.adapter.part_name}", prompts, wanted)
+        front = prompts.shape[0]
+    tokens = jnp.pad(tokens, ((0, 0), (front, 0), (0, 0))) if front else tokens
     real = tokens.shape[1]
     padding = padded_length(real, tokens.dtype, config.dim, config.heads) - real
     length = real if padding else None
@@ -530,6 +540,8 @@ def run_blocks(
 
     def body(carry: tuple[Array, Array | None], layer: Block) -> tuple[Any, Block]:
         tokens, side = carry
+        if front:
+            tokens = _with_prompts(tokens, layer, config)
         tokens, statistics = block(layer, tokens, grid, config, length=length, valid=valid)
         if side is not None:
             both = tokens + side
@@ -552,7 +564,15 @@ def run_blocks(
                 lambda carry, at: body(carry, _layer_at(stack, at)), carry, jnp.arange(count)
             )
     tokens, side = carry
-    return (tokens if side is None else side)[:, :length], statistics
+    return (tokens if side is None else side)[:, front:length], statistics
+
+
+def _with_prompts(tokens: TokenBatch, layer: Block, config: VisionTransformer) -> TokenBatch:
+    """Put a block's prompts in the place of the first tokens."""
+    prompts = config.adapter.prompts(layer.adapter)
+    assert prompts is not None
+    first = jnp.broadcast_to(prompts.astype(tokens.dtype), (tokens.shape[0], *prompts.shape))
+    return jnp.concatenate([first, tokens[:, len(prompts) :]], axis=1)
 
 
 def _layer_at(stack: Block, number: Int[Array, ""]) -> Block:

@@ -1,0 +1,41 @@
+"""Visual prompts: learnt tokens beside an image's own (Jia et al., ECCV 2022)."""
+
+import dataclasses
+import math
+
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import PositiveInt
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.adapters.base import ADAPTERS, Adapter, BlockShape
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+
+@pytree_dataclass
+class Prompts:
+    """The tokens of a block."""
+
+    tokens: Float[Array, "*stack prompt dim"]
+
+
+@ADAPTERS.register("prompts")
+@dataclasses.dataclass(frozen=True)
+class PromptsConfig(Adapter):
+    """Prompts in every block (VPT-deep: Jia et al., ECCV 2022), without dropout.
+
+    The tokens of an image attend to the block's prompts, whose own outputs are dropped. Attention
+    takes longer by their number. Unlike other adapters, untrained ones change the descriptors.
+    """
+
+    count: PositiveInt = 10
+    """Number of prompts in a block."""
+
+    def init(self, key: PRNGKeyArray, shape: BlockShape) -> Prompts:
+        """Draw uniformly within sqrt(3 / dim), as the authors' code does for ViT-B/16."""
+        bound = math.sqrt(3 / shape.dim)
+        tokens = random_init.uniform(key, (self.count, shape.dim), minval=-bound, maxval=bound)
+        return Prompts(tokens)
+
+    def prompts(self, params: Prompts) -> Float[Array, "prompt dim"]:
+        """Return the tokens."""
+        return params.tokens
