@@ -17,6 +17,7 @@ import crisalad_jax.nn.torch_layers
 import parity.cases.case
 import parity.cases.parts
 import parity.cases.run
+from crisalad_jax.nn import layers
 from crisalad_jax.nn.backbones import vit
 from crisalad_jax.nn.layers import Linear, at_least_float32
 from parity.cases import checks
@@ -282,7 +283,7 @@ def test_a_fault_of_bfloat16_shows_beside_float64_alone(
     fault: Callable[[Any], Any], quantities: set[str], monkeypatch: Patch
 ) -> None:
     assert not missed("MLP", "bfloat16")
-    replace(VIT, "linear", fault)(monkeypatch)
+    replace(layers, "linear", fault)(monkeypatch)
     assert missed("MLP", "bfloat16") == quantities
 
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend import core
 
+from crisalad_jax.nn.backbones.vit import run_blocks
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import TAPS
 from crisalad_jax.nn.model import attend_across_images, extract_tokens, parameter_shapes, self_mask
@@ -144,9 +145,17 @@ def _macs(equation: Any, name: str, scope: str) -> int:
 
 
 def adapter_macs(config: ModelConfig) -> int:
-    """Count one block's adapters' true multiply-accumulates per image, linears at every token."""
-    (macs,) = (cost.macs for cost in part_costs(config) if cost.part == "adapters")
-    return macs // config.backbone.depth
+    """Count the multiply-accumulates per image that the adapter adds to a block."""
+    backbone: Any = dataclasses.replace(config.backbone, depth=1)  # pyright: ignore
+    shape = 1, 1 + backbone.registers + config.patches, backbone.dim
+    tokens = jax.ShapeDtypeStruct(shape, jnp.float32)
+
+    def count(backbone: Any) -> int:
+        stacks = [jax.eval_shape(backbone.init, jax.random.key(0)).blocks]
+        run = functools.partial(run_blocks, grid=config.grid, config=backbone)
+        return count_macs(run, stacks, tokens).total()
+
+    return count(backbone) - count(dataclasses.replace(backbone, adapter="none"))
 
 
 def paper_adapter_macs(config: ModelConfig, macs: int) -> int:

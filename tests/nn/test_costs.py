@@ -63,6 +63,17 @@ def test_one_blocks_adapters_by_hand(kind: Any, macs: int, paper: int) -> None:
     assert paper_adapter_macs(config, macs) == paper
 
 
+def test_loras_and_prompts_cost_by_hand() -> None:
+    """LoRA of rank 8 at 257 tokens; ten prompts through the block's linears and its attention."""
+
+    def macs(name: str) -> int:
+        backbone = dataclasses.replace(PRESETS["b14"].backbone, adapter=name)
+        return adapter_macs(dataclasses.replace(PRESETS["b14"], backbone=backbone))
+
+    assert macs("lora") == 257 * 8 * (768 + 3 * 768 + 768 + 768)
+    assert macs("prompts") == 10 * 12 * 768**2 + 2 * 768 * (267**2 - 257**2)
+
+
 def test_parameters_of_the_public_backbone() -> None:
     """dinov2_vitb14's checkpoint holds 86,580,480 numbers, of them 768 of a mask token."""
     costs = {cost.part: cost.parameters for cost in part_costs(PRESETS["b14"])}

@@ -94,13 +94,14 @@ class AdapterCost(NamedTuple):
     """A row of Table 3."""
 
     adapter: str
-    paper_parameters: int
-    """Number of parameters as the paper counts them: docs/comparison.md."""
+    paper_parameters: int | None
+    """Number of parameters as the paper counts them: docs/comparison.md; None of adapters that it
+    does not have."""
     parameters: int
     """Number of parameters of one adapter here, with batch norms' running statistics."""
-    paper_macs: int
+    paper_macs: int | None
     macs: int
-    """Multiply-accumulates that an image really takes."""
+    """Multiply-accumulates that an image really takes more in a block."""
     time: Spread | None
     """Time over the depthwise adapter's, over the rounds; None where it was not measured."""
 
@@ -132,20 +133,20 @@ def adapter_calls() -> dict[str, Callable[[], Callable[[], Any]]]:
 
 
 def adapter_costs(seconds: Mapping[str, Sequence[float]]) -> list[AdapterCost]:
-    """Compute Table 3, of one adapter at the paper's size.
+    """Compute Table 3, of one adapter at the paper's size, with rows for all other adapters.
 
     Args:
         seconds: what `race` returns of `adapter_calls`; empty where they were not timed.
     """
     costs = []
-    for name, paper_parameters in _PAPER_PARAMETERS.items():
-        backbone = ViTConfig(adapter=name)
+    for name in (*_PAPER_PARAMETERS, *sorted({*ADAPTERS} - {"none", *_PAPER_PARAMETERS})):
+        backbone, paper_parameters = ViTConfig(adapter=name), _PAPER_PARAMETERS.get(name)
         model = dataclasses.replace(PRESETS["b14"], backbone=backbone)
         true_macs = adapter_macs(model)
-        macs = paper_adapter_macs(model, true_macs)
+        macs = None if paper_parameters is None else paper_adapter_macs(model, true_macs)
         if name == "mlp":  # the paper counts each weight twice here, and the biases
-            macs = 2 * macs + backbone.dim // 2 + backbone.dim
-        time = Spread.of(ratios(seconds, name, "depthwise")) if seconds else None
+            macs = 2 * (macs or 0) + backbone.dim // 2 + backbone.dim
+        time = Spread.of(ratios(seconds, name, "depthwise")) if name in seconds else None
         make = functools.partial(backbone.adapter.init, shape=backbone.block_shape)
         leaves = jax.tree.leaves(jax.eval_shape(make, jax.random.key(0)))
         parameters = sum(leaf.size for leaf in leaves)

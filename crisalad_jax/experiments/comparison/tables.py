@@ -148,10 +148,14 @@ def adapter_cells(cost: AdapterCost) -> dict[str, str]:
     printed = " (printed: 2,356,080)" if cost.adapter == "mlp" else ""
     return {
         "adapter": cost.adapter,
-        "parameters, paper": f"{cost.paper_parameters:,}{printed}",
+        "parameters, paper": NOTHING
+        if cost.paper_parameters is None
+        else f"{cost.paper_parameters:,}{printed}",
         "parameters here": f"{cost.parameters:,}",
-        "MACs, paper (M)": f"{cost.paper_macs / 1e6:.3f}",
-        "FLOPs, paper (M)": f"{2 * cost.paper_macs / 1e6:.3f}",
+        "MACs, paper (M)": NOTHING if cost.paper_macs is None else f"{cost.paper_macs / 1e6:.3f}",
+        "FLOPs, paper (M)": NOTHING
+        if cost.paper_macs is None
+        else f"{2 * cost.paper_macs / 1e6:.3f}",
         "true MACs (M)": f"{cost.macs / 1e6:.1f}",
         "time": NOTHING if cost.time is None else _ratios(cost.time),
     }
