@@ -50,7 +50,9 @@ from .nn.cross_image import register_cross_image as register_cross_image
 from .nn.model import Crisalad as Crisalad
 from .nn.model import Model as Model
 from .nn.model import attend_across_images as attend_across_images
+from .nn.model import attention_maps as attention_maps
 from .nn.model import cast_params as cast_params
+from .nn.model import cross_image_attention as cross_image_attention
 from .nn.model import describe as describe
 from .nn.model import extract_features as extract_features
 from .nn.model import extract_tokens as extract_tokens

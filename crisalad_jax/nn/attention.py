@@ -158,6 +158,27 @@ def first_token_attention(
     return jax.nn.softmax(scores, axis=-1)
 
 
+def attention_weights(
+    params: Attention,
+    x: Float[Array, "*batch token dim"],
+    heads: int,
+    *,
+    mask: Bool[Array, "token token"] | None = None,
+    rotation: Rotation | None = None,
+    update: LinearUpdate = no_update,
+) -> Float[Array, "*batch head token token"]:
+    """Compute how much of each token every token's `attention` takes, in float32 at least.
+
+    Rows sum to 1. `mask[i, j]` allows token i to attend to token j.
+    """
+    queries, keys = (split_heads(part_of_qkv(params, i, x, update), heads) for i in (0, 1))
+    if rotation is not None:
+        queries, keys = rotate(queries, rotation), rotate(keys, rotation)
+    queries = queries / math.sqrt(queries.shape[-1])
+    scores = _product("...ihd,...jhd->...hij", queries, keys, product_precision(x.dtype))
+    return jax.nn.softmax(scores, axis=-1, where=mask)
+
+
 def part_of_qkv(
     params: Attention,
     number: int,

@@ -17,10 +17,11 @@ from crisalad_jax.config.checks import Fraction, PositiveInt, require_field
 from crisalad_jax.config.part import Part, non_semantic_field
 from crisalad_jax.config.registry import Registry
 from crisalad_jax.nn import random_init
-from crisalad_jax.nn.attention import Attention, dot_product_attention
+from crisalad_jax.nn.attention import Attention, attention_weights, dot_product_attention
 from crisalad_jax.nn.layers import at_least_float32, dropout, gelu, linear, split_key
 from crisalad_jax.nn.torch_layers import EncoderLayer, encoder_layer, init_encoder_layer
 from crisalad_jax.utils.devices import IMAGE, image_mesh
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 Sequences = Float[Array, "image token dim"]
@@ -79,6 +80,21 @@ class CrossImage(Part, abc.ABC):
             mask: which images attend to which, every image to at least one; None is all to all.
             key: draws dropout; None means inference.
         """
+
+    def attention(
+        self, params: Any, tokens: Sequences, *, mask: Mask
+    ) -> Float[Array, "layer token head image image"]:
+        """Return how much of each image every image takes, for `cross_image_attention`.
+
+        Args:
+            params: of `init`.
+            tokens: as `apply` takes them.
+            mask: as `apply` takes it.
+
+        Raises:
+            InputError: it has no attention, as by default.
+        """
+        raise InputError(f"cross_image: found {self.part_name}, expected one that has attention")
 
 
 CROSS_IMAGE = Registry("cross_image", CrossImage)
@@ -147,6 +163,19 @@ class CrossImageConfig(CrossImage):
         """Attend from each token to the same token of all images."""
         return cross_image_encoder(params, tokens, self, mask=mask, key=key)
 
+    def attention(
+        self, params: Any, tokens: Sequences, *, mask: Mask
+    ) -> Float[Array, "layer token head image image"]:
+        """Return the weights of every layer's softmax."""
+        weights = []
+        for number, layer in enumerate(params.layers):
+            by_token = tokens.swapaxes(0, 1)
+            weights.append(attention_weights(layer.attn, by_token, self.heads, mask=mask))
+            one = CrossImageEncoder(params.layers[number : number + 1])
+            here = dataclasses.replace(self, layers=1)
+            tokens = cross_image_encoder(one, tokens, here, mask=mask, key=None)
+        return jnp.stack(weights)
+
 
 @pytree_dataclass
 class GatedEncoder:
@@ -177,6 +206,12 @@ class GatedCrossImageConfig(CrossImageConfig):
         attended = super().apply(params.encoder, tokens, mask=mask, key=key)
         before, after = at_least_float32(tokens), at_least_float32(attended)
         return (before + jnp.tanh(params.gate) * (after - before)).astype(tokens.dtype)
+
+    def attention(
+        self, params: GatedEncoder, tokens: Sequences, *, mask: Mask
+    ) -> Float[Array, "layer token head image image"]:
+        """Return the weights behind the gate."""
+        return super().attention(params.encoder, tokens, mask=mask)
 
 
 def cross_image_encoder(

@@ -470,6 +470,24 @@ def _extract_features(
 ) -> tuple[Features, Crisalad]:
     """Extract features; return parameters with updated statistics, as `Backbone.apply` does."""
     check_params(params, config)
+    images, params = _normalised(images, config), _widened(params, config)
+    request = config.aggregator.features(config.backbone.depth)
+    if with_insertion:
+        inserted = config.aggregator.inserted(params.aggregator)
+        request = dataclasses.replace(request, inserted=inserted)
+    with jax.named_scope("backbone"):
+        features, backbone = config.backbone.apply(
+            params.backbone,
+            images,
+            request,
+            remat=config.remat,
+            valid=valid,
+        )
+    return features, dataclasses.replace(params, backbone=backbone)
+
+
+def _normalised(images: Images, config: ModelConfig) -> Float[Array, "image height width 3"]:
+    """Check a batch of images, normalise bytes, and cast to the type to compute in."""
     images, are_bytes = jnp.asarray(images), images.dtype == jnp.uint8
     require(
         images.ndim == 4
@@ -482,20 +500,7 @@ def _extract_features(
     config.check_image_size((images.shape[1], images.shape[2]))
     if are_bytes:
         images = jax.vmap(functools.partial(normalise, how=config.preprocessing))(images)
-    params = _widened(params, config)
-    request = config.aggregator.features(config.backbone.depth)
-    if with_insertion:
-        inserted = config.aggregator.inserted(params.aggregator)
-        request = dataclasses.replace(request, inserted=inserted)
-    with jax.named_scope("backbone"):
-        features, backbone = config.backbone.apply(
-            params.backbone,
-            images.astype(config.compute_dtype),
-            request,
-            remat=config.remat,
-            valid=valid,
-        )
-    return features, dataclasses.replace(params, backbone=backbone)
+    return images.astype(config.compute_dtype)
 
 
 def _widened(params: Crisalad, config: ModelConfig) -> Crisalad:
@@ -569,13 +574,7 @@ def attend_across_images(
     )
     encoder = config.cross_image
     if encoder.attends:
-        if mask is not None:
-            require(
-                mask.shape == (count, count),
-                f"mask: found shape {mask.shape}, expected {(count, count)}, a row and a column "
-                "for each image",
-            )
-            mask = jnp.asarray(mask) | (self_mask(count) & ~mask.any(axis=1, keepdims=True))
+        mask = _checked_mask(mask, count)
         with jax.named_scope("cross_image"):
             sequence = as_sequence(tokens, global_token=encoder.global_token)
             sequence = sequence.astype(config.compute_dtype)
@@ -588,6 +587,114 @@ def attend_across_images(
         return descriptors
     with jax.named_scope("projection"):
         return project(params.projection, descriptors, config.projection)
+
+
+def _checked_mask(
+    mask: Bool[AnyArray, "image image"] | None, count: Any
+) -> Bool[Array, "image image"] | None:
+    """Return the mask of `describe`, in which an image that may attend to none attends to itself.
+
+    Raises:
+        InputError: it has another shape.
+    """
+    if mask is None:
+        return None
+    require(
+        mask.shape == (count, count),
+        f"mask: found shape {mask.shape}, expected {(count, count)}, a row and a column for each "
+        "image",
+    )
+    return jnp.asarray(mask) | (self_mask(count) & ~mask.any(axis=1, keepdims=True))
+
+
+@_of_images
+@functools.partial(compiler.jit, static_argnames=("config", "block"))
+def attention_maps(
+    params: Crisalad, images: Images, config: ModelConfig, *, block: int = -1
+) -> Float[Array, "image head token token"]:
+    """Compute the attention of a block of a vision transformer.
+
+    Entry (i, j) of a head's map is how much of token j the token i takes; rows sum to 1. Tokens are
+    the class token, the registers, then the patches in row order: `maps[:, :, 0, 1 + registers:]`
+    is what the class token takes of the patches.
+
+    Args:
+        params: see `describe`.
+        images: see `describe`.
+        config: see `describe`.
+        block: number of the block, from 0; negative numbers count from the last.
+
+    Returns:
+        The softmax of the scores, in float32 at least.
+
+    Raises:
+        InputError: the backbone has no such block or no attention, or adapters on a side path; or
+            as `describe`.
+
+    Example:
+        >>> import jax, numpy as np
+        >>> from crisalad_jax import PRESETS
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> attention_maps(params, np.zeros((1, 98, 98, 3), np.uint8), config, block=0).shape
+        (1, 4, 50, 50)
+    """
+    check_params(params, config)
+    backbone: Any = config.backbone
+    require(
+        backbone.exposes_cls_attention,
+        f"backbone: found {backbone.part_name}, expected one that has attention, such as vit",
+    )
+    require(
+        config.aggregator.features(backbone.depth).insertion is None,
+        f"aggregator: found {config.aggregator.part_name}, which inserts tokens, expected another",
+    )
+    require(
+        -backbone.depth <= block < backbone.depth,
+        f"block: found {block}, expected {-backbone.depth} to {backbone.depth - 1}",
+    )
+    pixels, number = _normalised(images, config), block % backbone.depth
+    return backbone.attention_maps(_widened(params, config).backbone, pixels, number)
+
+
+@_of_images
+@functools.partial(compiler.jit, static_argnames="config")
+def cross_image_attention(
+    params: Crisalad,
+    images: Images,
+    config: ModelConfig,
+    *,
+    mask: Bool[AnyArray, "image image"] | None = None,
+) -> Float[Array, "layer token head image image"]:
+    """Compute which images attend to which in the layers of the cross-image encoder.
+
+    Entry (i, j) is how much of image j's token the same token of image i takes; rows sum to 1. The
+    tokens are those of the global token, cut as the encoder takes it, then the clusters.
+
+    Args:
+        params: see `describe`.
+        images: see `describe`.
+        config: see `describe`.
+        mask: see `describe`.
+
+    Returns:
+        The softmax of the scores, in float32 at least.
+
+    Raises:
+        InputError: the model has no cross-image encoder with attention, or as `describe`.
+
+    Example:
+        >>> import jax, numpy as np
+        >>> from crisalad_jax import PRESETS
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> cross_image_attention(params, np.zeros((3, 98, 98, 3), np.uint8), config).shape
+        (2, 18, 4, 3, 3)
+    """
+    tokens, encoder = extract_tokens(params, images, config), config.cross_image
+    sequence = as_sequence(tokens, global_token=encoder.global_token).astype(config.compute_dtype)
+    mask = _checked_mask(mask, len(sequence))
+    return encoder.attention(_widened(params, config).cross_image, sequence, mask=mask)
 
 
 def describe_training_batch(

@@ -34,6 +34,7 @@ from crisalad_jax.nn.attention import (
     Attention,
     Rotation,
     attention,
+    attention_weights,
     first_token_attention,
     part_of_qkv,
 )
@@ -298,6 +299,24 @@ class VisionTransformer(Backbone):
             attended,
         )
         return features, params if valid is None else _statistics(params, measured)
+
+    def attention_maps(
+        self, params: ViT, images: Pixels, block: int
+    ) -> Float[Array, "image head token token"]:
+        """Compute the attention of a block; see `nn.model.attention_maps`."""
+        stack, grid = _one_stack(params), self.grid((images.shape[1], images.shape[2]))
+        request = FeatureSpec(class_attention=True)
+        _checked_levels(request, self)
+        tokens, _ = run_blocks([stack], embed(params, images, self), grid, self, count=block)
+        layer = _block_at([stack], block)
+        normed = layer_norm(layer.norm1, tokens, epsilon=self.norm_epsilon)
+        return attention_weights(
+            self.attention_of(layer),
+            normed,
+            self.heads,
+            rotation=self.rotation(grid),
+            update=_update_of(layer, self),
+        )
 
     @property
     def trains(self) -> tuple[str, ...]:
