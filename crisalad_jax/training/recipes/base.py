@@ -237,7 +237,7 @@ def with_part(config: TrainConfig, part: Any) -> TrainConfig:
 
     Another aggregator has no cross-image encoder: its descriptor depends on its own image alone. Of
     CriSALAD the backbone stays frozen, with the same adapters, so that methods differ only in what
-    they make of its features.
+    they make of its features. An adapter trains with the head, unless all trains.
 
     Raises:
         InputError: the part does not fit, or the recipe has no place for it.
