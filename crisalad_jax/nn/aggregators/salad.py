@@ -59,6 +59,8 @@ class Salad:
     """Logarithm of the entropic regularisation, where it is learnt."""
     step: Any = None
     """Learnt parameters of the transport's step."""
+    logit_tau: dict[str, Float[Array, ""]] | None = None
+    """Logits of `row_tau` and `column_tau`, where they are learnt."""
 
 
 _TINY = {"clusters": 16, "cluster_dim": 32, "token_dim": 64, "hidden": 128, "dropout": 0.0}
@@ -88,14 +90,19 @@ class SaladConfig(Aggregator):
     outside of logarithms."""
     column_tau: float = 1.0
     """The same as `row_tau` for the masses of the clusters and the dustbin."""
+    learn_tau: bool = False
+    """Whether `row_tau` and `column_tau`, where they are below 1, are learnt through a sigmoid."""
     sinkhorn: SinkhornConfig = SinkhornConfig()
     """Solver of the transport."""
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         resolve_names(self)
-        for name in ("row_tau", "column_tau"):
-            require_field(self, name, 0 < getattr(self, name) <= 1, "more than 0 and at most 1")
+        for name, tau in self._taus.items():
+            require_field(self, name, 0 < tau <= 1, "more than 0 and at most 1")
+        relaxed = min(self._taus.values()) < 1
+        expected = "a row_tau or column_tau below 1"
+        require_field(self, "learn_tau", relaxed or not self.learn_tau, expected)
 
     @property
     def scores(self) -> int:
@@ -134,7 +141,16 @@ class SaladConfig(Aggregator):
             dust_bin=self.dustbin.init(jax.random.fold_in(key, 3), dim),
             log_epsilon=jnp.log(jnp.full((), self.epsilon)) if self.learn_epsilon else None,
             step=self.sinkhorn.step.init_params(jax.random.fold_in(key, 4)),
+            logit_tau=self._logits() if self.learn_tau else None,
         )
+
+    @property
+    def _taus(self) -> dict[str, Any]:
+        return {"row_tau": self.row_tau, "column_tau": self.column_tau}
+
+    def _logits(self) -> dict[str, Array]:
+        below = {name: tau for name, tau in self._taus.items() if tau < 1}
+        return {name: jnp.full((), math.log(tau / (1 - tau))) for name, tau in below.items()}
 
     def dustbin_params(self, params: Any, features: Features) -> Any:
         """Return the dustbin's parameters, by default those that are learnt."""
@@ -154,8 +170,7 @@ class SaladConfig(Aggregator):
             self.dustbin,
             patches=at_least_float32(patches),
             epsilon=self.epsilon if learnt is None else jnp.exp(learnt),
-            row_tau=self.row_tau,
-            column_tau=self.column_tau,
+            **self._taus | jax.tree.map(jax.nn.sigmoid, params.logit_tau or {}),
             config=self.sinkhorn,
             step_params=params.step,
         )

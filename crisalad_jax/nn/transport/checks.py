@@ -26,12 +26,20 @@ def check_inputs(
     scores: Array,
     log_mu: Array,
     log_nu: Array,
-    epsilon: float | Array,
+    numbers: tuple[float | Array, float | Array | None, float | Array | None],
     init: Potentials | None,
     *,
     equal_totals: bool,
 ) -> None:
     """Check the shapes of a problem, and its values where they are known (outside of `jit`).
+
+    Args:
+        scores: see `solve`.
+        log_mu: see `solve`.
+        log_nu: see `solve`.
+        numbers: epsilon and both taus, each for all problems or one for each; a tau of None is 1.
+        init: see `solve`.
+        equal_totals: whether both sides' masses must sum to the same.
 
     Raises:
         InputError: naming the argument, what was found and what was expected.
@@ -44,7 +52,9 @@ def check_inputs(
     )
     require(not jnp.iscomplexobj(scores), "sinkhorn: found complex scores, expected real ones")
     starts = {"init.row": (init[0], rows), "init.column": (init[1], columns)} if init else {}
-    vectors = {"log_mu": (log_mu, rows), "log_nu": (log_nu, columns), "epsilon": (epsilon, ())}
+    named = dict(zip(("epsilon", "row_tau", "column_tau"), numbers, strict=True))
+    vectors = {"log_mu": (log_mu, rows), "log_nu": (log_nu, columns)}
+    vectors |= {name: (x, shape[:-2]) for name, x in named.items() if x is not None and jnp.ndim(x)}
     for name, (vector, target) in {**vectors, **starts}.items():
         require(
             _spreads(jnp.shape(vector), target),
@@ -59,12 +69,21 @@ def check_inputs(
         words = "found with NaN, infinity or no mass at all, expected finite numbers, or -inf for a"
         _check(f"{name} {words} mass of 0", _are_masses, masses)
     least = float(jnp.finfo(wide).tiny)  # a processor may take less for 0
-    _check(f"epsilon found {epsilon}, expected at least {least:.1e}", lambda x: x >= least, epsilon)
+    epsilon, *taus = numbers
+    shown = " ".join(str(epsilon).split())
+    _check(f"epsilon found {shown}, expected at least {least:.1e}", lambda x: x >= least, epsilon)
     _check(
-        f"epsilon found {epsilon}, by which scores overflow, expected numbers that {wide} can hold",
-        lambda scores, epsilon: jnp.isfinite(scores.astype(wide) / epsilon),
+        f"epsilon found {shown}, by which scores overflow, expected numbers that {wide} can hold",
+        lambda scores, epsilon: jnp.isfinite(
+            scores.astype(wide) / per_problem(jnp.asarray(epsilon), 2)
+        ),
         *(scores, epsilon),
     )
+    for name, tau in zip(("row_tau", "column_tau"), taus, strict=True):
+        if tau is not None:
+            shown = " ".join(str(tau).split())
+            words = f"{name} found {shown}, expected more than 0 and at most 1"
+            _check(words, lambda x: (x > 0) & (x <= 1), tau)
     if equal_totals and not isinstance(log_mu, Tracer) and not isinstance(log_nu, Tracer):
         mu, nu = (np.exp(np.asarray(x, np.float64)).sum(axis=-1) for x in (log_mu, log_nu))
         mu, nu = np.broadcast_arrays(mu, nu)
@@ -75,6 +94,11 @@ def check_inputs(
                 f"sinkhorn: masses exp(log_mu) and exp(log_nu) found to sum to {sums}, expected "
                 "the same"
             )
+
+
+def per_problem(numbers: Array, axes: int) -> Array:
+    """Append axes to numbers of which there is one for each problem; one for all stays as it is."""
+    return jnp.expand_dims(numbers, tuple(range(-axes, 0))) if numbers.ndim else numbers
 
 
 def _check(words: str, test: Callable[..., Array], *values: Any) -> None:

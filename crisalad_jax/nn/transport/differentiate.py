@@ -110,10 +110,15 @@ def _at_solution_jvp(primals: Any, tangents: Any) -> tuple[Potentials, Potential
 
     def row_change(column: Array) -> Array:
         moved = (shares * change.kernel).sum(axis=-1) + product("...nk,...k->...n", shares, column)
-        return problem.row_tau * (change.log_mu - moved)
+        changed = problem.row_tau * (change.log_mu - moved)
+        if problem.taus[0] is not None:
+            changed += change.taus[0] * potentials.row / problem.row_tau
+        return changed
 
     still = row_change(jnp.zeros_like(potentials.column))
     target = masses * change.log_nu - (plan * (change.kernel + still[..., None])).sum(axis=-2)
+    if problem.taus[1] is not None:
+        target += masses * potentials.column * change.taus[1] / problem.column_tau**2
     if problem.balanced:
         # Where only the masses' totals change, rows are met and columns follow, as in iterations.
         total = target.sum(axis=-1, keepdims=True) / masses.sum(axis=-1, keepdims=True)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.utils.pytree import pytree_dataclass, static_field
+from crisalad_jax.utils.pytree import pytree_dataclass
 
 SCALING_RANGE = 60
 """Largest difference of two scores of a row, over epsilon, that the scaling domain is exact for.
@@ -52,9 +52,9 @@ class Problem:
         last: the last column.
         log_mu: logarithms of the rows' masses; `EMPTY` for a mass of 0.
         log_nu: the same of the columns' masses.
-        row_tau: 1 where rows meet their marginals exactly; below 1 a Kullback-Leibler penalty of
-            weight epsilon * tau / (1 - tau) draws them there (Chizat et al., Math. Comp. 2018).
-        column_tau: the same for columns.
+        taus: of the rows and of the columns. None where they meet their marginals exactly; else an
+            array of shape (*batch, 1), below 1, by which a Kullback-Leibler penalty of weight
+            epsilon * tau / (1 - tau) draws them there (Chizat et al., Math. Comp. 2018).
 
     Example:
         >>> problem = Problem.of(jnp.eye(2), jnp.zeros(2), jnp.zeros(2))
@@ -66,8 +66,7 @@ class Problem:
     last: Rows
     log_mu: Rows
     log_nu: Float[Array, "*batch clusters+1"]
-    row_tau: float = static_field(default=1.0)
-    column_tau: float = static_field(default=1.0)
+    taus: tuple[Array | None, Array | None] = (None, None)
 
     @classmethod
     def of(
@@ -75,17 +74,35 @@ class Problem:
         kernel: Matrix,
         log_mu: Rows,
         log_nu: Columns,
-        row_tau: float = 1.0,
-        column_tau: float = 1.0,
+        row_tau: float | Array = 1.0,
+        column_tau: float | Array = 1.0,
     ) -> "Problem":
         """Make a problem of the scores over epsilon and the logarithms of the masses.
 
-        A mass of 0 has the logarithm -inf, or any below -1e5.
+        A mass of 0 has the logarithm -inf, or any below -1e5. A tau that is an array is that of
+        another problem, or has one number.
         """
+        one = (*kernel.shape[:-2], 1)
+        row_tau, column_tau = (
+            None
+            if isinstance(tau, float) and tau == 1
+            else jnp.broadcast_to(jnp.asarray(tau, kernel.dtype), one)
+            for tau in (row_tau, column_tau)
+        )
         log_mu, log_nu = (jnp.where(x < LOG_ZERO, EMPTY, x) for x in (log_mu, log_nu))
         # Split, not two slices: their gradients would be two zero-padded matrices to add up.
         clusters, last = jax.lax.split(kernel, (kernel.shape[-1] - 1, 1), axis=kernel.ndim - 1)
-        return Problem(clusters, last[..., 0], log_mu, log_nu, row_tau, column_tau)
+        return Problem(clusters, last[..., 0], log_mu, log_nu, (row_tau, column_tau))
+
+    @property
+    def row_tau(self) -> float | Array:
+        """Factor of the rows' half step: 1.0, or an array of shape (*batch, 1)."""
+        return 1.0 if self.taus[0] is None else self.taus[0]
+
+    @property
+    def column_tau(self) -> float | Array:
+        """The same of the columns."""
+        return 1.0 if self.taus[1] is None else self.taus[1]
 
     @property
     def kernel(self) -> Matrix:
@@ -95,7 +112,7 @@ class Problem:
     @property
     def balanced(self) -> bool:
         """Whether both sides meet their marginals exactly at convergence."""
-        return self.row_tau == self.column_tau == 1
+        return all(tau is None for tau in self.taus)
 
     @property
     def empty(self) -> tuple[Bool[Array, "*batch rows"], Bool[Array, "*batch columns"]]:

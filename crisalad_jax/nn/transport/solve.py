@@ -10,7 +10,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.nn.transport.checks import check_inputs, check_step, equal_totals, wide_dtype
+from crisalad_jax.nn.transport.checks import (
+    check_inputs,
+    check_step,
+    equal_totals,
+    per_problem,
+    wide_dtype,
+)
 from crisalad_jax.nn.transport.config import SinkhornConfig, Solution
 from crisalad_jax.nn.transport.differentiate import centred
 from crisalad_jax.nn.transport.dustbin import DUSTBINS, Dustbin, Marginals
@@ -53,9 +59,9 @@ def solve(
     log_mu: Float[Array, "*#batch rows"],
     log_nu: Float[Array, "*#batch columns"],
     *,
-    epsilon: float | Float[Array, ""] = 1.0,
-    row_tau: float = 1.0,
-    column_tau: float = 1.0,
+    epsilon: float | Float[Array, "*#batch"] = 1.0,
+    row_tau: float | Float[Array, "*#batch"] = 1.0,
+    column_tau: float | Float[Array, "*#batch"] = 1.0,
     config: SinkhornConfig = SinkhornConfig(),
     init: Potentials | None = None,
     step_params: Any = None,
@@ -82,10 +88,12 @@ def solve(
         log_nu: logarithms of the columns' masses; where the step is `entropic` and neither
             tau below 1 they sum to the same. Totals of half-precision masses may differ by their
             rounding: the columns take the rows' total.
-        epsilon: entropic regularisation, above 0. It may be traced or learnt.
+        epsilon: entropic regularisation, above 0: one for all problems of the batch, or one for
+            each. It may be traced or learnt.
         row_tau: 1 for rows that meet their marginals; below 1 a Kullback-Leibler penalty of
-            epsilon * row_tau / (1 - row_tau) draws them there. Static.
-        column_tau: the same for columns. Static.
+            epsilon * row_tau / (1 - row_tau) draws them there. An array, of one number or one for
+            each problem, may be traced or learnt, and must stay below 1.
+        column_tau: the same for columns.
         config: step, stopping and gradient. Static.
         init: potentials to start from, such as an earlier result's; by default zeros. Those of
             rows and columns of mass 0 are not used.
@@ -111,12 +119,13 @@ def solve(
         [0.5, 0.5]
     """
     scores, log_mu, log_nu = jnp.asarray(scores), jnp.asarray(log_mu), jnp.asarray(log_nu)
-    for name, tau in (("row_tau", row_tau), ("column_tau", column_tau)):
-        require(0 < tau <= 1, f"sinkhorn: {name} found {tau}, expected more than 0 and at most 1")
+    taus = tuple(
+        None if isinstance(tau, (int, float)) and tau == 1 else tau for tau in (row_tau, column_tau)
+    )
     # Totals may differ for a step of another problem, such as one with column capacities.
-    equal = row_tau == column_tau == 1 and config.step.entropic
-    check_inputs(scores, log_mu, log_nu, epsilon, init, equal_totals=equal)
-    arguments = scores, log_mu, log_nu, epsilon, init, step_params, row_tau, column_tau, config
+    equal = _balanced(taus) and config.step.entropic
+    check_inputs(scores, log_mu, log_nu, (epsilon, *taus), init, equal_totals=equal)
+    arguments = scores, log_mu, log_nu, epsilon, init, step_params, taus, config
     # A solver need not be hashable, so it cannot be a static argument.
     result = _compiled(*arguments) if solver is None else _solve(*arguments, solver)
     if not config.throw:
@@ -133,6 +142,10 @@ def solve(
     return result
 
 
+def _balanced(taus: tuple[Any, Any]) -> bool:
+    return all(tau is None for tau in taus)
+
+
 def _solve(
     scores: Array,
     log_mu: Array,
@@ -140,20 +153,20 @@ def _solve(
     epsilon: float | Array,
     init: Potentials | None,
     step_params: Any,
-    row_tau: float,
-    column_tau: float,
+    taus: tuple[Array | None, Array | None],
     config: SinkhornConfig,
     solver: Any = None,
 ) -> SinkhornResult:
     step, wide = config.step, wide_dtype(scores)
-    kernel = scores.astype(wide) / jnp.asarray(epsilon, wide)
+    kernel = scores.astype(wide) / per_problem(jnp.asarray(epsilon, wide), 2)
     zeros = zero_potentials(kernel)
-    meets_both = row_tau == column_tau == 1 and step.entropic
+    meets_both = _balanced(taus) and step.entropic
     if meets_both:
         log_mu, log_nu = equal_totals(log_mu, log_nu, wide)
     # Broadcast by the kernel, they vary over devices as it does.
     log_mu, log_nu = log_mu.astype(wide) + zeros.row, log_nu.astype(wide) + zeros.column
-    problem = Problem.of(kernel, log_mu, log_nu, row_tau, column_tau)
+    relaxed = (1.0 if x is None else per_problem(jnp.asarray(x, wide), 1) for x in taus)
+    problem = Problem.of(kernel, log_mu, log_nu, *relaxed)
     check_step(config, problem, step_params)
     problem = step.prepare(problem, step_params)
     start = problem.zeros()
@@ -178,7 +191,7 @@ def _solve(
     return SinkhornResult(log_plan, potentials, *errors, solution.iterations, converged, finite)
 
 
-_compiled = jax.jit(_solve, static_argnames=("row_tau", "column_tau", "config"))
+_compiled = jax.jit(_solve, static_argnames="config")
 
 
 def assign_with_dustbin(

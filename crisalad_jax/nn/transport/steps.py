@@ -136,14 +136,14 @@ class SinkhornStep(Step):
         row = problem.row_tau * (problem.log_mu - problem.lse_columns(column))
         return Potentials(self._further(potentials.row, row, problem.row_tau), column), state
 
-    def _further(self, old: Array, new: Array, tau: float) -> Array:
+    def _further(self, old: Array, new: Array, tau: float | Array) -> Array:
         if self.relaxation == 1:
             return new
         change = new - old
         beyond = (self.relaxation - 1) * change
         # The dual's gain by this entry, divided by its mass at `new`.
         gain = jnp.exp(-change) - jnp.exp(beyond)
-        if tau == 1:
+        if isinstance(tau, float):  # 1: no penalty
             gain += self.relaxation * change
         else:
             penalty = tau / (1 - tau)
@@ -224,7 +224,7 @@ class NewtonStep(Step):
 def _newton_change(problem: Problem, plan: Array, shares: Array, log_masses: Array) -> Array:
     """Compute Newton's change of the columns' potentials."""
     gradient = jnp.exp(problem.log_nu) - jnp.exp(log_masses)
-    newton = solve_columns(plan, shares, gradient, 1.0, 1.0)
+    newton = solve_columns(plan, shares, gradient)
     # A constant changes no plan. The median's, for a few columns may have very far to go.
     return newton - jnp.median(newton, axis=-1, keepdims=True)
 
@@ -338,7 +338,11 @@ def _marginal_error(problem: Problem, potentials: Potentials) -> Float[Array, "*
 
 
 def solve_columns(
-    plan: Matrix, shares: Matrix, target: Columns, row_tau: float, column_tau: float
+    plan: Matrix,
+    shares: Matrix,
+    target: Columns,
+    row_tau: float | Array = 1.0,
+    column_tau: float | Array = 1.0,
 ) -> Columns:
     """Solve the columns' part of the linearised optimality conditions.
 
@@ -350,17 +354,18 @@ def solve_columns(
         plan: masses.
         shares: each row's masses divided by their sum.
         target: the right-hand side.
-        row_tau: see `Problem`.
-        column_tau: see `Problem`.
+        row_tau: that of a `Problem`.
+        column_tau: that of a `Problem`.
     """
     # The floor handles columns so far from all rows that their masses are 0.
     masses = jnp.maximum(plan.sum(axis=-2), jnp.finfo(plan.dtype).tiny ** 0.5)
     identity = jnp.eye(masses.shape[-1], dtype=plan.dtype)
-    weights = row_tau * product("...nk,...nl->...kl", shares, plan) * (1 - identity)
+    weights = product("...nk,...nl->...kl", shares, plan) * (1 - identity)
+    weights = weights if isinstance(row_tau, float) else row_tau[..., None] * weights
     # The epsilons prevent a division by zero for clusters that share no row.
     slack = 1 / column_tau - row_tau + 8 * jnp.finfo(plan.dtype).eps
     diagonal = weights.sum(axis=-1) + masses * slack
-    if row_tau == column_tau == 1:
+    if isinstance(row_tau, float) and isinstance(column_tau, float):
         heaviest = jnp.arange(masses.shape[-1]) == masses.argmax(axis=-1, keepdims=True)
         diagonal += jnp.where(heaviest, masses, 0)
     factor = jax.scipy.linalg.cho_factor(diagonal[..., None] * identity - weights)
