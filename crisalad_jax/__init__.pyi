@@ -78,6 +78,7 @@ from .retrieval.serve import serve_map as serve_map
 from .sinkhorn import SinkhornConfig as SinkhornConfig
 from .sinkhorn import register_dustbin as register_dustbin
 from .sinkhorn import register_gradient as register_gradient
+from .sinkhorn import register_start as register_start
 from .sinkhorn import register_step as register_step
 from .training.callbacks import Callback as Callback
 from .training.callbacks import StopTraining as StopTraining

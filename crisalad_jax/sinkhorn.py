@@ -48,6 +48,12 @@ from crisalad_jax.nn.transport.solve import assign_with_dustbin as assign_with_d
 from crisalad_jax.nn.transport.solve import solve as solve
 from crisalad_jax.nn.transport.sparse import QuadraticStep as QuadraticStep
 from crisalad_jax.nn.transport.sparse import TopKStep as TopKStep
+from crisalad_jax.nn.transport.start import STARTS as STARTS
+from crisalad_jax.nn.transport.start import GaussianStart as GaussianStart
+from crisalad_jax.nn.transport.start import NetworkStart as NetworkStart
+from crisalad_jax.nn.transport.start import Start as Start
+from crisalad_jax.nn.transport.start import ZeroStart as ZeroStart
+from crisalad_jax.nn.transport.start import from_columns as from_columns
 from crisalad_jax.nn.transport.steps import STEPS as STEPS
 from crisalad_jax.nn.transport.steps import DualSoftmaxStep as DualSoftmaxStep
 from crisalad_jax.nn.transport.steps import NewtonStep as NewtonStep
@@ -58,3 +64,4 @@ from crisalad_jax.nn.transport.steps import Step as Step
 register_step = STEPS.register
 register_dustbin = DUSTBINS.register
 register_gradient = GRADIENTS.register
+register_start = STARTS.register

@@ -59,6 +59,8 @@ class Salad:
     """Logarithm of the entropic regularisation, where it is learnt."""
     step: Any = None
     """Learnt parameters of the transport's step."""
+    start: Any = None
+    """Learnt parameters of the transport's start."""
     logit_tau: dict[str, Float[Array, ""]] | None = None
     """Logits of `row_tau` and `column_tau`, where they are learnt."""
 
@@ -141,6 +143,7 @@ class SaladConfig(Aggregator):
             dust_bin=self.dustbin.init(jax.random.fold_in(key, 3), dim),
             log_epsilon=jnp.log(jnp.full((), self.epsilon)) if self.learn_epsilon else None,
             step=self.sinkhorn.step.init_params(jax.random.fold_in(key, 4)),
+            start=self.sinkhorn.start.init_params(jax.random.fold_in(key, 5)),
             logit_tau=self._logits() if self.learn_tau else None,
         )
 
@@ -173,6 +176,7 @@ class SaladConfig(Aggregator):
             **self._taus | jax.tree.map(jax.nn.sigmoid, params.logit_tau or {}),
             config=self.sinkhorn,
             step_params=params.step,
+            start_params=params.start,
         )
 
     def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:

@@ -136,6 +136,24 @@ def equal_totals(log_mu: Array, log_nu: Array, wide: jnp.dtype) -> tuple[Array, 
     return log_mu, log_nu + jnp.where(jnp.abs(more) <= allowed, more, 0)
 
 
+def check_start(config: SinkhornConfig, problem: Problem, params: Any) -> None:
+    """Check that a start returns potentials of the problem's shapes.
+
+    Raises:
+        InputError: it does not, or its parameters are missing; the message names the start.
+    """
+    start, name = config.start, f"start {config.start.part_name}"
+    _check_params(name, start, params, "start_params")
+    found = jax.eval_shape(start.potentials, problem, params)
+    expect_like(name, found, jax.eval_shape(problem.zeros))
+
+
+def _check_params(name: str, part: Any, params: Any, argument: str) -> None:
+    if params is None:
+        learnt = jax.eval_shape(part.init_params, jax.random.key(0))
+        require(learnt is None, f"{name}: found no {argument}, expected those of its init_params")
+
+
 def check_step(config: SinkhornConfig, problem: Problem, params: Any) -> None:
     """Check that a step returns potentials of the problem's shapes and keeps its state's shapes.
 
@@ -143,9 +161,7 @@ def check_step(config: SinkhornConfig, problem: Problem, params: Any) -> None:
         InputError: it does not, or its parameters are missing; the message names the step.
     """
     step, name = config.step, f"step {config.step.part_name}"
-    if params is None:
-        learnt = jax.eval_shape(step.init_params, jax.random.key(0))
-        require(learnt is None, f"{name}: found no step_params, expected those of its init_params")
+    _check_params(name, step, params, "step_params")
 
     def run_once(problem: Problem, params: Any) -> tuple[Any, Any]:
         prepared = step.prepare(problem, params)

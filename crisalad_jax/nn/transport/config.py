@@ -10,6 +10,7 @@ from crisalad_jax.config.part import OrName, Part
 from crisalad_jax.config.registry import Registry, part_field, resolve_names
 from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.nn.transport.problem import Potentials, Problem
+from crisalad_jax.nn.transport.start import STARTS, Start
 from crisalad_jax.nn.transport.steps import STEPS, Step
 
 
@@ -74,6 +75,8 @@ class SinkhornConfig:
     """Gradient of the potentials: unrolled (through the iterations), implicit (closed form of the
     optimality conditions), optimistix (fixed point and adjoint of that library), or stop
     (potentials are constants)."""
+    start: OrName[Start] = part_field(STARTS, "zeros")
+    """Potentials to start from, where no `init` is given; a registered start, or its name."""
 
     def __post_init__(self) -> None:
         """Check the ranges, and that the parts go together."""

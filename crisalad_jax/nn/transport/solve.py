@@ -12,6 +12,7 @@ from crisalad_jax.config.checks import require
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.nn.transport.checks import (
     check_inputs,
+    check_start,
     check_step,
     equal_totals,
     per_problem,
@@ -65,6 +66,7 @@ def solve(
     config: SinkhornConfig = SinkhornConfig(),
     init: Potentials | None = None,
     step_params: Any = None,
+    start_params: Any = None,
     solver: Any = None,
 ) -> SinkhornResult:
     """Solve the entropic transport problem.
@@ -95,9 +97,11 @@ def solve(
             each problem, may be traced or learnt, and must stay below 1.
         column_tau: the same for columns.
         config: step, stopping and gradient. Static.
-        init: potentials to start from, such as an earlier result's; by default zeros. Those of
+        init: potentials to start from, such as an earlier result's; by default those
+            of `config.start`. Those of
             rows and columns of mass 0 are not used.
         step_params: learnt parameters of the step (`Step.init_params`).
+        start_params: learnt parameters of the start (`Start.init_params`).
         solver: an optimistix solver, where the gradient is "optimistix".
 
     Returns:
@@ -125,7 +129,7 @@ def solve(
     # Totals may differ for a step of another problem, such as one with column capacities.
     equal = _balanced(taus) and config.step.entropic
     check_inputs(scores, log_mu, log_nu, (epsilon, *taus), init, equal_totals=equal)
-    arguments = scores, log_mu, log_nu, epsilon, init, step_params, taus, config
+    arguments = scores, log_mu, log_nu, epsilon, init, step_params, start_params, taus, config
     # A solver need not be hashable, so it cannot be a static argument.
     result = _compiled(*arguments) if solver is None else _solve(*arguments, solver)
     if not config.throw:
@@ -153,6 +157,7 @@ def _solve(
     epsilon: float | Array,
     init: Potentials | None,
     step_params: Any,
+    start_params: Any,
     taus: tuple[Array | None, Array | None],
     config: SinkhornConfig,
     solver: Any = None,
@@ -169,8 +174,10 @@ def _solve(
     problem = Problem.of(kernel, log_mu, log_nu, *relaxed)
     check_step(config, problem, step_params)
     problem = step.prepare(problem, step_params)
-    start = problem.zeros()
-    if init is not None:
+    if init is None:
+        check_start(config, problem, start_params)
+        start = config.start.potentials(problem, start_params)
+    else:
         start = jax.tree.map(lambda x, zero: jnp.asarray(x, wide) + zero, Potentials(*init), zeros)
     options = {} if solver is None else {"solver": solver}
     solution = config.gradient.solve(problem, config, step_params, start, **options)

@@ -228,7 +228,7 @@ def find_part(
 
 _KINDS = (
     *("aggregator", "adapter", "cross_image", "step", "dustbin", "loss", "backbone"),
-    *("augmentation", "gradient", "optimiser", "schedule"),
+    *("augmentation", "gradient", "start", "optimiser", "schedule"),
 )
 
 
@@ -272,7 +272,7 @@ def with_part(config: TrainConfig, part: Any) -> TrainConfig:
         return dataclasses.replace(config, model=dataclasses.replace(model, cross_image=part))
     if kind == "aggregator":
         return dataclasses.replace(config, model=with_head(model, part), validation_size=None)
-    # Steps and gradients are settings of the solver, and a dustbin of the aggregator itself.
+    # A dustbin is a setting of the aggregator, and the transport's other parts of the solver.
     field = "dustbin" if kind == "dustbin" else "sinkhorn"
     require(
         hasattr(model.aggregator, field),

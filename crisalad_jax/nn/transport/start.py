@@ -1,0 +1,149 @@
+"""Where a solver starts: at zeros, at a Gaussian guess, or where a small network says."""
+
+import abc
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PRNGKeyArray
+
+from crisalad_jax.config.checks import PositiveInt
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import Registry
+from crisalad_jax.nn.transport.problem import Columns, Potentials, Problem, product
+
+
+@dataclasses.dataclass(frozen=True)
+class Start(Part, abc.ABC):
+    """Base class of starts: the potentials from which the iterations of any step begin.
+
+    Example:
+        >>> from crisalad_jax.sinkhorn import SinkhornConfig, register_start, solve
+        >>> @register_start("softmax-rows")
+        ... @dataclasses.dataclass(frozen=True)
+        ... class SoftmaxRows(Start):
+        ...     def potentials(self, problem, params):
+        ...         return from_columns(problem, problem.zeros().column)
+        >>> config = SinkhornConfig(start="softmax-rows", iterations=1)
+        >>> float(solve(jnp.eye(2), jnp.zeros(2), jnp.zeros(2), config=config).column_error)
+        0.0
+    """
+
+    def init_params(self, key: PRNGKeyArray) -> Any:
+        """Return the start's initial parameters, a pytree of arrays; by default None."""
+        return None
+
+    @abc.abstractmethod
+    def potentials(self, problem: Problem, params: Any) -> Potentials:
+        """Return the potentials of rows and columns to start from.
+
+        Steps update the columns first, from the rows: give rows that fit the columns
+        (`from_columns`). The gradient "unrolled" goes through the start; that of a converged
+        solution does not depend on it.
+        """
+
+
+STARTS = Registry("start", Start)
+
+
+def from_columns(problem: Problem, column: Columns) -> Potentials:
+    """Return the potentials of these columns and of the rows that meet their marginals."""
+    _, column = problem.masked(Potentials(problem.log_mu, column))
+    return Potentials(problem.row_tau * (problem.log_mu - problem.lse_columns(column)), column)
+
+
+@STARTS.register("zeros")
+@dataclasses.dataclass(frozen=True)
+class ZeroStart(Start):
+    """Start at zeros, as published."""
+
+    def potentials(self, problem: Problem, params: Any) -> Potentials:
+        """Return zeros."""
+        return problem.zeros()
+
+
+@STARTS.register("gaussian")
+@dataclasses.dataclass(frozen=True)
+class GaussianStart(Start):
+    """Start at the potentials of two Gaussians, in closed form from the scores' spectrum.
+
+    A matrix of scores is, but for means of its rows and columns, one of inner products <x_n, y_k>,
+    by its singular vectors. Were x and y Gaussian, the entropic plan would be one too, and its
+    potentials quadratic (Janati et al., NeurIPS 2020; Thornton and Cuturi, AISTATS 2023, start
+    from them). With masses that sum to 1 and G the columns' weighted second moments of the scores,
+    the columns' potential is log nu - mean - (sqrt(1 + 4 G) - 1)_kk / (4 nu_k): for small scores
+    half a variance. It costs a product of the scores with themselves and an eigendecomposition.
+    """
+
+    def potentials(self, problem: Problem, params: Any) -> Potentials:
+        """Return the guess for the columns, and the rows that fit it."""
+        kernel = problem.kernel
+        rows, columns = (jax.nn.softmax(x, axis=-1) for x in (problem.log_mu, problem.log_nu))
+        mean = product("...n,...nk->...k", rows, kernel)
+        off = kernel - mean[..., None, :]
+        off = off - product("...k,...nk->...n", columns, off)[..., None]
+        moments = product("...n,...nk,...nl->...kl", rows, off, off)
+        some = jnp.sqrt(jnp.maximum(columns, jnp.finfo(columns.dtype).tiny))
+        moments = moments * some[..., None] * some[..., None, :]
+        bend = jnp.diagonal(_root(moments), axis1=-2, axis2=-1) - 1
+        # A column of little mass is far from Gaussian: no further than it would be by itself.
+        guess = problem.log_nu - mean - bend / (4 * some**2)
+        return from_columns(problem, guess)
+
+
+@jax.custom_jvp
+def _root(moments: Array) -> Array:
+    """Return the square root of 1 + 4 times a positive semidefinite matrix."""
+    values, vectors = jnp.linalg.eigh(moments)
+    roots = jnp.sqrt(1 + 4 * jnp.maximum(values, 0))
+    return product("...ij,...j,...kj->...ik", vectors, roots, vectors)
+
+
+@_root.defjvp
+def _root_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    """Solve X dX + dX X = 4 dG, which equal eigenvalues do not harm: roots are at least 1."""
+    (moments,), (change,) = primals, tangents
+    values, vectors = jnp.linalg.eigh(moments)
+    roots = jnp.sqrt(1 + 4 * jnp.maximum(values, 0))
+    inner = 4 * product("...ji,...jk,...kl->...il", vectors, change, vectors)
+    inner = inner / (roots[..., None] + roots[..., None, :])
+    return _root(moments), product("...ij,...jk,...lk->...il", vectors, inner, vectors)
+
+
+@STARTS.register("network")
+@dataclasses.dataclass(frozen=True)
+class NetworkStart(Start):
+    """Start at Sinkhorn's first columns, moved by a small network of each column's statistics.
+
+    Learnt starts are those of Amos et al. (Meta optimal transport, ICML 2023). Of every column the
+    network gets the first potential, and mean, deviation and maximum of its scores; it moves no
+    column at first. Its gradient is that of "unrolled": with others it does not learn.
+    """
+
+    hidden: PositiveInt = 16
+    """Width of the hidden layer."""
+
+    def init_params(self, key: PRNGKeyArray) -> dict[str, Array]:
+        """Draw the hidden layer; the output layer starts at 0."""
+        return {
+            "hidden": jax.random.normal(key, (4, self.hidden)) / 2,
+            "bias": jnp.zeros(self.hidden),
+            "out": jnp.zeros(self.hidden),
+        }
+
+    def potentials(self, problem: Problem, params: dict[str, Array]) -> Potentials:
+        """Return the moved columns, and the rows that fit them."""
+        kernel, (row, _) = problem.kernel, problem.zeros()
+        first = problem.column_tau * (problem.log_nu - problem.lse_rows(row))
+        rows = jax.nn.softmax(problem.log_mu, axis=-1)
+        mean = product("...n,...nk->...k", rows, kernel)
+        variance = product("...n,...nk->...k", rows, (kernel - mean[..., None, :]) ** 2)
+        # The floor: a constant column has a deviation without a gradient.
+        deviation = jnp.sqrt(variance + jnp.finfo(kernel.dtype).eps)
+        inputs = jnp.stack([first, mean, deviation, kernel.max(axis=-2)], axis=-1)
+        _, empty = problem.empty
+        hidden = jnp.tanh(
+            jnp.where(empty[..., None], 0, inputs) @ params["hidden"] + params["bias"]
+        )
+        return from_columns(problem, first + hidden @ params["out"])
