@@ -25,6 +25,7 @@ from crisalad_jax.nn.transport.differentiate import Implicit as Implicit
 from crisalad_jax.nn.transport.differentiate import Optimistix as Optimistix
 from crisalad_jax.nn.transport.differentiate import Stop as Stop
 from crisalad_jax.nn.transport.differentiate import Unrolled as Unrolled
+from crisalad_jax.nn.transport.divergence import sinkhorn_divergence as sinkhorn_divergence
 from crisalad_jax.nn.transport.dustbin import DUSTBINS as DUSTBINS
 from crisalad_jax.nn.transport.dustbin import ColumnDustbin as ColumnDustbin
 from crisalad_jax.nn.transport.dustbin import Dustbin as Dustbin
