@@ -3,7 +3,7 @@
 The problem is that of Cuturi (NeurIPS 2013), in the form that SALAD (Izquierdo and Civera, CVPR
 2024) took from SuperGlue (Sarlin et al., CVPR 2020). Arrays are laid out (..., N, K): N rows
 (patches), K columns (clusters, and the dustbin last), which runs faster than the published (K, N).
-`docs/sinkhorn.md` has the equations, the variants and how they compare.
+`docs/sinkhorn.md` says which variant is for what, and has the equations.
 
 A step, a dustbin or a gradient of your own is registered as the built-in ones are:
 

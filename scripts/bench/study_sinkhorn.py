@@ -1,6 +1,6 @@
 """What the transport's iterations do and leave undone, on random scores: tables and plots.
 
-    python scripts/bench/study_sinkhorn.py [--out DIR] [--page docs/sinkhorn.md] [STUDY ...]
+    python scripts/bench/study_sinkhorn.py [--out DIR] [--page docs/sinkhorn-studies.md] [STUDY ...]
 
 Two kinds of scores, of a batch of images each: "iid", independent Gaussians; "lowrank", inner
 products of rank 4 plus a bias per cluster, nearer to what a network makes. Each is scaled to a
@@ -219,6 +219,7 @@ SOLVERS: dict[str, dict[str, Any]] = {
     "relaxation 1.5": {"step": SinkhornStep(relaxation=1.5)},
     "relaxation 1.8": {"step": SinkhornStep(relaxation=1.8)},
     "Anderson 10": {"anderson_memory": 10},
+    "Nesterov": {"step": "nesterov"},
     "Newton": {"step": "newton"},
 }
 

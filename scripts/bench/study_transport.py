@@ -1,6 +1,7 @@
 """Recall by Sinkhorn variant: short trainings of `tiny` on the synthetic city, several seeds.
 
-    python scripts/bench/study_transport.py --runs RUNS [--data DIR] [--page docs/sinkhorn.md]
+    python scripts/bench/study_transport.py --runs RUNS [--data DIR]
+        [--page docs/sinkhorn-studies.md]
 
 With --data, some of the variants also on photographs: trained on DIR/sped_train (GSV-Cities
 layout), tested on DIR/sped_val (@UTM layout). Runs that RUNS already holds are gone on with. Writes
@@ -21,7 +22,7 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.demo import DemoConfig, demo_recipe
 from crisalad_jax.nn.model import Model
-from crisalad_jax.sinkhorn import SinkhornConfig
+from crisalad_jax.sinkhorn import PartialDustbin, SinkhornConfig
 from crisalad_jax.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
@@ -40,6 +41,17 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "column tau 0.9, k = 20": {"column_tau": 0.9, "iterations": 20},
     "softmax": {"step": "softmax"},
     "dual softmax": {"step": "dual-softmax"},
+    "partial, a quarter": {"dustbin": "partial", "step": "partial", "iterations": 10},
+    "partial, share learnt": {
+        "dustbin": PartialDustbin(learn=True),
+        "step": "partial",
+        "iterations": 10,
+    },
+    "capacities": {"step": "capacities", "iterations": 10},
+    "quadratic": {"step": "quadratic", "iterations": 10},
+    "top 4": {"step": "top-k"},
+    "Gaussian start, k = 3": {"start": "gaussian"},
+    "network start, k = 3": {"start": "network"},
 }
 ON_PHOTOGRAPHS = ("published, k = 3", "no dustbin", "dustbin a token", "softmax")
 KS = (1, 5)

@@ -97,7 +97,7 @@ def _at_solution(problem: Problem, potentials: Potentials) -> Potentials:
 
 @_at_solution.defjvp
 def _at_solution_jvp(primals: Any, tangents: Any) -> tuple[Potentials, Potentials]:
-    """Solve the linearised conditions (see docs/sinkhorn.md, "Implicit gradient")."""
+    """Solve the linearised conditions (see docs/sinkhorn-methods.md, "Implicit gradient")."""
     problem, potentials = primals
     change = tangents[0]
     # Use the rule itself, so that the derivative can be differentiated again.

@@ -42,6 +42,8 @@ class Dustbin(Part):
     """Number of dustbin scores that the score network gives each patch, after the clusters'."""
     takes_difference: ClassVar[bool] = False
     """Whether its mass is the number of patches minus that of clusters, which must be positive."""
+    capacities: ClassVar[bool] = False
+    """Whether its clusters may take less than their masses, which not every step can solve."""
 
     def init(self, key: PRNGKeyArray, dim: int) -> Any:
         """Return the initial parameters, a pytree of arrays; by default None.

@@ -43,6 +43,7 @@ class PartialDustbin(Dustbin):
         [1.0, 1.0, 6.0]
     """
 
+    capacities: ClassVar[bool] = True
     share: float = 0.25
     """Share of the patches' mass that moves, between 0 and 1; SALAD's at 224 x 224 is 0.25."""
     learn: bool = False

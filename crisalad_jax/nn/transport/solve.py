@@ -226,7 +226,8 @@ def assign_with_dustbin(
 
     Raises:
         InputError: what `solve` raises; no more patches than clusters where the dustbin's mass is
-            their difference; or parameters of another shape than the dustbin's.
+            their difference; parameters of another shape than the dustbin's; or a dustbin with
+            capacities and a step without.
 
     Example:
         >>> import jax.numpy as jnp
@@ -243,6 +244,12 @@ def assign_with_dustbin(
     scores = scores.astype(wide_dtype(scores))
     if isinstance(dustbin, str):
         dustbin = DUSTBINS.make(dustbin)
+    step = options.get("config", SinkhornConfig()).step
+    require(
+        step.capacities or not dustbin.capacities,
+        f"dustbin {dustbin.part_name}: found step {step.part_name}, expected one with capacities, "
+        "such as partial",
+    )
     marginals = dustbin.marginals(params, scores, patches)
     require(
         isinstance(marginals, Marginals),

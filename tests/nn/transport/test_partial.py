@@ -200,6 +200,12 @@ def test_bad_settings_raise(fields: Any, message: str) -> None:
         PartialDustbin(**fields)
 
 
+def test_a_step_without_capacities_is_refused() -> None:
+    words = "dustbin partial: found step sinkhorn, expected one with capacities, such as partial"
+    with pytest.raises(InputError, match=words):
+        assign_with_dustbin(jnp.zeros((6, 3)), None, "partial")
+
+
 def test_bad_parameters_raise() -> None:
     with pytest.raises(InputError, match=r"^dustbin: found parameters of shape \(3,\), expected"):
         assign_with_dustbin(jnp.zeros((6, 3)), jnp.zeros(3), "partial", config=CONFIG)
