@@ -161,6 +161,7 @@ def fit(
         del state  # whose arrays the trainer has copied
         steps, done = data.steps_per_epoch * config.epochs, files.record.step
         called.call("on_start", files.out, config, done)
+        called.stopped = bool(*distributed.all_max(called.stopped))
         silent = quiet or not distributed.is_primary()
         bar = progress_bar("training", steps, "steps", quiet=silent, done=done)
         with defer_signals() as signals, bar as bar:

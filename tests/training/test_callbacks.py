@@ -10,7 +10,10 @@ import pytest
 
 import crisalad_jax as cj
 from crisalad_jax.cli import train as train_command
+from crisalad_jax.data.loader import ImageCache
+from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.training import callbacks as module
+from crisalad_jax.training import validation
 from crisalad_jax.training.callbacks import CALLBACKS, Callback, Callbacks, make_callback
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
@@ -45,12 +48,12 @@ class Recorder(Callback):
 def test_a_run_that_callbacks_stop_resumes_to_the_same_bits(
     places, params, benchmark, run, tmp_path
 ) -> None:
-    """First within an epoch, then after a validation; `run` was not stopped."""
+    """First at a step, then at a validation; `run` was not stopped. Its epochs have two steps."""
     out, tables = tmp_path / "run", []
     arguments = ENDLESS, places, out
     options = {"validation": benchmark, "initial": params, "quiet": True}
     # The step after the one that is logged is under way, and is finished.
-    for stop, taken in ((("step", 2), 3), (("validation", 4), 4), (None, 6)):
+    for stop, taken in ((("step", 1), 2), (("validation", 4), 4), (None, 6)):
         recorder = Recorder(*([stop] if stop else []))
         result = fit(*arguments, **options, callbacks=[recorder, "csv"])
         assert (result.steps, result.stopped_early) == (taken, stop is not None)
@@ -58,7 +61,7 @@ def test_a_run_that_callbacks_stop_resumes_to_the_same_bits(
         tables.append(recorder)
     assert_same_run(out, run)
     starts = [recorder.got[0] for recorder in tables]
-    assert starts == [("start", {"step": step}) for step in (0, 3, 4)]
+    assert starts == [("start", {"step": step}) for step in (0, 2, 4)]
     # All of its lines, each once, in their order.
     found = [each for recorder in tables for each in recorder.got[1:-1]]
     lines = read_metrics(out / "metrics.jsonl")
@@ -68,6 +71,23 @@ def test_a_run_that_callbacks_stop_resumes_to_the_same_bits(
             rows = list(csv.DictReader(file))
         expected = [numbers for each, numbers in found if each == kind]
         assert rows == [{key: str(value) for key, value in each.items()} for each in expected]
+
+
+class Skipped(tuple):
+    """Of a validation that skips nothing."""
+
+    def rest_of(self, benchmark):
+        return benchmark
+
+
+def test_an_aggregators_own_numbers_are_those_of_a_validation(monkeypatch, benchmark, params):
+    result = types.SimpleNamespace(recalls={1: 0.25, 5: 0.5}, skipped=Skipped())
+    monkeypatch.setattr(validation, "evaluate", lambda *_, **__: [result])
+    monkeypatch.setattr(validation.Validator, "_watch_transport", lambda *_: {})
+    monkeypatch.setattr(SaladConfig, "numbers", lambda _, own: {"dust_bin": own.dust_bin})
+    how: Any = {"on_bad_image": "stop", "cache": ImageCache(0)}
+    found = validation.Validator(ENDLESS, benchmark, **how).validate(params)
+    assert found.metrics == {"R@1": 0.25, "R@5": 0.5, "dust_bin": float(params.aggregator.dust_bin)}
 
 
 def test_a_table_drops_what_comes_again(tmp_path) -> None:
