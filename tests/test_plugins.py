@@ -461,7 +461,7 @@ def test_an_adapter_and_an_encoder_of_the_manual_are_trained_saved_and_exported(
     plug = ("--plugin", *files)
     succeeds(
         *(capfd, "train", "--data", shared / "city", "--out", tmp_path / "run", "--quiet", *plug),
-        *("--config", shared / "recipe.json", "--epochs", 1, "--trainable", "adapters+head"),
+        *("--config", shared / "recipe.json", "--epochs", 1, "--trainable", "adapters,head"),
         *("--model.backbone.adapter", "my-lora", "--model.backbone.adapter.rank", 2),
         *("--model.cross-image", "gated-mean", "--loss.kind.base", 0.5),
     )
