@@ -359,7 +359,7 @@ def test_files_that_need_a_part_that_is_not_there_name_its_plug_in(
     config = dataclasses.replace(RECIPE, model=load_weights(weights)[1])
     write_json(run, to_plain(config))
     monkeypatch.setattr(steps, "_parts", built_in)
-    words = "step: found 'momentum', expected one of dual-softmax, "
+    words = "step: found 'momentum', expected one of "
     hint = "(the plug-in momentum.py had it: --plugin momentum.py, or load_plugin)"
     with pytest.raises(InputError) as error:
         load_weights(weights)
