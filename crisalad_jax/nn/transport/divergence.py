@@ -11,12 +11,10 @@ from crisalad_jax.nn.transport.config import SinkhornConfig
 from crisalad_jax.nn.transport.problem import LOG_ZERO, product
 from crisalad_jax.nn.transport.solve import per_problem, solve
 
-Tokens = Float[Array, "*batch token dim"]
-
 
 def sinkhorn_divergence(
-    x: Tokens,
-    y: Tokens,
+    x: Float[Array, "*batch x_token dim"],
+    y: Float[Array, "*batch y_token dim"],
     *,
     log_mu: Float[Array, "*#batch x_token"] | None = None,
     log_nu: Float[Array, "*#batch y_token"] | None = None,
@@ -49,7 +47,7 @@ def sinkhorn_divergence(
 
     Example:
         >>> x = jnp.eye(3)
-        >>> float(sinkhorn_divergence(x, x)), float(sinkhorn_divergence(x, x + 1).round(3))
+        >>> float(sinkhorn_divergence(x, x)), round(float(sinkhorn_divergence(x, x + 1)), 3)
         (0.0, 3.0)
     """
     x, y = (jnp.asarray(side) for side in (x, y))
@@ -84,7 +82,9 @@ def sinkhorn_divergence(
     return transport(*sides) - (selves[0] + selves[1]) / 2
 
 
-def squared_distances(x: Tokens, y: Tokens) -> Float[Array, "*batch x_token y_token"]:
+def squared_distances(
+    x: Float[Array, "*batch x_token dim"], y: Float[Array, "*batch y_token dim"]
+) -> Float[Array, "*batch x_token y_token"]:
     """Return |x_n - y_k|^2 for all pairs of tokens, at least 0."""
     squares = [(side**2).sum(axis=-1) for side in (x, y)]
     inner = product("...nd,...kd->...nk", x, y)

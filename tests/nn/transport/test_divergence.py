@@ -56,8 +56,9 @@ def test_values_and_gradients_are_otts() -> None:
 @pytest.mark.usefixtures("float64")
 def test_it_nears_the_linear_programme_as_epsilon_falls() -> None:
     x, y, log_mu, log_nu = sets()
-    exact = ot.emd2(np.exp(log_mu), np.exp(log_nu), ot.dist(np.asarray(x), np.asarray(y)))
-    errors = [abs(float(ours(*sets(), epsilon)) - exact) for epsilon in (2.0, 0.2)]
+    costs: Any = ot.dist(np.asarray(x), np.asarray(y))
+    exact: Any = ot.emd2(np.exp(log_mu), np.exp(log_nu), costs)
+    errors = [abs(float(ours(*sets(), epsilon=epsilon)) - exact) for epsilon in (2.0, 0.2)]
     assert errors[1] < 0.05 * exact
     assert errors[1] < 0.5 * errors[0]
 
@@ -68,7 +69,7 @@ def test_batches_symmetry_zero_masses_and_equal_sets() -> None:
     x, y, log_mu, log_nu = (jnp.stack(part) for part in zip(*each, strict=True))
     epsilon = jnp.array([0.3, 0.5, 1.0])
     found = ours(x, y, log_mu, log_nu, epsilon)
-    alone = [ours(*at, epsilon[i]) for i, at in enumerate(each)]
+    alone = [ours(*at, epsilon=epsilon[i]) for i, at in enumerate(each)]
     # Rest.
     np.testing.assert_allclose(found, alone, rtol=1e-8)
     np.testing.assert_allclose(ours(y, x, log_nu, log_mu, epsilon), found, rtol=1e-8)
