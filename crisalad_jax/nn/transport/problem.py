@@ -83,16 +83,18 @@ class Problem:
         another problem, or has one number.
         """
         one = (*kernel.shape[:-2], 1)
-        row_tau, column_tau = (
-            None
-            if isinstance(tau, float) and tau == 1
-            else jnp.broadcast_to(jnp.asarray(tau, kernel.dtype), one)
-            for tau in (row_tau, column_tau)
-        )
+
+        def relaxed(tau: float | Array) -> Array | None:
+            if isinstance(tau, float) and tau == 1:
+                return None
+            return jnp.broadcast_to(jnp.asarray(tau, kernel.dtype), one)
+
         log_mu, log_nu = (jnp.where(x < LOG_ZERO, EMPTY, x) for x in (log_mu, log_nu))
         # Split, not two slices: their gradients would be two zero-padded matrices to add up.
         clusters, last = jax.lax.split(kernel, (kernel.shape[-1] - 1, 1), axis=kernel.ndim - 1)
-        return Problem(clusters, last[..., 0], log_mu, log_nu, (row_tau, column_tau))
+        return Problem(
+            clusters, last[..., 0], log_mu, log_nu, (relaxed(row_tau), relaxed(column_tau))
+        )
 
     @property
     def row_tau(self) -> float | Array:

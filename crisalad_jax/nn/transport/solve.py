@@ -123,9 +123,10 @@ def solve(
         [0.5, 0.5]
     """
     scores, log_mu, log_nu = jnp.asarray(scores), jnp.asarray(log_mu), jnp.asarray(log_nu)
-    taus = tuple(
+    row, column = (
         None if isinstance(tau, (int, float)) and tau == 1 else tau for tau in (row_tau, column_tau)
     )
+    taus: tuple[Any, Any] = row, column
     # Totals may differ for a step of another problem, such as one with column capacities.
     equal = _balanced(taus) and config.step.entropic
     check_inputs(scores, log_mu, log_nu, (epsilon, *taus), init, equal_totals=equal)

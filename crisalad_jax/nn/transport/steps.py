@@ -361,7 +361,7 @@ def solve_columns(
     masses = jnp.maximum(plan.sum(axis=-2), jnp.finfo(plan.dtype).tiny ** 0.5)
     identity = jnp.eye(masses.shape[-1], dtype=plan.dtype)
     weights = product("...nk,...nl->...kl", shares, plan) * (1 - identity)
-    weights = weights if isinstance(row_tau, float) else row_tau[..., None] * weights
+    weights = weights if isinstance(row_tau, float) else jnp.asarray(row_tau)[..., None] * weights
     # The epsilons prevent a division by zero for clusters that share no row.
     slack = 1 / column_tau - row_tau + 8 * jnp.finfo(plan.dtype).eps
     diagonal = weights.sum(axis=-1) + masses * slack

@@ -36,14 +36,14 @@ def pot_plan(
     """The plan of the library POT, whose marginals are penalised where a tau is below 1."""
     problem = np.exp(log_mu), np.exp(log_nu), -np.asarray(scores), epsilon
     if row_tau == column_tau == 1:
-        return ot.sinkhorn(*problem, stopThr=1e-13, numItermax=20000)
+        return np.asarray(ot.sinkhorn(*problem, stopThr=1e-13, numItermax=20000))
     penalties = tuple(
         epsilon * tau / (1 - tau) if tau < 1 else np.inf for tau in (row_tau, column_tau)
     )
     # "entropy": that of the plan by itself, as here, not against mu nu^T.
     kind = {"reg_type": "entropy", "c": np.ones(np.shape(scores))}
     limits = {"stopThr": 1e-14, "numItermax": 20000}
-    return ot.unbalanced.sinkhorn_unbalanced(*problem, penalties, **kind, **limits)
+    return np.asarray(ot.unbalanced.sinkhorn_unbalanced(*problem, penalties, **kind, **limits))
 
 
 def assert_three_ways(

@@ -44,6 +44,10 @@ def inputs(std: float = 2.0, more: float = 1.0) -> Inputs:
     return Inputs(*map(jnp.asarray, (scores, np.log(mu), np.log(nu))))
 
 
+def log_sums(x: np.ndarray) -> np.ndarray:
+    return np.asarray(scipy.special.logsumexp(x, axis=1))
+
+
 def plan_of(result: SinkhornResult) -> np.ndarray:
     return np.exp(np.asarray(result.log_plan, np.float64))
 
@@ -100,7 +104,7 @@ def test_nesterov_takes_fewer_iterations_of_sharp_scores() -> None:
     assert fast.iterations.sum() < 0.5 * plain.iterations.sum()
     # The tolerance, for a plain iteration a good part of the distance that is left.
     np.testing.assert_allclose(plan_of(fast), plan_of(plain), atol=3e-2)
-    taus = {"row_tau": 0.9, "column_tau": 0.7}
+    taus: dict[str, Any] = {"row_tau": 0.9, "column_tau": 0.7}
     plain, fast = (
         assign_with_dustbin(scores, 0.0, config=implicit(step=step, iterations=2000), **taus)
         for step in ("sinkhorn", "nesterov")
@@ -114,7 +118,8 @@ def test_nesterov_takes_fewer_iterations_of_sharp_scores() -> None:
 def test_annealing_by_hand() -> None:
     """Its schedule in numpy; at its end it is at epsilon itself, and before the rows are met."""
     scores, log_mu, log_nu = map(np.asarray, inputs())
-    row, lse = np.zeros(ROWS), scipy.special.logsumexp
+    row: Any = np.zeros(ROWS)
+    lse: Any = scipy.special.logsumexp
     for epsilon in (8.0, 4.0, 2.0, 1.0):
         column = epsilon * (log_nu - lse((scores + row[:, None]) / epsilon, axis=0))
         row = epsilon * (log_mu - lse((scores + column) / epsilon, axis=1))
@@ -147,16 +152,16 @@ def test_capacities_are_the_bounded_dual() -> None:
     for free in (True, False):
 
         def worth(column: np.ndarray) -> tuple[float, np.ndarray]:
-            sums = scipy.special.logsumexp(kernel + column, axis=1)
+            sums = log_sums(kernel + column)
             masses = (mu[:, None] * np.exp(kernel + column - sums[:, None])).sum(axis=0)
-            return mu @ sums - nu @ column, masses - nu
+            return float(mu @ sums - nu @ column), masses - nu
 
         bounds = [(None, 0)] * (COLUMNS - 1) + [(0 if free else None, 0)]
         options = {"ftol": 1e-16, "gtol": 1e-12}
         column = scipy.optimize.minimize(
             worth, np.zeros(COLUMNS), jac=True, method="L-BFGS-B", bounds=bounds, options=options
         ).x
-        sums = scipy.special.logsumexp(kernel + column, axis=1)
+        sums = log_sums(kernel + column)
         expected = mu[:, None] * np.exp(kernel + column - sums[:, None])
         result = at_rest(CapacityStep(free_last=free), at)
         # L-BFGS-B stops where its gradient is of order 1e-8.
@@ -173,7 +178,7 @@ def test_quadratic_plans_are_pots_and_sparse() -> None:
     at = inputs()
     mu, nu = np.exp(at.log_mu), np.exp(at.log_nu)
     limits = {"stopThr": 1e-14, "numItermax": 100000}
-    expected = ot.smooth.smooth_ot_dual(mu, nu, -np.asarray(at.scores), 0.7, "l2", **limits)
+    expected: Any = ot.smooth.smooth_ot_dual(mu, nu, -np.asarray(at.scores), 0.7, "l2", **limits)
     plan = plan_of(at_rest("quadratic", at, tolerance=1e-11))
     # What POT's L-BFGS leaves.
     np.testing.assert_allclose(plan, expected, atol=1e-6)
@@ -224,7 +229,7 @@ ALL: dict[str, tuple[Any, str, float]] = {
 
 
 @float64
-@pytest.mark.parametrize("name", slow_unless({"nesterov", "capacities", "quadratic"}, ALL))
+@pytest.mark.parametrize("name", slow_unless({"capacities", "quadratic"}, ALL))
 def test_gradients_three_ways(name: str) -> None:
     """By scores and masses; what a sum of all masses moves, no balanced plan says."""
     step, gradient, more = ALL[name]
@@ -239,7 +244,7 @@ def test_gradients_three_ways(name: str) -> None:
     assert_three_ways(loss, inputs(more=more), step, count=200, gradient=gradient)
 
 
-@pytest.mark.parametrize("name", slow_unless({"nesterov", "quadratic", "top-k"}, ALL))
+@pytest.mark.parametrize("name", slow_unless({"nesterov", "quadratic"}, ALL))
 def test_float32_is_finite_for_any_scores(name: str) -> None:
     """Flat and sharp scores in one batch; half-precision ones are widened."""
     scores = jax.random.normal(jax.random.key(0), (4, 20, 5))
