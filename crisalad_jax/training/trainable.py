@@ -132,8 +132,9 @@ def _choose(params: Crisalad, config: ModelConfig, trainable: str) -> dict[str, 
     for term in terms_of(trainable):
         word = term.removeprefix("-")
         own = matched(*_patterns_of(word, config))
-        # A norm that the aggregator leaves out has no gradient: weight decay alone would move it.
-        may_lack = word == "norm" or term == f"-{ADAPTERS}"
+        # Models may have no head. A norm that the aggregator leaves out has no gradient: weight
+        # decay alone would move it.
+        may_lack = word in (ALL, HEAD, "norm") or term == f"-{ADAPTERS}"
         require(bool(own) or may_lack, f"trainable: {_unmatched(word, config, names)}")
         found[word == term] |= own
     fixed = {(leaf, 0) for leaf in names if _is_fixed(leaf, config)}

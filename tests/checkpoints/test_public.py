@@ -191,7 +191,7 @@ def test_what_no_description_depends_on_comes_back(tmp_path: pathlib.Path, layou
         "remat": "none",
         "backbone.layer_scale_init": 1e-5,
         "preprocessing.filter": "bicubic",
-        "cross_image.dropout": 0.2,
+        **({"cross_image.dropout": 0.2} if public.config.cross_image.attends else {}),
         **({"aggregator.dropout": 0.1} if layout == "dino-salad" else {}),
     }
     config = with_values(public.config, changes)

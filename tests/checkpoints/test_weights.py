@@ -67,6 +67,7 @@ def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
         "aggregator": "salad",
         "aggregator.dustbin": "column",
         "aggregator.sinkhorn.step": "sinkhorn",
+        "aggregator.sinkhorn.start": "zeros",
         "aggregator.sinkhorn.gradient": "unrolled",
     }
     # Only a part from a user's file has a digest.

@@ -94,7 +94,7 @@ UNKNOWN_STEP = {"name": "salad", "sinkhorn": {"step": {"name": "x"}}}
         ({"model": {"backbone": "x"}}, "backbone: found 'x', expected one of d", "model.backbone"),
         (
             {"model": {"aggregator": UNKNOWN_STEP}},
-            "step: found 'x', expected one of dual-softmax, newton, ",
+            "step: found 'x', expected one of annealing, ",
             "model.aggregator.sinkhorn.step",
         ),
     ],

@@ -146,6 +146,7 @@ def test_mlflow_gets_the_numbers(monkeypatch, tmp_path) -> None:
     fake.end_run.assert_called_once_with()
 
 
+@pytest.mark.usefixtures("_unchecked")
 def test_callbacks_that_do_not_fit_are_refused(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(InputError, match=r"^callback wandb: found no module wandb, .* pip install"):

@@ -48,7 +48,21 @@ STARTS = Registry("start", Start)
 
 
 def from_columns(problem: Problem, column: Columns) -> Potentials:
-    """Return the potentials of these columns and of the rows that meet their marginals."""
+    """Complete the columns' potentials by those of rows that meet their marginals.
+
+    Args:
+        problem: the transport problem.
+        column: potentials of the columns.
+
+    Returns:
+        The potentials of both.
+
+    Example:
+        >>> problem = Problem.of(jnp.eye(2), jnp.zeros(2), jnp.zeros(2))
+        >>> start = from_columns(problem, jnp.zeros(2))
+        >>> jnp.exp(problem.log_plan(start)).sum(axis=1).tolist()
+        [1.0, 1.0]
+    """
     _, column = problem.masked(Potentials(problem.log_mu, column))
     return Potentials(problem.row_tau * (problem.log_mu - problem.lse_columns(column)), column)
 

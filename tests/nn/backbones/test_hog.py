@@ -41,7 +41,8 @@ def test_its_file_is_its_configuration():
     assert config == CONFIG
     header = read_header(find_weights("hog"))
     assert header["model_sha256"] == model_hash(params, config)
-    assert header["parts"] == {"backbone": ["hog", None], "aggregator": ["class-token", None]}
+    parts = {"backbone": "hog", "aggregator": "class-token", "cross_image": "none"}
+    assert header["parts"] == {field: [name, None] for field, name in parts.items()}
 
 
 def _grey_picture(grey):
