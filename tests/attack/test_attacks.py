@@ -1,4 +1,8 @@
-"""The attacks: a handful of tries of each kind, and all of them (slow)."""
+"""The attacks: a handful of tries of three kinds, and all of them (slow).
+
+Of kills, tests/training/test_interruption.py has some of training, tests/retrieval/serve some of the
+service.
+"""
 
 import json
 import os
@@ -11,14 +15,10 @@ import pytest
 from tests.attack.world import ROOT
 
 SOME = (
-    ("damage", 0, "", 32),
     # In a container root may not mount, and writes into any folder: three tries then.
     ("disks", 0, "convert", 3),
-    ("hostile", 0, "a sample", 6),
     ("inputs", 0, "a sample", 16),
     ("interruptions", 0, "some", 18),
-    # Of training: tests/training/test_interruption.py; of the service: tests/retrieval/serve.
-    ("kills", 0, "maps, extract .npy", 7),
 )
 ALL = (
     ("damage", 1, "", 4800),
