@@ -1,6 +1,6 @@
 """The attacks: a handful of tries of three kinds, and all of them (slow).
 
-Of kills, tests/training/test_interruption.py has some of training, tests/retrieval/serve some of the
+Of kills, tests/training/test_interruption.py has some of training, and tests/retrieval/serve of the
 service.
 """
 
