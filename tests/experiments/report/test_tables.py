@@ -3,6 +3,7 @@
 from rich.console import Console
 
 from crisalad_jax.experiments import report
+from crisalad_jax.experiments.report.tables import Cell, Table
 
 ROWS = [
     report.RecallRow("streets", "HOG", "single", {1: 0.405, 5: 0.6126}),
@@ -40,3 +41,10 @@ def test_terminal_table_has_the_same_numbers():
     ]
     rules = [number for number, line in enumerate(lines) if line.startswith("├")]
     assert rules == [6]  # between the two data sets, and nowhere else
+
+
+def test_words_are_at_the_left_and_numbers_at_the_right():
+    rows = [[Cell(text), Cell("x"), Cell("1")] for text in ("a", "b")]
+    table = Table(["first", "second", "number"], rows, labels=2).terminal()
+    assert [column.justify for column in table.columns] == ["left", "left", "right"]
+    assert not any(row.end_section for row in table.rows)  # two labels part no groups
