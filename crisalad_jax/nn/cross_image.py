@@ -168,12 +168,10 @@ class CrossImageConfig(CrossImage):
     ) -> Float[Array, "layer token head image image"]:
         """Return the weights of every layer's softmax."""
         weights = []
-        for number, layer in enumerate(params.layers):
+        for layer in params.layers:
             by_token = tokens.swapaxes(0, 1)
             weights.append(attention_weights(layer.attn, by_token, self.heads, mask=mask))
-            one = CrossImageEncoder(params.layers[number : number + 1])
-            here = dataclasses.replace(self, layers=1)
-            tokens = cross_image_encoder(one, tokens, here, mask=mask, key=None)
+            tokens = _run_layer(layer, tokens, self, mask=mask, key=None)
         return jnp.stack(weights)
 
 
@@ -228,10 +226,21 @@ def cross_image_encoder(
     means inference.
     """
     for layer, layer_key in zip(params.layers, split_key(key, config.layers), strict=True):
-        weights_key, *keys = split_key(layer_key, 4)
-        attended = _attend_across(layer.attn, tokens, config, mask=mask, key=weights_key)
-        tokens = encoder_layer(layer, tokens, attended, gelu, rate=config.dropout, keys=keys)
+        tokens = _run_layer(layer, tokens, config, mask=mask, key=layer_key)
     return tokens
+
+
+def _run_layer(
+    params: EncoderLayer,
+    tokens: Sequences,
+    config: CrossImageConfig,
+    *,
+    mask: Mask,
+    key: PRNGKeyArray | None,
+) -> Sequences:
+    weights_key, *keys = split_key(key, 4)
+    attended = _attend_across(params.attn, tokens, config, mask=mask, key=weights_key)
+    return encoder_layer(params, tokens, attended, gelu, rate=config.dropout, keys=keys)
 
 
 def _attend_across(

@@ -9,7 +9,7 @@ import functools
 import itertools
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal
 
 import jax
@@ -305,18 +305,9 @@ class VisionTransformer(Backbone):
     ) -> Float[Array, "image head token token"]:
         """Compute the attention of a block; see `nn.model.attention_maps`."""
         stack, grid = _one_stack(params), self.grid((images.shape[1], images.shape[2]))
-        request = FeatureSpec(class_attention=True)
-        _checked_levels(request, self)
+        _checked_levels(FeatureSpec(class_attention=True), self)  # the same adapters are refused
         tokens, _ = run_blocks([stack], embed(params, images, self), grid, self, count=block)
-        layer = _block_at([stack], block)
-        normed = layer_norm(layer.norm1, tokens, epsilon=self.norm_epsilon)
-        return attention_weights(
-            self.attention_of(layer),
-            normed,
-            self.heads,
-            rotation=self.rotation(grid),
-            update=_update_of(layer, self),
-        )
+        return _attention_by(attention_weights, _block_at([stack], block), tokens, grid, self)
 
     @property
     def trains(self) -> tuple[str, ...]:
@@ -489,14 +480,23 @@ def _class_attention(
 
     The block's own attention does not keep its weights: one row of them is computed a second time.
     """
+    shares = _attention_by(first_token_attention, layer, tokens, grid, config)
+    return shares.sum(axis=-2)[:, 1 + config.registers :]
+
+
+def _attention_by(
+    weigh: Callable[..., Array],
+    layer: Block,
+    tokens: TokenBatch,
+    grid: Grid,
+    config: VisionTransformer,
+) -> Array:
+    """Compute weights of a block's attention, those of `first_token_attention` or of all tokens."""
     with jax.named_scope("blocks"):
         normed = layer_norm(layer.norm1, tokens, epsilon=config.norm_epsilon)
         attn, rotation = config.attention_of(layer), config.rotation(grid)
         update = _update_of(layer, config)
-        shares = first_token_attention(
-            attn, normed, config.heads, rotation=rotation, update=update
-        ).sum(axis=-2)
-    return shares[:, 1 + config.registers :]
+        return weigh(attn, normed, config.heads, rotation=rotation, update=update)
 
 
 def embed(

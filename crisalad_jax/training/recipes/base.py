@@ -246,7 +246,7 @@ def with_part(config: TrainConfig, part: Any) -> TrainConfig:
     if kind == "augmentation":
         return dataclasses.replace(config, augmentation=part)
     if kind in ("optimiser", "schedule"):
-        field = {"optimiser": "kind"}.get(kind, kind)
+        field = "kind" if kind == "optimiser" else "schedule"
         optimiser = dataclasses.replace(config.optimiser, **{field: part})
         return dataclasses.replace(config, optimiser=optimiser)
     if kind == "loss":
