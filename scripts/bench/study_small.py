@@ -2,11 +2,11 @@
 
     python scripts/bench/study_small.py --runs RUNS [--data SET...] [--page PAGE] [STUDY...]
 
-Studies: transport and encoder (a small ViT with SALAD, five seeds) and world (a small ResNet with
-Conv-AP, from which the world leaves out one variation at a time). All train on rendered places
-alone, and are asked on other rendered places and on each SET, by its folder's name. Runs that RUNS
-already holds are gone on with. A run takes about two minutes of a core; transport with encoder, and
-world, may run at once.
+Studies: transport, transport_more and encoder (a small ViT with SALAD), adapters (such a ViT that
+was trained on a plainer world, frozen) and world (a small ResNet with Conv-AP, from which the world
+leaves out one variation at a time). All train on rendered places alone, and are asked on other
+rendered places and on each SET, by its folder's name. Runs that RUNS already holds are gone on
+with. A run takes about two minutes of a core.
 """
 
 import collections
@@ -23,6 +23,7 @@ import scipy.stats
 from study_transport import VARIANTS, WATCHED, with_transport
 from tables import Study, Table, flags, leave, read_some
 
+from crisalad_jax.checkpoints.public import with_backbone_of
 from crisalad_jax.config.io import read_config, to_plain
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
@@ -30,11 +31,11 @@ from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.cross_image import CrossImage
-from crisalad_jax.nn.model import Model
+from crisalad_jax.nn.model import Model, init_crisalad
 from crisalad_jax.synthetic import SCENERIES, VARIATIONS, WorldConfig, write_world
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
-from crisalad_jax.training.loop import fit
+from crisalad_jax.training.loop import fit, run_keys
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.progress import progress_bar
@@ -48,6 +49,25 @@ TRANSPORTS: dict[str, dict[str, Any]] = {
     "epsilon learnt": {"learn_epsilon": True},
     "softmax": VARIANTS["softmax"],
 }
+MORE_TRANSPORTS: dict[str, dict[str, Any]] = {
+    **{
+        label: VARIANTS[label]
+        for label in (
+            "published, k = 3",
+            "partial, a quarter",
+            "partial, share learnt",
+            "capacities",
+            "quadratic",
+            "top 4",
+            "Gaussian start, k = 3",
+            "network start, k = 3",
+        )
+    },
+    "annealing, k = 6": {"step": "annealing", "iterations": 6},
+    "Nesterov, k = 10": {"step": "nesterov", "iterations": 10},
+    "column tau learnt, k = 20": VARIANTS["column tau 0.9, k = 20"] | {"learn_tau": True},
+}
+ADAPTERS = ("depthwise", "multi-resolution", "mlp", "serial-parallel", "side", "lora", "prompts")
 
 
 class Asked(NamedTuple):
@@ -63,6 +83,8 @@ class Arm(NamedTuple):
     label: str
     config: TrainConfig
     world: WorldConfig
+    start: "Arm | None" = None
+    """Whose run with the same seed gives the backbone to start from."""
 
 
 def small_vit() -> TrainConfig:
@@ -104,6 +126,37 @@ def transport() -> list[Arm]:
     ]
 
 
+def transport_more() -> list[Arm]:
+    """Further transports, each in the place of the published one."""
+    return [
+        Arm(label, with_transport(small_vit(), fields), WorldConfig())
+        for label, fields in MORE_TRANSPORTS.items()
+    ]
+
+
+def adapters() -> list[Arm]:
+    """A frozen backbone that has seen no seasons, times or weather, and adapters that then do."""
+    world = WorldConfig()
+
+    def config(adapter: str, trainable: str) -> TrainConfig:
+        scratch = small_vit()
+        backbone: Any = dataclasses.replace(scratch.model.backbone, adapter=adapter)
+        model = dataclasses.replace(scratch.model, backbone=backbone)
+        return dataclasses.replace(scratch, model=model, trainable=trainable)
+
+    plain = dataclasses.replace(world, varied=("stand",))
+    start = Arm("plain world", config("none", "all"), plain)
+
+    def arm(label: str, adapter: str, trainable: str) -> Arm:
+        return Arm(label, config(adapter, trainable), world, start)
+
+    return [
+        arm("no adapter", "none", "head"),
+        *(arm(name, name, "adapters,head") for name in ADAPTERS),
+        arm("no adapter, all trained", "none", "all"),
+    ]
+
+
 def encoder() -> list[Arm]:
     """Without and with the cross-image encoder."""
     without, world = small_vit(), WorldConfig()
@@ -130,7 +183,13 @@ def world() -> list[Arm]:
     return arms
 
 
-STUDIES = {"transport": transport, "encoder": encoder, "world": world}
+STUDIES = {
+    "transport": transport,
+    "transport_more": transport_more,
+    "encoder": encoder,
+    "adapters": adapters,
+    "world": world,
+}
 
 
 def digest(value: Any) -> str:
@@ -149,11 +208,18 @@ def open_asked(path: pathlib.Path) -> Asked:
     return Asked(data, digest([files, [list(map(int, each)) for each in data.ground_truth()]]))
 
 
+def folder_of(arm: Arm, seed: int, runs: pathlib.Path) -> pathlib.Path:
+    """Where an arm's training with a seed is kept."""
+    names = [named(dataclasses.replace(arm.config, seed=seed)), named(arm.world)]
+    if arm.start is not None:
+        names.append(folder_of(arm.start, seed, runs).name)
+    return runs / "runs" / "-".join(names)
+
+
 def run(arm: Arm, seed: int, asked: Mapping[str, Asked], runs: pathlib.Path) -> dict[str, Any]:
     """Recalls of one trained model by set and grouping, and its transport's statistics."""
     config = dataclasses.replace(arm.config, seed=seed)
-    root = runs / "worlds" / named(arm.world)
-    folder = runs / "runs" / f"{named(config)}-{named(arm.world)}"
+    root, folder = runs / "worlds" / named(arm.world), folder_of(arm, seed, runs)
     result = folder / "recalls.json"
     found: dict[str, Any] = json.loads(result.read_text()) if result.exists() else {"contents": {}}
     there = found["contents"]
@@ -162,7 +228,14 @@ def run(arm: Arm, seed: int, asked: Mapping[str, Asked], runs: pathlib.Path) -> 
         return found
     write_world(root, arm.world)
     places = read_places(root / "train", min_images=config.min_images)
-    params = fit(config, places, folder, quiet=True).params
+    initial = None
+    if arm.start is not None:
+        run(arm.start, seed, asked, runs)
+        file = folder_of(arm.start, seed, runs) / "last.safetensors"
+        initial = with_backbone_of(
+            init_crisalad(run_keys(seed)[0], config.model), config.model, file
+        )
+    params = fit(config, places, folder, initial=initial, quiet=True).params
     alone = not config.model.cross_image.attends
     groupings = ("single",) if alone else ("single", "shuffled", "sequential")
     for name, one in left.items():
