@@ -24,6 +24,9 @@ from .data.query_set import read_query_set as read_query_set
 from .data.reading import Reading as Reading
 from .data.reading import image_batches as image_batches
 from .data.resize import resize_image as resize_image
+from .data.samplers import Draw as Draw
+from .data.samplers import Sampler as Sampler
+from .data.samplers import register_sampler as register_sampler
 from .evaluation.calibrate import calibrate as calibrate
 from .evaluation.evaluate import evaluate as evaluate
 from .evaluation.operating_point import operating_point as operating_point

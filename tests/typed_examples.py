@@ -32,6 +32,7 @@ def parts_by_name(preset: cj.ModelConfig) -> None:
     assert_type(cj.LossConfig(kind="triplet", miner="none").kind, cj.Loss)
     training = cj.TrainConfig(model=preset, augmentation="none", trainable="head")
     assert_type(training.augmentation, cj.Augmentation)
+    assert_type(training.sampler, cj.Sampler)
     assert_type(dataclasses.replace(training, augmentation="light"), cj.TrainConfig)
     encoder = "none"
     assert_type(cj.with_aggregator(preset, "gem", "tiny", cross_image=encoder), cj.ModelConfig)
@@ -45,7 +46,7 @@ def refused(preset: cj.ModelConfig, places: cj.Map) -> None:
     cj.SinkhornConfig(step=3)  # pyright: ignore[reportArgumentType]
     cj.ModelConfig(aggregator=ResNetConfig())  # pyright: ignore[reportArgumentType]
     cj.ModelConfig(aggregater="gem")  # pyright: ignore[reportCallIssue]
-    cj.TrainConfig(batch_order="random")  # pyright: ignore[reportArgumentType]
+    cj.TrainConfig(sampler=3)  # pyright: ignore[reportArgumentType]
     cj.describe(preset, np.zeros((1, 28, 28, 3)), preset)  # pyright: ignore[reportArgumentType]
     cj.query(places, "frames", model=cj.Model(preset, places.config))  # pyright: ignore[reportArgumentType]
 

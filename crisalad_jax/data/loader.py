@@ -18,7 +18,7 @@ from crisalad_jax.config.checks import check_count, check_types, require_range, 
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.config.short_repr import brief, with_field_docs
 from crisalad_jax.data.images import OnBadImage, read_pixels
-from crisalad_jax.data.places import Order, Places, epoch_batches
+from crisalad_jax.data.places import Places
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.utils.errors import InputError
@@ -28,6 +28,7 @@ from crisalad_jax.utils.shapes import Bool, Float32, Int, Int32, Int64, UInt8
 if TYPE_CHECKING:  # who only reads images starts sooner without them
     from crisalad_jax.data.augmentations.base import Augmentation
     from crisalad_jax.data.query_set import QuerySet
+    from crisalad_jax.data.samplers.base import Describe, Sampler
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -231,7 +232,7 @@ def training_batches(
     image_size: tuple[int, int],
     places_per_batch: int,
     images_per_place: int,
-    order: Order,
+    sampler: "Sampler | str",
     augmentation: "Augmentation | str",
     seed: int,
     epoch: int,
@@ -242,6 +243,7 @@ def training_batches(
     on_bad_image: OnBadImage = "stop",
     threads: int = THREADS,
     cache: ImageCache | None = None,
+    describe: "Describe | None" = None,
 ) -> Iterator[ImageBatch]:
     """Yield the batches of one epoch, place after place.
 
@@ -251,29 +253,30 @@ def training_batches(
     epoch or, under "skip", leaves a slot that is not valid.
 
     Args:
-        places: what to draw from; see `epoch_batches` for the order.
+        places: what to draw from.
         image_size: height and width in pixels that images are resized to.
         places_per_batch: number of places of a batch.
         images_per_place: number of images of each.
-        order: "within-city" draws a batch from one city, "shuffled" from all.
+        sampler: draws the batches; a registered sampler, or its name.
         augmentation: changes each image; a registered augmentation, or its name.
         seed: draws everything, together with the epoch and the step.
         epoch: from 0.
         preprocessing: whose filter resizes bytes. Every image gets the same size, whatever its
             rule.
-        steps: number of batches; None takes every place once.
+        steps: number of batches; None takes what the sampler draws, which is every place once.
         start_step: the first batch to give, to go on with an epoch that was interrupted.
         part: (i, n) gives the i-th of n equal parts of every batch, for the i-th of n processes.
         on_bad_image: "stop" at an unreadable image, or "skip" it.
         threads: how many decode ahead; 0 decodes in the caller's thread.
         cache: holds decoded images from epoch to epoch.
+        describe: takes image files and returns their descriptors, for samplers that draw by them.
 
     Yields:
         The batches: pixels, labels, and which images are valid.
 
     Raises:
-        InputError: at once for arguments out of range, as in `epoch_batches`; while iterating under
-            "stop" for an image that cannot be read.
+        InputError: at once for arguments out of range, or a sampler that finds no batch; while
+            iterating under "stop" for an image that cannot be read.
 
     Example:
         >>> from crisalad_jax import read_places
@@ -282,7 +285,7 @@ def training_batches(
         ...     image_size=(98, 98),
         ...     places_per_batch=2,
         ...     images_per_place=3,
-        ...     order="shuffled",
+        ...     sampler="shuffled",
         ...     augmentation="none",
         ...     seed=0,
         ...     epoch=0,
@@ -290,19 +293,23 @@ def training_batches(
         >>> next(batches).images.shape
         (6, 98, 98, 3)
     """
+    from crisalad_jax.data.samplers.base import SAMPLERS, epoch_batches, labels_of
+
+    sampler = SAMPLERS.resolve(sampler, "sampler")
     chosen = epoch_batches(
         places,
+        sampler=sampler,
         places_per_batch=places_per_batch,
         images_per_place=images_per_place,
-        order=order,
         seed=seed,
         epoch=epoch,
         steps=steps,
+        describe=describe,
     )
     return batches_of_groups(
         places,
         chosen,
-        places.image_place[chosen],
+        labels_of(places, sampler, chosen),
         image_size=image_size,
         preprocessing=preprocessing,
         augmentation=augmentation,

@@ -1,17 +1,15 @@
-"""Training places in the layout of GSV-Cities or of your own, in order, and the batches of them."""
+"""Training places in the layout of GSV-Cities, of your own, or made of positions or an order."""
 
 import dataclasses
 import functools
-import itertools
 import math
 import os
 import pathlib
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 
-from crisalad_jax.config.checks import PATH, choose, takes
+from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.named_places import COLUMNS as COLUMNS
@@ -26,12 +24,7 @@ from crisalad_jax.data.sources import check_rate_used, open_source
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.output import warn
-from crisalad_jax.utils.shapes import Float64, Int, Int32, Int64
-
-_TURNS = 20
-"""Draws of all places after which no batch of places that are far from each other is expected."""
-
-Order = Literal["within-city", "shuffled"]
+from crisalad_jax.utils.shapes import Float64, Int32, Int64
 
 
 @brief
@@ -188,107 +181,3 @@ def _places(
         views=np.array(views) if views else None,
         near=near if any(place.near for place in found) else None,
     )
-
-
-def epoch_batches(
-    places: Places,
-    *,
-    places_per_batch: int,
-    images_per_place: int,
-    order: Order,
-    seed: int,
-    epoch: int,
-    steps: int | None = None,
-) -> Int[np.ndarray, "steps places images"]:
-    """Draw the images of every batch of an epoch, as a pure function of (seed, epoch).
-
-    Every place comes at most once, with `images_per_place` of its images sampled without
-    replacement. An incomplete last batch is dropped. "within-city" shuffles the places of each
-    city and joins the cities in random order, as the public loaders do. A batch is then nearly
-    always of one city, whose places are hard to tell apart. "shuffled" mixes all cities.
-
-    With `steps` the epoch has exactly this number of batches: it is cut short, or continued with
-    new draws of all places.
-
-    Places that are `Places.near` each other are never in one batch: in its turn, a place goes into
-    the first unfinished batch without a place that is near. Then epochs without `steps` may differ
-    in length.
-
-    Raises:
-        InputError: a place has fewer than `images_per_place` images, there are fewer places than
-            `places_per_batch` (or too few that are not near each other), an unknown order, a
-            negative seed or epoch, less than one step.
-    """
-    choose("order", order, {"within-city": None, "shuffled": None})
-    least = 1 if steps is None else steps
-    if min(places_per_batch, images_per_place, least, seed + 1, epoch + 1) < 1:
-        raise InputError(
-            f"epoch_batches: found {places_per_batch=}, {images_per_place=}, {seed=}, {epoch=} and "
-            f"{steps=}, expected numbers from 1, and from 0 for the seed and the epoch"
-        )
-    counts = places.image_counts
-    if counts.min() < images_per_place:
-        place = int(counts.argmin())
-        raise InputError(
-            f"{places.root}: place {places.names[place]} has {counts[place]} images, expected at "
-            f"least images_per_place {images_per_place}"
-        )
-    drawn: list[np.ndarray] = []
-    for turn in itertools.count():
-        # The spawn key makes this stream independent of the loader's from (seed, epoch). The
-        # first turn draws the same as an epoch without `steps`.
-        entropy = (seed, epoch, turn) if turn else (seed, epoch)
-        generator = np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=(0,)))
-        drawn.append(_draw(places, places_per_batch, images_per_place, order, generator))
-        found = sum(map(len, drawn))
-        if not found and turn == _TURNS - 1:
-            raise InputError(
-                f"{places.root}: found {len(counts)} places, expected places_per_batch "
-                f"{places_per_batch} (--places-per-batch) of them that are not near each other"
-            )
-        if found >= least:
-            break
-    return np.concatenate(drawn)[:steps]
-
-
-def _draw(
-    places: Places,
-    places_per_batch: int,
-    images_per_place: int,
-    order: Order,
-    generator: np.random.Generator,
-) -> Int[np.ndarray, "steps places images"]:
-    """Draw the batches of one turn, in which every place comes once."""
-    counts = places.image_counts
-    if order == "within-city":
-        city_rank = generator.permutation(len(places.cities))[places.place_city]
-    else:
-        city_rank = np.zeros(len(counts), np.int64)
-    place_order = np.lexsort((generator.random(len(counts)), city_rank))
-    if places.near is None:
-        steps = len(counts) // places_per_batch
-        chosen = place_order[: steps * places_per_batch].reshape(steps, places_per_batch)
-    else:
-        chosen = _apart(place_order.tolist(), places.near, places_per_batch)
-    # Sorting all images by (place, random key) shuffles the images within each place.
-    shuffled = np.lexsort((generator.random(len(places.files)), places.image_place))
-    return shuffled[places.place_start[chosen][..., None] + np.arange(images_per_place)]
-
-
-def _apart(
-    order: Sequence[int], near: Sequence[Int64[np.ndarray, " _"]], size: int
-) -> Int64[np.ndarray, "steps places"]:
-    """Fill batches with places in this order, so that none is near another of its batch."""
-    full: list[list[int]] = []
-    unfinished: list[tuple[list[int], set[int]]] = []
-    for place in order:
-        fitting = (number for number, (_, near_it) in enumerate(unfinished) if place not in near_it)
-        number = next(fitting, len(unfinished))
-        if number == len(unfinished):
-            unfinished.append(([], set()))
-        batch, near_it = unfinished[number]
-        batch.append(place)
-        near_it.update(near[place].tolist())
-        if len(batch) == size:
-            full.append(unfinished.pop(number)[0])
-    return np.array(full, np.int64).reshape(-1, size)

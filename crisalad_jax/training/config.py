@@ -15,6 +15,7 @@ from crisalad_jax.config.part import OrName
 from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.data.augmentations import AUGMENTATIONS, Augmentation
+from crisalad_jax.data.samplers import SAMPLERS, Sampler
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.optimisers import OPTIMISERS, Optimiser
@@ -153,8 +154,8 @@ class TrainConfig:
     mining: MiningConfig = MiningConfig()
     """Tuples of a set of queries, in the place of places. Then `places_per_batch` tuples make a
     batch, each of `images_per_place` images: a query, a positive, and the negatives."""
-    batch_order: Literal["within-city", "shuffled"] = "within-city"
-    """A batch of one city's places (hard negatives; the public loaders) or of all cities'."""
+    sampler: OrName[Sampler] = part_field(SAMPLERS, "within-city")
+    """Which places make a batch; a registered sampler, or its name."""
     cities: tuple[str, ...] | None = None
     """Which cities; None takes all."""
     epochs: int = 8
@@ -186,6 +187,7 @@ class TrainConfig:
         divides = micro_batch > 0 and batch % micro_batch == 0
         classifies, terms = loss.grouping is not None, terms_of(self.trainable)
         adapts = ADAPTERS not in terms or has_adapters(self.model)
+        draws_places = not (self.sampler.describes or self.sampler.regroups)
         classified = f"for loss {loss.part_name}, which classifies"
         tuples = f"'whole' or 'sample' for loss {loss.part_name}, which takes mined tuples"
         for config, name, fits, expected in (
@@ -194,6 +196,7 @@ class TrainConfig:
             (self.optimiser, "accumulate", accumulate == 1 or not classifies, f"1 {classified}"),
             (self.mining, "kind", not (classifies and self.mines), f"'none' {classified}"),
             (self.mining, "kind", self.mines or not loss.of_tuples, tuples),
+            (self, "sampler", draws_places or not classifies, f"another {classified}"),
             (self, "images_per_place", is_tuple, f"{size} with mined tuples"),
             (self, "min_images", self.min_images >= images or self.mines, f"at least {images}"),
             (self, "trainable", all(terms), "words and patterns with commas between them"),
@@ -211,9 +214,10 @@ class TrainConfig:
 
     @property
     def min_images_of_place(self) -> int:
-        """Smallest number of images of a place; 1 where images are regrouped to classes."""
+        """Smallest number of images of a place; 1 where images are regrouped."""
         grouping = self.loss.kind.grouping
-        return 1 if grouping is not None and grouping.kind != "places" else self.min_images
+        to_classes = grouping is not None and grouping.kind != "places"
+        return 1 if to_classes or self.sampler.regroups else self.min_images
 
 
 def has_adapters(model: ModelConfig) -> bool:

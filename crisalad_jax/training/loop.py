@@ -217,8 +217,8 @@ class _Loop:
                 self.save()
             if record.step == steps or record.stopped_early or self.callbacks.stopped:
                 return
-            if isinstance(self.data, Miner) and self.data.is_due(record.step):
-                self._mine(self.data)
+            if self.data.is_due(record.step):
+                self._mine()
             self._take_round()
 
     def _take_round(self) -> None:
@@ -312,18 +312,18 @@ class _Loop:
         self.bar.say(f"epoch {epoch}, step {record.step}: {words}")
         return self.files.record
 
-    def _mine(self, miner: Miner) -> None:
-        """Mine the tuples of the round that begins, by the model as it is."""
+    def _mine(self) -> None:
+        """Draw the batches of the round that begins by the model as it is."""
         trainable = self.trainer.gather(self.trainer.state.trainable)
 
         def mine() -> str:
             params = self.trainer.params(trainable)
             describe = functools.partial(self.validator.describe, params)
             with self.signals.at_once():
-                return miner.mine(self.files.record.step, describe)
+                return self.data.mine(self.files.record.step, describe)
 
         self.bar.say(distributed.run_on_primary(mine))
-        miner.mined = jax.tree.map(np.asarray, distributed.broadcast(miner.mined))
+        self.data.mined = jax.tree.map(np.asarray, distributed.broadcast(self.data.mined))
 
     def save(self) -> None:
         """Write the weights and the state to resume from."""

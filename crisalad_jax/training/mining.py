@@ -5,8 +5,7 @@ code and of Berton et al. (CVPR 2022), which Patch-NetVLAD and SelaVPR train wit
 """
 
 import math
-import pathlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,12 +14,10 @@ from jaxtyping import Float, Int, Int32
 from crisalad_jax.config.checks import require
 from crisalad_jax.data.loader import ImageBatch, batches_of_groups
 from crisalad_jax.data.query_set import QuerySet
+from crisalad_jax.data.samplers.base import Describe
 from crisalad_jax.training.batches import prepared_as
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.losses.pairs import Role, tuple_labels
-
-Describe = Callable[[Sequence[pathlib.Path]], Float[np.ndarray, "n descriptor"]]
-"""Takes image files; returns their descriptors, NaN for images that cannot be read."""
 
 
 class Mined(NamedTuple):

@@ -21,6 +21,7 @@ from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad, Model
 from crisalad_jax.training import distributed
+from crisalad_jax.training.batches import Drawn
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog
 from crisalad_jax.training.mining import Mined
@@ -38,8 +39,8 @@ class RunState(NamedTuple):
     """The arrays of a run."""
 
     training: TrainState
-    mined: Mined | None
-    """The tuples of the round that it is in; None where nothing is mined."""
+    mined: Mined | Drawn | None
+    """The batches of the round that it is in; None where they do not depend on the model."""
 
 
 @dataclasses.dataclass

@@ -53,7 +53,7 @@ loaded, before = time.perf_counter(), memory()
 places = read_places(sys.argv[1])
 indexed, index_memory = time.perf_counter(), memory()
 batches = training_batches(
-    places, image_size=(224, 224), places_per_batch=48, images_per_place=4, order="within-city",
+    places, image_size=(224, 224), places_per_batch=48, images_per_place=4, sampler="within-city",
     augmentation=RandAugmentConfig(), seed=0, epoch=0,
 )
 next(batches)

@@ -41,7 +41,8 @@ import torch  # isort: skip
 from crisalad_jax.config.preprocessing import IMAGENET_DEVIATION, IMAGENET_MEAN
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.data.loader import ImageBatch, training_batches
-from crisalad_jax.data.places import COLUMNS, Places, epoch_batches, read_places
+from crisalad_jax.data.places import COLUMNS, Places, read_places
+from crisalad_jax.data.samplers.base import epoch_batches
 from crisalad_jax.utils.host import usable_cores
 from parity.reference.augment import rand_augment
 
@@ -98,7 +99,7 @@ def epoch_of(batch: int) -> dict[str, Any]:
     return {
         "places_per_batch": batch // IMAGES_PER_PLACE,
         "images_per_place": IMAGES_PER_PLACE,
-        "order": "within-city",
+        "sampler": "within-city",
         "seed": 0,
         "epoch": 0,
     }

@@ -97,7 +97,7 @@ def small_vit() -> TrainConfig:
         backbone=dataclasses.replace(backbone, dim=64, depth=3, heads=2),
         cross_image="none",
     )
-    return dataclasses.replace(start, model=model, epochs=3, batch_order="shuffled", **BATCH)
+    return dataclasses.replace(start, model=model, epochs=3, sampler="shuffled", **BATCH)
 
 
 def with_encoder(config: TrainConfig) -> TrainConfig:

@@ -18,10 +18,11 @@ from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.loader import ImageBatch, ImageCache, training_batches
-from crisalad_jax.data.places import Places, epoch_batches, read_places
+from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import image_batches
 from crisalad_jax.data.resize import resize_image
+from crisalad_jax.data.samplers.base import epoch_batches
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import write_picture
 from tests.data.benchmarks.trees import refused
@@ -45,7 +46,7 @@ def start(places: Places, **changes) -> Iterator[ImageBatch]:
         "image_size": SIZE,
         "places_per_batch": 2,
         "images_per_place": 3,
-        "order": "within-city",
+        "sampler": "within-city",
         "augmentation": NoAugmentation(),
         "seed": 1,
         "epoch": 4,
@@ -72,7 +73,7 @@ def assert_same(found: list[ImageBatch], expected: list[ImageBatch]) -> None:
 def test_training_batches_hold_the_images_that_the_epoch_drew(places):
     batches = train(places)
     drawn = epoch_batches(
-        places, places_per_batch=2, images_per_place=3, order="within-city", seed=1, epoch=4
+        places, places_per_batch=2, images_per_place=3, sampler="within-city", seed=1, epoch=4
     )
     assert len(batches) == len(drawn) == 3
     for batch, images in zip(batches, drawn.reshape(3, 6), strict=True):

@@ -9,7 +9,8 @@ import crisalad_jax as cj
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.data.class_groups import class_groups, views_of
 from crisalad_jax.data.loader import ImageCache, training_batches
-from crisalad_jax.data.places import epoch_batches, read_places
+from crisalad_jax.data.places import read_places
+from crisalad_jax.data.samplers.base import epoch_batches
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.conftest import RECIPE, write_picture, write_video
@@ -122,7 +123,7 @@ def test_negatives_of_a_batch_are_farther_than_its_positives(tmp_path, seed):
     table = _write_table(touch_all(tmp_path, points) / "t.csv", "name,x,y", rows)
     places = read_places(table, place_radius=10, min_images=4)
     where = np.array([points[file] for file in places.files])
-    draw = {"places_per_batch": 8, "images_per_place": 4, "order": "shuffled", "seed": seed}
+    draw = {"places_per_batch": 8, "images_per_place": 4, "sampler": "shuffled", "seed": seed}
     batches = epoch_batches(places, epoch=0, **draw)
     for batch in batches:
         place, at = places.image_place[batch.ravel()], where[batch.ravel()]
@@ -141,7 +142,7 @@ def test_negatives_of_a_batch_are_farther_than_its_positives(tmp_path, seed):
 def test_too_many_places_for_a_batch(tmp_path):
     # 100 m hold at most three 40 m apart.
     places = _by_radius(_street(tmp_path / "walk", range(0, 100, 2)), 2)
-    draw = {"images_per_place": 2, "order": "shuffled", "seed": 0, "epoch": 0}
+    draw = {"images_per_place": 2, "sampler": "shuffled", "seed": 0, "epoch": 0}
     assert len(epoch_batches(places, places_per_batch=2, **draw))
     with pytest.raises(InputError, match=r"expected places_per_batch 5 .* not near each other"):
         epoch_batches(places, places_per_batch=5, **draw)
@@ -166,7 +167,7 @@ def test_a_video_trains_as_its_frames(tmp_path, cache):
     places = read_places(video, place_frames=4, fps=10, min_images=4)
     seconds = ("0.000", "0.400", "0.800", "1.200")
     assert places.names == tuple(f"walk.avi#t={second}" for second in seconds)
-    how = {"order": "shuffled", "augmentation": "none", "seed": 0, "epoch": 0, "cache": cache}
+    how = {"sampler": "shuffled", "augmentation": "none", "seed": 0, "epoch": 0, "cache": cache}
     sizes = {"image_size": (48, 64), "places_per_batch": 2, "images_per_place": 2}
     batches = training_batches(places, **sizes, **how)
     for batch in batches:
@@ -246,7 +247,7 @@ def test_each_folder_with_images_is_a_place(folders):
     assert places.path(2) == folders / "north" / "park" / "a.png"
     assert read_places(folders, min_images=1).image_counts.tolist() == [2, 1, 2]
     sizes = {"places_per_batch": 2, "images_per_place": 2}
-    batches = epoch_batches(places, order="within-city", seed=0, epoch=0, **sizes)
+    batches = epoch_batches(places, sampler="within-city", seed=0, epoch=0, **sizes)
     assert sorted(batches.ravel().tolist()) == [0, 1, 2, 3]
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crisalad_jax.data.places import Places, epoch_batches, read_places
+from crisalad_jax.data.places import Places, read_places
+from crisalad_jax.data.samplers.base import epoch_batches
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.conftest import PHOTOGRAPHS
@@ -164,23 +165,23 @@ def test_a_field_that_is_no_number(two_cities, column, text):
         read_places(two_cities)
 
 
-def draw(places: Places, order="shuffled", seed=0, epoch=0, **changes) -> np.ndarray:
+def draw(places: Places, sampler="shuffled", seed=0, epoch=0, **changes) -> np.ndarray:
     sizes = {"places_per_batch": 4, "images_per_place": 4} | changes
-    return epoch_batches(places, order=order, seed=seed, epoch=epoch, **sizes)
+    return epoch_batches(places, sampler=sampler, seed=seed, epoch=epoch, **sizes)
 
 
-@pytest.mark.parametrize("order", ["within-city", "shuffled"])
-def test_epoch_samples_each_place_once(order):
+@pytest.mark.parametrize("sampler", ["within-city", "shuffled"])
+def test_epoch_samples_each_place_once(sampler):
     """As a function of the seed and the epoch; a city after the other, or all mixed."""
     places = uneven(cities=3, places_per_city=10)
-    batches = draw(places, order, 1, 2)
-    np.testing.assert_array_equal(batches, draw(places, order, 1, 2))
-    assert (batches != draw(places, order, 1, 3)).any()
-    assert (batches != draw(places, order, 2, 2)).any()
+    batches = draw(places, sampler, 1, 2)
+    np.testing.assert_array_equal(batches, draw(places, sampler, 1, 2))
+    assert (batches != draw(places, sampler, 1, 3)).any()
+    assert (batches != draw(places, sampler, 2, 2)).any()
     assert batches.shape == (7, 4, 4)  # 30 places: the last two are dropped
     cities = places.place_city[places.image_place[batches[..., 0]]]
     changes = (np.diff(cities.ravel()) != 0).sum()
-    assert changes == 2 if order == "within-city" else changes > 2
+    assert changes == 2 if sampler == "within-city" else changes > 2
     labels = places.image_place[batches]
     assert (labels == labels[..., :1]).all()
     assert Counter(labels[..., 0].ravel().tolist()).most_common(1)[0][1] == 1
@@ -237,7 +238,7 @@ def test_within_city_shuffles_places_and_cities():
         ({"images_per_place": 5}, "place 0 has 4 images, expected at least .* 5"),
         ({"places_per_batch": 0}, "found places_per_batch=0, .* expected numbers from 1"),
         ({"steps": 0}, "found .*steps=0, expected numbers from 1"),
-        ({"order": "random"}, "order: found 'random', expected one of shuffled, within-city"),
+        ({"sampler": "random"}, "sampler: found 'random', expected one of cliques, .*within-city"),
     ],
 )
 def test_bad_epoch_arguments(changes, message):

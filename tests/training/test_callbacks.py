@@ -1,6 +1,7 @@
 """Callbacks: the numbers that they get, a run that one stops, and what they write elsewhere."""
 
 import csv
+import dataclasses
 import sys
 import types
 from typing import Any
@@ -9,6 +10,7 @@ from unittest import mock
 import pytest
 
 import crisalad_jax as cj
+from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli import train as train_command
 from crisalad_jax.data.loader import ImageCache
 from crisalad_jax.nn.aggregators.salad import SaladConfig
@@ -18,7 +20,12 @@ from crisalad_jax.training.callbacks import CALLBACKS, Callback, Callbacks, make
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
 from crisalad_jax.utils.errors import InputError
-from tests.training.test_loop import ENDLESS, assert_same_run
+from tests.training.test_loop import (
+    ENDLESS,
+    assert_same_params,
+    assert_same_run,
+    metrics_of,
+)
 
 
 class Recorder(Callback):
@@ -71,6 +78,26 @@ def test_a_run_that_callbacks_stop_resumes_to_the_same_bits(
             rows = list(csv.DictReader(file))
         expected = [numbers for each, numbers in found if each == kind]
         assert rows == [{key: str(value) for key, value in each.items()} for each in expected]
+
+
+def test_a_run_whose_batches_depend_on_the_model_resumes_to_the_same_bits(
+    places, params, tmp_path
+) -> None:
+    """Stopped within its second epoch, whose batches the weights of its beginning have drawn."""
+    plain, how = dataclasses.replace(ENDLESS, places_per_batch=2, epochs=2), {"quiet": True}
+    config = dataclasses.replace(plain, sampler="hard-negatives")
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    fit(config, places, whole, initial=params, **how)
+    # The step after the one that is logged is under way, and is finished.
+    for stop, taken in ((("step", 5), 6), (None, 8)):
+        recorder = Recorder(*([stop] if stop else []))
+        result = fit(config, places, parts, initial=params, callbacks=[recorder], **how)
+        assert result.steps == taken
+    assert metrics_of(parts) == metrics_of(whole)
+    assert_same_params(load_weights(parts / "last.safetensors")[0], result.params)
+    assert_same_params(load_weights(whole / "last.safetensors")[0], result.params)
+    fit(plain, places, tmp_path / "plain", initial=params, **how)
+    assert metrics_of(tmp_path / "plain")[0]["loss"] != metrics_of(whole)[0]["loss"]
 
 
 class Skipped(tuple):

@@ -19,9 +19,10 @@ from crisalad_jax.config.plugins import sources_of
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.loader import ImageCache
-from crisalad_jax.data.places import epoch_batches, read_places
+from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import resize_image
+from crisalad_jax.data.samplers.base import epoch_batches
 from crisalad_jax.evaluation.evaluate import GroupingResult, evaluate
 from crisalad_jax.nn.config import with_aggregator
 from crisalad_jax.nn.model import Crisalad, Model, extract_tokens
@@ -429,7 +430,12 @@ def test_unreadable_images_are_counted_each_time_they_come_up(tmp_path, city, pa
         places.path(image).write_bytes(b"")
     drawn = [
         epoch_batches(
-            places, places_per_batch=3, images_per_place=2, order="within-city", seed=5, epoch=epoch
+            places,
+            places_per_batch=3,
+            images_per_place=2,
+            sampler="within-city",
+            seed=5,
+            epoch=epoch,
         )
         for epoch in range(3)
     ]

@@ -228,7 +228,7 @@ def find_part(
 
 _KINDS = (
     *("aggregator", "adapter", "cross_image", "step", "dustbin", "loss", "backbone"),
-    *("augmentation", "gradient", "start", "optimiser", "schedule"),
+    *("augmentation", "sampler", "gradient", "start", "optimiser", "schedule"),
 )
 
 
@@ -243,8 +243,8 @@ def with_part(config: TrainConfig, part: Any) -> TrainConfig:
         InputError: the part does not fit, or the recipe has no place for it.
     """
     kind, model = part.registry.kind, config.model
-    if kind == "augmentation":
-        return dataclasses.replace(config, augmentation=part)
+    if kind in ("augmentation", "sampler"):
+        return dataclasses.replace(config, **{kind: part})
     if kind in ("optimiser", "schedule"):
         field = "kind" if kind == "optimiser" else "schedule"
         optimiser = dataclasses.replace(config.optimiser, **{field: part})
@@ -328,7 +328,7 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
         trainable="all",
         augmentation=augmentation,
         **({} if config.mines else batches),
-        batch_order="shuffled",
+        sampler="shuffled",
         epochs=150,
         validate_every=10,
         patience=None,

@@ -32,7 +32,7 @@ def _classified(model: ModelConfig, loss: LargeMarginCosineConfig, **fields: Any
         ),
         places_per_batch=32,
         images_per_place=1,
-        batch_order="shuffled",
+        sampler="shuffled",
         patience=None,
         **fields,
     )

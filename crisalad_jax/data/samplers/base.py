@@ -1,0 +1,251 @@
+"""Samplers: which places, and which of their images, make the batches of an epoch."""
+
+import abc
+import dataclasses
+import itertools
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.config.part import Part
+from crisalad_jax.config.registry import Registry, count_arguments
+from crisalad_jax.data.places import Places
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float, Int
+
+_TURNS = 20
+"""Turns without a batch after which none is expected."""
+
+Describe = Callable[[Sequence[pathlib.Path]], Float[np.ndarray, "n descriptor"]]
+"""Takes image files; returns their descriptors, NaN for images that cannot be read."""
+
+
+class Draw(NamedTuple):
+    """What a sampler draws by: the size of a batch, the epoch, and its random numbers."""
+
+    places_per_batch: int
+    images_per_place: int
+    epoch: int
+    """From 0."""
+    generator: np.random.Generator
+    """Draws the same for the same seed and epoch."""
+    described: Int[np.ndarray, " n"]
+    """Images of `Sampler.images_to_describe`; none where `Sampler.describes` is False."""
+    descriptors: Float[np.ndarray, "n descriptor"]
+    """Their descriptors by the model as it is; NaN for images that cannot be read."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sampler(Part, abc.ABC):
+    """The way batches are drawn from places: a frozen dataclass with its settings as fields.
+
+    A plain function of (places, draw) is a sampler without settings.
+
+    Example:
+        >>> import numpy as np
+        >>> from crisalad_jax import TrainConfig, read_places, register_sampler
+        >>> @register_sampler("south-to-north")
+        ... def south_to_north(places, draw):
+        ...     latitude = places.views[places.place_start[:-1], 0]
+        ...     return np.argsort(latitude)
+        >>> TrainConfig(sampler="south-to-north").sampler.part_name
+        'south-to-north'
+    """
+
+    describes: ClassVar[bool] = False
+    """Whether it draws by descriptors, which the model makes as it is when an epoch begins."""
+    regroups: ClassVar[bool] = False
+    """Whether it makes places of its own: images of a group may be of several of the set's places,
+    and of these some may have few images."""
+
+    def check(self, places: Places) -> None:
+        """Raise InputError where it cannot draw from these places; by default never."""
+
+    def images_to_describe(
+        self, places: Places, generator: np.random.Generator
+    ) -> Int[np.ndarray, " n"]:
+        """Return the images of `Draw.descriptors`; by default one of each place, drawn anew."""
+        return generator.integers(places.place_start[:-1], places.place_start[1:])
+
+    @abc.abstractmethod
+    def apply(
+        self, places: Places, draw: Draw
+    ) -> Int[np.ndarray, " order"] | Int[np.ndarray, "steps places images"]:
+        """Draw batches, as many as take every place about once.
+
+        Args:
+            places: the training set.
+            draw: the size of a batch, and random numbers.
+
+        Returns:
+            Places in an order, of which consecutive ones make a batch, or the images of every
+            batch. In an order a place may be missing, or come again; then it has other images. A
+            place that is `Places.near` another of its batch goes into the next.
+        """
+
+
+def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
+    """Return the methods of a sampler that is a plain function."""
+    count = count_arguments(function, "places", "draw")
+
+    def apply(_: Sampler, places: Places, draw: Draw) -> np.ndarray:
+        return function(*(places, draw)[:count])
+
+    return {"apply": apply}
+
+
+SAMPLERS = Registry("sampler", Sampler, of_function=_of_function)
+
+
+def epoch_batches(
+    places: Places,
+    *,
+    sampler: Sampler | str,
+    places_per_batch: int,
+    images_per_place: int,
+    seed: int,
+    epoch: int,
+    steps: int | None = None,
+    describe: Describe | None = None,
+) -> Int[np.ndarray, "steps places images"]:
+    """Draw the images of every batch of an epoch, as a function of (seed, epoch).
+
+    Of each place `images_per_place` images are sampled without replacement. An incomplete last
+    batch is dropped. With `steps` the epoch has exactly this number of batches: it is cut short, or
+    continued with new draws. Without, the number may differ from epoch to epoch where places are
+    `Places.near` each other.
+
+    Args:
+        places: the training set.
+        sampler: what draws; a registered sampler, or its name.
+        places_per_batch: number of places of a batch.
+        images_per_place: number of images of each.
+        seed: draws, with the epoch.
+        epoch: from 0.
+        steps: number of batches; None is what the sampler draws in a turn.
+        describe: describes images; for samplers with `Sampler.describes`.
+
+    Returns:
+        Numbers of images.
+
+    Raises:
+        InputError: a place has too few images, the sampler finds no batch, or returns anything but
+            what `Sampler.apply` says; no such sampler, a negative seed or epoch, less than one
+            step, or no `describe`.
+    """
+    drawn_by = SAMPLERS.resolve(sampler, "sampler")
+    least = 1 if steps is None else steps
+    require(
+        min(places_per_batch, images_per_place, least, seed + 1, epoch + 1) > 0,
+        f"epoch_batches: found {places_per_batch=}, {images_per_place=}, {seed=}, {epoch=} and "
+        f"{steps=}, expected numbers from 1, and from 0 for the seed and the epoch",
+    )
+    counts = places.image_counts
+    place = int(counts.argmin())
+    require(
+        drawn_by.regroups or counts[place] >= images_per_place,
+        f"{places.root}: place {places.names[place]} has {counts[place]} images, expected at "
+        f"least images_per_place {images_per_place}",
+    )
+    drawn_by.check(places)
+
+    def generator(turn: int, key: int) -> np.random.Generator:
+        # The spawn key makes this stream independent of the loader's from (seed, epoch).
+        entropy = (seed, epoch, turn) if turn else (seed, epoch)
+        return np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=(key,)))
+
+    described, descriptors = np.zeros(0, np.int64), np.zeros((0, 0), np.float32)
+    if drawn_by.describes:
+        require(
+            describe is not None,
+            f"sampler: found {drawn_by.part_name}, which draws by descriptors, and no `describe`",
+        )
+        assert describe is not None
+        described = drawn_by.images_to_describe(places, generator(0, key=4))
+        descriptors = describe([places.path(image) for image in described])
+    drawn: list[np.ndarray] = []
+    for turn in itertools.count():
+        # The first turn draws the same as an epoch without `steps`.
+        size = places_per_batch, images_per_place
+        draw = Draw(*size, epoch, generator(turn, key=0), described, descriptors)
+        drawn.append(_draw(places, drawn_by, draw))
+        found = sum(map(len, drawn))
+        if not found and turn == _TURNS - 1:
+            raise InputError(
+                f"{places.root}: found {len(counts)} places of which sampler {drawn_by.part_name} "
+                f"makes no batch, expected places_per_batch {places_per_batch} "
+                "(--places-per-batch) of them that are not near each other"
+            )
+        if found >= least:
+            break
+    return np.concatenate(drawn)[:steps]
+
+
+def labels_of(
+    places: Places, sampler: Sampler, chosen: Int[np.ndarray, "steps places images"]
+) -> Int[np.ndarray, "steps places images"]:
+    """Return the images' places; numbers in the batch where the sampler makes places of its own."""
+    if sampler.regroups:
+        return np.broadcast_to(np.arange(chosen.shape[1], dtype=np.int32)[:, None], chosen.shape)
+    return places.image_place[chosen]
+
+
+def _draw(places: Places, sampler: Sampler, draw: Draw) -> Int[np.ndarray, "steps places images"]:
+    """Draw the batches of one turn, and check them."""
+    found = np.asarray(sampler.apply(places, draw))
+    is_order, count = found.ndim == 1, len(places.names if found.ndim == 1 else places.files)
+    size = draw.places_per_batch, draw.images_per_place
+    where, what = f"sampler {sampler.part_name}", "places" if is_order else "images"
+    require(
+        np.issubdtype(found.dtype, np.integer) and (is_order or found.shape[1:] == size),
+        f"{where}: found {found.dtype} of shape {found.shape}, expected numbers of places in an "
+        f"order, or of images in the shape (steps, {size[0]}, {size[1]})",
+    )
+    outside = found[(found < 0) | (found >= count)]
+    require(not outside.size, f"{where}: found {what} {outside[:3]}, expected 0 to {count - 1}")
+    if is_order:
+        return _images_of(places, _apart(found.tolist(), places.near, size[0]), draw)
+    labels = labels_of(places, sampler, found)
+    mixed = np.flatnonzero((labels != labels[..., :1]).any(axis=(1, 2)))
+    require(not mixed.size, f"{where}: found images of two places in a group of batch {mixed[:1]}")
+    return found
+
+
+def _images_of(
+    places: Places, chosen: Int[np.ndarray, "steps places"], draw: Draw
+) -> Int[np.ndarray, "steps places images"]:
+    """Sample images of places without replacement; of one that comes again, those that are left."""
+    # Sorting all images by (place, random key) shuffles the images within each place.
+    shuffled = np.lexsort((draw.generator.random(len(places.files)), places.image_place))
+    flat = chosen.reshape(-1)
+    order = np.argsort(flat, kind="stable")
+    _, first, times = np.unique(flat[order], return_index=True, return_counts=True)
+    before = np.empty(len(flat), np.int64)
+    before[order] = np.arange(len(flat)) - np.repeat(first, times)
+    offset = before.reshape(*chosen.shape, 1) * draw.images_per_place
+    offset = (offset + np.arange(draw.images_per_place)) % places.image_counts[chosen][..., None]
+    return shuffled[places.place_start[chosen][..., None] + offset]
+
+
+def _apart(
+    order: Sequence[int], near: Sequence[np.ndarray] | None, size: int
+) -> Int[np.ndarray, "steps places"]:
+    """Fill batches with places in this order, so that none is near another of its batch."""
+    full: list[list[int]] = []
+    unfinished: list[tuple[list[int], set[int]]] = []
+    for place in order:
+        fitting = (number for number, (_, near_it) in enumerate(unfinished) if place not in near_it)
+        number = next(fitting, len(unfinished))
+        if number == len(unfinished):
+            unfinished.append(([], set()))
+        batch, near_it = unfinished[number]
+        batch.append(place)
+        near_it.add(place)
+        if near is not None:
+            near_it.update(near[place].tolist())
+        if len(batch) == size:
+            full.append(unfinished.pop(number)[0])
+    return np.array(full, np.int64).reshape(-1, size)

@@ -1,0 +1,136 @@
+"""CliqueMining: places made of images that stand close together, in streets that look alike.
+
+Written from the paper (Izquierdo and Civera, "Close, But Not There: Boosting Geographic Distance
+Sensitivity in Visual Place Recognition", ECCV 2024). There an earlier model describes the clusters
+once; here the model that is trained does, when an epoch begins.
+"""
+
+import collections
+import dataclasses
+from typing import ClassVar
+
+import numpy as np
+
+from crisalad_jax.config.checks import NonNegativeInt, PositiveFloat, require
+from crisalad_jax.data.class_groups import Views, views_of
+from crisalad_jax.data.places import Places
+from crisalad_jax.data.samplers.base import SAMPLERS, Draw, Sampler
+from crisalad_jax.utils.shapes import Float, Int
+
+
+@SAMPLERS.register("cliques")
+@dataclasses.dataclass(frozen=True)
+class Cliques(Sampler):
+    """Groups of images within `radius` of each other, and of no image of another group.
+
+    A batch begins with a random place of the set, and others of its city that are drawn the more
+    likely the more they look like it. Their images are cut into groups; where these do not fill the
+    batch, it goes on with another city.
+    """
+
+    describes: ClassVar[bool] = True
+    regroups: ClassVar[bool] = True
+    radius: PositiveFloat = 25.0
+    """Metres."""
+    similar: NonNegativeInt = 15
+    """Number of places that are drawn by their likeness to a random one."""
+
+    def check(self, places: Places) -> None:
+        """Require positions of all cities.
+
+        Raises:
+            InputError: the images have none.
+        """
+        require(
+            bool(views_of(places).known.all()),
+            f"{places.root}: found no positions, or one for all images of a city, expected a table "
+            "name,place,lat,lon, names with positions, or the layout of GSV-Cities, for sampler "
+            f"{self.part_name}",
+        )
+
+    def apply(self, places: Places, draw: Draw) -> Int[np.ndarray, "steps places images"]:
+        """Return as many batches as would take every place once; fewer where some do not fill."""
+        views = views_of(places)
+        steps = max(1, len(places.names) // draw.places_per_batch)
+        batches = (self._batch(places, views, draw) for _ in range(steps))
+        full = [batch for batch in batches if batch is not None]
+        size = draw.places_per_batch, draw.images_per_place
+        return np.array(full, np.int64).reshape(-1, *size)
+
+    def _batch(
+        self, places: Places, views: Views, draw: Draw
+    ) -> Int[np.ndarray, "places images"] | None:
+        """Draw a batch; None where all places together do not fill one."""
+        points = np.column_stack([views.east, views.north])
+        left, in_new_city = np.ones((2, len(places.names)), bool)
+        groups: list[np.ndarray] = []
+        taken: dict[int, list[np.ndarray]] = collections.defaultdict(list)
+        """City -> positions of its groups' images."""
+        while left.any():
+            some = in_new_city if in_new_city.any() else left
+            first = draw.generator.choice(np.flatnonzero(some))
+            city = int(places.place_city[first])
+            in_city = places.place_city == city
+            in_new_city &= ~in_city
+            drawn = self._similar(first, np.flatnonzero(left & in_city), draw)
+            left[drawn] = False
+            starts, ends = places.place_start[drawn], places.place_start[drawn + 1]
+            images = np.concatenate(list(map(np.arange, starts, ends)))
+            for others in taken[city]:
+                apart = _distances(points[images], others) >= self.radius
+                images = images[apart.all(axis=1)]
+            images = draw.generator.permutation(images)
+            for clique in _cliques(points[images], self.radius, draw.images_per_place):
+                groups.append(draw.generator.choice(images[clique], draw.images_per_place, False))
+                taken[city].append(points[images[clique]])
+                if len(groups) == draw.places_per_batch:
+                    return np.array(groups)
+        return None
+
+    def _similar(
+        self, first: int, others: Int[np.ndarray, " place"], draw: Draw
+    ) -> Int[np.ndarray, " place"]:
+        """Draw places by the likeness of their descriptors to that of `first`, which is one."""
+        others = others[others != first]
+        difference = draw.descriptors[others] - draw.descriptors[first]
+        distances = np.sqrt((difference * difference).sum(axis=1))
+        # One whose image cannot be read is as far as the farthest, and so not drawn.
+        farthest = np.nan_to_num(distances).max(initial=0)
+        likeness = farthest - np.nan_to_num(distances, nan=farthest)
+        if not likeness.any():
+            likeness = np.ones(len(others))
+        count = min(self.similar, int(np.count_nonzero(likeness)))
+        if count == 0:
+            return np.array([first])
+        shares = likeness / likeness.sum()
+        return np.append(draw.generator.choice(others, count, replace=False, p=shares), first)
+
+
+def _cliques(
+    points: Float[np.ndarray, "image 2"], radius: float, size: int
+) -> list[Int[np.ndarray, " clique"]]:
+    """Find groups of at least `size` points within a radius of each other, apart by the radius.
+
+    A group grows from the first point that is left by the nearest that is within the radius of all
+    its members, so it is maximal; then its neighbours are left out.
+    """
+    distances = _distances(points, points)
+    found, left = [], np.ones(len(points), bool)
+    for first in range(len(points)):
+        clique, fitting = [], left & (distances[first] < radius)
+        while left[first] and fitting.any():
+            nearest = int(np.where(fitting, distances[first], np.inf).argmin())
+            clique.append(nearest)
+            fitting &= distances[nearest] < radius
+            fitting[nearest] = False
+        if len(clique) >= size:
+            found.append(np.array(clique))
+            left &= (distances[clique] >= radius).all(axis=0)
+    return found
+
+
+def _distances(
+    points: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "m 2"]
+) -> Float[np.ndarray, "n m"]:
+    """Compute distances in metres."""
+    return np.linalg.norm(points[:, None] - others, axis=-1)

@@ -1,0 +1,36 @@
+"""Batches of places that the model confuses."""
+
+import dataclasses
+from typing import ClassVar
+
+import numpy as np
+
+from crisalad_jax.data.places import Places
+from crisalad_jax.data.samplers.base import SAMPLERS, Draw, Sampler
+from crisalad_jax.utils.shapes import Int
+
+
+@SAMPLERS.register("hard-negatives")
+@dataclasses.dataclass(frozen=True)
+class HardNegatives(Sampler):
+    """A random place and those that look most like it, by the model when an epoch begins.
+
+    An image stands for each place. GPM (Ali-bey et al., BMVC 2022) draws such batches by proxies
+    that are trained with the model.
+    """
+
+    describes: ClassVar[bool] = True
+
+    def apply(self, places: Places, draw: Draw) -> Int[np.ndarray, " order"]:
+        """Return every place once, each batch's first at random, the others nearest to it first."""
+        left = draw.generator.permutation(len(places.names))
+        order = []
+        while len(left):
+            similarity = draw.descriptors[left] @ draw.descriptors[left[0]]
+            # A place whose image cannot be read is like no other.
+            similarity = np.nan_to_num(similarity, nan=-np.inf)
+            similarity[0] = np.inf
+            nearest = np.argsort(-similarity, kind="stable")[: draw.places_per_batch]
+            order.append(left[nearest])
+            left = np.delete(left, nearest)
+        return np.concatenate(order)

@@ -1,0 +1,33 @@
+"""Random places, of all cities or of one in a batch."""
+
+import dataclasses
+
+import numpy as np
+
+from crisalad_jax.data.places import Places
+from crisalad_jax.data.samplers.base import SAMPLERS, Draw, Sampler
+from crisalad_jax.utils.shapes import Int
+
+
+@SAMPLERS.register("shuffled")
+@dataclasses.dataclass(frozen=True)
+class Shuffled(Sampler):
+    """Places of all cities in random order."""
+
+    def apply(self, places: Places, draw: Draw) -> Int[np.ndarray, " order"]:
+        """Return every place once."""
+        return np.argsort(draw.generator.random(len(places.names)))
+
+
+@SAMPLERS.register("within-city")
+@dataclasses.dataclass(frozen=True)
+class WithinCity(Sampler):
+    """City after city in random order, as the public loaders draw.
+
+    A batch is then nearly always of one city, whose places are hard to tell apart.
+    """
+
+    def apply(self, places: Places, draw: Draw) -> Int[np.ndarray, " order"]:
+        """Return every place once, those of a city together."""
+        city_rank = draw.generator.permutation(len(places.cities))[places.place_city]
+        return np.lexsort((draw.generator.random(len(places.names)), city_rank))
