@@ -12,6 +12,7 @@ import numpy as np
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.registry import Registry, count_arguments
+from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.places import Places
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Int
@@ -23,6 +24,7 @@ Describe = Callable[[Sequence[pathlib.Path]], Float[np.ndarray, "n descriptor"]]
 """Takes image files; returns their descriptors, NaN for images that cannot be read."""
 
 
+@brief
 class Draw(NamedTuple):
     """What a sampler draws by: the size of a batch, the epoch, and its random numbers."""
 
