@@ -4,14 +4,14 @@ import dataclasses
 import functools
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from crisalad_jax.nn.adapters import ADAPTERS, Adapter
-from crisalad_jax.nn.backbones.vit import ViTConfig
+from crisalad_jax.nn.adapters import ADAPTERS
+from crisalad_jax.nn.backbones.vit import Block, ViTConfig, run_blocks
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.costs import adapter_macs, paper_adapter_macs
 from crisalad_jax.utils.compiler import jit
@@ -103,12 +103,15 @@ class AdapterCost(NamedTuple):
     macs: int
     """Multiply-accumulates that an image really takes more in a block."""
     time: Spread | None
-    """Time over the depthwise adapter's, over the rounds; None where it was not measured."""
+    """Time of a training step's block over one without adapter, over the rounds; None where it was
+    not measured."""
+    memory: float | None
+    """Memory of the same over that of a block without adapter, as the compiler counts it."""
 
 
 NOTES = (
     "Table 3 at the paper's size (ViT-B/14, 224 x 224 pixels); docs/comparison.md says what the "
-    "paper counts.",
+    "paper counts. Time and memory are of a block in training, over those of one without adapter.",
 )
 
 
@@ -120,23 +123,36 @@ _PAPER_PARAMETERS: Mapping[str, int] = {
 """By the count that docs/comparison.md explains."""
 
 
+class AdapterMeasurements(NamedTuple):
+    """Measurements of a block of a ViT-B/14 in training, by the name of its adapter."""
+
+    seconds: Mapping[str, Sequence[float]]
+    """What `race` returns of `adapter_calls`."""
+    memory: Mapping[str, int]
+    """Bytes of its activations and gradients."""
+
+
 def adapter_calls() -> dict[str, Callable[[], Callable[[], Any]]]:
-    """Make what `race` takes, to time an adapter of each kind on four images."""
-    key, tokens = jax.random.key(0), jnp.ones((4, 1 + 16 * 16, ViTConfig().dim), jnp.float32)
+    """Make what `race` takes, to time a block's training with each adapter on four images."""
 
     def ready(name: str) -> Callable[[], Any]:
-        adapter = ADAPTERS.make(name)
-        params = adapter.init(key, ViTConfig().block_shape)
-        return lambda: jax.block_until_ready(_apply_adapter(params, tokens, adapter))
+        inputs = _stack_and_tokens(name)
+        return lambda: jax.block_until_ready(_block_program(name)(*inputs))
 
-    return {name: functools.partial(ready, name) for name in _PAPER_PARAMETERS}
+    return {name: functools.partial(ready, name) for name in ADAPTERS}
 
 
-def adapter_costs(seconds: Mapping[str, Sequence[float]]) -> list[AdapterCost]:
+def adapter_memory(names: Iterable[str]) -> dict[str, int]:
+    """Return the bytes of a block's training with each of these adapters, on four images."""
+    analyses = {name: _block_program(name).memory_analysis() for name in names}
+    return {name: each.temp_size_in_bytes for name, each in analyses.items() if each is not None}
+
+
+def adapter_costs(measured: AdapterMeasurements) -> list[AdapterCost]:
     """Compute Table 3, of one adapter at the paper's size, with rows for all other adapters.
 
     Args:
-        seconds: what `race` returns of `adapter_calls`; empty where they were not timed.
+        measured: with empty mappings where nothing was measured.
     """
     costs = []
     for name in (*_PAPER_PARAMETERS, *sorted({*ADAPTERS} - {"none", *_PAPER_PARAMETERS})):
@@ -146,14 +162,33 @@ def adapter_costs(seconds: Mapping[str, Sequence[float]]) -> list[AdapterCost]:
         macs = None if paper_parameters is None else paper_adapter_macs(model, true_macs)
         if name == "mlp":  # the paper counts each weight twice here, and the biases
             macs = 2 * (macs or 0) + backbone.dim // 2 + backbone.dim
-        time = Spread.of(ratios(seconds, name, "depthwise")) if name in seconds else None
+        seconds, memory = measured
+        time = Spread.of(ratios(seconds, name, "none")) if name in seconds else None
+        relative = memory[name] / memory["none"] if name in memory else None
         make = functools.partial(backbone.adapter.init, shape=backbone.block_shape)
         leaves = jax.tree.leaves(jax.eval_shape(make, jax.random.key(0)))
-        parameters = sum(leaf.size for leaf in leaves)
-        costs.append(AdapterCost(name, paper_parameters, parameters, macs, true_macs, time))
+        sizes = paper_parameters, sum(leaf.size for leaf in leaves), macs, true_macs
+        costs.append(AdapterCost(name, *sizes, time, relative))
     return costs
 
 
-@functools.partial(jit, static_argnames="adapter")
-def _apply_adapter(params: Any, tokens: jax.Array, adapter: Adapter) -> Any:
-    return adapter.mlp_update(params, tokens, (16, 16))[0]
+def _stack_and_tokens(name: str) -> tuple[Block, jax.Array]:
+    """Make a stack of one block, and the tokens of four images."""
+    backbone = ViTConfig(depth=1, adapter=name)
+    tokens = jnp.ones((4, 1 + 16 * 16, backbone.dim), jnp.float32)
+    return backbone.init(jax.random.key(0)).blocks, tokens  # pyright: ignore[reportReturnType]
+
+
+@functools.cache
+def _block_program(name: str) -> jax.stages.Compiled:
+    """Compile the gradient of a block for its adapter and its input; its weights are frozen."""
+    backbone = ViTConfig(depth=1, adapter=name)
+
+    def total(adapter: Any, stack: Block, tokens: jax.Array) -> jax.Array:
+        stack = dataclasses.replace(stack, adapter=adapter)
+        return run_blocks([stack], tokens, (16, 16), backbone)[0].sum()
+
+    def gradient(stack: Block, tokens: jax.Array) -> Any:
+        return jax.grad(total, argnums=(0, 2))(stack.adapter, stack, tokens)
+
+    return jit(gradient).lower(*_stack_and_tokens(name)).compile()

@@ -19,6 +19,7 @@ from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
 from crisalad_jax.experiments.comparison.costs import (
     NOTES,
     AdapterCost,
+    AdapterMeasurements,
     Spread,
     adapter_costs,
     ratios,
@@ -280,7 +281,7 @@ def summarise(prepared: Prepared, runs: Sequence[Run], speed: Mapping[str, Any])
         prepared: the comparison.
         runs: its runs, which are done.
         speed: the times of all models: "rounds", "batch_size", "device", whether seconds are
-            "absolute", and the times of "adapters".
+            "absolute", and the times of "adapters" and "adapter_memory".
 
     Returns:
         The summary.
@@ -298,7 +299,8 @@ def summarise(prepared: Prepared, runs: Sequence[Run], speed: Mapping[str, Any])
         require(run.is_done, f"{path}: found none of this run's, expected it until the end")
         results.setdefault(run.variant.run, []).append((run, run.read()))
     rows = [_rows(variant, reference, sets, results, speed) for variant in prepared.variants]
-    adapters = adapter_costs(speed["adapters"]) if config.is_papers else []
+    measured = AdapterMeasurements(speed["adapters"], speed["adapter_memory"])
+    adapters = adapter_costs(measured) if config.is_papers else []
     return Summary(
         kind=config.kind,
         headers=("method",) if config.kind == "compare" else ("row", "changed"),

@@ -3,7 +3,7 @@
 OUT/config.json                       what the last command here compared
 OUT/NAME/seed-S/result.json           a run's settings, the time of its training, its evaluations
 OUT/NAME/seed-S/run/                  its training, which can be resumed, or its vocabulary
-OUT/speed.json                        the timing of all models, and of the paper's adapters
+OUT/speed.json                        the timing of all models, and of adapters
 """
 
 import contextlib
@@ -26,6 +26,7 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.comparison.costs import (
     adapter_calls,
+    adapter_memory,
     machine,
     race,
 )
@@ -260,6 +261,7 @@ def _speed(
         "batch_size": size,
         "rounds": race(calls, quiet=quiet),
         "adapters": race(adapters),
+        "adapter_memory": adapter_memory(adapters),
     }
     write_json(path, record)
     return record

@@ -157,7 +157,8 @@ def adapter_cells(cost: AdapterCost) -> dict[str, str]:
         if cost.paper_macs is None
         else f"{2 * cost.paper_macs / 1e6:.3f}",
         "true MACs (M)": f"{cost.macs / 1e6:.1f}",
-        "time": NOTHING if cost.time is None else _ratios(cost.time),
+        "time of a block": NOTHING if cost.time is None else _ratios(cost.time),
+        "memory of a block": NOTHING if cost.memory is None else f"{cost.memory:.2f} x",
     }
 
 

@@ -13,7 +13,15 @@ from crisalad_jax.experiments.comparison import (
     prepare,
     runner,
 )
-from crisalad_jax.experiments.comparison.costs import Spread, adapter_calls, race, ratios
+from crisalad_jax.experiments.comparison.costs import (
+    AdapterMeasurements,
+    Spread,
+    adapter_calls,
+    adapter_memory,
+    race,
+    ratios,
+)
+from crisalad_jax.nn.adapters import ADAPTERS
 from crisalad_jax.training.recipes import from_scratch, recipe
 from tests.cli.test_cli import succeeds
 from tests.conftest import BATCH
@@ -21,7 +29,7 @@ from tests.conftest import BATCH
 
 def test_table_3_to_the_unit():
     """Parameters and MACs as printed, and by hand at 768 and 384 wide, 16 x 16 patches."""
-    costs = {cost.adapter: cost for cost in adapter_costs({})}
+    costs = {cost.adapter: cost for cost in adapter_costs(AdapterMeasurements({}, {}))}
     linears = 2 * 768 * 384
     depthwise = 9 * 384 + 384 * 384
     branches = 384 * 192 + 2 * 384 * 24 + (9 + 25) * 24 * 96
@@ -41,12 +49,18 @@ def test_table_3_to_the_unit():
 
 
 @pytest.mark.filterwarnings("error:Explicitly requested dtype float64")
-def test_adapters_are_timed_in_float32_in_the_64_bit_mode() -> None:
+def test_adapters_are_measured_in_float32_in_the_64_bit_mode() -> None:
+    calls = adapter_calls()
+    assert {*calls} == {*ADAPTERS}
     with jax.enable_x64(True):
-        costs = adapter_costs(race(adapter_calls(), rounds=1))
-    times = {cost.adapter: cost.time for cost in costs if cost.paper_macs is not None}
-    assert None not in times.values()
-    assert times["depthwise"] == (1, 1, 1)  # over itself
+        few = {name: calls[name] for name in ("none", "mlp")}
+        measured = AdapterMeasurements(race(few, rounds=1), adapter_memory(few))
+    costs = {cost.adapter: cost for cost in adapter_costs(measured)}
+    # Of four images, more than one activation of 384 numbers a token.
+    more = (costs["mlp"].memory - 1) * measured.memory["none"]
+    assert 4 * 257 * 384 * 4 < more < 10 * 4 * 257 * 768 * 4
+    assert costs["mlp"].time.least > 0
+    assert costs["lora"].time is costs["lora"].memory is None
 
 
 def test_rows_change_one_thing_each():
@@ -79,6 +93,7 @@ def test_ablate(flags, capfd, tmp_path, monkeypatch):
     """The row of the whole model is trained as `compare` trains CriSALAD."""
     calls = dict.fromkeys(adapter_calls(), lambda: lambda: time.sleep(1e-4))
     monkeypatch.setattr(runner, "adapter_calls", lambda: calls)
+    monkeypatch.setattr(runner, "adapter_memory", lambda names: dict.fromkeys(names, 1))
     out = tmp_path / "out"
     given = ("ablate", "--rows", "crisalad", "--seeds", 1, *flags[flags.index("--epochs") :])
     printed = succeeds(capfd, *given, "--preset", "tiny", "--out", out)

@@ -124,12 +124,17 @@ def test_on_a_narrow_page_what_a_row_changes_stands_below_its_name(tmp_path):
     ("cost", "line"),
     [
         (
-            AdapterCost("depthwise", 741_504, 741_504, 39_223_296, 190_218_240, (1.0, 0.9, 1.1)),
-            "| depthwise | 741,504 | 741,504 | 39.223 | 78.447 | 190.2 | 1.00 x (0.90 to 1.10) |",
+            AdapterCost(
+                *("depthwise", 741_504, 741_504, 39_223_296, 190_218_240),
+                time=Spread(1.2, 1.1, 1.3),
+                memory=1.5,
+            ),
+            "| depthwise | 741,504 | 741,504 | 39.223 | 78.447 | 190.2 | 1.20 x (1.10 to 1.30) "
+            "| 1.50 x |",
         ),
         (  # what the paper prints, and no count gives
-            AdapterCost("mlp", 590_976, 590_976, 1_180_800, 151_584_768, None),
-            "| mlp | 590,976 (printed: 2,356,080) | 590,976 | 1.181 | 2.362 | 151.6 | - |",
+            AdapterCost("mlp", 590_976, 590_976, 1_180_800, 151_584_768, None, None),
+            "| mlp | 590,976 (printed: 2,356,080) | 590,976 | 1.181 | 2.362 | 151.6 | - | - |",
         ),
     ],
 )
