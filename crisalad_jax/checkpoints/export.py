@@ -289,6 +289,7 @@ def write_export(
             },
             "grouping": how.grouping,
             "grouping_means": GROUPINGS[how.grouping],
+            "attends_across_images": config.cross_image.attends,
             "jax_version": jax.__version__,
             "model_sha256": digest,
             "model": to_plain(config),

@@ -57,6 +57,8 @@ class Runtime:
     """The `model_hash` of the weights that an int8 program was made of."""
     grouping: str
     """What the programs are for; see `export.GROUPINGS`."""
+    attends: bool
+    """Whether a descriptor depends on the other images of its batch."""
     dim: int
     """Numbers in a descriptor."""
     input_size: Size
@@ -89,7 +91,7 @@ class Runtime:
         Raises:
             InputError: it is for images that are described alone, or for a whole call's together.
         """
-        if self.model["cross_image"]["name"] == "none" or self.grouping == "any":
+        if not self.attends or self.grouping == "any":
             return
         wanted = {kind for grouping in groupings for kind in grouping.split("/")}
         if self.grouping == "batch" or wanted != {"single"}:
@@ -214,6 +216,7 @@ def open_runtime(
         digest=manifest["model_sha256"],
         quantised_from=manifest.get("quantised_from"),
         grouping=manifest["grouping"],
+        attends=manifest["attends_across_images"],
         dim=manifest["descriptors"]["shape"][1],
         input_size=(height, width),
         fixed_batch=count if isinstance(count, int) else None,

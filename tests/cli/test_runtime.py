@@ -163,6 +163,20 @@ def test_a_program_outside_of_its_folder_is_not_opened(exported, tmp_path):
         open_runtime(folder, "onnxruntime")
 
 
+def test_an_encoder_of_a_plugin_that_does_not_attend_fits_all_groupings(exported, tmp_path):
+    """The plug-in itself is not there: the folder says it."""
+    folder = tmp_path / "program"
+    shutil.copytree(exported, folder)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    with pytest.raises(InputError, match="grouping single, expected any"):
+        open_runtime(folder, "onnxruntime").check_groupings(["sequential"])
+    assert manifest["attends_across_images"] is True
+    manifest["model"]["cross_image"] = {"name": "scaled"}
+    del manifest["checksum"]
+    write_json(folder / "manifest.json", manifest | {"attends_across_images": False})
+    open_runtime(folder, "onnxruntime").check_groupings(["sequential"])
+
+
 def test_a_program_of_other_weights_is_not_a_maps(exported, shared, tmp_path, capfd):
     other = tmp_path / "other.safetensors"
     save_weights(other, Model(init_crisalad(jax.random.key(0), MODEL), MODEL))

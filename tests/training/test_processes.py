@@ -16,8 +16,11 @@ import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.places import read_places
 from crisalad_jax.training import distributed as processes
 from crisalad_jax.training.log import read_metrics
+from crisalad_jax.training.loop import fit
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.pytree import named_leaves
@@ -299,6 +302,35 @@ def test_a_signal_to_one_process_stops_all_and_all_go_on(shared, by_devices, tmp
     assert len(logged(out, STEP)) < 10
     assert [code for code, _ in ends(start(shared, out, both=both))] == [0, 0]
     assert_same_run(out, by_devices / "1")
+
+
+STOP = """
+import crisalad_jax as cj
+
+@cj.register_callback("stop-at-3")
+class StopAt3(cj.Callback):
+    def on_step(self, numbers):
+        if numbers["step"] == 3:
+            raise cj.StopTraining
+"""
+
+
+@pytest.mark.slow
+def test_a_callback_stops_all_processes_and_all_go_on(shared, tmp_path):
+    """And batches that one of them has drawn by descriptors are those of all."""
+    plugin = tmp_path / "stop.py"
+    plugin.write_text(STOP)
+    hard = ("--sampler", "hard-negatives", "--plugin", str(plugin))
+    out = tmp_path / "run"
+    found = ends(start(shared, out, both=(*hard, "--callback", "stop-at-3")))
+    assert [code for code, _ in found] == [0, 0], found
+    # The step after the one that is logged is under way, and is finished.
+    assert len(logged(out, STEP)) == 4
+    assert [code for code, _ in ends(start(shared, out, both=hard))] == [0, 0]
+    config = dataclasses.replace(CONFIG, sampler="hard-negatives")
+    places, town = read_places(shared / "city", min_images=2), open_benchmark(shared / "town")
+    fit(config, places, tmp_path / "one", validation=town, quiet=True)
+    assert_same_run(out, tmp_path / "one")
 
 
 @pytest.mark.parametrize(
