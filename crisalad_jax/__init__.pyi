@@ -86,6 +86,7 @@ from .sinkhorn import register_step as register_step
 from .training.callbacks import Callback as Callback
 from .training.callbacks import StopTraining as StopTraining
 from .training.callbacks import register_callback as register_callback
+from .training.classifier import load_loss as load_loss
 from .training.config import MiningConfig as MiningConfig
 from .training.config import OptimiserConfig as OptimiserConfig
 from .training.config import TrainConfig as TrainConfig

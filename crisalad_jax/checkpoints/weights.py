@@ -31,6 +31,8 @@ from crisalad_jax.utils.version import VERSION
 
 EXTRA = "extra."
 """Prefix of the names of arrays that only a conversion to a public checkpoint needs."""
+LOSS = "loss."
+"""Prefix of the names of a loss's parameters, which no descriptor needs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +48,8 @@ class Header:
     """What the aggregator keeps besides arrays."""
     model_sha256: str
     """The `model_hash` of the parameters."""
+    loss: dict = dataclasses.field(default_factory=dict)
+    """The run's loss, a `LossConfig` as JSON values, where the file has its parameters."""
 
 
 @brief
@@ -60,6 +64,8 @@ class Checkpoint(NamedTuple):
     """Public format of the file; None for a file of this package."""
     digest: str | None = None
     """The `model_hash` of the parameters, where a file of this package says it."""
+    loss: tuple[dict, dict[str, np.ndarray]] | None = None
+    """`Header.loss` and the loss's parameters by name, where the file has them."""
 
     @property
     def model(self) -> Model:
@@ -74,6 +80,7 @@ def save_weights(
     *,
     extras: Mapping[str, np.ndarray] | None = None,
     half: bool = False,
+    loss: tuple[Any, Any] | None = None,
 ) -> None:
     """Write parameters under their dotted names, and the configuration in the file's metadata.
 
@@ -83,6 +90,8 @@ def save_weights(
         extras: arrays of a public checkpoint that no descriptor needs (see `convert`).
         half: whether to keep float32 parameters as float16, in half the room. They are rounded, and
             are float32 again when they are read.
+        loss: the `LossConfig` of a run, and what the loss learnt, for `load_loss`. The model and
+            its digest do not depend on it.
 
     Raises:
         InputError: parameters that `load_weights` would refuse; the folder cannot be made, or the
@@ -108,12 +117,15 @@ def save_weights(
     config.aggregator.check_backbone(params.aggregator, params.backbone, str(path))
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(stored).items()}
     arrays |= {EXTRA + name: array for name, array in (extras or {}).items()}
+    learnt = {} if loss is None else named_leaves(loss[1])
+    arrays |= {LOSS + name: np.asarray(leaf) for name, leaf in learnt.items()}
     header = {
         "config": to_plain(config),
         "version": VERSION,
         "parts": sources_of(config),
         "aggregator": config.aggregator.metadata(params.aggregator),
         "model_sha256": model_hash(params, config),
+        **({} if loss is None else {"loss": to_plain(loss[0])}),
     }
     write_sealed(path, arrays, FORMAT, header)
 
@@ -178,7 +190,10 @@ def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkp
         is_cached = user_cache() in pathlib.Path(path).parents
         advice = "; remove it, and the same command makes it again" if is_cached else ""
         raise InputError(f"{error}{advice}") from error
-    extras = {n.removeprefix(EXTRA): arrays.pop(n) for n in list(arrays) if n.startswith(EXTRA)}
+    extras, learnt = (
+        {n.removeprefix(prefix): arrays.pop(n) for n in list(arrays) if n.startswith(prefix)}
+        for prefix in (EXTRA, LOSS)
+    )
     check_sizes(value.get("config"), arrays.values(), str(path))
     header = from_plain(Header, value, source=f"{path} (metadata)")
     config = header.config
@@ -193,7 +208,8 @@ def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkp
             f"{path}: found another source of {', '.join(changed)} than these weights were written "
             "with; descriptors may differ"
         )
-    return Checkpoint(params, config, extras, None, header.model_sha256)
+    loss = (header.loss, learnt) if header.loss else None
+    return Checkpoint(params, config, extras, None, header.model_sha256, loss)
 
 
 def with_metadata(

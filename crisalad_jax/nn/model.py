@@ -46,6 +46,7 @@ _ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
 AnyArray = Array | np.ndarray
 Images = UInt8[AnyArray, "image height width 3"] | Float[AnyArray, "image height width 3"]
 _F = TypeVar("_F", bound=Callable[..., Any])
+_T = TypeVar("_T")
 
 
 @pytree_dataclass
@@ -798,7 +799,20 @@ def params_of(arrays: Mapping[str, np.ndarray], config: ModelConfig, *, source: 
         >>> jax.tree.structure(again) == jax.tree.structure(params)
         True
     """
-    template = parameter_shapes(config)
+    return tree_of(arrays, parameter_shapes(config), source=source)
+
+
+def tree_of(arrays: Mapping[str, np.ndarray], template: _T, *, source: str) -> _T:
+    """Make a tree of stored arrays by their dotted names.
+
+    Args:
+        arrays: finite arrays.
+        template: a tree of their shapes and types.
+        source: the file, for messages.
+
+    Raises:
+        InputError: they are not those of the template; the first differences are listed.
+    """
     names = named_leaves(template)
     problems = diff_trees(arrays, names) or not_finite(arrays)
     require(not problems, f"{source}: weights do not fit: {few(problems)}")

@@ -1,5 +1,6 @@
 """Parameters of a loss, for each group of classes: they train beside the model."""
 
+import os
 from typing import NamedTuple
 
 import jax
@@ -7,7 +8,12 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Int, PRNGKeyArray, PyTree
 
-from crisalad_jax.training.losses import Loss
+from crisalad_jax.checkpoints.weights import read_weights
+from crisalad_jax.config.checks import PATH, takes
+from crisalad_jax.config.io import from_plain
+from crisalad_jax.nn.model import tree_of
+from crisalad_jax.training.losses import Loss, LossConfig
+from crisalad_jax.utils import compiler
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import check_drawn
 
@@ -75,3 +81,54 @@ def update_classifiers(
     updates, optimiser = optax.adam(learning_rate).update(gradient, mine.optimiser)
     stepped = Classifiers(optax.apply_updates(mine.weights, updates), optimiser)
     return jax.tree.map(lambda all_, new: all_.at[group].set(new), classifiers, stepped)
+
+
+@takes(path=PATH)
+def load_loss(path: str | os.PathLike[str]) -> tuple[LossConfig, PyTree]:
+    """Read the loss that a run trained with, and the parameters that it learnt.
+
+    `load` reads the model of the same file. A run that starts from the file draws the parameters of
+    its loss anew. Those of a loss that classifies, a vector for each class of the training set, are
+    in the run's `state/` alone.
+
+    Args:
+        path: the `last.safetensors` or `best.safetensors` of a run.
+
+    Returns:
+        (configuration, parameters), as `metric_loss` takes them.
+
+    Raises:
+        InputError: what `load` raises; the loss has learnt nothing, or classifies; or it is a
+            part that is not registered.
+
+    Example:
+        >>> import dataclasses
+        >>> import crisalad_jax as cj
+        >>> @cj.register_loss("warm")
+        ... @dataclasses.dataclass(frozen=True)
+        ... class Warm(cj.Loss):
+        ...     def init(self, key, classes, dim):
+        ...         return {"temperature": jnp.ones(())}
+        ...
+        ...     def apply(self, params, batch):
+        ...         return cj.LossValue(params["temperature"] * batch.similarities.sum())
+        >>> config = cj.recipe("tiny").model
+        >>> model = cj.Model(cj.init_crisalad(jax.random.key(0), config), config)
+        >>> learnt = cj.LossConfig(kind=Warm()), {"temperature": jnp.array(0.5)}
+        >>> cj.save_weights(folder / "last.safetensors", model, loss=learnt)
+        >>> loss, params = load_loss(folder / "last.safetensors")
+        >>> loss.kind.part_name, float(params["temperature"])
+        ('warm', 0.5)
+    """
+    found = read_weights(path)
+    if found.loss is None:
+        raise InputError(
+            f"{path}: found no parameters of a loss, expected the weights of a run whose loss "
+            "learns some, and not a vector for each class"
+        )
+    plain, arrays = found.loss
+    config = from_plain(LossConfig, plain, source=f"{path} (metadata)")
+    dim = found.config.descriptor_dim
+    with compiler.number_types():
+        template = jax.eval_shape(lambda key: config.kind.init(key, 0, dim), jax.random.key(0))
+    return config, tree_of(arrays, template, source=f"{path}: loss {config.kind.part_name}")

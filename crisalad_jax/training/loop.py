@@ -81,8 +81,9 @@ def fit(
 
     The files are: `config.json`; `metrics.jsonl`, a line for each step and each validation, and the
     same for TensorBoard in `tensorboard/`; `state/`, the checkpoint that a later call resumes from;
-    and `last.safetensors`. A validation adds `best.safetensors`, the weights of the best recall by
-    `config.monitor` (grouping `single`), and the best `config.save_top_k` weights in `best/`.
+    and `last.safetensors`, the weights, with what the loss learnt (`load_loss`). A validation adds
+    `best.safetensors`, the weights of the best recall by `config.monitor` (grouping `single`), and
+    the best `config.save_top_k` weights in `best/`.
 
     A run in `out` of fewer epochs is extended: it goes on to those of `config`, which may differ in
     nothing else. If the learning rate depends on the run's length, a note says how it jumps.
@@ -294,7 +295,9 @@ class _Loop:
         """Log the recalls, save the best weights, and decide on an early stop."""
         record = self.files.record
         epoch = record.step // self.data.steps_per_epoch
-        trainable = self.trainer.gather(self.trainer.state.averaged)
+        state = self.trainer.state
+        learnt = state.averaged, state.saved_loss(self.config.loss)
+        trainable, loss = self.trainer.gather(learnt)
 
         def validate() -> tuple[str, dict[str, Any], bool]:
             params = self.trainer.params(trainable)
@@ -303,7 +306,7 @@ class _Loop:
             line = {"step": record.step, "epoch": epoch, **found.metrics}
             self.files.log(line, of=self.validator.name)
             record.add_validation(found.monitored, self.config)
-            self.files.save_if_best(params)
+            self.files.save_if_best(params, loss)
             self.callbacks.call("on_validation", line)
             return found.words, dataclasses.asdict(record), self.callbacks.stopped
 

@@ -9,7 +9,9 @@ import zlib
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from crisalad_jax.checkpoints.train_state import StateStore
 from crisalad_jax.checkpoints.weights import save_weights
@@ -143,15 +145,26 @@ class RunFiles:
             with wrap_os_errors(self.out):
                 self._log.write(values, of=of)
 
-    def save_if_best(self, params: Crisalad) -> None:
-        """Write the weights of this step, if the record counts it among the best."""
+    def save_if_best(self, params: Crisalad, loss: PyTree) -> None:
+        """Write the weights of this step, if the record counts it among the best.
+
+        Args:
+            params: the model's.
+            loss: of `TrainState.saved_loss`.
+        """
         steps = [step for _, step in self.record.best]
         paths = [self.out / "best.safetensors"] if steps[0] == self.record.step else []
         if self._config.save_top_k > 1 and self.record.step in steps:
             paths.append(self._best_path(self.record.step))
         with wrap_os_errors(self.out):
             for path in paths:
-                save_weights(path, Model(params, self._config.model))
+                self._save_weights(path, params, loss)
+
+    def _save_weights(self, path: pathlib.Path, params: Crisalad, loss: PyTree) -> None:
+        # Of pairs there is a single group.
+        learnt = None if loss is None else jax.tree.map(lambda leaf: leaf[0], loss)
+        saved = None if loss is None else (self._config.loss, learnt)
+        save_weights(path, Model(params, self._config.model), loss=saved)
 
     def save_is_due(self) -> bool:
         """Return whether the last saved state is old, by the primary process's clock."""
@@ -164,7 +177,8 @@ class RunFiles:
         """
         if distributed.is_primary() and self._saved != self.record:
             with wrap_os_errors(self.out):
-                save_weights(self.out / "last.safetensors", Model(params(), self._config.model))
+                loss = state.training.saved_loss(self._config.loss)
+                self._save_weights(self.out / "last.safetensors", params(), loss)
                 self._states.save(self.record.step, state, dataclasses.asdict(self.record))
                 self._drop_old_best()
             self._saved = copy.deepcopy(self.record)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -55,6 +55,14 @@ class TrainState(NamedTuple):
     classifiers: Classifiers | None = None
     """Parameters of the loss, if it has any."""
 
+    def saved_loss(self, config: LossConfig) -> PyTree:
+        """Return the loss's parameters that weight files hold; None for a vector of each class.
+
+        These are as large as the training set, and of use for no other: `state/` alone has them.
+        """
+        classifies = config.kind.grouping is not None
+        return None if classifies or self.classifiers is None else self.classifiers.weights
+
     @property
     def averaged(self) -> PyTree:
         """`trainable` to validate and save, with the optimiser's average where it keeps one."""
@@ -71,6 +79,8 @@ class Metrics(NamedTuple):
     """Share of the anchors whose positives are all easy."""
     accuracy: Float[Array, ""] | None
     """Share of the images that are nearest to their own class; None without classification."""
+    loss_numbers: Mapping[str, Array] | None
+    """The loss's own numbers (`LossValue.numbers`)."""
     gradient_norm: Float[Array, ""]
     """Norm of the whole gradient, that of a classifier included."""
     learning_rate: Float[Array, ""] | None
@@ -84,8 +94,11 @@ class Metrics(NamedTuple):
 
 
 def named_scalars(values: Metrics | TransportStatistics) -> dict[str, float]:
-    """List scalars by name, those of the transport among them; None is left out."""
-    return {name.rpartition(".")[2]: float(leaf) for name, leaf in named_leaves(values).items()}
+    """List scalars by name, the transport's by their own, a loss's as `loss.NAME`; no None."""
+    return {
+        name.removeprefix("transport.").replace("loss_numbers.", "loss.", 1): float(leaf)
+        for name, leaf in named_leaves(values).items()
+    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -372,6 +385,7 @@ def train_step(
         loss=loss,
         easy_anchor_fraction=result.easy_anchor_fraction,
         accuracy=result.accuracy,
+        loss_numbers=result.numbers,
         gradient_norm=norm,
         learning_rate=learning_rate,
         images=all_valid.sum(),

@@ -9,22 +9,24 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.checkpoints.safetensors_io import read_header
+from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.config.classes import ClassesConfig
+from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.places import Places
 from crisalad_jax.nn.config import with_aggregator
-from crisalad_jax.nn.model import describe
-from crisalad_jax.training.classifier import init_classifiers, update_classifiers
+from crisalad_jax.nn.model import Model, describe
+from crisalad_jax.training.classifier import init_classifiers, load_loss, update_classifiers
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
-from crisalad_jax.training.losses import LossConfig, metric_loss
+from crisalad_jax.training.losses import LOSSES, Loss, LossConfig, LossValue, metric_loss
 from crisalad_jax.training.losses.large_margin_cosine import LargeMarginCosineConfig
 from crisalad_jax.training.step import StepConfig, init_train_state, train_step
 from crisalad_jax.training.trainable import merge_params
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
-from tests.conftest import MODEL, RECIPE, random_params
+from tests.conftest import MODEL, RECIPE, assert_equal, random_params
 from tests.nn.test_model import pictures
 from tests.training.programs import run_on_devices
 from tests.training.test_loop import assert_same_run, interrupt
@@ -131,6 +133,67 @@ def test_a_run_logs_validates_and_keeps_classifiers_out_of_its_weights(
     params, config = load_weights(finished / "last.safetensors")
     assert config == CONFIG.model
     assert named_leaves(params).keys() == named_leaves(random_params(config)).keys()
+    with pytest.raises(InputError, match=r"last.safetensors: found no parameters of a loss, expec"):
+        load_loss(finished / "last.safetensors")
+
+
+@dataclasses.dataclass(frozen=True)
+class Scaled(Loss):
+    """Pulls by a learnt scale, which it reports."""
+
+    def init(self, key, classes, dim):
+        return {"scale": jnp.full((), 2.0), "width": jnp.full(dim, 1.0)}
+
+    def apply(self, params, batch):
+        pull = jax.nn.softplus(params["scale"] * (0.5 - batch.similarities)) * params["width"][0]
+        loss = jnp.where(batch.pairs.positives, pull, 0).sum() / batch.anchors
+        return LossValue(loss, numbers={"scale": params["scale"]})
+
+
+@pytest.mark.usefixtures("own_parts")
+def test_weight_files_have_what_a_loss_learnt(tmp_path, places, benchmark):
+    """A step logs the scale that it begins with, so the first after a save logs the saved one."""
+    out = tmp_path / "run"
+    LOSSES.register("scaled")(Scaled)
+    config = dataclasses.replace(
+        CONFIG, loss=LossConfig(kind="scaled", miner="none"), epochs=1, validate_every=1
+    )
+    end = fit(config, places, out, validation=benchmark, quiet=True).steps
+    found = {name: load_loss(out / f"{name}.safetensors") for name in ("last", "best")}
+    assert found["last"][0] == config.loss
+    assert found["last"][1]["width"].shape == (config.model.descriptor_dim,)
+    for each in jax.tree.leaves(found["last"][1]):
+        assert each.dtype == jnp.float32
+    assert_equal(found["best"][1], found["last"][1])  # of the same step
+    scale = float(found["last"][1]["scale"])
+    fit(dataclasses.replace(config, epochs=2), places, out, validation=benchmark, quiet=True)
+    lines = read_metrics(out / "metrics.jsonl")
+    logged = {line["step"]: line["loss.scale"] for line in lines if "loss" in line}
+    assert logged[1] == 2.0
+    assert logged[end + 1] == scale != 2.0
+
+
+@pytest.mark.usefixtures("own_parts")
+def test_a_model_does_not_depend_on_the_loss_in_its_file(tmp_path):
+    params, config = random_params(CONFIG.model), CONFIG.model
+    LOSSES.register("scaled")(Scaled)
+    loss = LossConfig(kind=Scaled()), Scaled().init(None, 0, config.descriptor_dim)
+    for name, learnt in (("with", loss), ("without", None)):
+        save_weights(tmp_path / name, Model(params, config), loss=learnt)
+    headers = [read_header(tmp_path / name) for name in ("with", "without")]
+    assert headers[0].pop("loss") == to_plain(loss[0])
+    assert headers[0] == headers[1]
+    LOSSES._parts.pop("scaled")  # the model needs no loss
+    assert_equal(load_weights(tmp_path / "with").params, params)
+    with pytest.raises(
+        InputError, match=r"with \(metadata\): loss: found 'scaled', expected one of"
+    ):
+        load_loss(tmp_path / "with")
+    wrong = {"scale": loss[1]["scale"]}
+    LOSSES.register("scaled")(Scaled)
+    save_weights(tmp_path / "wrong", Model(params, config), loss=(loss[0], wrong))
+    with pytest.raises(InputError, match=r"wrong: loss scaled: weights do not fit: width missing"):
+        load_loss(tmp_path / "wrong")
 
 
 @pytest.mark.parametrize("call", [4, 6])

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import re
-from typing import Literal
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from crisalad_jax.nn.model import (
     parameter_shapes,
 )
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
-from crisalad_jax.training.losses import LossConfig, metric_loss
+from crisalad_jax.training.losses import Loss, LossConfig, LossValue, metric_loss
 from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.training.optimiser import learning_rate_schedule, make_optimiser
 from crisalad_jax.training.optimisers import AdamW
@@ -33,6 +33,7 @@ from crisalad_jax.training.step import (
     TrainState,
     init_train_state,
     make_train_step,
+    named_scalars,
     step_config,
     train_step,
 )
@@ -489,3 +490,34 @@ def test_labels_that_32_bits_cannot_tell_apart_are_refused(params) -> None:
     labels = np.array([0, 2**32, 1, 2**32 + 1, 2, 2])
     with pytest.raises(InputError, match=r"^labels: found up to 4294967297, expected numbers bel"):
         make_train_step(static)(state, frozen, pictures(6), labels, jax.random.key(0))
+
+
+@dataclasses.dataclass(frozen=True)
+class Scaled(Loss):
+    """Softplus of similarities times a learnt scale, which it reports."""
+
+    part_name: ClassVar[str] = "scaled"
+
+    def init(self, key, classes, dim):
+        return {"scale": jnp.full((), 2.0)}
+
+    def apply(self, params, batch):
+        scale = params["scale"]
+        pull = jax.nn.softplus(scale * (0.5 - batch.similarities))
+        loss = jnp.where(batch.pairs.positives, pull, 0).sum() / batch.anchors
+        return LossValue(loss, numbers={"scale": scale, "pairs": batch.pairs.positives.sum()})
+
+
+def test_a_step_tells_a_losss_own_numbers(params) -> None:
+    """The scale steps down as Adam does at first, by its learning rate of 0.01."""
+    loss = LossConfig(kind=Scaled(), miner="none")
+    static = dataclasses.replace(STEP, loss=loss)
+    state, frozen = init_train_state(params, "head,-adapters", static, key=jax.random.key(0))
+    found = []
+    for _ in range(2):
+        state, metrics = take_step(state, frozen, config=static)
+        found.append(named_scalars(metrics))
+    assert [each["loss.scale"] for each in found] == [2.0, pytest.approx(2.01, abs=1e-6)]
+    assert found[0]["loss.pairs"] == 6  # of three places of two images
+    assert "loss" in found[0]
+    assert "marginal_error" in found[0]

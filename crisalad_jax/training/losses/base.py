@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.registry import Registry, count_arguments
@@ -65,10 +66,13 @@ class LossBatch:
 
 @brief
 class LossValue(NamedTuple):
-    """A loss, and an accuracy that a classification logs beside it."""
+    """A loss, and what is logged with it."""
 
     loss: Float[Array, ""]
     accuracy: Float[Array, ""] | None = None
+    """Of a classification."""
+    numbers: Mapping[str, Any] | None = None
+    """Other scalars by name, such as a learnt temperature; each step logs them as `loss.NAME`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,11 +158,15 @@ def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
 
 
 def check_value(value: Any, name: str) -> None:
-    """Check that a loss has returned a number, in float32 at least; `name` is for messages."""
+    """Check that a loss has returned numbers, in float32 at least; `name` is for messages."""
     dtype = getattr(getattr(value, "loss", None), "dtype", None)
     number: Any = jax.ShapeDtypeStruct((), jnp.float64 if dtype == jnp.float64 else jnp.float32)
     has_accuracy = getattr(value, "accuracy", None) is not None
-    expect_like(name, value, LossValue(number, number if has_accuracy else None))
+    numbers = getattr(value, "numbers", None)
+    expect_like(name, value, LossValue(number, number if has_accuracy else None, numbers))
+    for key, each in (numbers or {}).items():
+        shape = jnp.shape(each)
+        require(shape == (), f"{name}: found number {key!r} of shape {shape}, expected a scalar")
 
 
 LOSSES = Registry("loss", Loss, of_function=_of_function)

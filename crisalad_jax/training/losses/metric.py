@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -55,6 +56,8 @@ class LossResult(NamedTuple):
     """Share of the anchors without a mined positive: all their positives are easy."""
     accuracy: Float[Array, ""] | None = None
     """Share of the images whose nearest class is their own; None for losses of pairs."""
+    numbers: Mapping[str, Array] | None = None
+    """The loss's own (`LossValue.numbers`)."""
 
 
 @takes(config=LossConfig)
@@ -132,4 +135,4 @@ def metric_loss(
     anchors = batch.anchors if pairs is None else jnp.maximum(pairs.positives.any(axis=1).sum(), 1)
     # Of two whole numbers JAX's 64-bit mode makes a float64.
     easy = 1 - mined.positives.any(axis=1).sum(dtype=wide.dtype) / anchors
-    return LossResult(loss, easy, value.accuracy)
+    return LossResult(loss, easy, value.accuracy, jax.tree.map(jnp.asarray, value.numbers))
