@@ -1,12 +1,15 @@
 """The public names, each once."""
 
+from . import faiss_index as faiss_index
 from . import sinkhorn as sinkhorn
+from . import synthetic as synthetic
 from .checkpoints.export import ExportConfig as ExportConfig
 from .checkpoints.export import write_export as write_export
 from .checkpoints.load import load as load
 from .checkpoints.public import convert as convert
 from .checkpoints.public import read_backbone as read_backbone
 from .checkpoints.weights import save_weights as save_weights
+from .config.classes import ClassesConfig as ClassesConfig
 from .config.plugins import load_plugin as load_plugin
 from .config.preprocessing import PreprocessingConfig as PreprocessingConfig
 from .config.registry import make_part as make_part
@@ -18,6 +21,7 @@ from .data.images import read_image as read_image
 from .data.live import Camera as Camera
 from .data.live import FolderWatch as FolderWatch
 from .data.loader import training_batches as training_batches
+from .data.places import Places as Places
 from .data.places import read_places as read_places
 from .data.query_set import QuerySet as QuerySet
 from .data.query_set import read_query_set as read_query_set
@@ -30,9 +34,13 @@ from .data.samplers import register_sampler as register_sampler
 from .evaluation.calibrate import calibrate as calibrate
 from .evaluation.evaluate import evaluate as evaluate
 from .evaluation.operating_point import operating_point as operating_point
+from .evaluation.record import evaluation_record as evaluation_record
+from .experiments.comparison import ComparisonConfig as ComparisonConfig
 from .experiments.comparison import compare as compare
+from .experiments.comparison import paired_difference as paired_difference
 from .experiments.report import show_retrievals as show_retrievals
 from .experiments.report import show_transport as show_transport
+from .experiments.report import write_report as write_report
 from .experiments.train import train as train
 from .nn.adapters import Adapter as Adapter
 from .nn.adapters import BlockShape as BlockShape
@@ -40,10 +48,12 @@ from .nn.adapters import register_adapter as register_adapter
 from .nn.aggregators import Aggregator as Aggregator
 from .nn.aggregators import TokenShape as TokenShape
 from .nn.aggregators import register_aggregator as register_aggregator
+from .nn.aggregators.salad import SaladConfig as SaladConfig
 from .nn.backbones import Backbone as Backbone
 from .nn.backbones import Features as Features
 from .nn.backbones import FeatureSpec as FeatureSpec
 from .nn.backbones import register_backbone as register_backbone
+from .nn.backbones.vit import ViTConfig as ViTConfig
 from .nn.config import PRESETS as PRESETS
 from .nn.config import ModelConfig as ModelConfig
 from .nn.config import with_aggregator as with_aggregator
@@ -62,6 +72,7 @@ from .nn.model import extract_tokens as extract_tokens
 from .nn.model import init_crisalad as init_crisalad
 from .nn.model import merge_adapters as merge_adapters
 from .nn.model import self_mask as self_mask
+from .nn.model import transport_masses as transport_masses
 from .nn.model import valid_mask as valid_mask
 from .nn.projection import ProjectionConfig as ProjectionConfig
 from .nn.tokens import Tokens as Tokens
@@ -72,9 +83,14 @@ from .retrieval.extract import extract as extract
 from .retrieval.maps.build import index as index
 from .retrieval.maps.live import query_live as query_live
 from .retrieval.maps.map import Map as Map
+from .retrieval.maps.map import MapImage as MapImage
 from .retrieval.maps.query import query as query
+from .retrieval.neighbours import Neighbours as Neighbours
 from .retrieval.pca import fit_pca as fit_pca
 from .retrieval.pca import load_pca as load_pca
+from .retrieval.pca import save_pca as save_pca
+from .retrieval.reranking import Reranker as Reranker
+from .retrieval.reranking import Reranking as Reranking
 from .retrieval.search import search as search
 from .retrieval.sequence import BayesFilter as BayesFilter
 from .retrieval.serve import serve_map as serve_map
@@ -119,6 +135,7 @@ from .training.trainable import split_params as split_params
 from .training.vocabulary import build_vocabulary as build_vocabulary
 from .utils.compiler import set_up as set_up
 from .utils.errors import InputError as InputError
+from .utils.pytree import named_leaves as named_leaves
 from .utils.pytree import pytree_dataclass as pytree_dataclass
 
 __version__: str

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 import crisalad_jax as cj
-from crisalad_jax.nn.cross_image import cross_image_encoder
 
 NAMES = {
     "attn.qkv.weight": "self_attn.in_proj_weight",
@@ -43,7 +42,7 @@ def main():
     target = jax.random.normal(jax.random.key(2), tokens.shape)
 
     def loss(params):
-        output = cross_image_encoder(params, tokens, config, key=None)
+        output = config.apply(params, tokens, mask=None, key=None)
         return ((output - target) ** 2).sum(), output
 
     (_, output), gradient = jax.value_and_grad(loss, has_aux=True)(params)

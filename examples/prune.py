@@ -10,7 +10,6 @@ import pathlib
 import tempfile
 
 import crisalad_jax as cj
-from crisalad_jax.synthetic import SyntheticCityConfig, write_synthetic_city
 
 TRIALS, EPOCHS = 3, 4
 
@@ -38,8 +37,8 @@ def main():
         print("optuna is not installed: pip install optuna")
         return None
     folder = pathlib.Path(tempfile.mkdtemp())
-    sizes = SyntheticCityConfig(train_places=24, test_places=12, image_size=(70, 70))
-    write_synthetic_city(folder / "city", sizes, quiet=True)
+    sizes = cj.synthetic.SyntheticCityConfig(train_places=24, test_places=12, image_size=(70, 70))
+    cj.synthetic.write_synthetic_city(folder / "city", sizes, quiet=True)
     places = cj.read_places(folder / "city" / "train")
     validation = cj.open_benchmark(folder / "city" / "test")
     config = cj.recipe("tiny")

@@ -1,5 +1,6 @@
 """The documentation: it builds, nothing public is left out, and what it shows runs."""
 
+import inspect
 import os
 import pathlib
 import re
@@ -19,6 +20,7 @@ TEXTS = [
     *(README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "examples" / "README.md"),
     *PAGES,
 ]
+MODULES = {name for name in cj.__all__ if inspect.ismodule(getattr(cj, name))}
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 PATH = re.compile(r"`((?:examples|scripts|tests|docs|\.ci)/[\w./-]*[\w/])`")
 
@@ -65,7 +67,7 @@ def test_reference_has_every_public_name(entries):
         anchors = [f"crisalad_jax.{name}"]
         if getattr(sinkhorn, name, None) == getattr(cj, name):
             anchors.append(f"crisalad_jax.sinkhorn.{name}")
-        if name not in ("sinkhorn", "__version__") and not _documented(entries, anchors):
+        if name not in (*MODULES, "__version__") and not _documented(entries, anchors):
             missing.append(name)
     assert not missing
 
@@ -92,6 +94,51 @@ def test_public_names_say_what_they_do():
 
 def test_a_name_left_out_would_be_found(entries):
     assert not _documented(entries, ["crisalad_jax.no_such_name"])
+
+
+USES = [
+    *(page for page in TEXTS if page.name != "CHANGELOG.md" and page.parent.name != "reference"),
+    *sorted((ROOT / "examples").rglob("*.py")),
+    *sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")),
+]
+# A link's anchor, a file, and the group of entry points have names of the package too.
+NAME = re.compile(r"(?<![#/\w.])crisalad_jax\.(?!plugins\b)(\w+(?:\.\w+)*)|\bcj\.(\w+(?:\.\w+)*)")
+IMPORTED = re.compile(r"from crisalad_jax((?:\.\w+)*) import ([\w, ]+)")
+
+
+def _private(text):
+    """The names in a text that are neither of the package nor of its published modules."""
+    named = [f"{m[1] or m[2]}" for m in NAME.finditer(text)]
+    named += [
+        f"{m[1][1:]}.{name.strip()}".lstrip(".")
+        for m in IMPORTED.finditer(text)
+        for name in m[2].split(",")
+    ]
+    private = []
+    for name in named:
+        first, _, rest = name.partition(".")
+        if first not in cj.__all__ or (
+            first in MODULES and rest and not hasattr(getattr(cj, first), rest.partition(".")[0])
+        ):
+            private.append(name)
+    return private
+
+
+@pytest.mark.parametrize("page", USES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_what_is_shown_uses_public_names_alone(page):
+    assert not _private(page.read_text(encoding="utf-8"))
+
+
+def test_examples_in_public_docstrings_use_public_names_alone():
+    shown = [line for n in cj.__all__ for line in (getattr(cj, n).__doc__ or "").splitlines()]
+    assert not _private("\n".join(line for line in shown if line.lstrip().startswith(">>>")))
+
+
+def test_a_private_name_would_be_found():
+    shown = "import crisalad_jax.nn.model\nfrom crisalad_jax.nn.vit import A, B\ncj.no, cj.load"
+    assert _private(shown) == ["nn.model", "nn.vit", "no", "nn.vit.A", "nn.vit.B"]
+    modules = "cj.sinkhorn.solve(x)\nfrom crisalad_jax.sinkhorn import solve, none"
+    assert _private(modules) == ["sinkhorn.none"]
 
 
 def test_readme_is_short():

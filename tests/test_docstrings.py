@@ -20,7 +20,7 @@ PUBLIC = {
     )
     for module in (crisalad_jax, crisalad_jax.sinkhorn)
     for name in getattr(module, "__all__", vars(module))
-    if name != "sinkhorn" and not name.startswith("_")
+    if not name.startswith("_") and not inspect.ismodule(getattr(module, name))
 }
 DOCUMENTED = {
     name: value
@@ -30,7 +30,8 @@ DOCUMENTED = {
 FUNCTIONS = {name: value for name, value in DOCUMENTED.items() if not inspect.isclass(value)}
 SLOW = {
     *("Map", "attend_across_images", "build_vocabulary", "convert", "evaluate", "extract"),
-    *("extract_features", "extract_tokens", "fit", "index", "init_train_state"),
+    *("evaluation_record", "extract_features", "extract_tokens", "fit", "index"),
+    *("init_train_state", "transport_masses", "write_report"),
     *("merge_params", "query", "query_live", "read_backbone", "show_transport", "split_params"),
     *("train", "write_export"),
 }

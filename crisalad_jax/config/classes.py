@@ -13,6 +13,10 @@ class ClassesConfig:
     """Classes of a training set, and the groups that epochs train in turn.
 
     The constants are CosPlace's (Berton et al., CVPR 2022); see docs/methods.md.
+
+    Example:
+        >>> ClassesConfig(kind="cells", cell=15.0).groups
+        8
     """
 
     kind: Literal["places", "cells", "viewpoints"] = "places"

@@ -30,7 +30,13 @@ from crisalad_jax.utils.shapes import Float64, Int32, Int64
 @brief
 @dataclasses.dataclass(frozen=True, eq=False)
 class Places:
-    """Images grouped by place: place p owns images `place_start[p]` to `place_start[p + 1]`."""
+    """Images grouped by place: place p owns images `place_start[p]` to `place_start[p + 1]`.
+
+    Example:
+        >>> found = read_places(places, min_images=2)
+        >>> len(found.names), found.image_counts[:2].tolist(), found.path(0).exists()
+        (8, [3, 3], True)
+    """
 
     root: pathlib.Path
     cities: tuple[str, ...]

@@ -49,6 +49,24 @@ def evaluation_record(
         **asked: what `crisalad evaluate` was asked for: the files `weights` (None is an untrained
             model), `pca` and `rerank_weights` (None is the first stage's), `batch_size`, `seed`,
             `seeds` and `rerank`.
+
+    Returns:
+        The record, whose settings `write_report` takes.
+
+    Example:
+        >>> import shutil
+        >>> import crisalad_jax as cj
+        >>> for side in ("queries", "database"):
+        ...     _ = shutil.copytree(pictures, folder / "set" / side)
+        >>> lines = ["query,database", *(f"{number}.png,{number}.png" for number in range(4))]
+        >>> _ = (folder / "set" / "ground_truth.csv").write_text("\\n".join(lines))
+        >>> benchmark = cj.open_benchmark(folder / "set", layout="folders")
+        >>> model, quiet = cj.load("starter"), cj.Reading(quiet=True)
+        >>> results = cj.evaluate(model, benchmark, groupings=["single"], reading=quiet)
+        >>> asked = {"model_name": "starter", "batch_size": 4, "seed": 0, "seeds": 1}
+        >>> record = evaluation_record(results, benchmark, model.config, **asked)
+        >>> record.values["results"][0]["model"]
+        'starter'
     """
     files = {name: each for name, each in asked.items() if isinstance(each, os.PathLike)}
     settings = {

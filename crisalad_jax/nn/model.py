@@ -740,8 +740,24 @@ def transport_masses(
 
     A patch sends a mass of 1. If there is a dustbin, it is the last column.
 
+    Args:
+        params: see `describe`.
+        images: see `describe`.
+        config: see `describe`.
+
+    Returns:
+        The plan of each image.
+
     Raises:
         InputError: the model's aggregator has no transport, or as `describe`.
+
+    Example:
+        >>> import jax, numpy as np
+        >>> from crisalad_jax import PRESETS
+        >>> config = PRESETS["tiny"]
+        >>> params = init_crisalad(jax.random.key(0), config)
+        >>> transport_masses(params, np.zeros((1, 98, 98, 3), np.uint8), config).shape
+        (1, 49, 17)
     """
     return config.aggregator.plan(params.aggregator, extract_features(params, images, config))
 

@@ -272,8 +272,19 @@ def pca_hash(pca: Pca) -> str:
 def save_pca(path: str | os.PathLike[str], pca: Pca) -> None:
     """Write the components as safetensors, their configuration in the metadata.
 
+    Args:
+        path: the file, a .safetensors.
+        pca: the components, of `fit_pca`.
+
     Raises:
         InputError: the file cannot be written.
+
+    Example:
+        >>> import numpy as np
+        >>> descriptors = np.random.default_rng(0).normal(size=(50, 8)).astype(np.float32)
+        >>> save_pca(folder / "pca.safetensors", fit_pca(descriptors, 3))
+        >>> load_pca(folder / "pca.safetensors").components.shape
+        (3, 8)
     """
     arrays = {name: np.array(getattr(pca, name), order="C") for name in _ARRAYS}
     write_sealed(path, arrays, FORMAT, {"config": to_plain(pca.config), "model": pca.model})
@@ -296,7 +307,7 @@ def load_pca(path: str | os.PathLike[str], *, verify: bool = True) -> Pca:
 
     Example:
         >>> import numpy as np
-        >>> from crisalad_jax.retrieval.pca import save_pca
+        >>> from crisalad_jax import save_pca
         >>> descriptors = np.random.default_rng(0).normal(size=(50, 8)).astype(np.float32)
         >>> save_pca(folder / "pca.safetensors", fit_pca(descriptors, 3))
         >>> load_pca(folder / "pca.safetensors").apply(descriptors).shape

@@ -124,7 +124,18 @@ class _Word:
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:
-    """Return the leaves by dotted path, as in `backbone.blocks.mlp.fc1.weight`, in tree order."""
+    """Return the leaves by dotted path, as in `backbone.blocks.mlp.fc1.weight`, in tree order.
+
+    Args:
+        tree: a pytree, such as a model's parameters.
+
+    Returns:
+        The leaves by their names.
+
+    Example:
+        >>> named_leaves({"conv": {"weight": 2.0}, "bias": None})
+        {'conv.weight': 2.0}
+    """
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 

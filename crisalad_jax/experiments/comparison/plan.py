@@ -52,7 +52,13 @@ _VIEWS = 4
 
 @dataclasses.dataclass(frozen=True)
 class ComparisonConfig:
-    """Everything that decides a comparison's results; `config.json` in its folder."""
+    """Everything that decides a comparison's results; `config.json` in its folder.
+
+    Example:
+        >>> rows = ("gem: model.aggregator=gem",)
+        >>> ComparisonConfig("ablate", ("crisalad",), test=("SET",), train="DIR", rows=rows).lines
+        ('crisalad', 'gem')
+    """
 
     kind: Literal["compare", "ablate"]
     names: tuple[str, ...]

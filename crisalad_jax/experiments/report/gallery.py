@@ -76,8 +76,7 @@ def show_retrievals(
 
     Example:
         >>> import numpy as np, pathlib
-        >>> from crisalad_jax.retrieval.maps.map import MapImage
-        >>> from crisalad_jax.retrieval.neighbours import Neighbours
+        >>> from crisalad_jax import MapImage, Neighbours
         >>> near = Neighbours(np.array([[0, 1]]), np.array([[1.0, 0.5]]))
         >>> images = [MapImage(f"{n}.png", 1, None, str(pictures)) for n in range(4)]
         >>> figure = show_retrievals(Answers([pictures / "0.png"], near, images, None))

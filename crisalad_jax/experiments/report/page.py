@@ -59,7 +59,7 @@ def write_report(
     settings: dict[str, Any],
     similarities: Float[np.ndarray, "rows columns"] | None = None,
 ) -> pathlib.Path:
-    """Write index.html, its charts and results.csv into the folder `out`; return the page's path.
+    """Write index.html, its charts and results.csv into the folder `out`.
 
     Retrievals, map and matrix are those of the first grouping; results.csv has a row for every
     query under every grouping.
@@ -73,9 +73,28 @@ def write_report(
         settings: those of an `evaluation_record`, shown folded.
         similarities: what `similarity.similarity_map` gives of the first grouping.
 
+    Returns:
+        The path of the page.
+
     Raises:
         InputError: no ground truth, an image that cannot be read, or files that cannot be written:
             then none of them is.
+
+    Example:
+        >>> import shutil
+        >>> import crisalad_jax as cj
+        >>> for side in ("queries", "database"):
+        ...     _ = shutil.copytree(pictures, folder / "set" / side)
+        >>> lines = ["query,database", *(f"{number}.png,{number}.png" for number in range(4))]
+        >>> _ = (folder / "set" / "ground_truth.csv").write_text("\\n".join(lines))
+        >>> benchmark = cj.open_benchmark(folder / "set", layout="folders")
+        >>> model, quiet = cj.load("starter"), cj.Reading(quiet=True)
+        >>> results = cj.evaluate(model, benchmark, groupings=["single"], reading=quiet)
+        >>> asked = {"model_name": "starter", "batch_size": 4, "seed": 0, "seeds": 1}
+        >>> record = cj.evaluation_record(results, benchmark, model.config, **asked)
+        >>> names = {"model_name": "starter", "settings": record.settings}
+        >>> write_report(folder / "report", benchmark, results, model=model, **names).name
+        'index.html'
     """
     main = groupings[0]
     subject = Subject.of(benchmark, main.neighbours)

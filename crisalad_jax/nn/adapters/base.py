@@ -39,7 +39,7 @@ class Adapter(Part, abc.ABC):
     Example:
         >>> import jax
         >>> import jax.numpy as jnp
-        >>> from crisalad_jax import register_adapter
+        >>> from crisalad_jax import ViTConfig, register_adapter
         >>> @register_adapter("shift")
         ... @dataclasses.dataclass(frozen=True)
         ... class Shift(Adapter):
@@ -48,7 +48,6 @@ class Adapter(Part, abc.ABC):
         ...
         ...     def mlp_update(self, params, tokens, grid, *, length=None, valid=None):
         ...         return params["shift"].astype(tokens.dtype), params
-        >>> from crisalad_jax.nn.backbones.vit import ViTConfig
         >>> jax.eval_shape(ViTConfig(adapter="shift").init, jax.random.key(0)).blocks.adapter
         {'shift': ShapeDtypeStruct(shape=(12, 768), dtype=float32)}
     """

@@ -71,7 +71,13 @@ _TINY = {"clusters": 16, "cluster_dim": 32, "token_dim": 64, "hidden": 128, "dro
 @AGGREGATORS.register("salad", tiny=_TINY)
 @dataclasses.dataclass(frozen=True)
 class SaladConfig(Aggregator):
-    """SALAD aggregation (Izquierdo and Civera, CVPR 2024)."""
+    """SALAD aggregation (Izquierdo and Civera, CVPR 2024).
+
+    Example:
+        >>> from crisalad_jax import ModelConfig
+        >>> ModelConfig(aggregator=SaladConfig(clusters=32)).descriptor_dim
+        4352
+    """
 
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     clusters: PositiveInt = 64

@@ -361,7 +361,13 @@ class VisionTransformer(Backbone):
 @BACKBONES.register("vit")
 @dataclasses.dataclass(frozen=True)
 class ViTConfig(VisionTransformer):
-    """A DINOv2 vision transformer with patches of 14 x 14 (Oquab et al. 2023)."""
+    """A DINOv2 vision transformer with patches of 14 x 14 (Oquab et al. 2023).
+
+    Example:
+        >>> from crisalad_jax import ModelConfig
+        >>> ModelConfig(backbone=ViTConfig(dim=384, heads=6)).patches
+        256
+    """
 
     position_grid: PositiveInt = 37
     """Side of the stored grid of position embeddings (37 in the public checkpoints: 518 / 14)."""

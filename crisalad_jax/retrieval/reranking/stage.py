@@ -68,7 +68,12 @@ _NUMBERS = 2**25
 
 @dataclasses.dataclass(frozen=True)
 class Reranking:
-    """Which retrievals are re-ranked, by which method, with which model."""
+    """Which retrievals are re-ranked, by which method, with which model.
+
+    Example:
+        >>> Reranking("transvpr", 100).label
+        'transvpr:100'
+    """
 
     name: str
     """patch-netvlad, patch-netvlad-ransac or patch-netvlad-sum, by a model with NetVLAD; selavpr or
