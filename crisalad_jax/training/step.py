@@ -354,12 +354,12 @@ def train_step(
             micro_batch=config.micro_batch,
         )
         descriptors = devices.gather_images(descriptors)
-        reads_dense = config.loss.kind.reads_dense
-        dense = devices.gather_images(tokens.dense) if reads_dense else None
+        compared = config.loss.kind.reads_tokens
+        local = devices.gather_images(getattr(tokens, compared)) if compared else None
         compute = functools.partial(_loss, config=config)
         if len(all_labels) <= WHOLE_LOSS:
             compute = devices.whole_on_each(compute)
-        result = compute(descriptors, dense, all_labels, all_valid, classifier, group)
+        result = compute(descriptors, local, all_labels, all_valid, classifier, group)
         updated = measured if updates_statistics else statistics
         return result.loss, (result, tokens.transport, updated)
 
@@ -423,7 +423,7 @@ def _gathered(
 
 def _loss(
     descriptors: Float[Array, "image descriptor"],
-    dense: Float[Array, "image feature local"] | None,
+    tokens: Float[Array, "image token dim"] | None,
     labels: Int[Array, " image"],
     valid: Bool[Array, " image"],
     classifier: PyTree,
@@ -439,5 +439,5 @@ def _loss(
         params=classifier,
         classes=jnp.asarray(config.classes)[group] if config.classes else None,
         pairs=tuple_pairs(labels, valid=valid) if config.tuples else None,
-        dense=dense,
+        tokens=tokens,
     )

@@ -108,7 +108,7 @@ def test_the_loss_of_selavpr_by_a_loop_in_torch(seed, lost):
     def loss(dense):
         pairs = tuple_pairs(jnp.asarray(labels), valid=valid)
         arrays = jnp.asarray(descriptors), jnp.asarray(labels)
-        return metric_loss(*arrays, config, pairs=pairs, dense=dense).loss
+        return metric_loss(*arrays, config, pairs=pairs, tokens=dense).loss
 
     found, gradient = jax.value_and_grad(loss)(jnp.asarray(dense))
     theirs = torch.tensor(dense, requires_grad=True)
@@ -143,7 +143,7 @@ def test_a_loss_of_tuples_refuses_places_and_models_without_local_features():
     arrays = jnp.asarray(descriptors), jnp.asarray(labels)
     with pytest.raises(InputError, match="loss selavpr: found no tuples, expected the pairs"):
         metric_loss(*arrays, config)
-    with pytest.raises(InputError, match="loss selavpr: found no local features"):
+    with pytest.raises(InputError, match="loss selavpr: found no tokens, expected the aggregator"):
         metric_loss(*arrays, config, pairs=tuple_pairs(arrays[1]))
 
 

@@ -145,10 +145,11 @@ def test_a_training_step_is_the_same() -> None:
 def test_losses_of_float32_are_float32(name: str) -> None:
     rows = np.random.default_rng(0).normal(size=(4, 6)).astype(np.float32)
     config = LossConfig(kind=LOSSES.make(name), miner="none")
-    if config.kind.grouping is not None or config.kind.reads_dense:
+    if config.kind.grouping is not None or config.kind.reads_tokens == "dense":
         pytest.skip("takes more than descriptors; the training step is tested above")
+    tokens = jnp.asarray(rows[:, :, None]) if config.kind.reads_tokens else None
     with jax.enable_x64(True):
-        result = metric_loss(jnp.asarray(rows), jnp.asarray(LABELS), config)
+        result = metric_loss(jnp.asarray(rows), jnp.asarray(LABELS), config, tokens=tokens)
     assert {leaf.dtype for leaf in jax.tree.leaves(result)} == {jnp.dtype("float32")}
 
 

@@ -11,6 +11,8 @@ from crisalad_jax.nn.transport.config import SinkhornConfig
 from crisalad_jax.nn.transport.problem import LOG_ZERO, product
 from crisalad_jax.nn.transport.solve import per_problem, solve
 
+_SOLVER = SinkhornConfig(tolerance=1e-4, iterations=500, gradient="stop")
+
 
 def sinkhorn_divergence(
     x: Float[Array, "*batch x_token dim"],
@@ -19,7 +21,7 @@ def sinkhorn_divergence(
     log_mu: Float[Array, "*#batch x_token"] | None = None,
     log_nu: Float[Array, "*#batch y_token"] | None = None,
     epsilon: float | Float[Array, "*#batch"] = 0.1,
-    config: SinkhornConfig = SinkhornConfig(tolerance=1e-4, iterations=500, gradient="stop"),
+    config: SinkhornConfig = _SOLVER,
 ) -> Float[Array, "*batch"]:
     """Compute the Sinkhorn divergence of two sets of tokens (Feydy et al., AISTATS 2019).
 
@@ -59,27 +61,43 @@ def sinkhorn_divergence(
     )
     wide = jnp.promote_types(jnp.promote_types(x.dtype, y.dtype), jnp.float32)
     sides = [
-        (side.astype(wide), _normalised(side, masses).astype(wide))
+        (side.astype(wide), log_masses(side, masses).astype(wide))
         for side, masses in ((x, log_mu), (y, log_nu))
     ]
 
-    def transport(first: tuple[Array, Array], second: tuple[Array, Array]) -> Array:
-        (tokens, log_mu), (others, log_nu) = first, second
-        cost = squared_distances(tokens, others)
-        fixed = jax.lax.stop_gradient((-cost, log_mu, log_nu))
-        at = jax.lax.stop_gradient(epsilon)
-        row, column = solve(*fixed, epsilon=at, config=config).potentials
-        # The dual's potentials count from the masses.
-        f = jax.lax.stop_gradient(_from_masses(row, log_mu))
-        g = jax.lax.stop_gradient(_from_masses(column, log_nu))
-        mu, nu = jnp.exp(log_mu), jnp.exp(log_nu)
-        kernel = -cost / per_problem(jnp.asarray(epsilon, wide), 2)
-        shares = jnp.exp(kernel + f[..., :, None] + g[..., None, :])
-        total = product("...n,...nk,...k->...", mu, shares, nu)
-        return epsilon * ((mu * f).sum(axis=-1) + (nu * g).sum(axis=-1) + 1 - total)
+    options = {"epsilon": epsilon, "config": config}
+    selves = [entropic_cost(side, side, **options) for side in sides]
+    return entropic_cost(*sides, **options) - (selves[0] + selves[1]) / 2
 
-    selves = [transport(side, side) for side in sides]
-    return transport(*sides) - (selves[0] + selves[1]) / 2
+
+def entropic_cost(
+    first: tuple[Array, Array],
+    second: tuple[Array, Array],
+    *,
+    epsilon: float | Float[Array, "*#batch"],
+    config: SinkhornConfig = _SOLVER,
+) -> Float[Array, "*batch"]:
+    """Compute OT(x, y) of `sinkhorn_divergence`, whose gradient it has.
+
+    Args:
+        first: tokens, and the logarithms of their masses, which sum to 1.
+        second: the same of the other image.
+        epsilon: see `sinkhorn_divergence`.
+        config: see `sinkhorn_divergence`.
+    """
+    (tokens, log_mu), (others, log_nu) = first, second
+    cost = squared_distances(tokens, others)
+    fixed = jax.lax.stop_gradient((-cost, log_mu, log_nu))
+    at = jax.lax.stop_gradient(epsilon)
+    row, column = solve(*fixed, epsilon=at, config=config).potentials
+    # The dual's potentials count from the masses.
+    f = jax.lax.stop_gradient(_from_masses(row, log_mu))
+    g = jax.lax.stop_gradient(_from_masses(column, log_nu))
+    mu, nu = jnp.exp(log_mu), jnp.exp(log_nu)
+    kernel = -cost / per_problem(jnp.asarray(epsilon, cost.dtype), 2)
+    shares = jnp.exp(kernel + f[..., :, None] + g[..., None, :])
+    total = product("...n,...nk,...k->...", mu, shares, nu)
+    return epsilon * ((mu * f).sum(axis=-1) + (nu * g).sum(axis=-1) + 1 - total)
 
 
 def squared_distances(
@@ -91,11 +109,12 @@ def squared_distances(
     return jnp.maximum(squares[0][..., :, None] + squares[1][..., None, :] - 2 * inner, 0)
 
 
-def _normalised(tokens: Array, log_masses: Array | None) -> Array:
+def log_masses(tokens: Array, given: Array | None = None) -> Array:
+    """Return the logarithms of tokens' masses, which sum to 1; by default all are equal."""
     shape = tokens.shape[:-1]
-    if log_masses is None:
+    if given is None:
         return jnp.full(shape, -math.log(shape[-1]))
-    return jnp.broadcast_to(jax.nn.log_softmax(jnp.asarray(log_masses), axis=-1), shape)
+    return jnp.broadcast_to(jax.nn.log_softmax(jnp.asarray(given), axis=-1), shape)
 
 
 def _from_masses(potential: Array, log_mass: Array) -> Array:

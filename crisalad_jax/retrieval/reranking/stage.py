@@ -17,7 +17,7 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, cast_params
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.retrieval.reranking import matching, patch_netvlad
+from crisalad_jax.retrieval.reranking import divergence, matching, patch_netvlad
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import Bar, progress_bar
@@ -28,8 +28,8 @@ from crisalad_jax.utils.shapes import Bool, Float, Int
 class Method:
     """A second stage's local features, and its scores of pairs of images."""
 
-    aggregator: str
-    """Name of the aggregator whose models it takes."""
+    aggregator: str | None
+    """Name of the aggregator whose models it takes; None takes any that has what it compares."""
     shape: Callable[[ModelConfig], tuple[int, int]]
     """Returns the number of an image's features, and their length."""
     describe: Callable[[Crisalad, Any, ModelConfig], Any]
@@ -53,6 +53,7 @@ _METHODS: Mapping[str, Method] = {
     "patch-netvlad": _PATCH_NETVLAD,
     "patch-netvlad-ransac": dataclasses.replace(_PATCH_NETVLAD, score=patch_netvlad.inlier_scores),
     "patch-netvlad-sum": dataclasses.replace(_PATCH_NETVLAD, fuse=patch_netvlad.weighted_sum),
+    "sinkhorn-divergence": Method(None, divergence.shape, divergence.describe, divergence.scores),
     "selavpr": Method(
         "selavpr", matching.selavpr_shape, matching.describe_selavpr, matching.count_matches
     ),
@@ -77,7 +78,7 @@ class Reranking:
 
     name: str
     """patch-netvlad, patch-netvlad-ransac or patch-netvlad-sum, by a model with NetVLAD; selavpr or
-    transvpr, by one with that aggregator."""
+    transvpr, by one with that aggregator; sinkhorn-divergence, by one with local tokens."""
     top: int
     """Number of a query's first retrievals that are re-ranked; the later ones keep their places."""
     model: Model | None = None
@@ -105,10 +106,11 @@ class Reranking:
         """
         method, own = _METHODS[self.name], config if self.model is None else self.model.config
         found = own.aggregator.part_name, own.preprocessing.size_rule
-        if found != (method.aggregator, "fixed"):
+        wanted = method.aggregator or found[0], "fixed"
+        if found != wanted:
             raise InputError(
                 f"rerank: found a model with aggregator {found[0]} and size rule {found[1]}, "
-                f"expected {method.aggregator} and fixed, whose local features {self.name} "
+                f"expected {wanted[0]} and fixed, whose local features {self.name} "
                 "compares (--rerank-weights takes another model than the first stage's)"
             )
         method.shape(own)

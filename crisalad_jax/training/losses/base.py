@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,8 +43,8 @@ class LossBatch:
     """Pairs that the miner chose."""
     classes: Int[Array, ""] | int | None = None
     """Number of classes, where the loss has a vector for each."""
-    dense: Float[Array, "image feature local"] | None = None
-    """Unit local features (`Tokens.dense`), for a loss that `reads_dense`."""
+    tokens: Float[Array, "image token dim"] | None = None
+    """The field of `Tokens` that the loss's `reads_tokens` names."""
 
     @functools.cached_property
     def similarities(self) -> Similarities:
@@ -98,8 +98,9 @@ class Loss(Part, abc.ABC):
     of_tuples: ClassVar[bool] = False
     """Whether the loss takes mined tuples alone, where an image is in a single pair."""
 
-    reads_dense: ClassVar[bool] = False
-    """Whether the loss compares local features, which few aggregators have in training."""
+    reads_tokens: ClassVar[Literal["local", "dense"] | None] = None
+    """Field of `Tokens` that the loss compares, besides descriptors: the aggregator's local tokens,
+    or local features, which few aggregators have in training."""
 
     @property
     def grouping(self) -> ClassesConfig | None:

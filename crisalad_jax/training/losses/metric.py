@@ -70,7 +70,7 @@ def metric_loss(
     params: Any = None,
     classes: Int[Array, ""] | int | None = None,
     pairs: Pairs | None = None,
-    dense: Float[Array, "image feature local"] | None = None,
+    tokens: Float[Array, "image token dim"] | None = None,
 ) -> LossResult:
     """Compute the loss `config.kind` over the pairs that `config.miner` chooses.
 
@@ -84,7 +84,7 @@ def metric_loss(
         params: what trains beside the model (`Loss.init`).
         classes: number of classes, where `params` have a vector for each and more.
         pairs: the pairs to choose from, such as `tuple_pairs`; None means `all_pairs`.
-        dense: local features of each image, for a loss that compares them.
+        tokens: local tokens or features of each image, for a loss that compares them.
 
     Returns:
         The loss and what is logged beside it.
@@ -107,9 +107,13 @@ def metric_loss(
     kind, name = config.kind, f"loss {config.kind.part_name}"
     init = functools.partial(kind.init, classes=1, dim=descriptors.shape[1])
     learns = params is None and jax.eval_shape(init, jax.random.key(0)) is not None
+    found = 0 if tokens is None else tokens.shape[1]
     for lacks, what in (
         (kind.of_tuples and pairs is None, "tuples, expected the pairs of mined ones"),
-        (kind.reads_dense and dense is None, "local features, expected those of selavpr's tokens"),
+        (
+            kind.reads_tokens and not found,
+            f"tokens, expected the aggregator's Tokens.{kind.reads_tokens}",
+        ),
         (learns, "params, expected those of its init"),
     ):
         require(not lacks, f"{name}: found no {what}")
@@ -119,7 +123,7 @@ def metric_loss(
     else:  # what takes no part may be NaN
         wide = jnp.where(valid[:, None], wide, 0)
     every = all_pairs(labels, valid=valid) if pairs is None else pairs
-    batch = LossBatch(wide, labels, valid, every, classes, dense)
+    batch = LossBatch(wide, labels, valid, every, classes, tokens)
     similarities = jax.lax.stop_gradient(batch.similarities)
     mined = mine(similarities, every, margin=config.miner_margin)
     chosen = every if config.miner == "none" else mined

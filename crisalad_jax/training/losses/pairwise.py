@@ -197,7 +197,7 @@ class SelaVprLoss(Loss):
     """The loss of Lu et al. (ICLR 2024), whose margin of local features is 0."""
 
     of_tuples: ClassVar[bool] = True
-    reads_dense: ClassVar[bool] = True
+    reads_tokens: ClassVar[Literal["local", "dense"]] = "dense"
 
     margin: float = 0.1
     """Distance by which a positive's descriptor must be nearer than a negative's."""
@@ -208,8 +208,8 @@ class SelaVprLoss(Loss):
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Add the mean of the triplets of descriptors and that of local similarities."""
-        assert batch.dense is not None
-        dense = batch.dense
+        assert batch.tokens is not None
+        dense = batch.tokens
         positives, negatives = batch.pairs
         # Each image but a query is in a single pair.
         anchor = (positives | negatives).argmax(axis=0)

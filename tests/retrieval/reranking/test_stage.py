@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
+from ott.geometry.pointcloud import PointCloud
+from ott.tools.sinkhorn_divergence import sinkhorn_divergence as ott_divergence
 
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.reading import Reading
@@ -15,10 +17,17 @@ from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.aggregators.vlad import NetVladConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.model import Model
+from crisalad_jax.nn.model import Model, extract_tokens
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.retrieval.reranking import Reranker, Reranking, matching, parse_reranking, stage
+from crisalad_jax.retrieval.reranking import (
+    Reranker,
+    Reranking,
+    divergence,
+    matching,
+    parse_reranking,
+    stage,
+)
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL, random_params
 
@@ -35,7 +44,7 @@ NETVLAD = dataclasses.replace(
 )
 
 
-OWN = {"transvpr": TRANSVPR, "selavpr": SELAVPR}
+OWN = {"transvpr": TRANSVPR, "selavpr": SELAVPR, "sinkhorn-divergence": PLAIN}
 
 
 def model_of(name: str) -> tuple:
@@ -236,3 +245,31 @@ def test_a_full_disk_is_one_line(first_stage, benchmark, monkeypatch) -> None:
     monkeypatch.setattr(stage.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(InputError, match=r"GiB free, expected .* for the local features of 5 im"):
         rerank(reranking("transvpr", 3), first_stage, benchmark.database, benchmark.queries)
+
+
+def test_tokens_are_compared_by_their_divergence_as_otts(benchmark) -> None:
+    """In float16 tokens: unit vectors to 5e-4, and their costs, of 0 to 4, to 4e-3 at most."""
+    own, config = model_of("sinkhorn-divergence")
+    shape = (BATCH, *config.image_size, 3)
+    images = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
+    local = np.asarray(extract_tokens(own, images, config).local, np.float64)
+    local /= np.linalg.norm(local, axis=-1, keepdims=True)
+    rows = np.asarray(divergence.describe(own, images, config))
+    assert rows.shape[1:] == divergence.shape(config)
+    found = np.asarray(divergence.scores(rows[0], rows, config))
+
+    def expected(other: np.ndarray) -> float:
+        options = {"epsilon": 0.1, "solve_kwargs": {"threshold": 1e-6, "max_iterations": 5000}}
+        return -float(ott_divergence(PointCloud, local[0], other, scale_cost=1.0, **options)[0])
+
+    assert abs(found[0]) < 1e-5
+    assert len(np.unique(found.round(3))) > 1
+    np.testing.assert_allclose(found, [expected(other) for other in local], atol=4e-3)
+
+
+def test_a_model_without_local_tokens_is_refused() -> None:
+    config = dataclasses.replace(PLAIN, aggregator="gem")
+    with pytest.raises(
+        InputError, match=r"^rerank: found a model with aggregator gem, which has no"
+    ):
+        Reranking("sinkhorn-divergence", 2).check(config)

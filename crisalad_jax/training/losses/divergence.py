@@ -1,0 +1,69 @@
+"""Triplets of Sinkhorn divergences between the local tokens of images."""
+
+import dataclasses
+from typing import Any, ClassVar, Literal
+
+import jax
+import jax.numpy as jnp
+
+from crisalad_jax.config.checks import require_positive
+from crisalad_jax.nn.layers import l2_normalise
+from crisalad_jax.nn.transport.divergence import entropic_cost, log_masses
+from crisalad_jax.training.losses.base import LOSSES, Loss, LossBatch, LossValue
+from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
+
+
+@LOSSES.register("sinkhorn-divergence")
+@dataclasses.dataclass(frozen=True)
+class SinkhornDivergenceLoss(MultiSimilarityConfig):
+    """Multi-similarity loss of the descriptors, and a triplet loss of the images' local tokens.
+
+    The distance of a triplet is the Sinkhorn divergence (Feydy et al., AISTATS 2019) between the
+    unit local tokens of two images, each of the same mass, by squared Euclidean costs. An anchor's
+    triplet has its least similar positive and its most similar negative, by the descriptors, of the
+    pairs that the miner chose (Hermans et al. 2017). Both mean divergences are logged.
+    """
+
+    reads_tokens: ClassVar[Literal["local", "dense"]] = "local"
+
+    weight: float = 1.0
+    """Factor of the triplet loss."""
+    margin: float = 0.1
+    """Divergence by which a positive must be nearer than a negative."""
+    epsilon: float = 0.1
+    """Entropic regularisation, in units of the costs, which are 0 to 4."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        super().__post_init__()
+        require_positive(self, "weight", "margin", "epsilon")
+
+    def from_scratch(self) -> Loss:
+        """Return base 0.5, as of the multi-similarity loss."""
+        return dataclasses.replace(self, base=0.5)
+
+    def apply(self, params: Any, batch: LossBatch) -> LossValue:
+        """Add the mean violation of the margin over the anchors that have both pairs."""
+        assert batch.tokens is not None
+        # What takes no part may be NaN.
+        tokens = l2_normalise(jnp.where(batch.valid[:, None, None], batch.tokens, 0))
+        sets = tokens, log_masses(tokens).astype(tokens.dtype)
+
+        def cost_to(other: Any) -> Any:
+            return entropic_cost(sets, (tokens[other], sets[1]), epsilon=self.epsilon)
+
+        similarities = jax.lax.stop_gradient(batch.similarities)
+        positives, negatives = batch.pairs
+        positive = jnp.where(positives, -similarities, -jnp.inf).argmax(axis=1)
+        negative = jnp.where(negatives, similarities, -jnp.inf).argmax(axis=1)
+        own = cost_to(jnp.arange(len(tokens)))
+        near, far = (cost_to(other) - (own + own[other]) / 2 for other in (positive, negative))
+        used = positives.any(axis=1) & negatives.any(axis=1)
+
+        def mean(each: Any) -> Any:
+            return jnp.where(used, each, 0).sum() / jnp.maximum(used.sum(), 1)
+
+        triplets = mean(jax.nn.relu(self.margin + near - far))
+        numbers = {"positive_divergence": mean(near), "negative_divergence": mean(far)}
+        total = super().apply(None, batch).loss + self.weight * triplets
+        return LossValue(total, numbers=numbers)
