@@ -89,18 +89,26 @@ class ModelConfig:
             f"cross_image: found {encoder.part_name} for {aggregator}, with which nothing trains, "
             "expected none",
         )
-        whole, rest = encoder.global_token, global_dim % dim
-        for fits, expected in (
-            (not whole or not rest, f"False: its width is no multiple of {dim}"),
-            (whole or tokens > 0, "True, or no encoder: it is the only token"),
+        whole, cuts = encoder.global_token, encoder.width is not None
+        length, rest = self.unprojected_dim, 0 if cuts or not whole else global_dim % dim
+        for name, fits, expected in (
+            ("width", not cuts or length % self.sequence_dim == 0, f"a divisor of {length}"),
+            ("global_token", rest == 0, f"False: its width is no multiple of {dim}"),
+            ("global_token", whole or tokens > 0, "True, or no encoder: it is the only token"),
         ):
-            require_field(encoder, "global_token", fits, expected)
-        encoder.check(dim)
+            require_field(encoder, name, fits, expected)
+        encoder.check(self.sequence_dim)
 
     @property
     def token_shape(self) -> TokenShape:
         """Shape of an image's tokens."""
         return TokenShape(*self.aggregator.token_shape(self.backbone.dim))
+
+    @property
+    def sequence_dim(self) -> int:
+        """Width of the cross-image encoder's tokens."""
+        width = self.cross_image.width
+        return self.token_shape.token_dim if width is None else width
 
     @property
     def descriptor_dim(self) -> int:
@@ -109,8 +117,9 @@ class ModelConfig:
 
     @property
     def unit_length(self) -> bool:
-        """Whether descriptors are unit vectors; a projection may leave their lengths alone."""
-        return not self.projection.dim or self.projection.renormalise
+        """Whether descriptors are unit vectors, as the projection or the encoder leaves them."""
+        alone = not self.cross_image.attends or self.cross_image.width is None
+        return self.projection.renormalise if self.projection.dim else alone
 
     @property
     def unprojected_dim(self) -> int:

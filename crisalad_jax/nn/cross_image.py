@@ -60,6 +60,9 @@ class CrossImage(Part, abc.ABC):
     """Whether a descriptor depends on the other images of its batch."""
     global_token = True  # without a type, so that a class may make it a field
     """Whether the global token takes part, cut into tokens of the local ones' width."""
+    width = None  # without a type, as well
+    """Width of the tokens that it cuts the finished unit descriptor into, of which it makes the
+    descriptor: no normalisation follows. None takes the aggregator's tokens."""
 
     def check(self, dim: int) -> None:
         """Raise InputError where it does not fit tokens of this width; by default never."""
@@ -125,23 +128,15 @@ class CrossImageEncoder:
     layers: tuple[EncoderLayer, ...]
 
 
-@CROSS_IMAGE.register("transformer", tiny={"heads": 4, "feedforward": 128, "dropout": 0.0})
 @dataclasses.dataclass(frozen=True)
-class CrossImageConfig(CrossImage):
-    """The transformer encoder that attends across the images of a batch (paper section 3.4).
-
-    Example:
-        >>> CrossImageConfig(layers=1).layers
-        1
-    """
+class TransformerEncoder(CrossImage):
+    """Layers of torch's, each of which attends from a token to the same token of all images."""
 
     layers: PositiveInt = 2
     """Number of layers."""
     heads: PositiveInt = 16
     feedforward: PositiveInt = 2048
     dropout: Fraction = non_semantic_field(0.1)
-    global_token: bool = True
-    """Whether the global token takes part too, cut into tokens of the clusters' width."""
 
     def check(self, dim: int) -> None:
         """Require heads that divide a token."""
@@ -175,6 +170,37 @@ class CrossImageConfig(CrossImage):
         return jnp.stack(weights)
 
 
+_TINY = {"heads": 4, "feedforward": 128, "dropout": 0.0}
+
+
+@CROSS_IMAGE.register("transformer", tiny=_TINY)
+@dataclasses.dataclass(frozen=True)
+class CrossImageConfig(TransformerEncoder):
+    """The transformer encoder that attends across the images of a batch (paper section 3.4).
+
+    Example:
+        >>> CrossImageConfig(layers=1).layers
+        1
+    """
+
+    global_token: bool = True
+    """Whether the global token takes part too, cut into tokens of the clusters' width."""
+
+
+@CROSS_IMAGE.register("sage", tiny={**_TINY, "width": 96})
+@dataclasses.dataclass(frozen=True)
+class SageCrossImageConfig(TransformerEncoder):
+    """SAGE's transformer encoder (ICLR 2026), over a finished descriptor cut into tokens.
+
+    Its descriptors are not unit vectors, and are compared by Euclidean distance. A loss takes them
+    normalised.
+    """
+
+    feedforward: PositiveInt = 1024
+    width: PositiveInt = 768
+    """Width of a token, a divisor of the descriptor's."""
+
+
 @pytree_dataclass
 class GatedEncoder:
     """A gate, and what is behind it."""
@@ -183,7 +209,7 @@ class GatedEncoder:
     encoder: CrossImageEncoder
 
 
-@CROSS_IMAGE.register("gated", tiny={"heads": 4, "feedforward": 128, "dropout": 0.0})
+@CROSS_IMAGE.register("gated", tiny=_TINY)
 @dataclasses.dataclass(frozen=True)
 class GatedCrossImageConfig(CrossImageConfig):
     """The paper's encoder behind a learnt gate: y = x + tanh(g) (f(x) - x).
@@ -215,7 +241,7 @@ class GatedCrossImageConfig(CrossImageConfig):
 def cross_image_encoder(
     params: CrossImageEncoder,
     tokens: Float[Array, "image token dim"],
-    config: CrossImageConfig,
+    config: TransformerEncoder,
     *,
     mask: Bool[Array, "image image"] | None = None,
     key: PRNGKeyArray | None,
@@ -233,7 +259,7 @@ def cross_image_encoder(
 def _run_layer(
     params: EncoderLayer,
     tokens: Sequences,
-    config: CrossImageConfig,
+    config: TransformerEncoder,
     *,
     mask: Mask,
     key: PRNGKeyArray | None,
@@ -246,7 +272,7 @@ def _run_layer(
 def _attend_across(
     params: Attention,
     x: Float[Array, "image token dim"],
-    config: CrossImageConfig,
+    config: TransformerEncoder,
     *,
     mask: Bool[Array, "image image"] | None,
     key: PRNGKeyArray | None,

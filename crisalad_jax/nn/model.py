@@ -98,7 +98,7 @@ def init_crisalad(key: PRNGKeyArray, config: ModelConfig) -> Crisalad:
         check_drawn(backbone, f"backbone {config.backbone.part_name}")
         aggregator = config.aggregator.init(keys[1], config.backbone, config.grid)
         check_drawn(aggregator, f"aggregator {config.aggregator.part_name}")
-        cross_image = config.cross_image.init(keys[2], config.token_shape.token_dim)
+        cross_image = config.cross_image.init(keys[2], config.sequence_dim)
         check_drawn(cross_image, f"cross_image {config.cross_image.part_name}")
         projection = None
         if config.projection.dim:
@@ -273,7 +273,7 @@ def describe(
         micro_batch: see `extract_tokens`; images still attend to the whole batch.
 
     Returns:
-        Descriptors of length 1 (but see `ProjectionConfig.renormalise`), in float32 at least.
+        Descriptors of length 1 where the model has `unit_length`, in float32 at least.
 
     Raises:
         InputError: parameters that are not of the configuration; while tracing, for images of the
@@ -573,21 +573,36 @@ def attend_across_images(
         f"tokens: found a global token of shape {found[0]} and local tokens of {found[1]}, "
         f"expected {expected[0]} and {expected[1]}",
     )
-    encoder = config.cross_image
+    encoder, sequence = config.cross_image, None
     if encoder.attends:
         mask = _checked_mask(mask, count)
         with jax.named_scope("cross_image"):
-            sequence = as_sequence(tokens, global_token=encoder.global_token)
-            sequence = sequence.astype(config.compute_dtype)
+            sequence = _sequence(tokens, config)
             found = encoder.apply(params.cross_image, sequence, mask=mask, key=key)
             expect_like(f"cross_image {encoder.part_name}", found, sequence)
             sequence = found.astype(tokens.local.dtype)
-        tokens = from_sequence(sequence, tokens, global_token=encoder.global_token)
-    descriptors = to_descriptor(tokens, config.aggregator)
+    if sequence is not None and encoder.width is not None:
+        descriptors = sequence.reshape(count, config.unprojected_dim)
+    else:
+        if sequence is not None:
+            tokens = from_sequence(sequence, tokens, global_token=encoder.global_token)
+        descriptors = to_descriptor(tokens, config.aggregator)
     if params.projection is None:
         return descriptors
     with jax.named_scope("projection"):
         return project(params.projection, descriptors, config.projection)
+
+
+def _sequence(tokens: Tokens, config: ModelConfig) -> Float[Array, "image token dim"]:
+    """Return what the cross-image encoder takes: tokens, or a descriptor that is cut into some."""
+    encoder = config.cross_image
+    if encoder.width is None:
+        sequence = as_sequence(tokens, global_token=encoder.global_token)
+    else:
+        descriptors = to_descriptor(tokens, config.aggregator)
+        pieces = config.unprojected_dim // encoder.width, encoder.width
+        sequence = descriptors.reshape(descriptors.shape[0], *pieces)
+    return sequence.astype(config.compute_dtype)
 
 
 def _checked_mask(
@@ -670,7 +685,8 @@ def cross_image_attention(
     """Compute which images attend to which in the layers of the cross-image encoder.
 
     Entry (i, j) is how much of image j's token the same token of image i takes; rows sum to 1. The
-    tokens are those of the global token, cut as the encoder takes it, then the clusters.
+    tokens are those of the global token, cut as the encoder takes it, then the clusters; or the
+    pieces of a descriptor that the encoder cuts.
 
     Args:
         params: see `describe`.
@@ -693,7 +709,7 @@ def cross_image_attention(
         (2, 18, 4, 3, 3)
     """
     tokens, encoder = extract_tokens(params, images, config), config.cross_image
-    sequence = as_sequence(tokens, global_token=encoder.global_token).astype(config.compute_dtype)
+    sequence = _sequence(tokens, config)
     mask = _checked_mask(mask, len(sequence))
     return encoder.attention(_widened(params, config).cross_image, sequence, mask=mask)
 
@@ -720,7 +736,8 @@ def describe_training_batch(
         micro_batch: see `extract_tokens`.
 
     Returns:
-        (descriptors, tokens, statistics), the last as `tokens_and_statistics` returns them.
+        (descriptors, tokens, statistics), the last as `tokens_and_statistics` returns them. The
+        descriptors are unit vectors, as losses take them, whatever the model leaves them.
     """
     tokens_key, cross_key = split_key(key, 2)
     tokens, statistics = tokens_and_statistics(
@@ -728,6 +745,8 @@ def describe_training_batch(
     )
     mask = valid_mask(valid)
     descriptors = attend_across_images(params, tokens, config, mask=mask, key=cross_key)
+    if not config.unit_length:
+        descriptors = l2_normalise(descriptors)
     return descriptors, tokens, statistics
 
 
