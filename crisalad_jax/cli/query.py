@@ -75,8 +75,8 @@ class Query(ReadFlags, JsonFlag):
     json: Annotated[pathlib.Path | None, Target((".json", ".jsonl"))] = None
     """File for the answers: .jsonl, a line of JSON for each query, or .json, a list; - prints
     lines."""
-    gallery: Annotated[pathlib.Path | None, Target((".png",))] = None
-    """PNG of up to 24 queries beside up to 8 answers each."""
+    gallery: Annotated[pathlib.Path | None, Target((".png", ".svg", ".pdf"))] = None
+    """PNG, SVG or PDF of up to 24 queries beside up to 8 answers each."""
     map_images: pathlib.Path | None = None
     """Folder of the map's images, for the gallery, if they are not where they were."""
     verify: bool = True

@@ -21,6 +21,7 @@ from crisalad_jax.experiments.report import (
     recall_curves,
     recall_table,
     save,
+    save_chart,
     show_retrievals,
     training_curves,
 )
@@ -123,7 +124,7 @@ def _run(config: DemoConfig, out: pathlib.Path, quiet: bool) -> DemoSummary:
         "gallery.png": show_retrievals(results["trained"][0], benchmark, rows=6, title=title),
     }
     for name, figure in figures.items():
-        save(figure, out / name)
+        (save if name == "gallery.png" else save_chart)(figure, out / name)
     write_text(out / "recalls.md", recall_table(rows).markdown())
     pictures = [out / name for name in figures]
     return DemoSummary(rows, pictures, time.monotonic() - started, training_seconds)

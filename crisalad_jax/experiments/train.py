@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.query_set import QuerySet
-from crisalad_jax.experiments.report import save, training_curves
+from crisalad_jax.experiments.report import save_chart, training_curves
 from crisalad_jax.training.callbacks import Callback
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.distributed import is_primary
@@ -121,5 +121,5 @@ def train(
     )
     if is_primary():
         out = pathlib.Path(out)
-        save(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
+        save_chart(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
     return result

@@ -61,7 +61,7 @@ RESUMABLE: Mapping[str, str] = {
 """Folders that may stay behind: work that the same command goes on with."""
 # Files that hold times, or are drawn from them.
 _TIMED = re.compile(
-    r"metrics\.jsonl|/tensorboard/|/state/|curves\.png|training\.(json|png)|speed\.json|index\.html|"
+    r"metrics\.jsonl|/tensorboard/|/state/|curves\.(png|svg|pdf)|training\.(json|png|svg|pdf)|speed\.json|index\.html|"
     r"table\.(md|csv|json)|results\.json|summary\.json|sittings\.json|test-\d\.json|map\.json|"
     r"config\.json|adapters\.json|\.names\.txt\.lock"
 )

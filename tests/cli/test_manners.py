@@ -229,7 +229,8 @@ def test_json_is_never_written_under_the_name_of_another_format(capfd, tmp_path,
         words = (f"--json: found {name}, expected a name that ends in .json",)
         fails(capfd, verb, *given, "--json", name, words=words)
     gallery = ("query", "a", "--map", "m", "--gallery", name)
-    fails(capfd, *gallery, words=(f"--gallery: found {name}, expected a name that ends in .png",))
+    ends = "a name that ends in .png or .svg or .pdf"
+    fails(capfd, *gallery, words=(f"--gallery: found {name}, expected {ends}",))
     extract = ("extract", "--images", "a", "--out", "d.npy", "--pairs", name)
     fails(capfd, *extract, words=(f"--pairs: found {name}, expected a name that ends in .txt",))
     assert list(tmp_path.iterdir()) == []

@@ -26,7 +26,7 @@ _PAGE_TITLES = {"compare": "Methods compared", "ablate": "What each part brings"
 
 
 def write_tables(summary: Summary, out: pathlib.Path) -> None:
-    """Write table.md, table.csv, results.json, and index.html with its charts, recall_N.png."""
+    """Write table.md, table.csv, results.json, and index.html with its charts, recall_N."""
     write_text(out / "table.md", markdown(summary))
     write_csv(out / "table.csv", list(csv_rows(summary)))
     write_json(out / "results.json", as_json(summary))

@@ -43,6 +43,8 @@ _LOSSES = (
 _TIMES, _LEAST = 10, 1000.0
 _SHARE, _COUNT = 0.02, 5
 _TRUTH = "#d55e00"
+_MANY = 20_000
+"""Number of images above which their marks are pixels in vectors too, for small files."""
 
 
 def recall_curves(
@@ -221,22 +223,26 @@ def position_map(
 
     database, queries = database - low, queries - low
     size = float(np.clip(4000 / len(points), 2, 18))
-    there = database[database_placed]
-    axes.scatter(*there.T, s=2.5 * size, c=PLAIN, linewidths=0, label="database")
+    there, pixels = database[database_placed], len(points) > _MANY
+    plain: Any = {"c": PLAIN, "linewidths": 0, "label": "database", "rasterized": pixels}
+    axes.scatter(*there.T, s=2.5 * size, **plain)
     joined = (outcomes == "wrong") & queries_placed & database_placed[first]
     lines = np.stack([queries[joined], database[first[joined]]], axis=1)
     # Paler where there are many, so that what is below them shows.
     alpha = float(np.clip(60 / max(len(lines), 1), 0.05, 0.45))
-    axes.add_collection(LineCollection(lines.tolist(), colors=WRONG, linewidths=0.6, alpha=alpha))
+    thin: Any = {"colors": WRONG, "linewidths": 0.6, "alpha": alpha, "rasterized": pixels}
+    axes.add_collection(LineCollection(lines.tolist(), **thin))
     hollow = {"facecolors": "none", "edgecolors": UNMATCHED, "marker": "^", "linewidths": 0.8}
-    for outcome, marks in (
-        ("right", {"c": RIGHT, "marker": "o", "linewidths": 0}),
-        ("wrong", {"c": WRONG, "marker": "x", "linewidths": 1}),
-        ("no positive", hollow),
-    ):
+    styles: dict[str, dict[str, Any]] = {
+        "right": {"c": RIGHT, "marker": "o", "linewidths": 0},
+        "wrong": {"c": WRONG, "marker": "x", "linewidths": 1},
+        "no positive": hollow,
+    }
+    for outcome, marks in styles.items():
         mask = (outcomes == outcome) & queries_placed
         if mask.any():
-            axes.scatter(*queries[mask].T, s=1.4 * size, label=f"{outcome} ({mask.sum()})", **marks)
+            marks |= {"label": f"{outcome} ({mask.sum()})", "rasterized": pixels}
+            axes.scatter(*queries[mask].T, s=1.4 * size, **marks)
     legend_below(figure)
     return figure
 
@@ -288,7 +294,8 @@ def similarity_matrix(
     axes.imshow(truth, tint, alpha=0.9 * truth, interpolation="nearest", **where)
     size = float(np.clip(600 / queries, 0.6, 30))
     colours = np.where(outcomes == "right", RIGHT, WRONG).tolist()
-    axes.scatter(first + 0.5, np.arange(queries) + 0.5, s=size, c=colours, linewidths=0)
+    dots: Any = {"c": colours, "linewidths": 0, "rasterized": queries > _MANY}
+    axes.scatter(first + 0.5, np.arange(queries) + 0.5, s=size, **dots)
     bar = figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, pad=0.02)
     bar.set_label("similarity", fontsize=9, color=INK)
     bar.ax.tick_params(labelsize=8, labelcolor=INK, color=GREY)

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
 
 import cv2
+import matplotlib
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib.axes import Axes
@@ -36,7 +37,12 @@ PLAIN = "#c4c4c4"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 WIDE = {"width": 7.0, "dpi": 120}
 """Size of a figure that stands for itself."""
+FORMATS = (".png", ".svg", ".pdf")
+"""What a figure may be written as: pixels for pages, and vectors for papers."""
 _WEBP_QUALITY = 78
+_UNDATED = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+# Names in an SVG are not drawn at random; a PDF has TrueType fonts, as publishers ask for.
+_FIXED = {"svg.hashsalt": "crisalad", "pdf.fonttype": 42}
 
 
 class Picture(Figure):
@@ -45,6 +51,13 @@ class Picture(Figure):
     def _repr_jpeg_(self) -> bytes:
         """Return the figure for IPython's display; photographs as a PNG fill a notebook."""
         return _encode(self, "jpg", pil_kwargs={"quality": 88})
+
+    def savefig(self, fname: Any, **options: Any) -> None:
+        """Write the figure as PNG, SVG or PDF; the same figure gives the same bytes."""
+        kind = options.get("format") or pathlib.Path(str(fname)).suffix[1:].lower()
+        options = {"facecolor": "white", "metadata": _UNDATED.get(kind)} | options
+        with matplotlib.rc_context(_FIXED), _any_names(self):
+            super().savefig(fname, **options)
 
 
 def new_figure(height: float, title: str = "", *, width: float = 4.0, dpi: int = 200) -> Picture:
@@ -102,18 +115,23 @@ def _any_names(figure: Figure) -> Iterator[None]:
         yield
 
 
-def _encode(figure: Figure, kind: str, **options: Any) -> bytes:
+def _encode(figure: Picture, kind: str, **options: Any) -> bytes:
     data = io.BytesIO()
-    with _any_names(figure):
-        figure.savefig(data, format=kind, facecolor="white", **options)
+    figure.savefig(data, format=kind, **options)
     return data.getvalue()
 
 
-def save(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure as a PNG, whole or not at all."""
-    data = _encode(figure, "png")
+def save(figure: Picture, path: str | os.PathLike[str]) -> None:
+    """Write a figure in the format of the file's suffix, by default PNG, whole or not at all."""
+    data = _encode(figure, pathlib.Path(path).suffix[1:].lower() or "png")
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
+
+
+def save_chart(figure: Picture, path: pathlib.Path) -> None:
+    """Write a figure as a PNG, and as a vector in an SVG and in a PDF of the same name."""
+    for suffix in FORMATS:
+        save(figure, path.with_suffix(suffix))
 
 
 class Drawing(NamedTuple):
@@ -129,13 +147,13 @@ class Drawing(NamedTuple):
     """What is below it."""
 
 
-def chart(figure: Figure, path: pathlib.Path, alt: str) -> Drawing:
-    """Write a figure as a PNG, and embed that."""
-    save(figure, path)
+def chart(figure: Picture, path: pathlib.Path, alt: str) -> Drawing:
+    """Write a figure as `save_chart`, and embed the PNG."""
+    save_chart(figure, path)
     return _embed(figure, "png", path.read_bytes(), alt)
 
 
-def illustration(figure: Figure, alt: str) -> Drawing:
+def illustration(figure: Picture, alt: str) -> Drawing:
     """Embed a figure with photographs in it, as a WebP."""
     data = _encode(figure, "webp", pil_kwargs={"quality": _WEBP_QUALITY})
     return _embed(figure, "webp", data, alt)

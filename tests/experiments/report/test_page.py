@@ -9,6 +9,7 @@ import pathlib
 import re
 import shutil
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ import pytest
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.metrics import Interval, precision_recall
 from crisalad_jax.evaluation.results import GroupingResult, Scores
-from crisalad_jax.experiments.report import write_report
+from crisalad_jax.experiments.report import recall_curves, write_report
 from crisalad_jax.experiments.report.charts import outcomes_of
 from crisalad_jax.experiments.report.page import Subject, page_rows, query_results
 from crisalad_jax.experiments.report.tables import write_csv
@@ -155,6 +156,36 @@ def test_drawings_are_the_files_beside_the_page(written: pathlib.Path, page: Pag
     # Photographs are in the page alone.
     names = ("recall_curves.png", "precision_recall.png", "positions.png", "similarities.png")
     assert sorted(held) == sorted(files) == sorted(names)
+
+
+def test_every_chart_is_a_vector_too(written: pathlib.Path):
+    names = {path.stem for path in written.glob("*.png")}
+    for name in names:
+        height, width = cv2.imread(str(written / f"{name}.png")).shape[:2]
+        points = [72 / 200 * each for each in (width, height)]  # of 200 pixels an inch
+        svg = ElementTree.parse(written / f"{name}.svg").getroot()
+        sides = [float(svg.attrib[each].removesuffix("pt")) for each in ("width", "height")]
+        assert sides == pytest.approx(points, abs=0.4)  # a pixel is 0.36 points
+        pdf = (written / f"{name}.pdf").read_bytes()
+        (box,) = re.findall(rb"/MediaBox \[ 0 0 (\S+) (\S+) \]", pdf)
+        assert [float(each) for each in box] == pytest.approx(points, abs=0.4)
+    assert len(names) == 4
+    for suffix in ("svg", "pdf"):
+        assert {path.stem for path in written.glob(f"*.{suffix}")} == names
+
+
+def test_a_figure_has_the_same_bytes_each_time(tmp_path: pathlib.Path):
+    def written(name: str) -> bytes:
+        recall_curves({"a $x^2$ \x1b": {1: 0.5, 5: 0.7}}).savefig(tmp_path / name)
+        return (tmp_path / name).read_bytes()
+
+    for suffix in ("png", "svg", "pdf"):
+        assert written(f"a.{suffix}") == written(f"b.{suffix}")
+    assert b"<dc:date>" not in written("a.svg")
+    pdf = written("a.pdf")
+    assert b"/CreationDate" not in pdf
+    assert b"/Type3" not in pdf
+    assert b"/CIDFontType2" in pdf  # TrueType
 
 
 def test_the_table_holds_the_numbers(page: Page):
