@@ -4,8 +4,8 @@ import dataclasses
 import pathlib
 from typing import Any
 
-from crisalad_jax.cli.common import echo, find_given, open_set, show
-from crisalad_jax.cli.flags import JsonFlag, ReadFlags, SetFlags
+from crisalad_jax.cli.common import echo, find_given, open_set, show_tables
+from crisalad_jax.cli.flags import ReadFlags, SetFlags, TableFlags
 from crisalad_jax.cli.tables import points_table
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.evaluation.calibrate import calibrate, operating_point_of
@@ -17,7 +17,7 @@ EXAMPLE = "crisalad calibrate --map corridor.map --data corridor-set --precision
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Calibrate(ReadFlags, SetFlags, JsonFlag):
+class Calibrate(ReadFlags, SetFlags, TableFlags):
     """Measure from which similarity on a map's answers are right, and let the map remember it.
 
     Every image is described independently, at the map's size, by the map's model. The database of
@@ -44,7 +44,7 @@ def run(arguments: Calibrate) -> dict[str, Any]:
         benchmark = open_set(arguments)
         calibration = calibrate(places, benchmark, arguments.precision, reading=arguments.reading)
     point = operating_point_of(calibration)
-    show(points_table({"single": point}))
+    show_tables(points_table({"single": point}), latex=arguments.latex)
     for words in caveats(point):
         echo(words)
     echo(

@@ -12,7 +12,9 @@ import rich.table
 
 from crisalad_jax.checkpoints.load import OpenedModel, find_weights, open_model
 from crisalad_jax.cli.flags import ModelFlags, RuntimeName, SetFlags, SizeFlags, Target
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.part import with_non_semantic_fields_of
+from crisalad_jax.experiments.tables import Table, write_text
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_format, write_json
 from crisalad_jax.utils.output import printable
@@ -73,23 +75,26 @@ def _part(
 
 
 STDOUT = pathlib.Path("-")
-"""Name of the terminal, or of what reads the output, in place of a file of JSON."""
+"""Name of the terminal, or of what reads the output, in place of a file of JSON or LaTeX."""
 
 
 def prepare_output(flags: Any) -> None:
     """Check all that a command will write before any work.
 
-    Where --json is `STDOUT`, print all else on stderr.
+    Where --json or --latex is `STDOUT`, print all else on stderr.
 
     Raises:
-        InputError: a file or folder cannot be made, or its name says another format.
+        InputError: a file or folder cannot be made, its name says another format, or both of these
+            are to be printed.
     """
-    console.stderr = getattr(flags, "json", None) == STDOUT
+    printed = [name for name in ("json", "latex") if getattr(flags, name, None) == STDOUT]
+    require(len(printed) < 2, "--latex: found - with --json -, expected only one of the two")
+    console.stderr = bool(printed)
     hints = get_type_hints(type(flags), include_extras=True)
     marks = [(name, mark) for name in hints for mark in getattr(hints[name], "__metadata__", ())]
     for name, target in marks:
         path = getattr(flags, name)
-        if isinstance(target, Target) and path is not None and (name, path) != ("json", STDOUT):
+        if isinstance(target, Target) and path is not None and name not in printed:
             if target.suffixes:
                 check_format(f"--{name}", path, *target.suffixes)
             target.check(path)
@@ -105,6 +110,26 @@ def emit_json(file: pathlib.Path | None, value: Mapping[str, Any]) -> None:
         print(json.dumps(value, indent=2))
     elif file is not None:
         write_json(file, value)
+
+
+def show_tables(*tables: Table, latex: pathlib.Path | None = None) -> None:
+    """Print tables, and write them as LaTeX where that is asked for."""
+    for table in tables:
+        show(table.terminal())
+    emit_latex(latex, *tables)
+
+
+def emit_latex(file: pathlib.Path | None, *tables: Table) -> None:
+    """Write tables as LaTeX, or print them where the file is `STDOUT`; None does neither.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    text = "\n".join(table.latex() for table in tables)
+    if file == STDOUT:
+        print(text, end="")
+    elif file is not None:
+        write_text(file, text)
 
 
 def pick(flags: Any, *names: str) -> dict[str, Any]:

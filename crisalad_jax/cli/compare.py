@@ -6,18 +6,18 @@ from typing import Annotated, Any, Literal
 
 import rich.console
 
-from crisalad_jax.cli.common import echo, find_given, pick, show
-from crisalad_jax.cli.flags import FOLDER, JsonFlag, ReadFlags, SizeFlags
+from crisalad_jax.cli.common import echo, find_given, pick, show_tables
+from crisalad_jax.cli.flags import FOLDER, ReadFlags, SizeFlags, TableFlags
 
 COMMON = (
     "test out train methods weights backbone preset seeds epochs image-size grouping batch-size "
-    "rerank reference jobs page json on-bad-image quiet"
+    "rerank reference jobs page json latex on-bad-image quiet"
 )
 EXAMPLE = "crisalad compare --test pitts30k_test.mat --weights salad megaloc --out compared"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ComparisonFlags(ReadFlags, SizeFlags, JsonFlag):
+class ComparisonFlags(ReadFlags, SizeFlags, TableFlags):
     """The flags of both commands."""
 
     test: tuple[pathlib.Path, ...]
@@ -93,8 +93,7 @@ def run_comparison(
         **pick(flags, "page", "jobs", "quiet"),
         say=lambda line: notes.print(line, soft_wrap=True, highlight=False),
     )
-    for table in tables_of(summary).values():
-        show(table.terminal())
+    show_tables(*tables_of(summary).values(), latex=flags.latex)
     for note in summary.notes:
         echo(note)
     echo(f"table.md, table.csv, results.json, and a page: {flags.out / 'index.html'}")

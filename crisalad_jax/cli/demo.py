@@ -4,15 +4,15 @@ import dataclasses
 import pathlib
 from typing import Annotated, Any
 
-from crisalad_jax.cli.common import echo, show
-from crisalad_jax.cli.flags import FOLDER, JsonFlag, QuietFlag
+from crisalad_jax.cli.common import echo, show_tables
+from crisalad_jax.cli.flags import FOLDER, QuietFlag, TableFlags
 from crisalad_jax.retrieval.grouping import grouping_words
 
 EXAMPLE = "crisalad demo --out demo"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Demo(JsonFlag, QuietFlag):
+class Demo(TableFlags, QuietFlag):
     """Render a synthetic city, train a tiny model on it, and show Recall@K before and after."""
 
     out: Annotated[pathlib.Path, FOLDER] = pathlib.Path("demo")
@@ -27,7 +27,8 @@ def run(arguments: Demo) -> dict[str, Any]:
     from crisalad_jax.experiments.report import recall_table
 
     summary = run_demo(DemoConfig(seed=arguments.seed), arguments.out, quiet=arguments.quiet)
-    show(recall_table(summary.rows, "Recall@K in percent, synthetic city").terminal())
+    table = recall_table(summary.rows, "Recall@K in percent, synthetic city")
+    show_tables(table, latex=arguments.latex)
     echo(f"A descriptor of this model may depend on its batch: {grouping_words(GROUPINGS)}.")
     echo(
         f"{summary.seconds:.0f} s in all, {summary.training_seconds:.0f} s of it training. "

@@ -10,14 +10,15 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import (
     echo,
     emit_json,
+    emit_latex,
     open_flagged,
     open_set,
     pick,
     refuse_with,
     refuse_without,
-    show,
+    show_tables,
 )
-from crisalad_jax.cli.flags import FOLDER, JsonFlag, ModelFlags, ReadFlags, SetFlags
+from crisalad_jax.cli.flags import FOLDER, ModelFlags, ReadFlags, SetFlags, TableFlags
 from crisalad_jax.cli.tables import grouping_table, points_table
 from crisalad_jax.evaluation.evaluate import check_evaluation, evaluate
 from crisalad_jax.evaluation.record import evaluation_record
@@ -37,7 +38,7 @@ EXAMPLE = "crisalad evaluate --data pitts30k_test.mat --weights salad --report p
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Evaluate(ReadFlags, ModelFlags, SetFlags, JsonFlag):
+class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     """Print what a model recalls of an evaluation set under each grouping, and what these leak."""
 
     preset: str | None = None
@@ -99,9 +100,10 @@ def run(arguments: Evaluate) -> None:
         arguments, "batch_size", "seed", "seeds", "pca", "rerank", "rerank_weights"
     )
     record = evaluation_record(results, benchmark, config, model_name=name, **asked)
-    show(grouping_table(results))
+    tables = [grouping_table(results)]
     if points := {each.label: each.operating_point for each in results if each.operating_point}:
-        show(points_table(points))
+        tables.append(points_table(points))
+    show_tables(*tables)
     for note in record.notes:
         echo(note)
     readable = results[0].skipped.rest_of(benchmark)
@@ -124,6 +126,7 @@ def run(arguments: Evaluate) -> None:
                 settings=record.settings,
                 similarities=similarities.map,
             )
+        emit_latex(arguments.latex, *tables)
         emit_json(arguments.json, record.values)
     if arguments.report is not None:
         echo(f"report: {arguments.report / 'index.html'}")

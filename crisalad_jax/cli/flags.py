@@ -38,6 +38,14 @@ class JsonFlag:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class TableFlags(JsonFlag):
+    """Where a result with tables goes."""
+
+    latex: Annotated[pathlib.Path | None, Target((".tex",))] = None
+    """File for the tables as LaTeX (package booktabs); - prints them."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PluginFlag:
     """Where custom parts come from."""
 

@@ -4,8 +4,8 @@ import dataclasses
 import pathlib
 from typing import Any
 
-from crisalad_jax.cli.common import echo, load_model, refuse_with, refuse_without, show
-from crisalad_jax.cli.flags import JsonFlag, PluginFlag, SizeFlags
+from crisalad_jax.cli.common import echo, load_model, refuse_with, refuse_without, show_tables
+from crisalad_jax.cli.flags import PluginFlag, SizeFlags, TableFlags
 from crisalad_jax.cli.tables import fact_lines, summary_table
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.training.recipes import recipe
@@ -15,7 +15,7 @@ EXAMPLE = "crisalad info --preset b14"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Info(SizeFlags, PluginFlag, JsonFlag):
+class Info(SizeFlags, PluginFlag, TableFlags):
     """Print what a model is made of: parameters, what trains, multiply-accumulates an image."""
 
     preset: str | None = None
@@ -50,7 +50,7 @@ def _model(arguments: Info) -> dict[str, Any]:
         config = arguments.applied_to(defaults.model)
         trainable = trainable or defaults.trainable
     summary = model_summary(config, trainable, images=arguments.batch_size)
-    show(summary_table(summary, name))
+    show_tables(summary_table(summary, name), latex=arguments.latex)
     echo("\n".join(summary_lines(summary)))
     return summary_json(summary, name)
 

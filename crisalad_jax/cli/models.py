@@ -10,8 +10,8 @@ from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.cache import is_cached
 from crisalad_jax.checkpoints.published import PUBLISHED, Published, published_model
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.cli.common import echo, show
-from crisalad_jax.cli.flags import JsonFlag
+from crisalad_jax.cli.common import echo, refuse_with, show_tables
+from crisalad_jax.cli.flags import TableFlags
 from crisalad_jax.cli.tables import fact_lines, models_table
 from crisalad_jax.utils.files import user_cache
 
@@ -19,7 +19,7 @@ EXAMPLE = "crisalad models salad"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Models(JsonFlag):
+class Models(TableFlags):
     """List the models that others published, which --weights takes by name, or describe one."""
 
     name: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="NAME")] = None
@@ -30,12 +30,13 @@ def run(arguments: Models) -> dict[str, Any]:
     """Print the table of models or the facts of one."""
     name = arguments.name
     if name is not None:
+        refuse_with("NAME", latex=arguments.latex)
         facts = _own_facts(name) if name in starter.FILES else _facts(published_model(name))
         for line in fact_lines(facts):
             echo(line)
         return facts
     models = tuple(PUBLISHED.values())
-    show(models_table(models))
+    show_tables(models_table(models), latex=arguments.latex)
     echo(f"{len(models)} models; * in the cache, {user_cache()}")
     echo(
         f"{starter.NAME}: the small model in this package, which extract, index and evaluate take "

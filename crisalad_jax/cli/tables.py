@@ -3,42 +3,44 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from rich.table import Column, Table
-from rich.text import Text
-
 from crisalad_jax.checkpoints.cache import is_cached
 from crisalad_jax.checkpoints.published import GITHUB, Published
 from crisalad_jax.evaluation.operating_point import OperatingPoint
 from crisalad_jax.evaluation.results import GroupingResult, Scores, percent
+from crisalad_jax.experiments.tables import NOTHING, Cell, Table
+from crisalad_jax.nn.costs import PartCost
 from crisalad_jax.training.summary import ModelSummary
 from crisalad_jax.utils.output import printable
 
 
 def grouping_table(results: Sequence[GroupingResult]) -> Table:
-    """Make a table of results for the terminal, in percent, about 97 columns wide.
+    """Make a table of results in percent, in the terminal about 97 columns wide.
 
-    Each recall stands above its interval, and a mean over shuffles before their spread.
+    Each recall is above its interval, and a mean over shuffles before their spread.
     """
     recall_names = [f"R@{k}\n95 %" for k in results[0].recalls]
     names = ("same place\nq / db", *recall_names, "AP", "R at\n100 % P")
-    table = Table("queries/\ndatabase", *map(_right, names), show_lines=True)
+    rows = []
     for result in results:
         spread = result.spread or _NO_SPREAD
         recall_cells = (
-            f"{_or_dash(value)}{_spread(spread.recalls.get(k))}\n"
-            f"{_or_dash(result.intervals[k].low)}-{_or_dash(result.intervals[k].high)}"
+            Cell(
+                f"{_or_dash(value)}{_spread(spread.recalls.get(k))}",
+                f"{_or_dash(result.intervals[k].low)}-{_or_dash(result.intervals[k].high)}",
+            )
             for k, value in result.recalls.items()
         )
-        cells = (
-            result.grouping + (f"\n+ {result.rerank}" if result.rerank else ""),
-            f"{_or_dash(result.query_share)} / {_or_dash(result.database_share)}",
-            *recall_cells,
-            f"{_or_dash(result.average_precision)}\n{_spread(spread.average_precision)}",
-            f"{_or_dash(result.recall_at_full_precision)}\n"
-            f"{_spread(spread.recall_at_full_precision)}",
+        full = result.recall_at_full_precision
+        rows.append(
+            [
+                Cell(result.grouping, f"+ {result.rerank}" if result.rerank else ""),
+                Cell(f"{_or_dash(result.query_share)} / {_or_dash(result.database_share)}"),
+                *recall_cells,
+                Cell(_or_dash(result.average_precision), _spread(spread.average_precision)),
+                Cell(_or_dash(full), _spread(spread.recall_at_full_precision)),
+            ]
         )
-        table.add_row(*map(Text, cells))
-    return table
+    return Table(["queries/\ndatabase", *names], rows, stacked=True)
 
 
 def points_table(points: Mapping[str, OperatingPoint]) -> Table:
@@ -50,24 +52,28 @@ def points_table(points: Mapping[str, OperatingPoint]) -> Table:
         "right of\nanswered",
         "unknown places\nanswered",
     )
-    table = Table("queries/\ndatabase", *map(_right, names))
+    rows = []
     for name, point in points.items():
-        cells = (
-            f"{point.min_similarity:.9g}" if point.reached else "none",
-            f"{percent(point.precision)}\n{percent(point.lower_bound)}",
-            f"{percent(point.recall)}\n{point.right} of {point.queries}" if point.reached else "-",
-            f"{point.right} of {point.answered}",
-            f"{point.unknown_answered} of {point.unknown}",
+        grouping, plus, rerank = name.partition(" + ")
+        left = Cell(percent(point.recall), f"{point.right} of {point.queries}")
+        rows.append(
+            [
+                Cell(grouping, f"+ {rerank}" if plus else ""),
+                Cell(f"{point.min_similarity:.9g}" if point.reached else "none"),
+                Cell(percent(point.precision), percent(point.lower_bound)),
+                left if point.reached else Cell(NOTHING),
+                Cell(f"{point.right} of {point.answered}"),
+                Cell(f"{point.unknown_answered} of {point.unknown}"),
+            ]
         )
-        table.add_row(*map(Text, (name.replace(" + ", "\n+ "), *cells)))
-    return table
+    return Table(["queries/\ndatabase", *names], rows, stacked=True)
 
 
 _NO_SPREAD = Scores({}, None, None)
 
 
 def _or_dash(fraction: float | None) -> str:
-    return "-" if fraction is None else percent(fraction)
+    return NOTHING if fraction is None else percent(fraction)
 
 
 def _spread(fraction: float | None) -> str:
@@ -75,35 +81,32 @@ def _spread(fraction: float | None) -> str:
 
 
 def summary_table(summary: ModelSummary, name: str) -> Table:
-    """Make a table of a model's parts for the terminal; `name` is the model's."""
+    """Make a table of a model's parts; `name` is the model's."""
     height, width = summary.image_size
-    columns = map(_right, ("parameters", "multiply-accumulates an image"))
-    table = Table("part", *columns, title=printable(f"{name} at {height} x {width}"))
-    for cost in summary.parts:
-        table.add_row(cost.part, f"{cost.parameters:,}", f"{cost.macs:,}")
-    table.add_section()
-    parameters = sum(cost.parameters for cost in summary.parts)
-    table.add_row("all", f"{parameters:,}", f"{sum(cost.macs for cost in summary.parts):,}")
-    return table
+    whole = PartCost("all", *(sum(each) for each in list(zip(*summary.parts, strict=True))[1:]))
+    rows = [
+        [Cell(cost.part), Cell(f"{cost.parameters:,}"), Cell(f"{cost.macs:,}")]
+        for cost in (*summary.parts, whole)
+    ]
+    headers = ["part", "parameters", "multiply-accumulates an image"]
+    return Table(headers, rows, title=printable(f"{name} at {height} x {width}"), summed=True)
 
 
 def models_table(models: Sequence[Published]) -> Table:
-    """Make a table of published models for the terminal; those in the cache have a star."""
-    table = Table("name", _right("descriptor"), _right("parameters"), "licence", "images", "GitHub")
-    for model in models:
-        table.add_row(
+    """Make a table of published models; those in the cache have a star."""
+    rows = [
+        (
             f"{model.name} *" if is_cached(model) else model.name,
-            f"{model.descriptor:,}",
-            f"{model.parameters / 1e6:,.1f} M",
             model.licence.name,
             model.images,
             model.repository.removeprefix(GITHUB),
+            f"{model.descriptor:,}",
+            f"{model.parameters / 1e6:,.1f} M",
         )
-    return table
-
-
-def _right(header: str) -> Column:
-    return Column(header, justify="right")
+        for model in models
+    ]
+    headers = ["name", "licence", "images", "GitHub", "descriptor", "parameters"]
+    return Table(headers, [list(map(Cell, row)) for row in rows], labels=4)
 
 
 _MOST = 10

@@ -25,7 +25,7 @@ from crisalad_jax.experiments.report import (
     show_retrievals,
     training_curves,
 )
-from crisalad_jax.experiments.report.tables import write_text
+from crisalad_jax.experiments.tables import write_text
 from crisalad_jax.nn.model import Model, init_crisalad
 from crisalad_jax.synthetic import SyntheticCityConfig, write_synthetic_city
 from crisalad_jax.training.config import TrainConfig

@@ -21,7 +21,7 @@ from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.report import RecallRow, recall_table
-from crisalad_jax.experiments.report.tables import Cell, Table, write_text
+from crisalad_jax.experiments.tables import Cell, Table, write_text
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.loop import fit

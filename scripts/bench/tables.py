@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from crisalad_jax.experiments.report import style, tables
+from crisalad_jax.experiments import tables
+from crisalad_jax.experiments.report import style
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_target, split_markers
 

@@ -488,7 +488,7 @@ def test_evaluate_prints_and_writes_the_table(capfd, tmp_path, shared, params, b
         capfd,
         *("evaluate", "--weights", weights, "--data", shared / "town"),
         *("--batch-size", BATCH, "--seed", "3", "--json", tmp_path / "table.json", "--quiet"),
-        *("--seeds", "2", "--out", tmp_path / "pictures"),
+        *("--seeds", "2", "--out", tmp_path / "pictures", "--latex", tmp_path / "t.tex"),
     )
     assert "town/test (@UTM, 25 m): 5 queries, 7 database images; positive: UTM distance" in out
     # The customer is told that a descriptor depends on its batch.
@@ -505,6 +505,11 @@ def test_evaluate_prints_and_writes_the_table(capfd, tmp_path, shared, params, b
             **json.loads(json.dumps(to_json(result))),
         }
         assert f"{100 * result.recalls[1]:.1f}" in out
+    tex = (tmp_path / "t.tex").read_text().splitlines()
+    assert r"\shortstack[r]{R@1 \\ 95 \%}" in tex[2]
+    single, low, high = expected[0].recalls[1], *expected[0].intervals[1]
+    wanted = f"{100 * single:.1f} {{\\footnotesize {100 * low:.1f}--{100 * high:.1f}}}"
+    assert tex[4].split(" & ")[2] == wanted
     assert table["model"] == to_plain(MODEL)
     assert files_in(tmp_path / "pictures") == {
         "config.json",

@@ -231,6 +231,10 @@ def test_json_is_never_written_under_the_name_of_another_format(capfd, tmp_path,
     gallery = ("query", "a", "--map", "m", "--gallery", name)
     ends = "a name that ends in .png or .svg or .pdf"
     fails(capfd, *gallery, words=(f"--gallery: found {name}, expected {ends}",))
+    words = (f"--latex: found {name}, expected a name that ends in .tex",)
+    fails(capfd, "models", "--latex", name, words=words)
+    words = ("--latex: found - with --json -, expected only one of the two",)
+    fails(capfd, "models", "--latex", "-", "--json", "-", words=words)
     extract = ("extract", "--images", "a", "--out", "d.npy", "--pairs", name)
     fails(capfd, *extract, words=(f"--pairs: found {name}, expected a name that ends in .txt",))
     assert list(tmp_path.iterdir()) == []
@@ -254,6 +258,27 @@ def test_json_on_stdout_is_what_the_last_line_says(capfd, tmp_path, database, we
     found, _ = printed(capfd, *pca, "--out", tmp_path / "p.safetensors", "--json", "-")
     assert (found["components"], found["of"], found["descriptors"]) == (3, 48, 7)
     assert 0 < found["variance"] < 1
+
+
+def test_latex_on_stdout_is_the_table_alone(capfd):
+    out, words = runs(capfd, "info", "--preset", "tiny", "--latex", "-")
+    assert out.splitlines() == [
+        "% tiny at 98 x 98",
+        r"\begin{tabular}{lrr}",
+        r"\toprule",
+        r"part & parameters & multiply-accumulates an image \\",
+        r"\midrule",
+        r"backbone embedding, norm & 82,176 & 3,687,936 \\",
+        r"backbone blocks & 794,112 & 41,881,600 \\",
+        r"adapters & 84,736 & 4,192,512 \\",
+        r"aggregator & 63,985 & 1,961,056 \\",
+        r"cross-image encoder & 25,408 & 479,232 \\",
+        r"\midrule",
+        r"all & 1,050,417 & 52,202,336 \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
+    assert "descriptor" in words
 
 
 def test_a_run_prints_json(capfd, tmp_path, shared, run):

@@ -37,9 +37,16 @@ OUTPUTS = (
     *(f"{verb} --out" for verb in ("train", "evaluate", "extract", "index", "pca", "export")),
     *(f"{verb} --out" for verb in ("vocabulary", "compare", "ablate", "demo", "render")),
     *(f"{verb} --json" for verb in ("evaluate", "query", "info", "models", "calibrate")),
+    *(f"{verb} --latex" for verb in ("evaluate", "ablate", "info", "models", "calibrate")),
     *("evaluate --report", "extract --pairs", "query --gallery", "convert DST"),
 )
-SUFFIXES = {"--json": ".json", "--gallery": ".png", "--pairs": ".txt", "extract --out": ".npy"}
+SUFFIXES = {
+    "--json": ".json",
+    "--latex": ".tex",
+    "--gallery": ".png",
+    "--pairs": ".txt",
+    "extract --out": ".npy",
+}
 
 
 @pytest.mark.parametrize("output", OUTPUTS)

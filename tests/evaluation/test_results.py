@@ -86,7 +86,7 @@ def test_without_a_positive_there_is_no_curve():
 def cells_of(results, width: int) -> list[list[str]]:
     console = Console(width=width, color_system=None, force_terminal=False)
     with console.capture() as capture:
-        console.print(grouping_table(results))
+        console.print(grouping_table(results).terminal())
     return [
         [cell.strip() for cell in line.strip("│┃").replace("┃", "│").split("│")]
         for line in capture.get().splitlines()

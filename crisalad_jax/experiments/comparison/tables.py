@@ -19,7 +19,7 @@ from crisalad_jax.experiments.report.style import (
     label_axes,
     new_figure,
 )
-from crisalad_jax.experiments.report.tables import NOTHING, Cell, Table, write_csv, write_text
+from crisalad_jax.experiments.tables import NOTHING, Cell, Table, write_csv, write_text
 from crisalad_jax.utils.files import split_markers, write_json
 
 _PAGE_TITLES = {"compare": "Methods compared", "ablate": "What each part brings"}

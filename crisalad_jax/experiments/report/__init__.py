@@ -7,6 +7,6 @@ from crisalad_jax.experiments.report.gallery import write_galleries as write_gal
 from crisalad_jax.experiments.report.page import write_report as write_report
 from crisalad_jax.experiments.report.style import save as save
 from crisalad_jax.experiments.report.style import save_chart as save_chart
-from crisalad_jax.experiments.report.tables import RecallRow as RecallRow
-from crisalad_jax.experiments.report.tables import recall_table as recall_table
 from crisalad_jax.experiments.report.transport import show_transport as show_transport
+from crisalad_jax.experiments.tables import RecallRow as RecallRow
+from crisalad_jax.experiments.tables import recall_table as recall_table

@@ -28,13 +28,13 @@ from crisalad_jax.experiments.report.charts import (
 )
 from crisalad_jax.experiments.report.gallery import evenly, first_right_ranks, thumbnail
 from crisalad_jax.experiments.report.style import Drawing, chart, illustration, photograph
-from crisalad_jax.experiments.report.tables import (
+from crisalad_jax.experiments.report.transport import Transported, draw_transport, transport_of
+from crisalad_jax.experiments.tables import (
     Cell,
     Table,
     write_csv,
     write_text,
 )
-from crisalad_jax.experiments.report.transport import Transported, draw_transport, transport_of
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.locks import staged_folder

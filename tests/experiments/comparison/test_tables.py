@@ -66,6 +66,17 @@ def test_markdown():
     ]
 
 
+def test_latex_has_the_best_in_bold_and_every_interval():
+    lines = tables.tables_of(SUMMARY)["recall"].latex().splitlines()
+    best = r" & \textbf{62.5} {\footnotesize $\pm$ 12.5 (40.0--80.0)}" * 3
+    other = r" & 25.0 {\footnotesize (10.0--40.0)}" * 3
+    assert lines[4:-2] == [
+        rf"First, single{best} \\",
+        rf"First, shuffled{best} \\",
+        rf"A\textbar{{}}B{other} \\",
+    ]
+
+
 @pytest.mark.parametrize(("images", "speed"), [(None, "1.25 x"), (427.4, "427")])
 def test_on_a_gpu_times_are_absolute_and_need_a_spread(images, speed):
     given = row("first", "single", ONE, images_per_second=images)

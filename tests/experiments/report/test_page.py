@@ -21,7 +21,7 @@ from crisalad_jax.evaluation.results import GroupingResult, Scores
 from crisalad_jax.experiments.report import recall_curves, write_report
 from crisalad_jax.experiments.report.charts import outcomes_of
 from crisalad_jax.experiments.report.page import Subject, page_rows, query_results
-from crisalad_jax.experiments.report.tables import write_csv
+from crisalad_jax.experiments.tables import write_csv
 from crisalad_jax.nn.model import Crisalad, Model
 from crisalad_jax.retrieval.neighbours import Neighbours
 from tests.conftest import MODEL
