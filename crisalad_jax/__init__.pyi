@@ -88,6 +88,7 @@ from .retrieval.maps.query import query as query
 from .retrieval.neighbours import Neighbours as Neighbours
 from .retrieval.pca import fit_pca as fit_pca
 from .retrieval.pca import load_pca as load_pca
+from .retrieval.pca import project_to_plane as project_to_plane
 from .retrieval.pca import save_pca as save_pca
 from .retrieval.reranking import Reranker as Reranker
 from .retrieval.reranking import Reranking as Reranking
@@ -106,6 +107,7 @@ from .training.classifier import load_loss as load_loss
 from .training.config import MiningConfig as MiningConfig
 from .training.config import OptimiserConfig as OptimiserConfig
 from .training.config import TrainConfig as TrainConfig
+from .training.gradients import gradient_norms as gradient_norms
 from .training.loop import FitResult as FitResult
 from .training.loop import fit as fit
 from .training.losses import Loss as Loss

@@ -721,7 +721,7 @@ def describe_training_batch(
     *,
     valid: Bool[Array, " image"],
     measured: Bool[Array, " image"] | None,
-    key: Key[Array, ""],
+    key: Key[Array, ""] | None,
     micro_batch: int | None = None,
 ) -> tuple[Float[Array, "image descriptor"], Tokens, Crisalad | None]:
     """Describe a batch in the trace of a training step.
@@ -732,7 +732,7 @@ def describe_training_batch(
         config: see `describe`.
         valid: images that attend to each other; the others attend to themselves.
         measured: images that batch norms take their statistics of; None takes the stored ones.
-        key: draws the dropout.
+        key: draws the dropout; None is without.
         micro_batch: see `extract_tokens`.
 
     Returns:

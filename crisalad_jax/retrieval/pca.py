@@ -235,6 +235,40 @@ def fit_pca(
     return Pca(mean, components, variances, whole, config or PcaConfig(), model)
 
 
+@brief
+class Plane(NamedTuple):
+    """Descriptors in the plane of their first two principal components."""
+
+    positions: Float32[np.ndarray, "n 2"]
+    shares: Float32[np.ndarray, " 2"]
+    """Share of the descriptors' variance along each axis, 0 to 1."""
+
+
+def project_to_plane(descriptors: Descriptors) -> Plane:
+    """Project descriptors to the plane in which they vary most, for a picture of them.
+
+    The plane is that of the first two principal components. Distances in it are at most those of
+    the descriptors.
+
+    Args:
+        descriptors: n descriptors, as `search` takes them.
+
+    Returns:
+        Positions about the mean, and the share of the variance that each axis shows.
+
+    Raises:
+        InputError: what `fit_pca` raises; it needs three descriptors that are not on a line.
+
+    Example:
+        >>> import numpy as np
+        >>> descriptors = np.random.default_rng(0).normal(size=(50, 8)).astype(np.float32)
+        >>> project_to_plane(descriptors).positions.shape
+        (50, 2)
+    """
+    pca = fit_pca(descriptors, 2, PcaConfig(renormalise=False))
+    return Plane(pca.apply(descriptors), pca.variances / pca.total)
+
+
 def _rows_at_a_time(length: int) -> int:
     return max(1, _CHUNK_BYTES // (8 * length))
 

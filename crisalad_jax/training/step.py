@@ -292,17 +292,25 @@ def make_train_step(config: StepConfig) -> Callable[..., tuple[TrainState, Metri
         key: PRNGKeyArray,
         valid: Bool[Array | np.ndarray, " image"] | None = None,
     ) -> tuple[TrainState, Metrics]:
-        check_pixels(images, config.model.preprocessing)
-        # JAX would keep the lower half of each, and join places that differ in the upper one.
-        # Its own arrays have no such labels, and may be traced or still be computed.
-        if not isinstance(labels, jax.Array) and np.max(labels, initial=0) >= 2**31:
-            raise InputError(f"labels: found up to {np.max(labels)}, expected numbers below 2^31")
+        images, labels = checked_batch(images, labels, config.model)
         mask = jnp.ones(len(labels), bool) if valid is None else jnp.asarray(valid)
-        return train_step(
-            state, frozen, jnp.asarray(images), jnp.asarray(labels, jnp.int32), mask, key, config
-        )
+        return train_step(state, frozen, images, labels, mask, key, config)
 
     return step
+
+
+def checked_batch(
+    images: UInt8[Array | np.ndarray, "image height width 3"],
+    labels: Int[Array | np.ndarray, " image"],
+    config: ModelConfig,
+) -> tuple[Array, Int[Array, " image"]]:
+    """Check a batch, and return it as arrays of JAX; raises as the step of `make_train_step`."""
+    check_pixels(images, config.preprocessing)
+    # JAX would keep the lower half of each, and join places that differ in the upper one.
+    # Its own arrays have no such labels, and may be traced or still be computed.
+    if not isinstance(labels, jax.Array) and np.max(labels, initial=0) >= 2**31:
+        raise InputError(f"labels: found up to {np.max(labels)}, expected numbers below 2^31")
+    return jnp.asarray(images), jnp.asarray(labels, jnp.int32)
 
 
 @devices.over_images("images", 2)
@@ -331,8 +339,78 @@ def train_step(
     a loop may read metrics one step late, and still have the state before the failed step.
     """
     dropout_key = jax.random.fold_in(key, state.step)
-    group = state.step // config.steps_per_epoch % max(len(config.classes), 1)
-    classifier = None
+    found, (gradient, classifier_gradient) = loss_and_gradient(
+        state, frozen, images, labels, valid, dropout_key, config
+    )
+    loss, result, transport, statistics, all_valid = found
+    norm = optax.tree.norm((gradient, classifier_gradient))
+    learning_rate = config.learning_rate(state.step)
+    optimiser = config.make_optimiser()
+    _, learnt = split_statistics(state.trainable)
+    updates, new_optimiser = optimiser.update(gradient, state.optimiser, learnt)
+    classifiers = state.classifiers
+    if classifiers is not None:
+        rate, group = config.loss.kind.learning_rate, _group(state, config)
+        classifiers = update_classifiers(classifiers, group, classifier_gradient, rate)
+    trainable = eqx.combine(optax.apply_updates(learnt, updates), statistics)
+    new = TrainState(state.step + 1, trainable, new_optimiser, classifiers)
+    updated = proceed & jnp.isfinite(loss) & jnp.isfinite(norm) & all_valid.any()
+    state = jax.tree.map(lambda after, before: jnp.where(updated, after, before), new, state)
+    return _sharded(state, config.shard_over), Metrics(
+        loss=loss,
+        easy_anchor_fraction=result.easy_anchor_fraction,
+        accuracy=result.accuracy,
+        loss_numbers=result.numbers,
+        gradient_norm=norm,
+        learning_rate=learning_rate,
+        images=all_valid.sum(),
+        transport=transport,
+        updated=updated,
+    )
+
+
+def _group(state: TrainState, config: StepConfig) -> Int[Array, ""]:
+    """Return which group of classes trains, by the epoch."""
+    return state.step // config.steps_per_epoch % max(len(config.classes), 1)
+
+
+class BatchLoss(NamedTuple):
+    """What a forward pass of a batch gives."""
+
+    loss: Float[Array, ""]
+    result: LossResult
+    transport: TransportStatistics | None
+    """Means over the valid images."""
+    statistics: PyTree
+    """Running statistics after the batch."""
+    valid: Bool[Array, " image"]
+    """Valid images of all devices."""
+
+
+def loss_and_gradient(
+    state: TrainState,
+    frozen: PyTree,
+    images: UInt8[Array, "image height width 3"],
+    labels: Int[Array, " image"],
+    valid: Bool[Array, " image"],
+    key: PRNGKeyArray | None,
+    config: StepConfig,
+) -> tuple[BatchLoss, tuple[PyTree, PyTree]]:
+    """Compute the loss of a batch, and its gradient, in a trace; see `train_step`.
+
+    Args:
+        state: the state; its optimiser is not read.
+        frozen: parameters that do not train.
+        images: see `train_step`.
+        labels: see `train_step`.
+        valid: see `train_step`.
+        key: draws the dropout; None is without.
+        config: the step's.
+
+    Returns:
+        What the forward pass gave, and the gradients of the trainable parameters and of the loss's.
+    """
+    classifier, group = None, _group(state, config)
     if state.classifiers is not None:
         classifier = jax.tree.map(lambda leaf: leaf[group], state.classifiers.weights)
 
@@ -350,7 +428,7 @@ def train_step(
             config.model,
             valid=all_valid,
             measured=valid if updates_statistics else None,
-            key=dropout_key,
+            key=key,
             micro_batch=config.micro_batch,
         )
         descriptors = devices.gather_images(descriptors)
@@ -363,35 +441,13 @@ def train_step(
         updated = measured if updates_statistics else statistics
         return result.loss, (result, tokens.transport, updated)
 
-    (loss, (result, transport, statistics)), (gradient, classifier_gradient) = jax.value_and_grad(
-        loss_of, has_aux=True
-    )(_replicated((learnt, classifier), config.shard_over))
+    (loss, (result, transport, statistics)), gradients = jax.value_and_grad(loss_of, has_aux=True)(
+        _replicated((learnt, classifier), config.shard_over)
+    )
     transport = jax.tree.map(
         lambda each: jnp.where(valid, each, 0).sum() / all_valid.sum(), transport
     )
-    norm = optax.tree.norm((gradient, classifier_gradient))
-    learning_rate = config.learning_rate(state.step)
-    optimiser = config.make_optimiser()
-    updates, new_optimiser = optimiser.update(gradient, state.optimiser, learnt)
-    classifiers = state.classifiers
-    if classifiers is not None:
-        rate = config.loss.kind.learning_rate
-        classifiers = update_classifiers(classifiers, group, classifier_gradient, rate)
-    trainable = eqx.combine(optax.apply_updates(learnt, updates), statistics)
-    new = TrainState(state.step + 1, trainable, new_optimiser, classifiers)
-    updated = proceed & jnp.isfinite(loss) & jnp.isfinite(norm) & all_valid.any()
-    state = jax.tree.map(lambda after, before: jnp.where(updated, after, before), new, state)
-    return _sharded(state, config.shard_over), Metrics(
-        loss=loss,
-        easy_anchor_fraction=result.easy_anchor_fraction,
-        accuracy=result.accuracy,
-        loss_numbers=result.numbers,
-        gradient_norm=norm,
-        learning_rate=learning_rate,
-        images=all_valid.sum(),
-        transport=transport,
-        updated=updated,
-    )
+    return BatchLoss(loss, result, transport, statistics, all_valid), gradients
 
 
 def _replicated(tree: PyTree, mesh: Mesh | None) -> PyTree:

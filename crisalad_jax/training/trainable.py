@@ -87,7 +87,7 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
         (True, True)
     """
     check_params(params, config)
-    chosen = _choose(params, config, trainable)
+    chosen = choose(params, config, trainable)
     # For each block, whether it trains each of the parameters of a block that can.
     in_blocks = [f for n, f in chosen.items() if len(f) > 1 and not _is_fixed(n, config)]
     rows = list(zip(*in_blocks, strict=True))
@@ -110,15 +110,20 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
     return eqx.partition(params, jax.tree.map(lambda _: learns(next(names)), params))
 
 
-def _choose(params: Crisalad, config: ModelConfig, trainable: str) -> dict[str, tuple[bool, ...]]:
-    """Return whether each parameter trains, of a stack of blocks for each block."""
-    backbone, depth = config.backbone, config.backbone.depth
-    names: dict[str, list[str]] = {}
+def numbered_names(params: Crisalad, config: ModelConfig) -> dict[str, list[str]]:
+    """Return the name of each parameter, of a stack of blocks with the number of each block."""
+    depth, names = config.backbone.depth, {}
     for leaf, value in named_leaves(params).items():
         rest = leaf.removeprefix(_BLOCKS)
         is_stack = rest != leaf and not rest.partition(".")[0].isdecimal()
         is_stack = is_stack and value.ndim > 0 and len(value) == depth
         names[leaf] = [f"{_BLOCKS}{i}.{rest}" for i in range(depth)] if is_stack else [leaf]
+    return names
+
+
+def choose(params: Crisalad, config: ModelConfig, trainable: str) -> dict[str, tuple[bool, ...]]:
+    """Return whether each parameter trains, of a stack of blocks for each block."""
+    backbone, names = config.backbone, numbered_names(params, config)
 
     def matched(*patterns: str) -> set[tuple[str, int]]:
         return {

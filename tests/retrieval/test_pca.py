@@ -8,7 +8,13 @@ import safetensors.numpy
 
 from crisalad_jax.checkpoints.safetensors_io import write_sealed
 from crisalad_jax.retrieval import pca
-from crisalad_jax.retrieval.pca import PcaConfig, fit_pca, load_pca, save_pca
+from crisalad_jax.retrieval.pca import (
+    PcaConfig,
+    fit_pca,
+    load_pca,
+    project_to_plane,
+    save_pca,
+)
 from crisalad_jax.utils.errors import InputError
 
 PLAIN = PcaConfig(renormalise=False)
@@ -47,6 +53,19 @@ def test_components_are_numpys_singular_vectors(count, length, monkeypatch):
     whole = rows.astype(np.float64).var(axis=0, ddof=1).sum()
     assert found.kept == pytest.approx(variances.sum() / whole, rel=1e-6)
     assert found.components.dtype == found.mean.dtype == np.float32
+
+
+def test_a_plane_is_that_of_numpys_first_two_singular_vectors():
+    rows = _descriptors(60, 20)
+    found = project_to_plane(rows)
+    components, variances = _by_svd(rows, 2)
+    expected = (rows - rows.mean(axis=0, dtype=np.float64)) @ components.T
+    # Sums of 20 products up to 4 in float32, of numbers about 5.
+    np.testing.assert_allclose(found.positions, expected, atol=1e-5, rtol=0)
+    whole = rows.astype(np.float64).var(axis=0, ddof=1).sum()
+    np.testing.assert_allclose(found.shares, variances / whole, rtol=1e-6)
+    with pytest.raises(InputError, match="dim: found 2, expected 1 to 1"):
+        project_to_plane(rows[:2])
 
 
 def test_reduced_descriptors_are_coordinates_about_the_mean():
