@@ -38,6 +38,10 @@ from .evaluation.record import evaluation_record as evaluation_record
 from .experiments.comparison import ComparisonConfig as ComparisonConfig
 from .experiments.comparison import compare as compare
 from .experiments.comparison import paired_difference as paired_difference
+from .experiments.report import show_attention as show_attention
+from .experiments.report import show_descriptors as show_descriptors
+from .experiments.report import show_gradient_norms as show_gradient_norms
+from .experiments.report import show_image_attention as show_image_attention
 from .experiments.report import show_retrievals as show_retrievals
 from .experiments.report import show_transport as show_transport
 from .experiments.report import write_report as write_report

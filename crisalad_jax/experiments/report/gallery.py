@@ -68,7 +68,7 @@ def show_retrievals(
         title: stands above the picture.
 
     Returns:
-        A figure that a notebook shows; `figure.savefig(path)` writes it.
+        A figure that a notebook shows; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
         InputError: neither of these; a result without its benchmark, or answers with one; no query,

@@ -17,6 +17,8 @@ import matplotlib
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.text import Text as Label
@@ -99,6 +101,19 @@ def legend_below(figure: Figure) -> None:
     columns = 2 if max(map(len, names)) * 0.08 <= room else 1
     where = {"loc": "outside lower left", "ncols": columns}
     figure.legend(frameon=False, fontsize=9, labelcolor=INK, **where)
+
+
+def scale_below(
+    figure: Figure, plots: np.ndarray, scale: str, ends: tuple[float, float], label: str
+) -> Any:
+    """Draw a scale of colours below the plots, and return it."""
+    below: Any = {"location": "bottom", "shrink": 0.5, "aspect": 25, "pad": 0.02}
+    colours = ScalarMappable(Normalize(*ends), scale)
+    bar: Any = figure.colorbar(colours, ax=plots.ravel().tolist(), **below)
+    bar.set_label(label, fontsize=8, color=INK)
+    bar.ax.tick_params(labelsize=8, colors=GREY, labelcolor=INK)
+    bar.outline.set_visible(False)
+    return bar
 
 
 @contextlib.contextmanager

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from matplotlib import colors
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.patches import Patch
 
 from crisalad_jax.config.checks import takes
@@ -17,19 +16,21 @@ from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.prepare import as_rgb
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.experiments.report.gallery import thumbnail
-from crisalad_jax.experiments.report.style import GREY, INK, Picture, new_figure
+from crisalad_jax.experiments.report.style import INK, Picture, new_figure, scale_below
 from crisalad_jax.nn.model import Model, check_params, transport_masses
 from crisalad_jax.retrieval.describe import prepare_image
 
 CLUSTER_COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#0072b2", "#d55e00", "#cc79a7")
 """Okabe and Ito's colours, which the colour-blind can tell apart, on a grey photograph."""
-_HEAT = "inferno"
+HEAT = "inferno"
 _OPACITY = 0.65
 _PIXELS = 480
+Image = str | os.PathLike[str] | Pixels
+"""A file, or 8-bit RGB or grey, as `prepare_image` takes it."""
 
 
 @takes(model=Model)
-def show_transport(image: str | os.PathLike[str] | Pixels, model: Model) -> Picture:
+def show_transport(image: Image, model: Model) -> Picture:
     """Draw a picture, each patch's share in the dustbin, and the cluster that took most of it.
 
     The strongest seven clusters have colours; patches that others took stay grey. A colour's
@@ -41,7 +42,7 @@ def show_transport(image: str | os.PathLike[str] | Pixels, model: Model) -> Pict
         model: the model, as `load` returns it.
 
     Returns:
-        A figure that a notebook shows; `figure.savefig(path)` writes it.
+        A figure that a notebook shows; `figure.savefig(path)` writes it as PNG, SVG or PDF.
 
     Raises:
         InputError: the model's aggregator has no transport, parameters of another configuration,
@@ -57,9 +58,14 @@ def show_transport(image: str | os.PathLike[str] | Pixels, model: Model) -> Pict
         ['80 x 60 pixels', 'dustbin: 67 %', 'top clusters']
     """
     check_params(*model)
-    pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
-    picture = transport_of(as_rgb(pixels, model.config.preprocessing.bit_depth), model)
+    picture = transport_of(read_rgb(image, model), model)
     return draw_transport({"": picture}, [picture], photographs=True)
+
+
+def read_rgb(image: Image, model: Model) -> Pixels:
+    """Read an image, if it is a file, and make it 8-bit RGB as the model's configuration says."""
+    pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
+    return as_rgb(pixels, model.config.preprocessing.bit_depth)
 
 
 class Transported(NamedTuple):
@@ -135,20 +141,16 @@ def draw_transport(
         image = thumbnail(picture.image, _PIXELS)
         if photographs:
             rows, across = picture.masses.shape[:2]
-            _panel(first[0], image, f"{width} x {height} pixels, {rows} x {across} patches")
+            draw_panel(first[0], image, f"{width} x {height} pixels, {rows} x {across} patches")
         if picture.dustbin is not None:
             share = picture.masses[..., picture.clusters].sum() / picture.masses.sum()
-            _panel(first[-1], image, f"dustbin: {100 * share:.0f} %", picture.dustbin)
+            draw_panel(first[-1], image, f"dustbin: {100 * share:.0f} %", picture.dustbin)
             first[-1].images[-1].set_clim(np.min(shares), np.max(shares))
-        _panel(last, image, "top clusters", _cluster_colours(picture, list(clusters)))
+        draw_panel(last, image, "top clusters", _cluster_colours(picture, list(clusters)))
         (first or [last])[0].set_ylabel(name, fontsize=9, color=INK)
     if shares:
-        scale = ScalarMappable(colors.Normalize(np.min(shares), np.max(shares)), _HEAT)
-        below = {"location": "bottom", "shrink": 0.5, "aspect": 25, "pad": 0.02}
-        bar = figure.colorbar(scale, ax=panels.ravel().tolist(), **below)
-        bar.set_label("share of the patch in the dustbin", fontsize=8, color=INK)
-        bar.ax.tick_params(labelsize=8, colors=GREY, labelcolor=INK)
-        bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+        ends = float(np.min(shares)), float(np.max(shares))
+        scale_below(figure, panels, HEAT, ends, "share of the patch in the dustbin")
     figure.legend(
         handles=[
             Patch(color=colour, label=f"{number}: {100 * part:.0f} %")
@@ -166,7 +168,7 @@ def draw_transport(
     return figure
 
 
-def _panel(axes: Axes, image: Pixels, title: str, over: np.ndarray | None = None) -> None:
+def draw_panel(axes: Axes, image: Pixels, title: str, over: np.ndarray | None = None) -> None:
     """Draw a photograph, or over it in grey a value or a colour for each patch, which tile it."""
     axes.set(xticks=[], yticks=[], anchor="N")
     axes.spines[:].set_visible(False)
@@ -177,7 +179,7 @@ def _panel(axes: Axes, image: Pixels, title: str, over: np.ndarray | None = None
     axes.imshow(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), "gray", vmin=0, vmax=255)
     alpha = _OPACITY if over.ndim == 2 else None
     extent = (-0.5, image.shape[1] - 0.5, image.shape[0] - 0.5, -0.5)
-    axes.imshow(over, _HEAT, alpha=alpha, interpolation="nearest", extent=extent)
+    axes.imshow(over, HEAT, alpha=alpha, interpolation="nearest", extent=extent)
 
 
 def _cluster_colours(
