@@ -47,8 +47,8 @@ def test_links_lead_to_pages(path):
         assert target.with_suffix(".md").is_file() or target.with_suffix(".ipynb").is_file(), link
 
 
-def test_there_are_two():
-    assert [path.stem for path in BOOKS] == ["training", "transport"]
+def test_there_are_three():
+    assert [path.stem for path in BOOKS] == ["inside", "training", "transport"]
 
 
 @pytest.mark.slow
