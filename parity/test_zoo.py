@@ -46,6 +46,7 @@ LAYOUTS = {
     "patchnetvlad_pittsburgh_WPCA512": "patch-netvlad",
     "salad_cm": "dino-salad",
     "selavpr": "selavpr",
+    "sfrs_vgg16_pca4096": "sfrs",
     "supervlad": "supervlad",
     "supervlad_crossimage": "supervlad",
     "transvpr": "transvpr",

@@ -49,6 +49,7 @@ STORED = {
     "netvlad-nanne": "zoo/layouts/netvlad_vgg16_nanne",
     "netvlad-hloc": "zoo/layouts/netvlad_vgg16_hloc",
     "netvlad-hloc-tokyo": "zoo/layouts/netvlad_vgg16_hloc",
+    "sfrs": "zoo/layouts/sfrs_vgg16_pca4096",
     "patch-netvlad-mapillary-4096": "zoo/layouts/patchnetvlad_mapillary_WPCA4096",
     "patch-netvlad-pittsburgh-512": "zoo/layouts/patchnetvlad_pittsburgh_WPCA512",
     "transvpr-msls": "zoo/layouts/transvpr",
@@ -171,6 +172,8 @@ PREPROCESSING: dict[str, tuple[Any, ...]] = {
     "transvpr": ((480, 640), "fixed", *_PLAIN),
     # cvg/Hierarchical-Localization: OpenCV's INTER_AREA; pixels of 0 to 255 less a mean.
     "netvlad-hloc": ((768, 1024), "longer-side", "area", True, "floats", False, FROM_255),
+    # yxgeee/OpenIBL: Resize of Pillow's image; pixels of 0 to 255 less the same mean.
+    "sfrs": ((480, 640), "fixed", *_BYTES[:-1], FROM_255),
     # Ours: the demo of AnyLoc crops to multiples of 14 where we resize (docs/resizing.md).
     VOCABULARY: ((224, 224), "native", "bilinear", True, "floats", False, IMAGENET),
 }
