@@ -6,6 +6,7 @@ resized is held by tests/checkpoints/test_published.py, the filters by tests/dat
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -18,11 +19,14 @@ from crisalad_jax import describe
 from crisalad_jax.checkpoints.formats import infer, to_params, to_state
 from crisalad_jax.checkpoints.public import vocabulary_model
 from crisalad_jax.nn.aggregators.queries import decode
+from crisalad_jax.nn.aggregators.sage import pooled, weighted
 from crisalad_jax.nn.aggregators.selavpr import local_features
 from crisalad_jax.nn.aggregators.vlad import AnyLoc, nearest_words
 from crisalad_jax.nn.backbones import Features
-from crisalad_jax.nn.layers import l2_normalise
+from crisalad_jax.nn.backbones.vit import embed, run_blocks
+from crisalad_jax.nn.layers import l2_normalise, powers
 from crisalad_jax.nn.model import Crisalad, extract_features, unit_features
+from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.retrieval.reranking import patch_netvlad
 from parity import zoo
@@ -44,6 +48,7 @@ LAYOUTS = {
     "netvlad_vgg16_nanne": "netvlad",
     "patchnetvlad_mapillary_WPCA4096": "patch-netvlad",
     "patchnetvlad_pittsburgh_WPCA512": "patch-netvlad",
+    "sage_vitb14": "sage",
     "salad_cm": "dino-salad",
     "selavpr": "selavpr",
     "sfrs_vgg16_pca4096": "sfrs",
@@ -61,9 +66,9 @@ def test_every_golden_is_compared() -> None:
     assert set(LAYOUTS) == set(zoo.NAMES)
 
 
-def compare(found: jax.Array, expected: np.ndarray) -> None:
+def compare(found: jax.Array, expected: np.ndarray, bound: float = BOUND) -> None:
     assert found.shape == expected.shape
-    assert np.linalg.norm(found - expected) < BOUND * np.linalg.norm(expected)
+    assert np.linalg.norm(found - expected) < bound * np.linalg.norm(expected)
 
 
 def sampled(
@@ -114,6 +119,31 @@ def selavpr(params: Crisalad, features: Features, config: Any) -> dict[str, jax.
     return {"features": features.patches[:, ::4, ::16], "local": local[:, ::4, ::4, ::2]}
 
 
+def sage(params: Crisalad, features: Features, config: Any) -> dict[str, jax.Array]:
+    own, patches = params.aggregator, weighted(params.aggregator.weighting, features.patches)
+    maps = patches.reshape(2, *config.backbone.grid((154, 210)), -1)
+    clusters = config.aggregator.apply(own, features, config.grid, key=None).local
+    means = pooled(own, patches)
+    means = means + powers(own.power, means, means.mean(axis=-2, keepdims=True))
+    np.testing.assert_allclose(l2_normalise(means.swapaxes(-2, -1)), clusters, atol=1e-6)
+    return {
+        "recalibrated0": recalibrated(params, config)[:, ::4, ::8],
+        "cls": features.class_token,
+        "weighted": jnp.moveaxis(maps[..., :: maps.shape[-1] // 24], -1, 1),
+        "pooled": means[:, ::4],
+    }
+
+
+def recalibrated(params: Crisalad, config: Any) -> jax.Array:
+    """The tokens after the first block with a power, of the golden file's images."""
+    images = zoo.golden("sage_vitb14")["images"]
+    prepare = functools.partial(normalise, how=config.preprocessing)
+    pixels = jax.vmap(prepare)(jnp.asarray(images))
+    tokens = embed(params.backbone, pixels, config.backbone)
+    grid, count = config.backbone.grid(images.shape[1:3]), config.backbone.depth - 3
+    return run_blocks([params.backbone.blocks], tokens, grid, config.backbone, count=count)[0]
+
+
 def vladbuff(params: Crisalad, features: Features, config: Any) -> dict[str, jax.Array]:
     local = config.aggregator.apply(params.aggregator, features, config.grid, key=None).local
     return {"vlad": l2_normalise(local.reshape(2, -1))[:, ::4]}
@@ -121,6 +151,7 @@ def vladbuff(params: Crisalad, features: Features, config: Any) -> dict[str, jax
 
 STEPS: dict[str, Callable[[Crisalad, Features, Any], dict[str, jax.Array]]] = {
     "edtformer": edtformer,
+    "sage_vitb14": sage,
     "selavpr": selavpr,
     "vladbuff_192_wpca4096": vladbuff,
 }
@@ -139,7 +170,9 @@ def test_steps_are_the_public_codes(name: str) -> None:
     compared = {"features"} if golden["features"].ndim == 4 else set()
     assert found.keys() == golden.keys() - {"images", "descriptor"} - compared
     for key, array in found.items():
-        compare(array, golden[key])
+        # SAGE's power jumps by 2e-3 at 0, where rounding decides the sign: of the class token,
+        # float64 is 7e-5 from float32 here and 5e-5 from the public code's.
+        compare(array, golden[key], 3e-4 if key == "cls" else BOUND)
 
 
 @pytest.mark.slow

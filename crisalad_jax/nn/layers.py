@@ -38,6 +38,14 @@ class Linear:
 
 
 @pytree_dataclass
+class TwoLayer:
+    """A network of one hidden layer: linear, ReLU, linear."""
+
+    fc1: Linear
+    fc2: Linear
+
+
+@pytree_dataclass
 class LayerNorm:
     """Gain and shift of a layer norm."""
 
@@ -381,3 +389,29 @@ def l2_normalise(x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
     """
     squared = jnp.sum(x * x, axis=-1, keepdims=True)
     return x * jax.lax.rsqrt(jnp.maximum(squared, 1e-24))
+
+
+def init_two_layer(key: PRNGKeyArray, d_in: int, hidden: int, d_out: int) -> TwoLayer:
+    """Draw a network of one hidden layer, each layer as torch's `nn.Linear`."""
+    first, second = random_init.split(key)
+    return TwoLayer(init_linear(first, d_in, hidden), init_linear(second, hidden, d_out))
+
+
+def two_layer(
+    params: TwoLayer, x: Float[Array, "*batch d_in"], rate: float, key: Keys | None
+) -> Float[Array, "*batch d_out"]:
+    """Apply the network, with dropout of this rate before the ReLU where there is a key."""
+    hidden = dropout(linear(params.fc1, x), rate, key=key)
+    return linear(params.fc2, jax.nn.relu(hidden))
+
+
+def powers(
+    params: TwoLayer, x: Float[Array, "*batch n dim"], mean: Float[Array, "*batch 1 dim"]
+) -> Float[Array, "*batch n dim"]:
+    """Return sign(x) (|x| + 1e-6)^p, with an exponent from 0 to 1 for each entry of the batch.
+
+    The network makes the exponent from the mean (SAGE, ICLR 2026).
+    """
+    exponent = jax.nn.sigmoid(two_layer(params, at_least_float32(mean), 0.0, None))
+    wide = at_least_float32(x)
+    return (jnp.sign(wide) * (jnp.abs(wide) + 1e-6) ** exponent).astype(x.dtype)

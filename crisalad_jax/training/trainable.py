@@ -104,7 +104,8 @@ def split_params(params: Crisalad, config: ModelConfig, trainable: str) -> tuple
         if not cuts or not name.startswith(_BLOCKS):
             return any(chosen[name])
         part, _, rest = name.removeprefix(_BLOCKS).partition(".")
-        return chosen[_BLOCKS + rest][starts[int(part)]]
+        by_block = chosen[_BLOCKS + rest]
+        return by_block[starts[int(part)] if len(by_block) > 1 else 0]
 
     names = iter(named_leaves(params))
     return eqx.partition(params, jax.tree.map(lambda _: learns(next(names)), params))

@@ -122,6 +122,17 @@ def _blank_mask(config: Any) -> np.ndarray:
     return np.zeros((1, config.backbone.dim), np.float32)
 
 
+def _blank_branch(number: int) -> Callable[[Any], np.ndarray]:
+    """Make the arrays of SAGE's unused branch: two layers, as wide as published."""
+
+    def blank(config: Any) -> np.ndarray:
+        hidden, dim = config.aggregator.hidden, config.backbone.dim
+        shapes = (hidden, dim, 1, 1), (hidden,), (192, hidden, 1, 1), (192,)
+        return np.zeros(shapes[number], np.float32)
+
+    return blank
+
+
 def _published_periods(config: Any) -> np.ndarray:
     """Return a head's periods as DINOv3's public files have them, rounded to bfloat16."""
     periods = rotary_periods(config.backbone.dim // config.backbone.heads)
@@ -135,6 +146,7 @@ EXTRAS = {
     "extra-mask": Extra(_blank_mask),
     "extra-first-mask": Extra(_blank_mask, FIRST),
     "extra-periods": Extra(_published_periods),
+    **{f"extra-branch-{number}": Extra(_blank_branch(number)) for number in range(4)},
 }
 """What files have and no descriptor needs, by name."""
 ABSENT = {

@@ -138,6 +138,9 @@ def square_side(area: int, otherwise: str) -> int:
 
 def _infer_adapter(read: Reader, width: int) -> Adapter:
     """Infer which adapters there are, and their sizes; how much they weigh is as published."""
+    if count := read.count("gpn_norms."):
+        hidden = read.size("gpn_norms.0.projection.0.weight", 0)
+        return ADAPTERS.make("dynamic-power", last=count, hidden=hidden)
     in_block = "blocks.0.adapter"
     names = {"side": "adapters.0", "serial-parallel": f"{in_block}1", "mlp": in_block}
     has = [name for name, start in names.items() if read.has(f"{start}.D_fc1.weight")]

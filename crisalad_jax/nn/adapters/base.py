@@ -34,7 +34,7 @@ class Adapter(Part, abc.ABC):
     `init` is required, and at least one of the hooks below it does the work. A hook returns what is
     added to the result of a part of the block, in the shape and type of that result; None adds
     nothing. All blocks have one shape and run in one loop (`jax.lax.scan`). A hook therefore gets
-    the parameters of one block, and does the same in every block.
+    the parameters of one block, and does the same in every block that has an adapter.
 
     Example:
         >>> import jax
@@ -51,6 +51,9 @@ class Adapter(Part, abc.ABC):
         >>> jax.eval_shape(ViTConfig(adapter="shift").init, jax.random.key(0)).blocks.adapter
         {'shift': ShapeDtypeStruct(shape=(12, 768), dtype=float32)}
     """
+
+    last = None  # without a type, so that a class may make it a field
+    """Number of the last blocks that have an adapter, with parameters; None is all blocks."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> Any:
@@ -131,12 +134,24 @@ class Adapter(Part, abc.ABC):
         """
         return None, params
 
+    def output_update(
+        self, params: Any, tokens: AnyTokens, *, length: int | None = None
+    ) -> AnyTokens | None:
+        """Return what is added to the block's output.
+
+        Args:
+            params: of `init`.
+            tokens: the output.
+            length: see `attention_update`.
+        """
+        return None
+
     def side_path(
         self, params: Any, tokens: AnyTokens, grid: Grid, *, length: int | None = None
     ) -> AnyTokens:
         """Return the tokens of a path beside the blocks, whose last ones are the backbone's.
 
-        The path starts from the embedded image. An adapter with this method has one.
+        The path starts from the tokens before the first block that has an adapter.
 
         Args:
             params: of `init`.

@@ -17,28 +17,19 @@ from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid
 from crisalad_jax.nn.layers import (
     Conv,
     Keys,
-    Linear,
+    TwoLayer,
     at_least_float32,
-    dropout,
-    init_linear,
     init_transposed_conv,
+    init_two_layer,
     l2_normalise,
-    linear,
     split_key,
+    two_layer,
 )
 from crisalad_jax.nn.tokens import Tokens, TransportStatistics
 from crisalad_jax.nn.transport.config import SinkhornConfig
 from crisalad_jax.nn.transport.dustbin import DUSTBINS, Dustbin, TokenDustbin
 from crisalad_jax.nn.transport.solve import SinkhornResult, assign_with_dustbin
 from crisalad_jax.utils.pytree import pytree_dataclass
-
-
-@pytree_dataclass
-class TwoLayer:
-    """A network of one hidden layer: linear, ReLU, linear."""
-
-    fc1: Linear
-    fc2: Linear
 
 
 @pytree_dataclass
@@ -266,20 +257,6 @@ class FolConfig(SaladConfig):
         attention = features.class_attention
         assert attention is not None
         return 1 - jnp.where(attention >= LEAST_ATTENTION, attention, 0)
-
-
-def init_two_layer(key: PRNGKeyArray, d_in: int, hidden: int, d_out: int) -> TwoLayer:
-    """Draw a network of one hidden layer, each layer as torch's `nn.Linear`."""
-    first, second = random_init.split(key)
-    return TwoLayer(init_linear(first, d_in, hidden), init_linear(second, hidden, d_out))
-
-
-def two_layer(
-    params: TwoLayer, x: Float[Array, "*batch d_in"], rate: float, key: Keys | None
-) -> Float[Array, "*batch d_out"]:
-    """Apply the network, with dropout of this rate before the ReLU where there is a key."""
-    hidden = dropout(linear(params.fc1, x), rate, key=key)
-    return linear(params.fc2, jax.nn.relu(hidden))
 
 
 def _statistics(result: SinkhornResult, clusters: int) -> TransportStatistics:

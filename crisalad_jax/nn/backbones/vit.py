@@ -110,6 +110,8 @@ class Block:
 class ViT:
     """The backbone. In `blocks` every leaf has a leading depth axis.
 
+    That of adapters is shorter where only the last blocks have one.
+
     A tuple of such stacks runs in sequence. Training uses it to exclude frozen blocks from the
     gradient where only the last ones train. Rotary positions have no parameters: `pos_embed_cls`
     and `pos_embed` are None. Without registers `register_tokens` is None.
@@ -148,7 +150,10 @@ class VisionTransformer(Backbone):
         resolve_names(self)
         words = f"a multiple of the {self.heads} heads"
         require_field(self, "dim", self.dim % self.heads == 0, words)
-        self.adapter.check(self.block_shape)
+        adapter, few = self.adapter, self.adapter.last is not None
+        words = f"one of all blocks, which {adapter.part_name} with prompts has to be"
+        require_field(self, "adapter", not (few and adapter.has_prompts), words)
+        adapter.check(self.block_shape)
 
     @property
     def hidden(self) -> int:
@@ -201,9 +206,22 @@ class VisionTransformer(Backbone):
             register_tokens=registers if self.registers else None,
             pos_embed_cls=pos_embed_cls,
             pos_embed=pos_embed,
-            blocks=random_init.stacked(self._init_block, random_init.split(block, self.depth)),
+            blocks=self._init_blocks(random_init.split(block, self.depth)),
             norm=init_layer_norm(self.dim),
         )
+
+    def _init_blocks(self, keys: Sequence[PRNGKeyArray]) -> Block:
+        last = self.adapter.last
+        if last is None:
+            return random_init.stacked(self._init_block, keys)
+        bare = dataclasses.replace(self, adapter="none")
+
+        def adapter_of(key: PRNGKeyArray) -> Any:
+            return self.adapter.init(random_init.split(key, 5)[-1], self.block_shape)
+
+        adapters = random_init.stacked(adapter_of, keys[-last:])
+        blocks = random_init.stacked(bare._init_block, keys)
+        return dataclasses.replace(blocks, adapter=adapters)
 
     def _init_block(self, key: PRNGKeyArray) -> Block:
         qkv, proj, first, second, adapter_key = random_init.split(key, 5)
@@ -312,7 +330,9 @@ class VisionTransformer(Backbone):
     @property
     def trains(self) -> tuple[str, ...]:
         """Return the adapters' name."""
-        return () if isinstance(self.adapter, NoAdapter) else ("blocks.*.adapter",)
+        if isinstance(self.adapter, NoAdapter):
+            return ()
+        return ("blocks.*.adapter",) if self.adapter.last is None else ("blocks*.adapter",)
 
     def split_blocks(self, params: ViT, cuts: Sequence[int]) -> ViT:
         """Cut the stack of blocks."""
@@ -347,7 +367,12 @@ class VisionTransformer(Backbone):
                 layer, attn=each(layer.attn), mlp=each(layer.mlp), adapter=None
             )
 
-        blocks = jax.vmap(merged)(_one_stack(params))
+        stack = _one_stack(params)
+        first, depth = _unadapted(stack), self.depth
+        blocks = jax.vmap(merged)(_cut(stack, first, depth))
+        if first:
+            before = dataclasses.replace(_cut(stack, 0, first), adapter=None)
+            blocks = _joined([before, blocks])
         plain = dataclasses.replace(self, adapter="none")
         return plain, dataclasses.replace(params, blocks=blocks)
 
@@ -424,8 +449,10 @@ def _statistics(params: ViT, measured: Sequence[Block]) -> ViT:
     """Return the running statistics of blocks, in stacks as those of `params`."""
     blocks: Any = _joined(measured)
     if isinstance(params.blocks, tuple):
-        cuts = 0, *itertools.accumulate(len(stack.ls1) for stack in params.blocks)
-        blocks = tuple(_cut(blocks, *pair) for pair in itertools.pairwise(cuts))
+        # Statistics are adapters' alone.
+        rows = (len(stack.ls1) - _unadapted(stack) for stack in params.blocks)
+        cuts = 0, *itertools.accumulate(rows)
+        blocks = tuple(_rows(blocks, *pair) for pair in itertools.pairwise(cuts))
     return split_statistics(dataclasses.replace(params, blocks=blocks))[0]
 
 
@@ -445,8 +472,30 @@ def _checked_levels(request: FeatureSpec, config: VisionTransformer) -> tuple[in
     return levels
 
 
+def _rows(tree: Any, begin: int, end: int) -> Any:
+    return jax.tree.map(operator.itemgetter(slice(begin, end)), tree)
+
+
 def _cut(stack: Block, begin: int, end: int) -> Block:
-    return jax.tree.map(operator.itemgetter(slice(begin, end)), stack)
+    """Return the blocks from number `begin` to before `end`, with the adapters that they have."""
+    first = _unadapted(stack)
+    if first == 0:
+        return _rows(stack, begin, end)
+    adapter = _rows(stack.adapter, max(begin - first, 0), max(end - first, 0))
+    blocks = _rows(dataclasses.replace(stack, adapter=None), begin, end)
+    return dataclasses.replace(blocks, adapter=adapter)
+
+
+def _unadapted(stack: Block) -> int:
+    """Return how many of a stack's first blocks have no adapter, of one that others have."""
+    leaves = jax.tree.leaves(stack.adapter)
+    return len(stack.ls1) - len(leaves[0]) if leaves else 0
+
+
+def _adapter_of(layer: Block, config: VisionTransformer) -> Adapter:
+    """Return a block's adapter: none where only later blocks have one."""
+    has = layer.adapter is not None or config.adapter.last is None
+    return config.adapter if has else NoAdapter()
 
 
 def _joined(stacks: Sequence[Block]) -> Block:
@@ -466,6 +515,7 @@ def _between(stacks: Sequence[Block], begin: int, end: int) -> Sequence[Block]:
 
 def _block_at(stacks: Sequence[Block], number: int) -> Block:
     (one,) = _between(stacks, number, number + 1)
+    one = dataclasses.replace(one, adapter=None) if _unadapted(one) else one
     return jax.tree.map(operator.itemgetter(0), one)
 
 
@@ -577,18 +627,29 @@ def run_blocks(
 
     # prevent_cse=False: inside a scan, CSE cannot undo the remat.
     body = jax.checkpoint(body, prevent_cse=False, policy=_POLICIES[remat])
-    carry = tokens, tokens if config.adapter.has_side_path else None
-    statistics = []
+    side, statistics = None, []
     with jax.named_scope("blocks"):
-        for stack in stacks if count is None else ():
-            carry, measured = jax.lax.scan(body, carry, stack)
-            statistics.append(measured)
-        if count is not None:
-            (stack,) = stacks
-            carry, _ = jax.lax.scan(
-                lambda carry, at: body(carry, _layer_at(stack, at)), carry, jnp.arange(count)
-            )
-    tokens, side = carry
+        for stack in stacks:
+            size, first = len(stack.ls1), _unadapted(stack)
+            end = size if count is None else count
+            is_whole = count is None and first in (0, size)
+            for start, stop in ((0, min(first, end)), (first, end)):
+                if start >= stop:
+                    continue
+                part = dataclasses.replace(stack, adapter=None) if start < first else stack
+                if start == first and config.adapter.has_side_path and side is None:
+                    side = tokens
+                if is_whole:
+                    (tokens, side), measured = jax.lax.scan(body, (tokens, side), part)
+                else:
+                    # Slices of a stack would copy its weights.
+                    (tokens, side), measured = jax.lax.scan(
+                        lambda carry, at, part=part: body(carry, _layer_at(part, at)),
+                        (tokens, side),
+                        jnp.arange(start, stop),
+                    )
+                if start == first:
+                    statistics.append(measured)
     return (tokens if side is None else side)[:, front:length], statistics
 
 
@@ -601,7 +662,13 @@ def _with_prompts(tokens: TokenBatch, layer: Block, config: VisionTransformer) -
 
 
 def _layer_at(stack: Block, number: Int[Array, ""]) -> Block:
-    return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, number, 0, False), stack)
+    def at(tree: Any, number: Array) -> Any:
+        return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, number, 0, False), tree)
+
+    if first := _unadapted(stack):
+        bare = at(dataclasses.replace(stack, adapter=None), number)
+        return dataclasses.replace(bare, adapter=at(stack.adapter, number - first))
+    return at(stack, number)
 
 
 def block(
@@ -626,6 +693,7 @@ def block(
     Returns:
         (tokens, statistics): the second has the running statistics, and None for all else.
     """
+    adapter = _adapter_of(params, config)
     normed = layer_norm(params.norm1, tokens, epsilon=config.norm_epsilon)
     attn, rotation = config.attention_of(params), config.rotation(grid)
     linear_update = _update_of(params, config)
@@ -633,19 +701,23 @@ def block(
         attn, normed, config.heads, length=length, rotation=rotation, update=linear_update
     )
     with jax.named_scope("adapter"):
-        extra = config.adapter.attention_update(params.adapter, attended, grid, length=length)
+        extra = adapter.attention_update(params.adapter, attended, grid, length=length)
         attended = _added(attended, extra, config)
     tokens = checkpoint_name(_residual(tokens, params.ls1, attended), "attended")
     normed = layer_norm(params.norm2, tokens, epsilon=config.norm_epsilon)
     update = feed_forward(params.mlp, normed, linear_update)
     with jax.named_scope("adapter"):
-        extra, updated = config.adapter.mlp_update(
+        extra, updated = adapter.mlp_update(
             params.adapter, normed, grid, length=length, valid=valid
         )
         update = _added(update, extra, config)
     if updated is not params.adapter:
         params = dataclasses.replace(params, adapter=updated)
-    return _residual(tokens, params.ls2, update), split_statistics(params)[0]
+    tokens = _residual(tokens, params.ls2, update)
+    with jax.named_scope("adapter"):
+        extra = adapter.output_update(params.adapter, tokens, length=length)
+        tokens = _added(tokens, extra, config)
+    return tokens, split_statistics(params)[0]
 
 
 def _update_of(layer: Block, config: VisionTransformer) -> LinearUpdate:
@@ -654,7 +726,7 @@ def _update_of(layer: Block, config: VisionTransformer) -> LinearUpdate:
 
     def update(name: str, x: Array) -> Array | None:
         with jax.named_scope("adapter"):
-            extra = config.adapter.linear_update(layer.adapter, name, x)
+            extra = _adapter_of(layer, config).linear_update(layer.adapter, name, x)
         if extra is not None:
             wanted = jax.ShapeDtypeStruct((*x.shape[:-1], sizes[name][1]), x.dtype)
             expect_like(where, extra, wanted)

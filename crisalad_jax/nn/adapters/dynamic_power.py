@@ -1,0 +1,38 @@
+"""SAGE's dynamic power (ICLR 2026): every number of a block's output is raised to one exponent.
+
+Written from the facts of the public model; the training code is not published.
+"""
+
+import dataclasses
+
+from jaxtyping import PRNGKeyArray
+
+from crisalad_jax.config.checks import PositiveInt
+from crisalad_jax.nn.adapters.base import ADAPTERS, Adapter, AnyTokens, BlockShape
+from crisalad_jax.nn.layers import TwoLayer, init_two_layer, powers
+
+
+@ADAPTERS.register("dynamic-power")
+@dataclasses.dataclass(frozen=True)
+class DynamicPowerConfig(Adapter):
+    """SAGE's dynamic power after each of the last blocks: x + sign(x) (|x| + 1e-6)^p.
+
+    The exponent p, from 0 to 1, is of an image: a small network of the mean of all tokens. The
+    power jumps at 0, so numbers near it are sensitive to rounding.
+    """
+
+    last: PositiveInt | None = 4
+    """Number of the last blocks that have it; None is all."""
+    hidden: PositiveInt = 16
+    """Width of the network."""
+
+    def init(self, key: PRNGKeyArray, shape: BlockShape) -> TwoLayer:
+        """Draw the network as torch's linear layers."""
+        return init_two_layer(key, shape.dim, self.hidden, 1)
+
+    def output_update(
+        self, params: TwoLayer, tokens: AnyTokens, *, length: int | None = None
+    ) -> AnyTokens:
+        """Return the powers."""
+        mean = tokens[..., :length, :].mean(axis=-2, keepdims=True)
+        return powers(params, tokens, mean)

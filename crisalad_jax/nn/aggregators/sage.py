@@ -1,0 +1,113 @@
+"""SAGE's aggregation (ICLR 2026): clusters without a transport, of features weighed by length.
+
+Written from the facts of the public model; the training code is not published.
+"""
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import PositiveInt
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, FlattenOrder, TokenShape
+from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
+from crisalad_jax.nn.layers import (
+    Keys,
+    TwoLayer,
+    at_least_float32,
+    init_two_layer,
+    l2_normalise,
+    powers,
+    two_layer,
+)
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+
+@pytree_dataclass
+class Sage:
+    """The networks over features, and those of the weights and of the power."""
+
+    weighting: TwoLayer
+    """Network of a patch's length, which says how much it counts."""
+    token_features: TwoLayer
+    cluster_features: TwoLayer
+    score: TwoLayer
+    power: TwoLayer
+    """Network of the exponent."""
+
+
+@AGGREGATORS.register(
+    "sage", tiny={"clusters": 16, "cluster_dim": 32, "token_dim": 64, "hidden": 128}
+)
+@dataclasses.dataclass(frozen=True)
+class SageConfig(Aggregator):
+    """SAGE's aggregation (ICLR 2026).
+
+    Each cluster is a mean of the patches, weighed by a softmax of their scores; there is no dustbin
+    and no transport. The power of the clusters jumps at 0, so numbers near it are sensitive to
+    rounding.
+
+    Example:
+        >>> from crisalad_jax import ModelConfig
+        >>> ModelConfig(aggregator="sage", cross_image="none").descriptor_dim
+        8448
+    """
+
+    flatten_order: ClassVar[FlattenOrder] = "dimension-first"
+    clusters: PositiveInt = 64
+    cluster_dim: PositiveInt = 128
+    token_dim: PositiveInt = 256
+    """Width of the global token."""
+    hidden: PositiveInt = 512
+    """Hidden width of the networks over features."""
+    weighting_hidden: PositiveInt = 128
+    """Hidden width of the network of a patch's length."""
+
+    def features(self, depth: int) -> FeatureSpec:
+        """Request the last patches and the class token."""
+        return FeatureSpec(class_token=True)
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the tokens' shape, which does not depend on the backbone."""
+        return TokenShape(self.token_dim, self.clusters, self.cluster_dim)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Sage:
+        """Draw parameters as torch's default layers."""
+        keys, dim, hidden = random_init.split(key, 5), backbone.dim, self.hidden
+        return Sage(
+            weighting=init_two_layer(keys[0], 1, self.weighting_hidden, 1),
+            token_features=init_two_layer(keys[1], dim, hidden, self.token_dim),
+            cluster_features=init_two_layer(keys[2], dim, hidden, self.cluster_dim),
+            score=init_two_layer(keys[3], dim, hidden, self.clusters),
+            power=init_two_layer(keys[4], self.clusters, self.clusters // 2, 1),
+        )
+
+    def apply(self, params: Sage, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+        """Return the global token and the clusters, each L2-normalised, in float32."""
+        patches = weighted(params.weighting, features.patches)
+        means = pooled(params, patches)
+        # The exponent is of the image: one for all features of all clusters.
+        means = means + powers(params.power, means, means.mean(axis=-2, keepdims=True))
+        global_token = two_layer(params.token_features, features.class_token, 0.0, None)
+        clusters = l2_normalise(means.swapaxes(-2, -1))
+        return Tokens(l2_normalise(at_least_float32(global_token)), clusters)
+
+
+def weighted(params: TwoLayer, patches: Patches) -> Patches:
+    """Weigh each patch by 1 to 1.5, by a network of its length."""
+    length = jnp.linalg.norm(at_least_float32(patches), axis=-1, keepdims=True) + 1e-6
+    weights = 1 + 0.5 * jax.nn.sigmoid(two_layer(params, length, 0.0, None))
+    return (at_least_float32(patches) * weights).astype(patches.dtype)
+
+
+def pooled(params: Sage, patches: Patches) -> Float[Array, "*batch feature cluster"]:
+    """Compute each cluster's mean of the features, over the number of patches once more."""
+    features = at_least_float32(two_layer(params.cluster_features, patches, 0.0, None))
+    scores = at_least_float32(two_layer(params.score, patches, 0.0, None))
+    features = features - features.mean(axis=(-2, -1), keepdims=True)
+    shares = jax.nn.softmax(scores, axis=-2) / scores.shape[-2]
+    return jnp.einsum("...nd,...nm->...dm", features, shares)
