@@ -49,6 +49,7 @@ LAYOUTS = {
     "patchnetvlad_mapillary_WPCA4096": "patch-netvlad",
     "patchnetvlad_pittsburgh_WPCA512": "patch-netvlad",
     "sage_vitb14": "sage",
+    "sage_vitl14": "sage",
     "salad_cm": "dino-salad",
     "selavpr": "selavpr",
     "sfrs_vgg16_pca4096": "sfrs",

@@ -49,6 +49,8 @@ STORED = {
     "netvlad-nanne": "zoo/layouts/netvlad_vgg16_nanne",
     "netvlad-hloc": "zoo/layouts/netvlad_vgg16_hloc",
     "netvlad-hloc-tokyo": "zoo/layouts/netvlad_vgg16_hloc",
+    "sage-vitb14": "zoo/layouts/sage_vitb14",
+    "sage-vitl14": "zoo/layouts/sage_vitl14",
     "sfrs": "zoo/layouts/sfrs_vgg16_pca4096",
     "patch-netvlad-mapillary-4096": "zoo/layouts/patchnetvlad_mapillary_WPCA4096",
     "patch-netvlad-pittsburgh-512": "zoo/layouts/patchnetvlad_pittsburgh_WPCA512",
@@ -167,6 +169,8 @@ PREPROCESSING: dict[str, tuple[Any, ...]] = {
     "cricavpr": ((224, 224), "fixed", *_PLAIN),
     "selavpr": ((224, 224), "fixed", *_PLAIN),
     "fol": ((504, 504), "fixed", *_PLAIN),
+    # chenshunpeng/SAGE (torchvision 0.16): tensors, not antialiased.
+    "sage": ((322, 322), "fixed", *_PLAIN),
     # GaoShuang98/DINO-Mix, eval_files (torchvision 0.14.1), and TransVPR's code of 2022: the same.
     "dino-mix": ((224, 224), "fixed", *_PLAIN),
     "transvpr": ((480, 640), "fixed", *_PLAIN),
