@@ -50,6 +50,7 @@ LAYOUTS = {
     "patchnetvlad_pittsburgh_WPCA512": "patch-netvlad",
     "sage_vitb14": "sage",
     "sage_vitl14": "sage",
+    "sage_vitl14_crossimage": "sage",
     "salad_cm": "dino-salad",
     "selavpr": "selavpr",
     "sfrs_vgg16_pca4096": "sfrs",

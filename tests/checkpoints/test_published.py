@@ -51,6 +51,7 @@ STORED = {
     "netvlad-hloc-tokyo": "zoo/layouts/netvlad_vgg16_hloc",
     "sage-vitb14": "zoo/layouts/sage_vitb14",
     "sage-vitl14": "zoo/layouts/sage_vitl14",
+    "sage-vitl14-crossimage": "zoo/layouts/sage_vitl14_crossimage",
     "sfrs": "zoo/layouts/sfrs_vgg16_pca4096",
     "patch-netvlad-mapillary-4096": "zoo/layouts/patchnetvlad_mapillary_WPCA4096",
     "patch-netvlad-pittsburgh-512": "zoo/layouts/patchnetvlad_pittsburgh_WPCA512",

@@ -62,10 +62,13 @@ class Format:
     """Row of the projection, with {dim} for its width; None without one."""
     head_first: bool = False
     """Whether the head's first row is before the backbone's."""
+    encoder_first: bool = False
+    """Whether the cross-image encoder is before the head."""
     adapter: str = "none"
     """Name of the adapter; "any" is any."""
     encoder: str = "none"
-    """Name of the cross-image encoder; "any" where the file tells whether there is one."""
+    """Name of the cross-image encoder; "any", or "none,NAME", where the file tells whether there is
+    one."""
     extras: Rows = ()
     """What their files have and no descriptor needs."""
     settings: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
@@ -86,7 +89,7 @@ class Format:
             "aggregator": [self.head.kind.part_name],
             "backbone": [kind.part_name for kind in self.backbone.kinds] or ["any"],
             "adapter": [self.adapter],
-            "encoder": [self.encoder],
+            "encoder": self.encoder.split(","),
             "projection": ["no" if self.projection is None else "yes"],
         }
 
@@ -111,8 +114,9 @@ class Format:
         yield from expand(before, names, "aggregator.", head.prefix)
         yield from expand(backbone.rows, names, "backbone.", backbone.prefix)
         yield from expand(self.extras, names)
-        yield from expand(after, names, "aggregator.", head.prefix)
-        yield from expand(self.encoder_rows, names)
+        parts = [(after, "aggregator.", head.prefix), (self.encoder_rows, "", "")]
+        for rows, ours, theirs in parts[::-1] if self.encoder_first else parts:
+            yield from expand(rows, names, ours, theirs)
         if self.projection is not None:
             theirs = self.projection.theirs[0].format(dim=config.projection.dim)
             yield from expand((self.projection._replace(theirs=(theirs,)),), names)
@@ -141,7 +145,7 @@ class Format:
             preprocessing=self.preprocessing,
             backbone=infer_backbone(backbone.kinds, backbone.rows, Reader(state, backbone.prefix)),
             aggregator=self.head.infer(state),
-            cross_image="none" if self.encoder == "none" else infer_encoder(state),
+            cross_image="none" if self.encoder == "none" else infer_encoder(state, self.encoder),
             projection=ProjectionConfig(dim=self._projection_dim(state)),
         )
         parts = {

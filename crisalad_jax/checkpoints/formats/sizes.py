@@ -15,7 +15,12 @@ from crisalad_jax.nn.backbones.resnet import BLOCKS, STEM_SIDE, ResNetConfig
 from crisalad_jax.nn.backbones.transvpr import TransVprNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.backbones.vit import VisionTransformer
-from crisalad_jax.nn.cross_image import CrossImage, CrossImageConfig, NoCrossImage
+from crisalad_jax.nn.cross_image import (
+    CrossImage,
+    CrossImageConfig,
+    NoCrossImage,
+    SageCrossImageConfig,
+)
 from crisalad_jax.utils.errors import InputError
 
 _V = TypeVar("_V", bound=VisionTransformer)
@@ -185,11 +190,14 @@ def _infer_transvpr(read: Reader) -> TransVprNetConfig:
     )
 
 
-def infer_encoder(state: State) -> CrossImage:
+def infer_encoder(state: State, names: str) -> CrossImage:
     """Infer the encoder and its sizes; the number of heads is the published one."""
     read = Reader(state)
     layers = read.count("encoder.layers.")
     if not layers:
         return NoCrossImage()
     feedforward = read.size("encoder.layers.0.linear1.weight", 0)
-    return CrossImageConfig(layers=layers, heads=_ENCODER_HEADS, feedforward=feedforward)
+    sizes = {"layers": layers, "heads": _ENCODER_HEADS, "feedforward": feedforward}
+    if "sage" not in names:
+        return CrossImageConfig(**sizes)
+    return SageCrossImageConfig(**sizes, width=read.size("encoder.layers.0.linear1.weight", 1))
