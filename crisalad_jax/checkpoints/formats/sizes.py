@@ -197,7 +197,7 @@ def infer_encoder(state: State, names: str) -> CrossImage:
     if not layers:
         return NoCrossImage()
     feedforward = read.size("encoder.layers.0.linear1.weight", 0)
-    sizes = {"layers": layers, "heads": _ENCODER_HEADS, "feedforward": feedforward}
+    sizes: Any = {"layers": layers, "heads": _ENCODER_HEADS, "feedforward": feedforward}
     if "sage" not in names:
         return CrossImageConfig(**sizes)
     return SageCrossImageConfig(**sizes, width=read.size("encoder.layers.0.linear1.weight", 1))

@@ -236,15 +236,16 @@ def show_gradient_norms(norms: Mapping[str, float]) -> Picture:
         axes.set_yscale("log")
     plots[0].set_ylabel("norm of the gradient", fontsize=10, color=INK)
     for number, (name, line) in enumerate(lines.items()):
-        style = {"color": COLOURS[number % len(COLOURS)], "marker": _MARKS[number % len(_MARKS)]}
-        plots[0].plot(list(line), list(line.values()), label=name, markersize=5, **style)
+        colour, mark = COLOURS[number % len(COLOURS)], _MARKS[number % len(_MARKS)]
+        style: Any = {"color": colour, "marker": mark, "markersize": 5, "label": name}
+        plots[0].plot(list(line), list(line.values()), **style)
     if lines:
         plots[0].set_xlabel("block", fontsize=10, color=INK)
         plots[0].xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         plots[0].legend(frameon=False, fontsize=9, labelcolor=INK)
     if others:
         plots[-1].plot(range(len(others)), list(others.values()), "o", color=INK, markersize=5)
-        turned = {"rotation": 35, "ha": "right", "rotation_mode": "anchor", "fontsize": 9}
+        turned: Any = {"rotation": 35, "ha": "right", "rotation_mode": "anchor", "fontsize": 9}
         plots[-1].set_xticks(range(len(others)), list(others), **turned)
         plots[-1].set_xlim(-0.6, len(others) - 0.4)
     return figure
@@ -269,7 +270,7 @@ def show_descriptors(descriptors: Float[np.ndarray, "n d"], places: Sequence[str
         >>> import numpy as np
         >>> descriptors = np.random.default_rng(0).normal(size=(6, 8)).astype(np.float32)
         >>> figure = show_descriptors(descriptors, 2 * ["bridge", "park", "mill"])
-        >>> figure.axes[0].get_legend_handles_labels()[1]
+        >>> [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
         ['bridge', 'park', 'mill']
     """
     names = list(dict.fromkeys(places))
@@ -284,7 +285,8 @@ def show_descriptors(descriptors: Float[np.ndarray, "n d"], places: Sequence[str
     first, second = (f"{100 * share:.0f} % of the variance" for share in plane.shares)
     label_axes(axes, f"first component, {first}", f"second, {second}", grid="both")
     numbers = np.array([names.index(place) for place in places])
-    for number, name in enumerate(names):
+    marks = []
+    for number in range(len(names)):
         own = plane.positions[numbers == number]
         colour = COLOURS[number % len(COLOURS)]
         mark = _MARKS[(number + number // len(COLOURS)) % len(_MARKS)]
@@ -292,9 +294,11 @@ def show_descriptors(descriptors: Float[np.ndarray, "n d"], places: Sequence[str
             axes.plot(
                 *zip(own.mean(axis=0), end, strict=True), color=colour, linewidth=0.7, alpha=0.5
             )
-        axes.scatter(*own.T, s=36, c=colour, marker=mark, linewidths=0, label=str(name), zorder=3)
+        marks.append(axes.scatter(*own.T, s=36, c=colour, marker=mark, linewidths=0, zorder=3))
     axes.set_aspect("equal", adjustable="datalim")
-    axes.legend(
+    legend = axes.legend(
+        marks,
+        [str(name) for name in names],
         frameon=False,
         fontsize=8,
         labelcolor=INK,
@@ -302,4 +306,6 @@ def show_descriptors(descriptors: Float[np.ndarray, "n d"], places: Sequence[str
         bbox_to_anchor=(1, 0.5),
         ncols=math.ceil(len(names) / 18),
     )
+    for text in legend.get_texts():
+        text.set_parse_math(False)  # a dollar sign in a name starts no formula
     return figure

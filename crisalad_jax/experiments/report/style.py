@@ -44,7 +44,7 @@ FORMATS = (".png", ".svg", ".pdf")
 _WEBP_QUALITY = 78
 _UNDATED = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
 # Names in an SVG are not drawn at random; a PDF has TrueType fonts, as publishers ask for.
-_FIXED = {"svg.hashsalt": "crisalad", "pdf.fonttype": 42}
+_FIXED: Any = {"svg.hashsalt": "crisalad", "pdf.fonttype": 42}
 
 
 class Picture(Figure):
