@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar, cast
 from crisalad_jax.config.checks import REGISTRY, check_types, choose, require
 from crisalad_jax.config.io import PLUGIN, from_plain, to_plain
 from crisalad_jax.config.part import NAME, P, Part
-from crisalad_jax.config.plugins import load_entry_points
+from crisalad_jax.config.plugins import load_entry_points, loaded_plugins
 from crisalad_jax.config.short_repr import in_one_line, with_field_docs
 from crisalad_jax.utils.errors import InputError, locate_errors
 
@@ -152,6 +152,8 @@ class Registry(Generic[P]):
             load_entry_points()
         if name not in self:
             hint = "is a plug-in missing? --plugin FILE.py or MODULE, or load_plugin"
+            if loaded := loaded_plugins():
+                hint += f"; {', '.join(loaded)} did not register it"
             if plugin is not None:
                 hint = f"the plug-in {plugin} had it: --plugin {plugin}, or load_plugin"
             names = ", ".join([*self, *([self.others] if self.others else [])])

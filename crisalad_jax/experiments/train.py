@@ -119,7 +119,7 @@ def train(
         callbacks=callbacks,
         quiet=quiet,
     )
-    if is_primary():
+    if is_primary() and result.steps:
         out = pathlib.Path(out)
         save_chart(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
     return result

@@ -6,6 +6,7 @@ GELU.
 
 import abc
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import jax
@@ -66,6 +67,10 @@ class CrossImage(Part, abc.ABC):
 
     def check(self, dim: int) -> None:
         """Raise InputError where it does not fit tokens of this width; by default never."""
+
+    def numbers(self, params: Any) -> Mapping[str, Any]:
+        """Return numbers of the parameters that validations log by name; by default none."""
+        return {}
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray, dim: int) -> Any:
@@ -230,6 +235,10 @@ class GatedCrossImageConfig(CrossImageConfig):
         attended = super().apply(params.encoder, tokens, mask=mask, key=key)
         before, after = at_least_float32(tokens), at_least_float32(attended)
         return (before + jnp.tanh(params.gate) * (after - before)).astype(tokens.dtype)
+
+    def numbers(self, params: GatedEncoder) -> Mapping[str, Any]:
+        """Return how far the gate is open."""
+        return {"gate": jnp.tanh(params.gate)}
 
     def attention(
         self, params: GatedEncoder, tokens: Sequences, *, mask: Mask

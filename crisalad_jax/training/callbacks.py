@@ -41,6 +41,17 @@ class Callback:
         ...         print(numbers["step"], numbers["loss"])
     """
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Check that methods that begin with on_ are known."""
+        super().__init_subclass__(**options)
+        hooks = [name for name in dir(Callback) if name.startswith("on_")]
+        unknown = [name for name in vars(cls) if name.startswith("on_") and name not in hooks]
+        require(
+            not unknown,
+            f"{cls.__name__}: found a method {', '.join(unknown)}, which nothing calls, expected "
+            f"{', '.join(hooks)}",
+        )
+
     def on_start(self, out: pathlib.Path, config: TrainConfig, step: int) -> None:
         """Take what the run is.
 

@@ -4,6 +4,7 @@ import abc
 import dataclasses
 import functools
 import inspect
+import re
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
@@ -15,6 +16,7 @@ from crisalad_jax.config.part import Part
 from crisalad_jax.config.registry import Registry, count_arguments
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import one_line
+from crisalad_jax.utils.pytree import named_leaves
 
 Rate = Callable[[Any], Any]
 """A learning rate by the number of the step, as optax takes it."""
@@ -59,6 +61,12 @@ def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
         return _decayed(weight_decay, function(learning_rate))
 
     return {"make": make}
+
+
+_MATRICES = "muon_weight_dimension_numbers"
+"""Argument by which optax's Muon knows matrices, which it orthogonalises, from what Adam updates.
+By itself it takes an array of two axes for one, of three for none."""
+_TOKENS = re.compile(r"token|pos_embed")
 
 
 def _decayed(weight_decay: float, optimiser: Any) -> Any:
@@ -150,9 +158,30 @@ class _OptaxOptimiser(Optimiser):
         """Call the function; one without a weight decay gets it through its gradient."""
         settings = {each.name: getattr(self, each.name) for each in dataclasses.fields(self)}
         settings["learning_rate"] = learning_rate
-        if "weight_decay" in inspect.signature(self.function).parameters:
+        parameters = inspect.signature(self.function).parameters
+        if _MATRICES in parameters:
+            settings[_MATRICES] = _matrices
+        if "weight_decay" in parameters:
             return self.function(**settings, weight_decay=weight_decay)
         return _decayed(weight_decay, self.function(**settings))
+
+
+def _matrices(weights: Any) -> Any:
+    """Return where the two axes of each matrix are, and None for all else; see `_MATRICES`.
+
+    The first axis of a stack of blocks is no axis of theirs: blocks' vectors are no matrices. Nor
+    are tokens and positions, as embeddings are none (Jordan et al. 2024).
+    """
+    from optax.contrib import MuonDimensionNumbers
+
+    names = iter(named_leaves(weights))
+
+    def axes(leaf: Any) -> Any:
+        name = next(names)
+        own = leaf.ndim - name.startswith("backbone.blocks.")
+        return MuonDimensionNumbers(-2, -1) if own == 2 and not _TOKENS.search(name) else None
+
+    return jax.tree.map(axes, weights)
 
 
 OPTIMISERS = Registry(

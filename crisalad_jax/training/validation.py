@@ -92,7 +92,10 @@ class Validator:
         if skipped:
             words += f"; {skipped} unreadable images left out"
         watched = self._watch_transport(params, result.skipped.rest_of(self._benchmark))
-        own = self._model.aggregator.numbers(params.aggregator)
+        own = {
+            **self._model.aggregator.numbers(params.aggregator),
+            **self._model.cross_image.numbers(params.cross_image),
+        }
         watched |= {name: float(value) for name, value in own.items()}
         monitored = sum(result.recalls[k] for k in MONITORED[self._config.monitor])
         return Validation(monitored, recalls | watched, words)

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from crisalad_jax.config.part import Part
+from crisalad_jax.config.plugins import load_plugin
 from crisalad_jax.config.registry import (
     REGISTRIES,
     Registry,
@@ -209,3 +210,11 @@ def test_fields_of_a_plug_ins_part_are_checked_before_its_own_check(birds):
 
     with pytest.raises(InputError, match=r"^Swan\.eggs: found 'four', expected a whole number$"):
         birds.make("swan", eggs="four")
+
+
+@pytest.mark.usefixtures("own_parts")
+def test_a_plugin_that_registered_nothing_is_named(tmp_path):
+    (tmp_path / "forgot.py").write_text("import crisalad_jax as cj\n")
+    load_plugin(str(tmp_path / "forgot.py"))
+    with pytest.raises(InputError, match=r"\(is a plug-in missing\?.*; \S*forgot\.py did not"):
+        REGISTRIES["loss"].find("margin")

@@ -190,6 +190,7 @@ def test_images_may_be_chosen_one_by_one():
         ),
         (np.array([0, 6, 1, 2]), r"found places \[6\], expected 0 to 5"),
         (np.full((1, 4, 3), -1), r"found images \[-1 -1 -1\], expected 0 to 23"),
+        (np.zeros((1, 4, 3), int), r"found an image twice in batch \[0\]"),
         (np.arange(12).reshape(1, 4, 3), "found images of two places in a group of batch"),
     ],
 )

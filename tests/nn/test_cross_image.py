@@ -87,6 +87,8 @@ def test_an_untrained_gate_leaves_descriptors_alone() -> None:
     # tanh(20) is 1 in float32; x + (f - x) rounds once more than f.
     found, expected = gated(jnp.float32(20)), cj.attend_across_images(paper, tokens, config)
     np.testing.assert_allclose(found, expected, atol=1e-6)
+    opened = dataclasses.replace(params.cross_image, gate=jnp.float32(0.5))
+    assert GATED.cross_image.numbers(opened) == {"gate": jnp.tanh(jnp.float32(0.5))}
     slope = jax.grad(lambda gate: (gated(gate) * alone[::-1]).sum())(jnp.float32(0))
     step = 2.0**-8
     ends = [(gated(jnp.float32(x)) * alone[::-1]).sum() for x in (-step, step)]
@@ -180,7 +182,7 @@ def test_the_width_of_pieces_divides_the_descriptor() -> None:
         dataclasses.replace(SAGE, cross_image=SageCrossImageConfig(width=12))
     published = cj.ModelConfig(cross_image="sage")
     assert (published.descriptor_dim, published.sequence_dim) == (8448, 768)
-    tiny = cj.recipe("tiny", "scratch+sage").model
+    tiny = cj.recipe("tiny", "scratch+cross_image:sage").model
     assert tiny.descriptor_dim == 576
     assert not tiny.unit_length
     assert dataclasses.replace(tiny, projection=cj.ProjectionConfig(dim=8)).unit_length

@@ -14,6 +14,7 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli import train as train_command
 from crisalad_jax.data.loader import ImageCache
 from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.training import callbacks as module
 from crisalad_jax.training import validation
 from crisalad_jax.training.callbacks import CALLBACKS, Callback, Callbacks, make_callback
@@ -107,14 +108,16 @@ class Skipped(tuple):
         return benchmark
 
 
-def test_an_aggregators_own_numbers_are_those_of_a_validation(monkeypatch, benchmark, params):
+def test_parts_own_numbers_are_those_of_a_validation(monkeypatch, benchmark, params):
     result = types.SimpleNamespace(recalls={1: 0.25, 5: 0.5}, skipped=Skipped())
     monkeypatch.setattr(validation, "evaluate", lambda *_, **__: [result])
     monkeypatch.setattr(validation.Validator, "_watch_transport", lambda *_: {})
     monkeypatch.setattr(SaladConfig, "numbers", lambda _, own: {"dust_bin": own.dust_bin})
+    monkeypatch.setattr(CrossImageConfig, "numbers", lambda _, own: {"layers": len(own.layers)})
     how: Any = {"on_bad_image": "stop", "cache": ImageCache(0)}
     found = validation.Validator(ENDLESS, benchmark, **how).validate(params)
-    assert found.metrics == {"R@1": 0.25, "R@5": 0.5, "dust_bin": float(params.aggregator.dust_bin)}
+    own = {"dust_bin": float(params.aggregator.dust_bin), "layers": 2}
+    assert found.metrics == {"R@1": 0.25, "R@5": 0.5, **own}
 
 
 def test_a_table_drops_what_comes_again(tmp_path) -> None:
@@ -186,9 +189,23 @@ def test_callbacks_that_do_not_fit_are_refused(monkeypatch) -> None:
         cj.register_callback("csv")(Recorder)
     with pytest.raises(InputError, match=r"register_callback 'mine': found 3, expected a Callback"):
         cj.register_callback("mine")(3)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match=r"Mine: found a method on_steps, .* expected on_end"):
+        type("Mine", (Callback,), {"on_steps": lambda self, numbers: None})
     assert "mine" not in CALLBACKS
 
 
 def test_flags_name_callbacks() -> None:
     given = ["--data", "d", "--out", "o", "--callback", "csv", "wandb"]
     assert train_command.parse("train", given).callback == ("csv", "wandb")
+
+
+def test_a_run_that_is_stopped_before_its_first_step_has_no_curves(shared, tmp_path) -> None:
+    class Never(Callback):
+        def on_start(self, out, config, step):
+            raise cj.StopTraining
+
+    result = cj.train(ENDLESS, shared / "city", tmp_path / "run", callbacks=[Never()], quiet=True)
+    assert (result.steps, result.stopped_early) == (0, True)
+    assert not (tmp_path / "run" / "curves.png").exists()
+    assert cj.train(ENDLESS, shared / "city", tmp_path / "run", quiet=True).steps == 6
+    assert (tmp_path / "run" / "curves.png").exists()

@@ -1,6 +1,7 @@
 """Optimisers and schedules as parts: a user's, optax's by name, and an average of the weights."""
 
 import dataclasses
+import functools
 import pickle
 
 import jax
@@ -66,6 +67,44 @@ def test_a_function_of_optax_has_its_arguments_as_settings() -> None:
             weights = optax.apply_updates(weights, updates)
             # The same program in float64, but for the rate's place in it.
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), ours, weights)
+
+
+def test_muon_takes_the_matrices_of_stacked_blocks_one_by_one() -> None:
+    """Against Muon of each block's matrix by itself, and Adam of what has one axis in a block."""
+    shapes = {
+        "cls_token": (8,),
+        "register_tokens": (2, 8),
+        "pos_embed": (3, 3, 8),
+        "blocks": {"norm1": (3, 8), "qkv": {"weight": (3, 8, 24), "bias": (3, 24)}},
+        "head": (8, 5),
+    }
+    generator = np.random.default_rng(0)
+    weights, gradient = (
+        jax.tree.map(
+            lambda shape: jnp.asarray(generator.standard_normal(shape), jnp.float32),
+            {"backbone": shapes},
+            is_leaf=lambda x: isinstance(x, tuple),
+        )
+        for _ in range(2)
+    )
+    config = OptimiserConfig(kind="optax.contrib.muon", learning_rate=0.1, schedule="constant")
+    ours = make_optimiser(config, 3, 1)
+    found, _ = ours.update(gradient, ours.init(weights), weights)
+    decay = config.weight_decay
+
+    def expected(leaf: jax.Array, step: jax.Array, *, is_matrix: bool) -> jax.Array:
+        muon = optax.contrib.muon(0.1, weight_decay=decay)
+        adam = optax.adamw(0.1, weight_decay=0.0, nesterov=True)
+        optimiser = muon if is_matrix else adam
+        return optimiser.update(step, optimiser.init(leaf), leaf)[0]
+
+    leaves = zip(*(named_leaves(each).items() for each in (found, weights, gradient)), strict=True)
+    for (name, update), (_, leaf), (_, step) in leaves:
+        one = functools.partial(expected, is_matrix=name.endswith(("qkv.weight", "head")))
+        rows = "blocks" in name
+        each = jax.vmap(one)(leaf, step) if rows else one(leaf, step)
+        # Newton-Schulz iterations of float32, batched and not.
+        np.testing.assert_allclose(update, each, rtol=2e-4, atol=1e-6, err_msg=name)
 
 
 def test_one_without_a_weight_decay_gets_it_through_its_gradient() -> None:

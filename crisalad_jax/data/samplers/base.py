@@ -179,7 +179,7 @@ def epoch_batches(
             raise InputError(
                 f"{places.root}: found {len(counts)} places of which sampler {drawn_by.part_name} "
                 f"makes no batch, expected places_per_batch {places_per_batch} "
-                "(--places-per-batch) of them that are not near each other"
+                "(--places-per-batch) of them, each once, that are not near each other"
             )
         if found >= least:
             break
@@ -210,6 +210,9 @@ def _draw(places: Places, sampler: Sampler, draw: Draw) -> Int[np.ndarray, "step
     require(not outside.size, f"{where}: found {what} {outside[:3]}, expected 0 to {count - 1}")
     if is_order:
         return _images_of(places, _apart(found.tolist(), places.near, size[0]), draw)
+    ordered = np.sort(found.reshape(len(found), size[0] * size[1]), axis=1)
+    again = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
+    require(not again.size, f"{where}: found an image twice in batch {again[:1]}")
     labels = labels_of(places, sampler, found)
     mixed = np.flatnonzero((labels != labels[..., :1]).any(axis=(1, 2)))
     require(not mixed.size, f"{where}: found images of two places in a group of batch {mixed[:1]}")

@@ -41,7 +41,7 @@ from crisalad_jax.training.optimiser import with_short_warmup
 from crisalad_jax.training.run_files import checksum_of_places
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.utils.checksums import sha256_of
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.errors import InputError, locate_errors
 
 EPOCHS = 6
 """Number of epochs from random weights: all methods on two small sets, three seeds each, take less
@@ -246,7 +246,8 @@ def prepare(config: ComparisonConfig, *, quiet: bool = True) -> Prepared:
     smallest = min(len(benchmark.database) for benchmark in benchmarks)
     for variant in variants:
         if variant.trains:
-            count_trainable(variant.model, variant.training.trainable)  # raises where nothing could
+            with locate_errors("" if variant.row is None else f"--row {variant.name}: "):
+                count_trainable(variant.model, variant.training.trainable)
         if variant.rerank is not None:
             parse_reranking(variant.rerank).check(variant.model, smallest)
     if config.backbone is not None:

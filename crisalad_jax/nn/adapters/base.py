@@ -161,20 +161,28 @@ class Adapter(Part, abc.ABC):
         """
         raise NotImplementedError
 
+    def has(self, *hooks: str) -> bool:
+        """Return whether it has one of these methods of its own."""
+        return any(getattr(type(self), hook) is not getattr(Adapter, hook) for hook in hooks)
+
     @property
     def has_prompts(self) -> bool:
         """Whether it has `prompts`."""
-        return type(self).prompts is not Adapter.prompts
+        return self.has("prompts")
 
     @property
     def can_merge(self) -> bool:
         """Whether it has a `merge`."""
-        return type(self).merge is not Adapter.merge
+        return self.has("merge")
 
     @property
     def has_side_path(self) -> bool:
         """Whether it has a `side_path`."""
-        return type(self).side_path is not Adapter.side_path
+        return self.has("side_path")
 
 
+HOOKS = (
+    *("prompts", "linear_update", "attention_update", "mlp_update", "output_update", "side_path"),
+)
+"""Methods of adapters that change what a block does."""
 ADAPTERS = Registry("adapter", Adapter)

@@ -29,6 +29,7 @@ from crisalad_jax.config.part import OrName, non_semantic_field
 from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.adapters import ADAPTERS, Adapter, BlockShape
+from crisalad_jax.nn.adapters.base import HOOKS
 from crisalad_jax.nn.adapters.bottleneck import NoAdapter
 from crisalad_jax.nn.attention import (
     Attention,
@@ -151,6 +152,8 @@ class VisionTransformer(Backbone):
         words = f"a multiple of the {self.heads} heads"
         require_field(self, "dim", self.dim % self.heads == 0, words)
         adapter, few = self.adapter, self.adapter.last is not None
+        acts = isinstance(adapter, NoAdapter) or adapter.has(*HOOKS)
+        require_field(self, "adapter", acts, f"one with a method {', '.join(HOOKS)}")
         words = f"one of all blocks, which {adapter.part_name} with prompts has to be"
         require_field(self, "adapter", not (few and adapter.has_prompts), words)
         adapter.check(self.block_shape)
@@ -369,7 +372,9 @@ class VisionTransformer(Backbone):
 
         stack = _one_stack(params)
         first, depth = _unadapted(stack), self.depth
-        blocks = jax.vmap(merged)(_cut(stack, first, depth))
+        adapted = _cut(stack, first, depth)
+        blocks = jax.vmap(merged)(adapted)
+        _check_merged(_block_at([adapted], 0), _block_at([blocks], 0), self)
         if first:
             before = dataclasses.replace(_cut(stack, 0, first), adapter=None)
             blocks = _joined([before, blocks])
@@ -733,6 +738,21 @@ def _update_of(layer: Block, config: VisionTransformer) -> LinearUpdate:
         return extra
 
     return update
+
+
+def _check_merged(layer: Block, merged: Block, config: VisionTransformer) -> None:
+    """Check that a block's merged linear layers give what they gave with their updates."""
+    update = _update_of(layer, config)
+    for name, (width, _) in config.block_shape.linears.items():
+        part = "attn" if hasattr(layer.attn, name) else "mlp"
+        before, after = (getattr(getattr(each, part), name) for each in (layer, merged))
+        x = jnp.linspace(-1.0, 1.0, width)[None]
+        expected, found = adapted_linear(name, before, x, update), linear(after, x)
+        require(
+            bool(jnp.allclose(found, expected, rtol=1e-3, atol=1e-3 * jnp.abs(expected).max())),
+            f"adapter {config.adapter.part_name}: found `merge` to make another layer {name} than "
+            "`linear_update` does, expected the same",
+        )
 
 
 def _added(x: TokenBatch, update: TokenBatch | None, config: VisionTransformer) -> TokenBatch:

@@ -7,6 +7,7 @@ import pytest
 from crisalad_jax.experiments.comparison import ComparisonConfig, prepare
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.recipes import RECIPES, recipe
+from crisalad_jax.utils.errors import InputError
 from tests.cli.test_cli import fails
 
 
@@ -77,6 +78,13 @@ REFUSED = [
 def test_refused_before_any_work(flags, capfd, tmp_path, changed, words):
     fails(capfd, *flags, "--out", tmp_path / "out", *changed, words=words)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_row_that_leaves_its_adapters_untrained(settings):
+    given = settings | {"kind": "ablate", "rows": ("frozen: trainable=head",)}
+    words = r"^--row frozen: trainable: found 'head', which leaves backbone\.blocks"
+    with pytest.raises(InputError, match=words):
+        prepare(ComparisonConfig(**given))
 
 
 def test_weights_of_another_method(flags, shared, capfd, tmp_path):

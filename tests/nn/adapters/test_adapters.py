@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import crisalad_jax as cj
+from crisalad_jax.nn.adapters.lora import LoraConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig, block
 from tests.conftest import MODEL
 
@@ -88,3 +89,35 @@ def test_an_adapter_that_would_not_train_is_refused() -> None:
     # Trained ones may stay as they are, where that is said.
     trained, _ = cj.split_params(params, MODEL, "head,-adapters")
     assert not jax.tree.leaves(trained.backbone)
+
+
+@pytest.mark.usefixtures("own_parts")
+def test_an_adapter_that_does_nothing_is_refused() -> None:
+    @cj.register_adapter("test-idle")
+    @dataclasses.dataclass(frozen=True)
+    class Idle(cj.Adapter):
+        def init(self, key, shape):
+            return {"a": jnp.zeros(shape.dim)}
+
+        def mlp_updat(self, params, tokens, grid, *, length=None, valid=None):
+            return params["a"], params
+
+    with pytest.raises(cj.InputError, match=r"adapter: found .*Idle\(\), expected one with a m"):
+        ViTConfig(adapter="test-idle")
+
+
+@pytest.mark.usefixtures("own_parts")
+def test_a_merge_that_is_another_layer_is_told() -> None:
+    @cj.register_adapter("test-half")
+    @dataclasses.dataclass(frozen=True)
+    class Half(LoraConfig):
+        def merge(self, params, name, layer):
+            weight = 0.5 * layer.weight + 0.5 * super().merge(params, name, layer).weight
+            return dataclasses.replace(layer, weight=weight)
+
+    backbone: Any = MODEL.backbone
+    config = dataclasses.replace(MODEL, backbone=dataclasses.replace(backbone, adapter=Half()))
+    params = cj.init_crisalad(jax.random.key(0), config)
+    params = jax.tree.map(lambda leaf: leaf + 0.1, params)
+    with pytest.raises(cj.InputError, match="test-half: found `merge` to make another layer qkv"):
+        cj.merge_adapters(cj.Model(params, config))
