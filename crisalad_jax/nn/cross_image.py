@@ -192,7 +192,7 @@ class CrossImageConfig(TransformerEncoder):
     """Whether the global token takes part too, cut into tokens of the clusters' width."""
 
 
-@CROSS_IMAGE.register("sage", tiny={**_TINY, "width": 96})
+@CROSS_IMAGE.register("sage-encoder", tiny={**_TINY, "width": 96})
 @dataclasses.dataclass(frozen=True)
 class SageCrossImageConfig(TransformerEncoder):
     """SAGE's transformer encoder (ICLR 2026), over a finished descriptor cut into tokens.

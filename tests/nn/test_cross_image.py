@@ -180,9 +180,9 @@ def test_the_width_of_pieces_divides_the_descriptor() -> None:
         cj.InputError, match=r"heads: found 16, expected a divisor of the 12 numbers"
     ):
         dataclasses.replace(SAGE, cross_image=SageCrossImageConfig(width=12))
-    published = cj.ModelConfig(cross_image="sage")
+    published = cj.ModelConfig(cross_image="sage-encoder")
     assert (published.descriptor_dim, published.sequence_dim) == (8448, 768)
-    tiny = cj.recipe("tiny", "scratch+cross_image:sage").model
+    tiny = cj.recipe("tiny", "scratch+sage-encoder").model
     assert tiny.descriptor_dim == 576
     assert not tiny.unit_length
     assert dataclasses.replace(tiny, projection=cj.ProjectionConfig(dim=8)).unit_length
