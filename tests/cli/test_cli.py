@@ -324,7 +324,7 @@ def few_places(city: pathlib.Path) -> pathlib.Path:
     ("damage", "words"),
     [
         (few_images, "found no place with at least 2 images; the largest has 1"),
-        (few_places, "found 2 places, expected places_per_batch 3"),
+        (few_places, "found 2 places of which sampler within-city makes no batch, expected"),
     ],
 )
 def test_bad_places(capfd, tmp_path, shared, city, damage, words):

@@ -51,7 +51,10 @@ def test_draws_are_of_different_lines_and_the_same_again(plant_faults):
 @pytest.mark.parametrize(
     ("module", "tests"),
     [
-        ("training/losses/pairwise.py", ["training/losses/test_losses.py"]),
+        (
+            "training/losses/pairwise.py",
+            ["training/losses/test_losses.py", "training/losses/test_divergence.py"],
+        ),
         ("utils/checksums.py", ["utils/test_checksums.py"]),
     ],
 )

@@ -18,7 +18,7 @@ from crisalad_jax.config.checks import check_types, require_range
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.part import parts_of
 from crisalad_jax.config.plugins import source_digest
-from crisalad_jax.config.short_repr import brief
+from crisalad_jax.config.short_repr import brief, with_field_docs
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.benchmark import leave_out_unreadable
 from crisalad_jax.data.images import OnBadImage
@@ -50,6 +50,7 @@ _VIEWS = 4
 """Largest number of images of a place in a batch, as in all recipes of the paper."""
 
 
+@with_field_docs
 @dataclasses.dataclass(frozen=True)
 class ComparisonConfig:
     """Everything that decides a comparison's results; `config.json` in its folder.

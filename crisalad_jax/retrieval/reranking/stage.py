@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from crisalad_jax.config.checks import choose
+from crisalad_jax.config.short_repr import with_field_docs
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.config import ModelConfig
@@ -67,6 +68,7 @@ _NUMBERS = 2**25
 """Largest size of the features that are scored together, in numbers: 64 MiB."""
 
 
+@with_field_docs
 @dataclasses.dataclass(frozen=True)
 class Reranking:
     """Which retrievals are re-ranked, by which method, with which model.

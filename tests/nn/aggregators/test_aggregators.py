@@ -43,7 +43,7 @@ def test_a_descriptor_is_the_global_token_then_the_local_ones(
     np.testing.assert_allclose(to_descriptor(tokens, aggregator), expected, atol=1e-7)
 
 
-DIMENSION_FIRST = {"boq", "conv-ap", "edtformer", "fol", "mixvpr", "salad"}
+DIMENSION_FIRST = {"boq", "conv-ap", "edtformer", "fol", "mixvpr", "sage", "salad"}
 """Whose authors' code flattens (dimension, token)."""
 
 

@@ -43,7 +43,7 @@ def test_tokens_are_unit_vectors_and_do_not_depend_on_the_order_of_patches() -> 
 
 def test_dropout_stands_before_relu_of_the_two_local_networks(monkeypatch) -> None:
     """The public order (linear, dropout, ReLU, linear), with a key for each network."""
-    import crisalad_jax.nn.aggregators.salad as module
+    import crisalad_jax.nn.layers as module
 
     calls = []
 
