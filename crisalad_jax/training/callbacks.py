@@ -3,6 +3,7 @@
 import csv
 import importlib
 import pathlib
+import secrets
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -203,7 +204,7 @@ class WandbCallback(Callback):
         """Start the run, or go on with that of this folder."""
         identity = out / "wandb-run"
         if not identity.exists():
-            identity.write_text(self._wandb.util.generate_id(), encoding="utf-8")
+            identity.write_text(secrets.token_hex(4), encoding="utf-8")
         options = {"dir": str(out), "id": identity.read_text(encoding="utf-8"), "resume": "allow"}
         self._wandb.init(name=out.absolute().name, config=to_plain(config), **options)
 
