@@ -57,15 +57,14 @@ class PlaceBatches:
                 places_per_batch=config.places_per_batch,
             )
             self.classes = tuple(len(group.names) for group in self._groups)
-        self._sampler, self._seed = config.sampler, config.seed
-        size = config.places_per_batch, config.images_per_place
-        self._drawing: Any = dict(zip(("places_per_batch", "images_per_place"), size, strict=True))
+        self._config = config
         self.mined: Drawn | None = None
         """The epoch that trains now, where it was drawn by descriptors; a run saves it."""
         if config.sampler.describes:
             config.sampler.check(places)
             steps = max(1, len(places.names) // config.places_per_batch)
-            self.mined = Drawn(np.array(-1, np.int32), np.zeros((steps, *size), np.int32))
+            shape = steps, config.places_per_batch, config.images_per_place
+            self.mined = Drawn(np.array(-1, np.int32), np.zeros(shape, np.int32))
         else:
             steps = None if grouping is None else grouping.steps
             steps = steps or max(len(self._draw(group, 0)) for group in self._groups)
@@ -90,7 +89,8 @@ class PlaceBatches:
             self._groups[0], step // self.steps_per_epoch, self.steps_per_epoch, describe
         )
         self.mined = Drawn(np.array(step, np.int32), chosen.astype(np.int32))
-        return f"drew {len(chosen)} batches by descriptors (sampler {self._sampler.part_name})"
+        sampler = self._config.sampler.part_name
+        return f"drew {len(chosen)} batches by descriptors (sampler {sampler})"
 
     def batches(self, step: int) -> Iterator[ImageBatch]:
         """Yield the batches from `step` to the end of its epoch; see `batches_of_groups`."""
@@ -103,8 +103,8 @@ class PlaceBatches:
         return batches_of_groups(
             places,
             chosen,
-            labels_of(places, self._sampler, chosen),
-            seed=(self._seed, epoch),
+            labels_of(places, self._config.sampler, chosen),
+            seed=(self._config.seed, epoch),
             start_step=start_step,
             **self._reading,
         )
@@ -116,5 +116,14 @@ class PlaceBatches:
         steps: int | None = None,
         describe: Describe | None = None,
     ) -> Int[np.ndarray, "steps places images"]:
-        drawing: Any = self._drawing | {"steps": steps, "describe": describe}
-        return epoch_batches(places, sampler=self._sampler, seed=self._seed, epoch=epoch, **drawing)
+        config = self._config
+        return epoch_batches(
+            places,
+            sampler=config.sampler,
+            places_per_batch=config.places_per_batch,
+            images_per_place=config.images_per_place,
+            seed=config.seed,
+            epoch=epoch,
+            steps=steps,
+            describe=describe,
+        )

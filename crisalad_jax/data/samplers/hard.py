@@ -26,7 +26,8 @@ class HardNegatives(Sampler):
         left = draw.generator.permutation(len(places.names))
         order = []
         while len(left):
-            similarity = draw.descriptors[left] @ draw.descriptors[left[0]]
+            # Of all places: to take out those that are left would copy their descriptors each time.
+            similarity = (draw.descriptors @ draw.descriptors[left[0]])[left]
             # A place whose image cannot be read is like no other.
             similarity = np.nan_to_num(similarity, nan=-np.inf)
             similarity[0] = np.inf

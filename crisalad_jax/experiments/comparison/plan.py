@@ -201,6 +201,8 @@ class Variant:
     places: Places | None = None
     """Training set, if it is trained here or has a vocabulary; it includes small places if its loss
     regroups the images."""
+    steps_per_epoch: int = 0
+    """Steps of an epoch of its training; 0 of a model from a file."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Everything that decides its model, as JSON values: digests stand for files and sets."""
 
@@ -371,12 +373,14 @@ def _fitted(config: ComparisonConfig, variants: list[Variant]) -> list[Variant]:
         if row is not None:
             training = row.changed(training, config.preset)
         places = read(cities=training.cities, min_images=training.min_images_of_place)
+        per_epoch = PlaceBatches(training, places).steps_per_epoch
         if not sets("optimiser.warmup-"):
-            per_epoch = PlaceBatches(training, places).steps_per_epoch
             steps = per_epoch * training.epochs
             optimiser = with_short_warmup(training.optimiser, steps, per_epoch)
             training = dataclasses.replace(training, optimiser=optimiser)
-        return dataclasses.replace(variant, training=training, places=places)
+        return dataclasses.replace(
+            variant, training=training, places=places, steps_per_epoch=per_epoch
+        )
 
     return [each if each.weights is not None else fit(each) for each in variants]
 

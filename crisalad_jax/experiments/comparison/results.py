@@ -32,7 +32,6 @@ from crisalad_jax.experiments.comparison.plan import (
 )
 from crisalad_jax.experiments.report.page import render
 from crisalad_jax.nn.model import parameter_shapes
-from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.run_files import checksum_of_benchmark
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.utils.errors import InputError, few
@@ -403,9 +402,8 @@ def _notes(prepared: Prepared, reference: Variant, speed: Mapping[str, Any]) -> 
     for variant in variants:
         training = variant.training
         if variant.trains:
-            assert variant.places is not None
-            steps = PlaceBatches(training, variant.places).steps_per_epoch
-            size = training.epochs, steps, training.places_per_batch, training.images_per_place
+            batch = training.places_per_batch, training.images_per_place
+            size = training.epochs, variant.steps_per_epoch, *batch
             sizes.setdefault(size, {})[variant.labels[0]] = None
     context = {
         "config": prepared.config,
