@@ -50,7 +50,8 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     """Components that `crisalad pca` fitted, for shorter descriptors."""
     rerank: str | None = None
     """NAME:TOPK puts the first TOPK retrievals in a new order by local features: patch-netvlad,
-    patch-netvlad-ransac or patch-netvlad-sum, of a model with NetVLAD, selavpr or transvpr
+    patch-netvlad-ransac or patch-netvlad-sum, of a model with NetVLAD; fol, pair-vpr,
+    selavpr or transvpr, of one with that aggregator; sinkhorn-divergence, of any local tokens
     (docs/methods.md). Adds a row to each of the table."""
     rerank_weights: pathlib.Path | None = None
     """Model that makes these features, as --weights; by default the first stage's."""

@@ -13,6 +13,7 @@ from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig,
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.gem import CosPlaceConfig, GemConfig, GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.aggregators.pair_vpr import PairVprConfig
 from crisalad_jax.nn.aggregators.queries import BoqConfig, EdtFormerConfig
 from crisalad_jax.nn.aggregators.sage import SageConfig
 from crisalad_jax.nn.aggregators.salad import FolConfig
@@ -61,6 +62,7 @@ PARTS: dict[str, Aggregator] = {
     "vlad-buff": VladBuffConfig(clusters=4, reduced=12),
     "selavpr": SelaVprConfig(hidden=8, local=4),
     "sage": SageConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16, weighting_hidden=8),
+    "pair-vpr": PairVprConfig(dim=16, width=16, layers=2, hidden=8, positions=16),
     "fol": FolConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16, local_hidden=8, local=4),
 }
 RELATED = CrossImageConfig(layers=1, heads=2, feedforward=16, dropout=0.0)
