@@ -277,4 +277,4 @@ def describe_single(model: Model, paths: Sequence[pathlib.Path]) -> np.ndarray:
     """Describe images independently, by tokens and their grouping, in batches of `BATCH`."""
     describer = describer_of(model)
     tokens = TokenSet(describer, paths, Reading(batch_size=BATCH, quiet=True))
-    return tokens.describe("single")[0]
+    return tokens.describe(tokens.batches("single", None))
