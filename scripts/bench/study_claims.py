@@ -86,8 +86,8 @@ def claims() -> Study:
     device = f" on one {measured['device']}" if measured else ""
     caption = (
         "R@1 in percent, as printed. \\* VPR-Bench's lists of Nordland; † another split, see "
-        f'"measured". Speed: images described a second{device}, as a multiple of MegaLoc\'s, each '
-        "at its own image size, in bfloat16. The last column follows `crisalad evaluate --data SET`."
+        f'"measured". Speed: images described a second{device}, as a multiple of MegaLoc\'s, at '
+        "its own image size, in bfloat16. The last column follows `crisalad evaluate --data SET`."
     )
     return Study(Table((*header, "speed", "reproduces"), found, caption, 1), found)
 
