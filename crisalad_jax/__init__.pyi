@@ -8,6 +8,7 @@ from .checkpoints.export import write_export as write_export
 from .checkpoints.load import load as load
 from .checkpoints.public import convert as convert
 from .checkpoints.public import read_backbone as read_backbone
+from .checkpoints.published import register_published as register_published
 from .checkpoints.weights import save_weights as save_weights
 from .config.classes import ClassesConfig as ClassesConfig
 from .config.plugins import load_plugin as load_plugin

@@ -22,6 +22,8 @@ import jaxtyping
 import numpy as np
 import pytest
 
+from crisalad_jax.checkpoints.formats import families
+from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config import plugins
 from crisalad_jax.config.io import to_plain
@@ -259,7 +261,12 @@ def own_parts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
             monkeypatch.setattr(registry, name, dict(getattr(registry, name)))
     monkeypatch.setattr(plugins, "_LOADED", {})
     before = set(sys.modules)
+    named = (families.FORMATS, families.HEADS, families.TABLES, PUBLISHED)
+    copies = [dict(each) for each in named]
     yield
+    for each, copy in zip(named, copies, strict=True):
+        each.clear()
+        each.update(copy)
     for name in set(sys.modules) - before:
         if name.startswith("crisalad_plugin_"):
             del sys.modules[name]

@@ -93,7 +93,7 @@ class Runtime:
         """
         if not self.attends or self.grouping == "any":
             return
-        wanted = {kind for grouping in groupings for kind in grouping.partition("@")[0].split("/")}
+        wanted = {kind for grouping in groupings for kind in grouping.split("/")}
         if self.grouping == "batch" or wanted != {"single"}:
             raise InputError(
                 f"{self.folder}: found a program of grouping {self.grouping}, expected any, for "
