@@ -12,6 +12,7 @@ import safetensors.numpy
 import crisalad_jax as cj
 from crisalad_jax.checkpoints.formats import FORMATS
 from crisalad_jax.checkpoints.published import PUBLISHED
+from crisalad_jax.cli import main
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
 from crisalad_jax.utils.errors import InputError
 
@@ -139,3 +140,8 @@ def test_what_is_wrong_registers_nothing(text, words):
     with pytest.raises(InputError, match=f"^register_published: {words}"):
         cj.register_published(text)
     assert before == (FORMATS, PUBLISHED)
+
+
+def test_the_command_line_lists_it(tmp_path, capsys):
+    assert main(["models", "town-vlad", "--plugin", str(plugin(tmp_path))]) == 0
+    assert "Town et al. 2026" in capsys.readouterr().out
