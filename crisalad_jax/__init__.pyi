@@ -81,6 +81,7 @@ from .nn.model import transport_masses as transport_masses
 from .nn.model import valid_mask as valid_mask
 from .nn.projection import ProjectionConfig as ProjectionConfig
 from .nn.tokens import Tokens as Tokens
+from .retrieval.bits import pack_bits as pack_bits
 from .retrieval.describe import describe_files as describe_files
 from .retrieval.describe import describe_images as describe_images
 from .retrieval.describe import prepare_image as prepare_image
