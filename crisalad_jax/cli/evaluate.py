@@ -53,8 +53,8 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     """Components that `crisalad pca` fitted, for shorter descriptors."""
     rerank: str | None = None
     """NAME:TOPK puts the first TOPK retrievals in a new order by local features: patch-netvlad,
-    patch-netvlad-ransac or patch-netvlad-sum, of a model with NetVLAD, selavpr or transvpr
-    (docs/methods.md). Adds a row to each of the table."""
+    patch-netvlad-ransac or patch-netvlad-sum, of a model with NetVLAD, selavpr, selavprpp or
+    transvpr (docs/methods.md). Adds a row to each of the table."""
     rerank_weights: pathlib.Path | None = None
     """Model that makes these features, as --weights; by default the first stage's."""
     precision: float | None = None

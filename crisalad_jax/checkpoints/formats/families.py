@@ -84,7 +84,8 @@ class _Reference(Format):
         """Return the names of any such backbone."""
         found = parts_of(config)
         names = {"vit": "dinov2", "resnet": "resnet-numbers", "vgg": "vgg-numbers"}
-        name = "dinov2-side" if found["adapter"] == "side" else names[found["backbone"]]
+        sides = {"side": "dinov2-side", "side-multi-resolution": "dinov2-sides"}
+        name = sides.get(found["adapter"], names[found["backbone"]])
         return _BACKBONES[name]._replace(prefix="backbone.")
 
     def head_of(self, config: ModelConfig) -> Head:
