@@ -32,6 +32,7 @@ _COMMANDS = {
     "train": "Train on places, each with several images; go on with the run that is there.",
     "convert": "Convert a public torch checkpoint to a file of this package, or back.",
     "models": "List the models that others published, which --weights takes by name.",
+    "data": "List public data sets, download them, and say what a folder of images is.",
     "evaluate": "Print what a model recalls of an evaluation set under each grouping.",
     "compare": "Train or load methods, evaluate them alike, and table that (Table 1).",
     "ablate": "Train CriSALAD with one part changed at a time (Tables 2 and 3).",
