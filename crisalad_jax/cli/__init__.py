@@ -43,6 +43,7 @@ _COMMANDS = {
     "serve": "Answer over HTTP, and in a browser, where photographs were taken.",
     "vocabulary": "Build the vocabulary of AnyLoc or NetVLAD from a folder of images.",
     "export": "Write a model as a program that needs nothing of this package.",
+    "publish": "Write a run's model with a model card, to a folder or to Hugging Face's hub.",
     "pca": "Fit principal components to descriptors, for shorter ones.",
     "info": "Print what a model is made of: parameters, what trains, multiply-accumulates.",
     "completion": "Print a script that lets bash, zsh or fish complete what is typed.",

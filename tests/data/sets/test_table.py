@@ -1,6 +1,7 @@
 """The table of public data sets: its fields, and commands that parse."""
 
 import importlib
+import pathlib
 import re
 import shlex
 
@@ -15,6 +16,7 @@ CITIES = (
     "Bangkok BuenosAires LosAngeles MexicoCity OSL Rome Barcelona Chicago Madrid Miami Phoenix TRT "
     "Boston Lisbon Medellin Minneapolis PRG WashingtonDC Brussels London Melbourne Osaka PRS"
 )
+ROOT = pathlib.Path(crisalad_jax.cli.__file__).parents[2]
 ADDRESSES = {
     "http": r"https?://.+",
     "rsync": r"rsync://.+",
@@ -48,6 +50,15 @@ def test_the_commands_of_a_set_parse(name):
         assert program == "crisalad"
         module = importlib.import_module(f"crisalad_jax.cli.{verb}")
         assert crisalad_jax.cli._parse(verb, module, given) is not None
+
+
+def test_the_page_has_a_row_of_every_set():
+    page = (ROOT / "docs" / "datasets.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `([a-z0-9-]+)` \| .* \| (.*) \|$", page, re.MULTILINE))
+    for name, published in SETS.items():
+        for part in published.parts:
+            for count in (part.database, part.queries):
+                assert count is None or f"{count:,}" in rows[name]
 
 
 def test_the_cities_of_gsv_cities():
