@@ -5,6 +5,7 @@ from typing import Any
 
 from crisalad_jax.checkpoints.cache import is_cached
 from crisalad_jax.checkpoints.published import GITHUB, Published
+from crisalad_jax.data.sets import CheckedPart, PublishedSet
 from crisalad_jax.evaluation.operating_point import OperatingPoint
 from crisalad_jax.evaluation.results import GroupingResult, Scores, percent
 from crisalad_jax.experiments.tables import NOTHING, Cell, Table
@@ -131,6 +132,36 @@ def models_table(models: Sequence[Published]) -> Table:
     ]
     headers = ["name", "licence", "images", "GitHub", "descriptor", "parameters"]
     return Table(headers, [list(map(Cell, row)) for row in rows], labels=4)
+
+
+def sets_table(sets: Sequence[PublishedSet]) -> Table:
+    """Make a table of public data sets."""
+    rows = []
+    for each in sets:
+        counts = [
+            " + ".join(NOTHING if count is None else f"{count:,}" for count in numbers)
+            for part in each.parts
+            if any(numbers := (part.database, part.queries))
+        ]
+        size = "not known" if each.gigabytes is None else f"{each.gigabytes} GB"
+        fetched = "fetch" if each.is_fetched else "by hand"
+        licence = each.licence or "not known"
+        rows.append([each.name, each.title, fetched, each.host, licence, size, "; ".join(counts)])
+    headers = ["name", "set", "how", "where", "licence", "size", "database + queries"]
+    return Table(headers, [list(map(Cell, row)) for row in rows], labels=5)
+
+
+def checked_table(parts: Sequence[CheckedPart]) -> Table:
+    """Make a table of what a folder is, a row for each part."""
+    rows = []
+    for part in parts:
+        counts = [
+            NOTHING if count is None else f"{count:,}" for count in (part.database, part.queries)
+        ]
+        verdict = "does not match" if part.problem else "as published" if part.known else "own data"
+        rows.append([Cell(each) for each in (part.name, part.known or NOTHING, verdict, *counts)])
+    headers = ["part", "published as", "verdict", "images", "queries or places"]
+    return Table(headers, rows, labels=2 + 1)
 
 
 _MOST = 10
