@@ -129,6 +129,10 @@ def _zeros(shape: Callable[[Any], tuple[int, ...]], form: Form = SAME) -> Extra:
     return Extra(lambda config: np.zeros(shape(config), np.float32), form)
 
 
+def _width(config: Any) -> tuple[int, ...]:
+    return (config.backbone.dim,)
+
+
 def _mask_shape(config: Any) -> tuple[int, ...]:
     return (1, config.backbone.dim)
 
@@ -148,6 +152,8 @@ EXTRAS = {
     "extra-dustbin": _zeros(lambda config: ())._replace(optional=True),
     "extra-levels": _zeros(lambda config: (config.aggregator.levels,)),
     "extra-mask": _zeros(_mask_shape),
+    "extra-ones": Extra(lambda config: np.ones(_width(config), np.float32)),
+    "extra-zeros": _zeros(_width),
     "extra-first-mask": _zeros(_mask_shape, FIRST),
     "extra-periods": Extra(_published_periods),
     # SAGE's unused branch: two layers, as wide as published.
@@ -173,12 +179,13 @@ ABSENT = {
 """What files lack, by name."""
 
 
-def read_tables(texts: Mapping[str, str]) -> dict[str, Rows]:
+def read_tables(texts: Mapping[str, str], known: Mapping[str, Rows]) -> dict[str, Rows]:
     """Read tables that have rows of one another, the later ones of the earlier ones."""
     bias = Row(("bias",), ("bias",), SAME)
     tables: dict[str, Rows] = {
         name: (Row(("weight",), ("weight",), form), bias) for name, form in _LAYERS.items()
     }
+    tables |= known
     for name, text in texts.items():
         tables[name] = read_table(text, tables)
     return tables
