@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import statistics
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Int64
@@ -18,6 +18,7 @@ from crisalad_jax.evaluation.leakage import SamePlace, by_truth, near, same_plac
 from crisalad_jax.evaluation.operating_point import check_precision
 from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, summarise
 from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.bits import check_packable, pack_bits, sign_vectors
 from crisalad_jax.retrieval.chunks import Descriptors
 from crisalad_jax.retrieval.describe import TokenSet
 from crisalad_jax.retrieval.describer import Describer, describer_of
@@ -43,6 +44,7 @@ def evaluate(
     seed: int = 0,
     seeds: int = 3,
     pca: Pca | None = None,
+    dtype: Literal["float32", "bits"] = "float32",
     observe: Observe | None = None,
     rerank: Reranking | None = None,
     precision: float | None = None,
@@ -63,7 +65,10 @@ def evaluate(
         seed: draws the first shuffle: the database's, and with the next seed the queries'.
         seeds: shuffles, each from the second seed after the one before.
         pca: shortens the descriptors, fitted to images of other places.
-        observe: is given the descriptors of each grouping, of its first seed.
+        dtype: what descriptors are compared as; "bits" are their signs (`pack_bits`), compared by
+            the Hamming distance.
+        observe: is given the descriptors of each grouping, of its first seed; of bits, unit vectors
+            of the signs.
         rerank: a second stage; each grouping has a result without and then one with it.
         precision: asks each result for its `operating_point`: the similarity from which first
             retrievals are correct with this precision, and the recall that is left.
@@ -75,7 +80,8 @@ def evaluate(
         A result for each grouping, and with `rerank` a second one.
 
     Raises:
-        InputError: parameters of another configuration, no ground truth, an image cannot be read
+        InputError: parameters of another configuration, bits of a length that is not a multiple of
+            8, no ground truth, an image cannot be read
             or none of a side, components that are not for this model or make no unit vectors, such
             a precision, or what `parse_groupings`, `Reranking.check` and `Reranker` raise.
 
@@ -97,7 +103,10 @@ def evaluate(
     parsed = check_evaluation(groupings, seed=seed, seeds=seeds, precision=precision)
     describer = describer_of(model, groupings)
     config = describer.config
-    _, is_unit = shortened(pca, describer, "model")
+    length, is_unit = shortened(pca, describer, "model")
+    is_bits = dtype == "bits"
+    if is_bits:
+        check_packable(length, "dtype")
     if rerank is not None:
         rerank.check(config, len(benchmark.database))
         if rerank.model is None:
@@ -131,7 +140,7 @@ def evaluate(
             drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
             name = str(grouping) if config.cross_image.attends else ANY
             observer = observe and functools.partial(observe, name)
-            ranked = _rank(sides, grouping, drawn, k, observer, is_unit=is_unit)
+            ranked = _rank(sides, grouping, drawn, k, observer, unit=is_unit, bits=is_bits)
             rankings, (database_share, query_share) = ranked
             for label, stage in stages.items():
                 result = summarise(
@@ -210,19 +219,20 @@ def _rank(
     k: int,
     observe: Callable[[Descriptors, Descriptors], None] | None,
     *,
-    is_unit: bool,
+    unit: bool,
+    bits: bool,
 ) -> tuple[dict[int, Neighbours], list[float | None]]:
     """Rank the k nearest neighbours for each seed; only shuffled sides are described anew.
 
     `observe` is given the descriptors of the first seed. Those that are not unit vectors are ranked
-    by Euclidean distance.
+    by Euclidean distance, and bits by the Hamming distance.
 
     Returns:
         The rankings by seed, and both sides' share of same-place images: the mean over the seeds.
     """
 
     def compare(database: Descriptors, queries: Descriptors) -> Neighbours:
-        if not is_unit:
+        if not unit and not bits:
             database, queries = to_unit_vectors(database, queries)
         return search(database, queries, k=k)
 
@@ -234,9 +244,11 @@ def _rank(
         for number, (side, kind) in enumerate(zip(sides, kinds, strict=True)):
             if kind == "shuffled" or seed == seeds[0]:
                 descriptors.pop(number, None)  # makes room
-                descriptors[number], share = side.describe(kind, seed)
+                found, share = side.describe(kind, seed)
+                descriptors[number] = pack_bits(found) if bits else found
                 shares[number].extend([] if share is None else [share])
         if observe is not None and seed == seeds[0]:
-            observe(descriptors[0], descriptors[1])
+            pair = descriptors[0], descriptors[1]
+            observe(*(map(sign_vectors, pair) if bits else pair))
         rankings[seed] = compare(descriptors[0], descriptors[1])
     return rankings, [statistics.fmean(each) if each else None for each in shares]
