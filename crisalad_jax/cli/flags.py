@@ -50,7 +50,7 @@ class PluginFlag:
     """Where custom parts come from."""
 
     plugin: tuple[str, ...] = ()
-    """Files FILE.py or modules that register custom parts; their code is run."""
+    """Files FILE.py or modules that register custom parts or models; their code is run."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

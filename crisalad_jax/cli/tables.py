@@ -15,12 +15,12 @@ from crisalad_jax.utils.output import printable
 
 
 def grouping_table(results: Sequence[GroupingResult]) -> Table:
-    """Make a table of results in percent, in the terminal about 97 columns wide.
+    """Make a table of results in percent, in the terminal about 85 columns wide.
 
     Each recall is above its interval, and a mean over shuffles before their spread.
     """
     recall_names = [f"R@{k}\n95 %" for k in results[0].recalls]
-    names = ("same place\nq / db", *recall_names, "AP", "R at\n100 % P")
+    names = (*recall_names, "AP", "R at\n100 % P")
     rows = []
     for result in results:
         spread = result.spread or _NO_SPREAD
@@ -35,13 +35,37 @@ def grouping_table(results: Sequence[GroupingResult]) -> Table:
         rows.append(
             [
                 Cell(result.grouping, f"+ {result.rerank}" if result.rerank else ""),
-                Cell(f"{_or_dash(result.query_share)} / {_or_dash(result.database_share)}"),
                 *recall_cells,
                 Cell(_or_dash(result.average_precision), _spread(spread.average_precision)),
                 Cell(_or_dash(full), _spread(spread.recall_at_full_precision)),
             ]
         )
     return Table(["queries/\ndatabase", *names], rows, stacked=True)
+
+
+def leakage_table(results: Sequence[GroupingResult]) -> Table:
+    """Make a table of what groupings give over images described alone, and of what they leak."""
+    rows = []
+    for result in results:
+        gain = result.over_single
+        points = Cell(NOTHING)
+        if gain is not None:
+            points = Cell(_points(gain.mean), " to ".join(map(_points, gain.interval)))
+        rows.append(
+            [
+                Cell(result.grouping, f"+ {result.rerank}" if result.rerank else ""),
+                Cell(_or_dash(result.recalls.get(1))),
+                points,
+                Cell(f"{_or_dash(result.query_share)} / {_or_dash(result.database_share)}"),
+                Cell(_or_dash(result.mirrored_share)),
+            ]
+        )
+    names = ("R@1", "points over\nsingle, 95 %", "same place\nq / db", "mirrored")
+    return Table(["queries/\ndatabase", *names], rows, stacked=True)
+
+
+def _points(difference: float) -> str:
+    return f"{100 * difference:+.1f}"
 
 
 def points_table(points: Mapping[str, OperatingPoint]) -> Table:
