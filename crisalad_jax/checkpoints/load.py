@@ -171,6 +171,8 @@ def open_model(
     """
     file = find_weights(weights, engine=engine, quiet=quiet)
     short = f"{file.parent.name}/{file.name}" if file.parent.name else file.name
+    if is_hub(weights):  # its cache has folders named by commits
+        short = str(parse_hub(weights))
     name = starter.named(file) if file in starter.FILES.values() else short
     # Imported here: an engine's model is opened without JAX, and JAX's without an engine.
     if engine == "jax":

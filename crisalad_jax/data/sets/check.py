@@ -7,8 +7,6 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.benchmark import readable_images
@@ -206,9 +204,9 @@ def _named(folder: pathlib.Path) -> PublishedSet | None:
 
 def _unreadable(paths: Sequence[pathlib.Path], *, quiet: bool) -> list[str]:
     """Decode all images, and say which cannot be read."""
-    wrong = np.flatnonzero(~readable_images(paths, quiet=quiet))
-    shown = few([str(paths[each]) for each in wrong])
-    return [f"found {wrong.size} unreadable images: {shown}"] if wrong.size else []
+    readable = readable_images(paths, quiet=quiet).tolist()
+    wrong = [str(path) for path, whole in zip(paths, readable, strict=True) if not whole]
+    return [f"found {len(wrong)} unreadable images: {few(wrong)}"] if wrong else []
 
 
 def _checked_places(
