@@ -27,6 +27,7 @@ CHANGED: tuple[tuple[str, str, float], ...] = (
     ("netvlad", r"(pool\.centroids|netvlad\.centers)$", 0.4),
     ("netvlad", r"(whiten|WPCA\.0)\.bias$", 0.02),
     ("^sage", r"encoder\.layers\.\d\.self_attn\.(in_proj_bias|out_proj\.bias)$", 0.02),
+    ("^selavprpp", r"linear[24]\.bias$", 0.05),
     ("^sfrs", r"base_model\.base\.\d+\.weight$", 2**0.5),
     ("^sfrs", r"net_vlad\.conv\.weight$", 100.0),
     ("^sfrs", r"net_vlad\.centroids$", 0.4),
@@ -43,7 +44,10 @@ CHANGED: tuple[tuple[str, str, float], ...] = (
 a descriptor depends on the image more than on a bias."""
 POSITIVE = ("^apgem", r"^explained_variance_$", 0.005)
 """As `CHANGED`, of the size of the draws and a little more: variances."""
-FIXED = {r"(aggregation\.1|adpool)\.p$": 3.0, r"aggregator\.ab_params$": (8.0, 7.0, 1.0)}
+FIXED = {
+    r"(aggregation(_hashing)?\.1|adpool)\.p$": 3.0,
+    r"aggregator\.ab_params$": (8.0, 7.0, 1.0),
+}
 """Weights that are no draws, by a pattern of names: GeM's exponent, VLAD-BuFF's constants."""
 
 

@@ -54,6 +54,11 @@ STORED = {
     "sage-vitb14": "zoo/layouts/sage_vitb14",
     "sage-vitl14": "zoo/layouts/sage_vitl14",
     "sage-vitl14-crossimage": "zoo/layouts/sage_vitl14_crossimage",
+    **{
+        f"selavprpp-vit{size[0]}14{kind}": f"zoo/layouts/selavprpp_{size}{kind.replace('-', '_')}"
+        for size in ("base", "large")
+        for kind in ("", "-rerank")
+    },
     "sfrs": "zoo/layouts/sfrs_vgg16_pca4096",
     "patch-netvlad-mapillary-4096": "zoo/layouts/patchnetvlad_mapillary_WPCA4096",
     "patch-netvlad-pittsburgh-512": "zoo/layouts/patchnetvlad_pittsburgh_WPCA512",
@@ -178,6 +183,9 @@ PREPROCESSING: dict[str, tuple[Any, ...]] = {
     "cricavpr": ((224, 224), "fixed", *_PLAIN),
     "selavpr": ((224, 224), "fixed", *_PLAIN),
     "fol": ((504, 504), "fixed", *_PLAIN),
+    # Lu-Feng/SelaVPRplusplus names no antialias and pins no torchvision: today's.
+    "selavprpp": ((322, 322), "fixed", *_WRAPPER),
+    "selavprpp-hash": ((322, 322), "fixed", *_WRAPPER),
     # chenshunpeng/SAGE (torchvision 0.16): tensors, not antialiased.
     "sage": ((322, 322), "fixed", *_PLAIN),
     # GaoShuang98/DINO-Mix, eval_files (torchvision 0.14.1), and TransVPR's code of 2022: the same.

@@ -167,12 +167,13 @@ ABSENT = {
 """What files lack, by name."""
 
 
-def read_tables(texts: Mapping[str, str]) -> dict[str, Rows]:
+def read_tables(texts: Mapping[str, str], known: Mapping[str, Rows]) -> dict[str, Rows]:
     """Read tables that have rows of one another, the later ones of the earlier ones."""
     bias = Row(("bias",), ("bias",), SAME)
     tables: dict[str, Rows] = {
         name: (Row(("weight",), ("weight",), form), bias) for name, form in _LAYERS.items()
     }
+    tables |= known
     for name, text in texts.items():
         tables[name] = read_table(text, tables)
     return tables

@@ -156,7 +156,11 @@ def _infer_adapter(read: Reader, width: int) -> Adapter:
         return ADAPTERS.make("none")
     name = has[0]
     fields: dict[str, Any] = {"bottleneck": read.size(f"{names[name]}.D_fc1.weight", 0) / width}
-    if name == "side":
+    if read.has("adapters.0.branch1.conv.weight"):
+        name, last = "side-multi-resolution", read.count("adapters.")
+        fields["last"] = last if last < read.count("blocks.") else None
+        fields["paths"] = 2 if read.has("adapters_hashing.0.D_fc1.weight") else 1
+    elif name == "side":
         fields["alpha"] = _SIDE_ALPHA
     elif read.has(f"{in_block}.branch1.conv.weight"):
         name = "multi-resolution"
