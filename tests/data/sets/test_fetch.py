@@ -225,6 +225,10 @@ def test_rsync_is_asked_for_a_folder(monkeypatch, tmp_path):
     (tmp_path / "remote" / "map.png").write_bytes(b"")
     to = fetch_set("tiny", tmp_path / "to", quiet=True)
     assert sorted(os.listdir(to)) == ["images", "map.png"]
+    (tmp_path / "remote" / "map.png").unlink()
+    (tmp_path / "remote" / "images" / "test" / "database").mkdir(parents=True)
+    to = fetch_set("tiny", tmp_path / "bare", quiet=True)
+    assert os.listdir(to) == ["images"]  # which is the set's, not a folder around it
 
 
 def test_what_cannot_begin_writes_nothing(pairs, server, monkeypatch, tmp_path):
