@@ -19,11 +19,10 @@ from crisalad_jax.config.checks import require
 from crisalad_jax.config.io import differences, read_config, to_plain
 from crisalad_jax.config.plugins import changed_sources
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad, Model
 from crisalad_jax.training import distributed
-from crisalad_jax.training.batches import Drawn
+from crisalad_jax.training.batches import Drawn, TrainingSet, sets_of
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog
 from crisalad_jax.training.mining import Mined
@@ -269,8 +268,10 @@ def check_run(out: pathlib.Path, config: TrainConfig) -> bool:
     return existing.epochs < epochs
 
 
-def checksum_of_places(places: Places | QuerySet) -> int:
+def checksum_of_places(places: TrainingSet) -> int:
     """Compute the CRC of all images' names, and of their places or of the queries' positives."""
+    if isinstance(places, Mapping):
+        return checksum(map(checksum_of_places, sets_of(places)))
     if isinstance(places, QuerySet):
         names = (pathlib.Path(file).name for file in places.files)
         return checksum([_text(names), places.queries, *places.positives, *places.near])
