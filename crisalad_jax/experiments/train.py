@@ -14,7 +14,9 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.distributed import is_primary
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import FitResult, fit
+from crisalad_jax.training.run_files import write_data
 from crisalad_jax.training.start import read_inputs
+from crisalad_jax.utils.files import real_path
 
 Path = str | os.PathLike[str]
 
@@ -126,4 +128,6 @@ def train(
     if is_primary() and result.steps:
         out = pathlib.Path(out)
         save_chart(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
+        names = [real_path(pathlib.Path(root)).name for root in roots.values()]
+        write_data(out, ", ".join(names), places, benchmark)
     return result

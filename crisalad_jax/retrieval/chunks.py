@@ -17,6 +17,8 @@ Queries = Float32[np.ndarray, "q d"]
 # Descriptors may arrive as float16, whose unit vectors are off by up to 1e-3.
 UNIT_TOLERANCE = 1e-2
 WIDE = np.dtype(np.float32)
+BITS = np.dtype(np.uint8)
+"""Type of packed bits (`retrieval.bits`), which no other descriptors have."""
 _NARROW = (np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
 _CHECKED = 4096
 """Number of rows that are checked at a time."""
@@ -37,6 +39,8 @@ def as_rows(array: np.ndarray, name: str, length: int | None = None) -> Descript
     array = np.asanyarray(array)
     if array.dtype == np.dtype("V2"):
         array = array.view(ml_dtypes.bfloat16)
+    if array.dtype == BITS:
+        raise InputError(f"{name}: found packed bits (uint8), expected descriptors of real numbers")
     if array.dtype.kind in "cOSUMm" or array.dtype.type is np.void:
         raise InputError(f"{name}: found numbers of type {array.dtype}, expected real ones")
     if array.ndim != 2 or 0 in array.shape or length not in (None, array.shape[1]):

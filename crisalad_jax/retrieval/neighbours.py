@@ -186,6 +186,19 @@ def nearest(
     return Neighbours(indices, similarities)
 
 
+def best_products(products: Generator[Products, None, None], queries: int, k: int) -> Neighbours:
+    """Find the k largest products of each query, which are exact; of equal ones the lower indices.
+
+    Args:
+        products: of all queries and at least k rows, in the order of the rows.
+        queries: number of queries.
+        k: neighbours per query.
+    """
+    found, _ = _largest(products, np.full(queries, _LEAST, np.float32), k)
+    best = _first(found, k)
+    return Neighbours(best.index.reshape(-1, k), best.value.reshape(-1, k))
+
+
 def _largest(
     products: Generator[Products, None, None],
     least: Float32[np.ndarray, " q"],

@@ -15,7 +15,9 @@ from jaxtyping import Array, Float, Float32, Int32
 
 from crisalad_jax.config.checks import check_count
 from crisalad_jax.data.loader import one_ahead
+from crisalad_jax.retrieval.bits import Bits, search_bits
 from crisalad_jax.retrieval.chunks import (
+    BITS,
     Block,
     Descriptors,
     Queries,
@@ -33,8 +35,8 @@ from crisalad_jax.utils.target import target
 
 
 def search(
-    database: Descriptors,
-    queries: Float[np.ndarray, "q d"],
+    database: Descriptors | Bits,
+    queries: Float[np.ndarray, "q d"] | Bits,
     k: int,
     *,
     chunk: int = 4096,
@@ -52,11 +54,14 @@ def search(
     candidate's final similarity is summed in float64 and rounded to float32: the same bits whatever
     the chunk and the devices. Equal similarities are ordered by database index, lower first.
 
+    Packed bits are compared by their Hamming distance, by numpy. Their similarity is 1 - 2 h / d,
+    where h of the d bits differ: the cosine of the vectors of signs.
+
     Args:
         database: unit descriptors of the n database images, in float32, float16 or bfloat16 (which
             a .npy file holds as two bytes without a type, "V2"), or other numbers that become
-            float32.
-        queries: unit descriptors of the q queries, alike.
+            float32; or bits of `pack_bits`.
+        queries: unit descriptors of the q queries, or their bits.
         k: neighbours per query; a database of fewer images gives all of them, min(k, n).
         chunk: database rows compared at a time, rounded up so that devices share alike.
         quiet: no progress bar.
@@ -66,7 +71,7 @@ def search(
 
     Raises:
         InputError: an array that is empty, no matrix, or holds a row that is not finite or not of
-            unit length; descriptors of two lengths; k or chunk below 1.
+            unit length; descriptors of two lengths; bits on one side alone; k or chunk below 1.
 
     Example:
         >>> import numpy as np
@@ -75,6 +80,8 @@ def search(
     """
     for name, value in (("k", k), ("chunk", chunk)):
         check_count(name, value)
+    if BITS in (np.asanyarray(side).dtype for side in (database, queries)):
+        return search_bits(database, queries, k)
     database, queries = as_sides(database, queries)
     queries = as_unit_rows(queries, "queries")
     count, on_host = len(database), target().platform == "cpu"

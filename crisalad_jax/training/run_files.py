@@ -35,6 +35,9 @@ from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remov
 SAVE_SECONDS = 300
 """Longest time between saved states; validations and the end of a run save too."""
 
+DATA = "data.json"
+"""Name of what a run records of its data (`write_data`)."""
+
 
 class RunState(NamedTuple):
     """The arrays of a run."""
@@ -266,6 +269,30 @@ def check_run(out: pathlib.Path, config: TrainConfig) -> bool:
         "it, or another folder",
     )
     return existing.epochs < epochs
+
+
+def write_data(
+    out: pathlib.Path, name: str, places: TrainingSet, benchmark: Benchmark | None
+) -> None:
+    """Record in a run's folder what it was trained and validated on, for a model card.
+
+    Args:
+        out: the folder.
+        name: of the training data.
+        places: the training data.
+        benchmark: the validation set, if there is one.
+    """
+    counts = {"places": 0, "queries": 0, "images": 0}
+    for each in sets_of(places):
+        kind = "queries" if isinstance(each, QuerySet) else "places"
+        counts[kind] += len(each.queries if isinstance(each, QuerySet) else each.names)
+        counts["images"] += len(each.files)
+    validation = None
+    if benchmark is not None:
+        sides = {"database": len(benchmark.database), "queries": len(benchmark.queries)}
+        validation = {"name": benchmark.name, **sides}
+    training = {"name": name} | {what: count for what, count in counts.items() if count}
+    write_json(out / DATA, {"training": training, "validation": validation})
 
 
 def checksum_of_places(places: TrainingSet) -> int:

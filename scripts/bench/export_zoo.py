@@ -30,6 +30,7 @@ MODELS = (
     *("mixvpr-4096", "conv-ap-4096", "cosplace-vgg16-512", "cosplace-resnet18-512"),
     *("eigenplaces-resnet50-2048", "netvlad-nanne", "netvlad-hloc", "patch-netvlad-mapillary-4096"),
     *("selavpr-msls", "transvpr-msls", "supervlad", "supervlad-crossimage", "supervlad-1-cluster"),
+    *("selavprpp-vitb14", "selavprpp-vitb14-rerank"),
     *("edtformer", "image", "dino-mix", "vlad-buff-4096", "vlad-buff-8192", "fol-base"),
     *("salad-indoor-gb1-10-25", "dinov2-vits14", "dinov2-vitb14-reg4", "dinov3-vits16"),
     *("dinov3-vits16plus", "anyloc-indoor"),

@@ -15,7 +15,7 @@ from crisalad_jax.checkpoints.formats import (
     to_state,
 )
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.adapters.bottleneck import DepthwiseConfig
+from crisalad_jax.nn.adapters.bottleneck import DepthwiseConfig, SideMultiResolutionConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
@@ -78,6 +78,9 @@ BACKBONES = {
     "multi-resolution": {"adapter": "multi-resolution"},
     "serial and parallel": {"adapter": "serial-parallel"},
     "side": {"adapter": "side"},
+    "two sides of the last block": {
+        "adapter": SideMultiResolutionConfig(last=1, paths=2),
+    },
     "bias of the up-projection": {"adapter": DepthwiseConfig(bias="up")},
 }
 MODELS = {

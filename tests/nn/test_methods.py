@@ -8,15 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from crisalad_jax.config.registry import make_part
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig, ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
-from crisalad_jax.nn.aggregators.gem import CosPlaceConfig, GemConfig, GemPyramidConfig
+from crisalad_jax.nn.aggregators.gem import ApGemConfig, CosPlaceConfig, GemConfig, GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.queries import BoqConfig, EdtFormerConfig
 from crisalad_jax.nn.aggregators.sage import SageConfig
 from crisalad_jax.nn.aggregators.salad import FolConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
+from crisalad_jax.nn.aggregators.selavprpp import SelaVprPpConfig, SelaVprPpHashConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.aggregators.vlad import (
     AnyLocConfig,
@@ -51,6 +53,7 @@ PARTS: dict[str, Aggregator] = {
     "netvlad": NetVladConfig(clusters=4),
     "conv-ap": ConvApConfig(channels=16),
     "cosplace": CosPlaceConfig(dim=16),
+    "ap-gem": ApGemConfig(dim=16),
     "mixvpr": MixVprConfig(channels=16, rows=2, depth=2),
     "anyloc": AnyLocConfig(clusters=4, layer=-1),
     "boq": BoqConfig(channels=16, queries=3, rows=2),
@@ -60,6 +63,8 @@ PARTS: dict[str, Aggregator] = {
     "aggregation-tokens": AggregationTokensConfig(tokens=3, insertion=1),
     "vlad-buff": VladBuffConfig(clusters=4, reduced=12),
     "selavpr": SelaVprConfig(hidden=8, local=4),
+    "selavprpp": SelaVprPpConfig(dim=16),
+    "selavprpp-hash": SelaVprPpHashConfig(dim=16, bits=24),
     "sage": SageConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16, weighting_hidden=8),
     "fol": FolConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16, local_hidden=8, local=4),
 }
@@ -74,7 +79,11 @@ def pictures(*seeds: int) -> np.ndarray:
 
 
 def model(aggregator: str) -> tuple[Crisalad, ModelConfig]:
-    config = dataclasses.replace(SMALL, aggregator=PARTS[aggregator])
+    backbone = SMALL.backbone
+    if PARTS[aggregator].features(backbone.depth).second:
+        adapter = make_part("adapter", "side-multi-resolution", paths=2)
+        backbone = dataclasses.replace(backbone, adapter=adapter)
+    config = dataclasses.replace(SMALL, backbone=backbone, aggregator=PARTS[aggregator])
     return random_params(config), config
 
 

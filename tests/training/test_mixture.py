@@ -344,7 +344,8 @@ def test_recipes_have_their_papers_numbers():
             "schedule", "linear", end_fraction=0.2, decay_steps=4000
         )
         assert (config.model.image_size, config.model.descriptor_dim) == ((224, 224), 8448)
-    assert recipe("b14", "sage").model.backbone.adapter.part_name == "dynamic-power"
+    backbone: Any = recipe("b14", "sage").model.backbone
+    assert backbone.adapter.part_name == "dynamic-power"
     config = recipe("b14", "megaloc")
     assert [run.places_per_batch for run in config.alone] == [32] * 6
     # Of the published file: 64 clusters of 256 numbers and a token of 256, through a linear layer.

@@ -54,6 +54,9 @@ class Adapter(Part, abc.ABC):
 
     last = None  # without a type, so that a class may make it a field
     """Number of the last blocks that have an adapter, with parameters; None is all blocks."""
+    paths = 1  # the same
+    """Number of side paths, of an adapter with a `side_path`. Where it is above 1, `init` returns a
+    tuple: the parameters of each path. The features of the second are `Features.second`."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> Any:
@@ -147,17 +150,29 @@ class Adapter(Part, abc.ABC):
         return None
 
     def side_path(
-        self, params: Any, tokens: AnyTokens, grid: Grid, *, length: int | None = None
-    ) -> AnyTokens:
+        self,
+        params: Any,
+        side: AnyTokens,
+        tokens: AnyTokens,
+        grid: Grid,
+        *,
+        length: int | None = None,
+        valid: Valid = None,
+    ) -> tuple[AnyTokens, Any]:
         """Return the tokens of a path beside the blocks, whose last ones are the backbone's.
 
         The path starts from the tokens before the first block that has an adapter.
 
         Args:
-            params: of `init`.
-            tokens: the path's tokens, plus the output of the block.
+            params: of `init`, those of the path.
+            side: the path's tokens.
+            tokens: the output of the block.
             grid: see `attention_update`.
             length: see `attention_update`.
+            valid: see `mlp_update`.
+
+        Returns:
+            (side, updated): as `mlp_update` returns them.
         """
         raise NotImplementedError
 

@@ -163,15 +163,7 @@ class MultiResolutionConfig(BottleneckAdapter):
 
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> MultiResolutionAdapter:
         """Draw parameters as CricaVPR's public code: its convolutions start at 1e-5."""
-        width = self.width(shape.dim)
-        half, quarter, narrow = width // 2, width // 4, width // 16
-        return MultiResolutionAdapter(
-            down=init_linear(random_init.split(key, 3)[0], shape.dim, width),
-            branch1=_init_conv_norm(1, width, half),
-            branch2=(_init_conv_norm(1, width, narrow), _init_conv_norm(3, narrow, quarter)),
-            branch3=(_init_conv_norm(1, width, narrow), _init_conv_norm(5, narrow, quarter)),
-            up=_init_up(width, shape.dim),
-        )
+        return _init_multi_resolution(key, shape.dim, self.width(shape.dim))
 
     def mlp_update(
         self,
@@ -183,10 +175,8 @@ class MultiResolutionConfig(BottleneckAdapter):
         valid: Valid = None,
     ) -> tuple[AnyTokens, MultiResolutionAdapter]:
         """Project down, ReLU, convolve the patches, add the skip, project up."""
-        hidden = _project_down(params.down, tokens)
-        mix = functools.partial(_multi_resolution, params, valid=valid)
-        mixed, updated = _on_patches(mix, hidden, grid, length)
-        return self.alpha * linear(params.up, mixed + hidden), updated
+        update, updated = _multi_resolution(params, tokens, grid, length, valid)
+        return self.alpha * update, updated
 
 
 @ADAPTERS.register("mlp")
@@ -259,12 +249,71 @@ class SideConfig(BottleneckAdapter):
         return _init_mlp(key, shape.dim, self.width(shape.dim))
 
     def side_path(
-        self, params: MlpAdapter, tokens: AnyTokens, grid: Grid, *, length: int | None = None
-    ) -> AnyTokens:
+        self,
+        params: MlpAdapter,
+        side: AnyTokens,
+        tokens: AnyTokens,
+        grid: Grid,
+        *,
+        length: int | None = None,
+        valid: Valid = None,
+    ) -> tuple[AnyTokens, MlpAdapter]:
         """Add the MLP's output."""
-        update = _mlp(params, tokens, gelu)
-        total = at_least_float32(tokens) + self.alpha * at_least_float32(update)
-        return total.astype(tokens.dtype)
+        total = tokens + side
+        return _sum(total, self.alpha, _mlp(params, total, gelu)), params
+
+
+@ADAPTERS.register("side-multi-resolution")
+@dataclasses.dataclass(frozen=True)
+class SideMultiResolutionConfig(BottleneckAdapter):
+    """SelaVPR++'s convolutions, CricaVPR's on paths beside the blocks (Lu et al. 2025).
+
+    After every block a path's tokens are s + alpha A(s + x), where s are its tokens and x is the
+    block's output. No gradient runs through the blocks.
+    """
+
+    width_factor: ClassVar[int] = MultiResolutionConfig.width_factor
+    alpha: float = 1.0
+    """Weight of the adapter's output."""
+    last: PositiveInt | None = None
+    """Number of the last blocks that have it; None is all. SelaVPR++'s ViT-L has 16."""
+    paths: PositiveInt = 1
+    """Number of side paths: 2 where the second is of binary descriptors."""
+
+    def init(self, key: PRNGKeyArray, shape: BlockShape) -> Any:
+        """Draw parameters as `MultiResolutionConfig` does, the same for each path."""
+        one = _init_multi_resolution(key, shape.dim, self.width(shape.dim))
+        return one if self.paths == 1 else (one,) * self.paths
+
+    def side_path(
+        self,
+        params: MultiResolutionAdapter,
+        side: AnyTokens,
+        tokens: AnyTokens,
+        grid: Grid,
+        *,
+        length: int | None = None,
+        valid: Valid = None,
+    ) -> tuple[AnyTokens, MultiResolutionAdapter]:
+        """Add the convolutions of the sum with the block's output."""
+        update, updated = _multi_resolution(params, tokens + side, grid, length, valid)
+        return _sum(side, self.alpha, update), updated
+
+
+def _sum(tokens: AnyTokens, alpha: float, update: AnyTokens) -> AnyTokens:
+    total = at_least_float32(tokens) + alpha * at_least_float32(update)
+    return total.astype(tokens.dtype)
+
+
+def _init_multi_resolution(key: PRNGKeyArray, dim: int, width: int) -> MultiResolutionAdapter:
+    half, quarter, narrow = width // 2, width // 4, width // 16
+    return MultiResolutionAdapter(
+        down=init_linear(random_init.split(key, 3)[0], dim, width),
+        branch1=_init_conv_norm(1, width, half),
+        branch2=(_init_conv_norm(1, width, narrow), _init_conv_norm(3, narrow, quarter)),
+        branch3=(_init_conv_norm(1, width, narrow), _init_conv_norm(5, narrow, quarter)),
+        up=_init_up(width, dim),
+    )
 
 
 def _init_mlp(key: PRNGKeyArray, dim: int, width: int) -> MlpAdapter:
@@ -319,6 +368,20 @@ def _separable(params: DepthwiseAdapter, x: Map) -> Map:
 
 
 def _multi_resolution(
+    params: MultiResolutionAdapter,
+    tokens: AnyTokens,
+    grid: Grid,
+    length: int | None,
+    valid: Valid,
+) -> tuple[AnyTokens, MultiResolutionAdapter]:
+    """Project down, ReLU, convolve the patches, add the skip, project up."""
+    hidden = _project_down(params.down, tokens)
+    mix = functools.partial(_branches, params, valid=valid)
+    mixed, updated = _on_patches(mix, hidden, grid, length)
+    return linear(params.up, mixed + hidden), updated
+
+
+def _branches(
     params: MultiResolutionAdapter, x: Map, *, valid: Valid
 ) -> tuple[Map, MultiResolutionAdapter]:
     outputs, updated = [], []

@@ -62,6 +62,7 @@ from crisalad_jax.nn.layers import (
     init_small_linear,
     layer_norm,
     linear,
+    merge_statistics,
     no_update,
     split_statistics,
 )
@@ -171,6 +172,11 @@ class VisionTransformer(Backbone):
         first, second = ("w12", "w3") if swiglu else ("fc1", "fc2")
         mlp = {first: (dim, 2 * hidden if swiglu else hidden), second: (hidden, dim)}
         return BlockShape(dim, {"qkv": (dim, 3 * dim), "proj": (dim, dim), **mlp})
+
+    @property
+    def side_paths(self) -> int:
+        """Number of side paths of its adapters."""
+        return self.adapter.paths
 
     @property
     def extras(self) -> str:
@@ -313,11 +319,16 @@ class VisionTransformer(Backbone):
                 attended = _class_attention(_block_at(stacks, end), tokens, grid, self)
         if request.norm:
             outputs = [layer_norm(params.norm, x, epsilon=self.norm_epsilon) for x in outputs]
+        second = None
+        if self.adapter.paths > 1:
+            (outputs[-1], second), start = outputs[-1], 1 + self.registers
+            second = second[:, start:]
         features = Features(
             outputs[-1][:, front],
             jnp.concatenate([x[:, front + 1 + self.registers :] for x in outputs], axis=-1),
             None if request.inserted is None else outputs[-1][:, :front],
             attended,
+            second,
         )
         return features, params if valid is None else _statistics(params, measured)
 
@@ -585,10 +596,10 @@ def run_blocks(
     remat: str = "dots",
     valid: Valid = None,
     count: int | None = None,
-) -> tuple[TokenBatch, list[Block]]:
+) -> tuple[Float[Array, "*path image token dim"], list[Block]]:
     """Run stacks of blocks in turn, each with one compiled body.
 
-    An adapter may have a path of its own, from which the tokens then come (`Adapter.side_path`), or
+    An adapter may have paths of its own, from which the tokens then come (`Adapter.side_path`), or
     put prompts in front, which are dropped in the end.
     Between the first and the last block the tokens are padded
     as `attention` needs them on this platform.
@@ -604,7 +615,8 @@ def run_blocks(
             because a slice of the stack would copy its weights.
 
     Returns:
-        (tokens, statistics): the second has a stack of running statistics for each of `stacks`.
+        (tokens, statistics): with several side paths the first has a leading axis of these; the
+        second has a stack of running statistics for each of `stacks`.
     """
     front = 0
     if config.adapter.has_prompts:
@@ -618,21 +630,29 @@ def run_blocks(
     length = real if padding else None
     tokens = jnp.pad(tokens, ((0, 0), (0, padding), (0, 0))) if padding else tokens
 
-    def body(carry: tuple[Array, Array | None], layer: Block) -> tuple[Any, Block]:
-        tokens, side = carry
+    def body(carry: tuple[Array, tuple[Array, ...]], layer: Block) -> tuple[Any, Block]:
+        tokens, sides = carry
         if front:
             tokens = _with_prompts(tokens, layer, config)
         tokens, statistics = block(layer, tokens, grid, config, length=length, valid=valid)
-        if side is not None:
-            both = tokens + side
+        if sides:
+            several, layer = len(sides) > 1, merge_statistics(statistics, layer)
             with jax.named_scope("adapter"):
-                side = config.adapter.side_path(layer.adapter, both, grid, length=length)
-            expect_like(f"adapter {config.adapter.part_name}", side, both)
-        return (tokens, side), statistics
+                found = [
+                    config.adapter.side_path(own, side, tokens, grid, length=length, valid=valid)
+                    for own, side in zip(
+                        layer.adapter if several else (layer.adapter,), sides, strict=True
+                    )
+                ]
+            after, updated = zip(*found, strict=True)
+            expect_like(f"adapter {config.adapter.part_name}", after, sides)
+            layer = dataclasses.replace(layer, adapter=updated if several else updated[0])
+            sides, (statistics, _) = after, split_statistics(layer)
+        return (tokens, sides), statistics
 
     # prevent_cse=False: inside a scan, CSE cannot undo the remat.
     body = jax.checkpoint(body, prevent_cse=False, policy=_POLICIES[remat])
-    side, statistics = None, []
+    sides, statistics = (), []
     with jax.named_scope("blocks"):
         for stack in stacks:
             size, first = len(stack.ls1), _unadapted(stack)
@@ -642,20 +662,24 @@ def run_blocks(
                 if start >= stop:
                     continue
                 part = dataclasses.replace(stack, adapter=None) if start < first else stack
-                if start == first and config.adapter.has_side_path and side is None:
-                    side = tokens
+                if start == first and config.adapter.has_side_path and not sides:
+                    sides = (tokens,) * config.adapter.paths
                 if is_whole:
-                    (tokens, side), measured = jax.lax.scan(body, (tokens, side), part)
+                    (tokens, sides), measured = jax.lax.scan(body, (tokens, sides), part)
                 else:
                     # Slices of a stack would copy its weights.
-                    (tokens, side), measured = jax.lax.scan(
+                    (tokens, sides), measured = jax.lax.scan(
                         lambda carry, at, part=part: body(carry, _layer_at(part, at)),
-                        (tokens, side),
+                        (tokens, sides),
                         jnp.arange(start, stop),
                     )
                 if start == first:
                     statistics.append(measured)
-    return (tokens if side is None else side)[:, front:length], statistics
+    if len(sides) > 1:
+        tokens = jnp.stack(sides)
+    elif sides:
+        (tokens,) = sides
+    return tokens[..., front:length, :], statistics
 
 
 def _with_prompts(tokens: TokenBatch, layer: Block, config: VisionTransformer) -> TokenBatch:

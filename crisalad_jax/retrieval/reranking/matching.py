@@ -10,8 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from crisalad_jax.nn.aggregators.selavpr import SelaVpr, SelaVprConfig, local_features
+from crisalad_jax.nn.aggregators.selavprpp import SelaVprPpHash, SelaVprPpHashConfig, head
 from crisalad_jax.nn.aggregators.transvpr import TransVpr, TransVprConfig, key_features
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.layers import l2_normalise
 from crisalad_jax.nn.model import AnyArray, Crisalad, Images, extract_features
 from crisalad_jax.utils import compiler
 
@@ -114,6 +116,27 @@ def count_matches(query: Features, candidates: Features, config: ModelConfig) ->
     """Count the mutual matches (SelaVPR, section 3.4)."""
     matches = np.asarray(_match_all(query, candidates))
     return (matches >= 0).sum(axis=1).astype(np.float32)
+
+
+def selavprpp_shape(config: ModelConfig) -> tuple[int, int]:
+    """Return 1 and the length of SelaVPR++'s descriptor of real numbers."""
+    assert isinstance(config.aggregator, SelaVprPpHashConfig)
+    return 1, config.aggregator.dim
+
+
+@functools.partial(compiler.jit, static_argnames="config")
+def describe_selavprpp(
+    params: Crisalad, images: Images, config: ModelConfig
+) -> Float[Array, "image 1 dim"]:
+    """Compute SelaVPR++'s descriptor of real numbers of every image, a unit vector."""
+    assert isinstance(params.aggregator, SelaVprPpHash)
+    patches = extract_features(params, images, config).patches
+    return l2_normalise(head(params.aggregator.real, patches))[:, None]
+
+
+def nearness(query: Features, candidates: Features, config: ModelConfig) -> Scores:
+    """Compute the negative distance of the only feature of each image."""
+    return -np.linalg.norm(candidates[:, 0] - query[0], axis=1)
 
 
 def transvpr_shape(config: ModelConfig) -> tuple[int, int]:

@@ -41,6 +41,8 @@ class Method:
         lambda scores, config: scores
     )
     """Makes one score of the parts, of all candidates of a query together."""
+    dtype: type[np.floating] = np.float16
+    """Type of the features in the temporary file."""
 
 
 _PATCH_NETVLAD = Method(
@@ -57,6 +59,14 @@ _METHODS: Mapping[str, Method] = {
     "sinkhorn-divergence": Method(None, divergence.shape, divergence.describe, divergence.scores),
     "selavpr": Method(
         "selavpr", matching.selavpr_shape, matching.describe_selavpr, matching.count_matches
+    ),
+    # One feature an image: float32 takes little, and ranks as the authors' code does.
+    "selavprpp": Method(
+        "selavprpp-hash",
+        matching.selavprpp_shape,
+        matching.describe_selavprpp,
+        matching.nearness,
+        dtype=np.float32,
     ),
     "transvpr": Method(
         "transvpr", matching.transvpr_shape, matching.describe_transvpr, matching.count_inliers
@@ -80,7 +90,8 @@ class Reranking:
 
     name: str
     """patch-netvlad, patch-netvlad-ransac or patch-netvlad-sum, by a model with NetVLAD; selavpr or
-    transvpr, by one with that aggregator; sinkhorn-divergence, by one with local tokens."""
+    transvpr, by one with that aggregator; selavprpp, by one with selavprpp-hash;
+    sinkhorn-divergence, by one with local tokens."""
     top: int
     """Number of a query's first retrievals that are re-ranked; the later ones keep their places."""
     model: Model | None = None
@@ -151,9 +162,9 @@ class Reranker:
     """Puts the neighbours of any number of first stages over the same images in a new order.
 
     Local features of the queries and of the retrieved database images are computed once, by
-    `batch_size`. Temporary files hold them in float16, and the system caches these in memory as far
-    as there is room; scores of pairs stay in memory. The device scores up to 16 candidates of a
-    query at a time, in one compiled program.
+    `batch_size`. Temporary files hold them, most in float16, and the system caches these in memory
+    as far as there is room; scores of pairs stay in memory. The device scores up to 16 candidates
+    of a query at a time, in one compiled program.
     """
 
     def __init__(
@@ -182,7 +193,7 @@ class Reranker:
     def _side(self, paths: Sequence[pathlib.Path], name: str) -> _Side:
         shape = len(paths), *self._method.shape(self._config)
         file = pathlib.Path(self._folder.name) / name
-        features = np.memmap(file, np.float16, "w+", shape=shape)
+        features = np.memmap(file, self._method.dtype, "w+", shape=shape)
         return _Side(paths, features, np.zeros(len(paths), bool))
 
     def __enter__(self) -> Self:

@@ -43,7 +43,8 @@ def test_table_3_to_the_unit():
     assert costs["mlp"].parameters == linears + 384 + 768
     assert costs["depthwise"].macs == 257 * linears + 256 * depthwise
     # Adapters that the paper lacks, after its own: LoRA of rank 8, and ten prompts.
-    assert list(costs)[3:] == ["dynamic-power", "lora", "prompts", "serial-parallel", "side"]
+    side = ["side", "side-multi-resolution"]
+    assert list(costs)[3:] == ["dynamic-power", "lora", "prompts", "serial-parallel", *side]
     assert costs["lora"].parameters == 8 * (768 + 3 * 768 + 2 * 768)
     assert (costs["prompts"].parameters, costs["prompts"].paper_macs) == (7680, None)
 

@@ -1,0 +1,126 @@
+"""SelaVPR++: a generalised mean between linear layers, and a second one of few numbers, for bits.
+
+Written from the facts of the public model (Lu et al. 2025, "SelaVPR++: Towards Seamless Adaptation
+of Foundation Models for Efficient Place Recognition").
+"""
+
+import dataclasses
+
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import PositiveInt
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
+from crisalad_jax.nn.aggregators.gem import START, gem
+from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
+from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise, linear
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+
+@pytree_dataclass
+class SelaVprPp:
+    """The linear layers before and after the mean, and its exponent."""
+
+    p: Float[Array, ""]
+    before: Linear
+    after: Linear
+
+
+@AGGREGATORS.register("selavprpp", tiny={"dim": 256})
+@dataclasses.dataclass(frozen=True)
+class SelaVprPpConfig(Aggregator):
+    """SelaVPR++'s head (Lu et al. 2025).
+
+    Example:
+        >>> from crisalad_jax import ModelConfig
+        >>> ModelConfig(aggregator="selavprpp", cross_image="none").descriptor_dim
+        2048
+    """
+
+    dim: PositiveInt = 2048
+    """Width of the descriptor of real numbers: 4,096 of ViT-L."""
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of a global token."""
+        return TokenShape(self.dim, 0, self.dim)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> SelaVprPp:
+        """Start at an exponent of 3, with linear layers as torch's."""
+        return init_head(key, backbone.dim, self.dim)
+
+    def apply(
+        self, params: SelaVprPp, features: Features, grid: Grid, *, key: Keys | None
+    ) -> Tokens:
+        """Return the head's output, which is scaled to unit length later."""
+        return Tokens.of_global(head(params, features.patches))
+
+
+@pytree_dataclass
+class SelaVprPpHash:
+    """The heads of both side paths."""
+
+    real: SelaVprPp
+    """Of the first path: real numbers, which rank the first retrievals again."""
+    hash: SelaVprPp
+    """Of the second path: the model's own descriptor, whose bits are searched."""
+
+
+@AGGREGATORS.register("selavprpp-hash", tiny={"dim": 256, "bits": 128})
+@dataclasses.dataclass(frozen=True)
+class SelaVprPpHashConfig(SelaVprPpConfig):
+    """SelaVPR++ with its second path: a short descriptor whose bits are searched, and re-ranking.
+
+    Example:
+        >>> from crisalad_jax import ModelConfig, ViTConfig, make_part
+        >>> adapter = make_part("adapter", "side-multi-resolution", paths=2)
+        >>> backbone = ViTConfig(adapter=adapter)
+        >>> part = SelaVprPpHashConfig()
+        >>> ModelConfig(backbone=backbone, aggregator=part, cross_image="none").descriptor_dim
+        512
+    """
+
+    bits: PositiveInt = 512
+    """Width of the descriptor, and so number of its bits."""
+
+    def features(self, depth: int) -> FeatureSpec:
+        """Request the last patches of both side paths."""
+        return FeatureSpec(second=True)
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of a global token."""
+        return TokenShape(self.bits, 0, self.bits)
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> SelaVprPpHash:
+        """Draw both heads as `SelaVprPpConfig` does."""
+        first, second = random_init.split(key)
+        return SelaVprPpHash(
+            init_head(first, backbone.dim, self.dim), init_head(second, backbone.dim, self.bits)
+        )
+
+    def apply(
+        self, params: SelaVprPpHash, features: Features, grid: Grid, *, key: Keys | None
+    ) -> Tokens:
+        """Return the second path's output; in training, for a loss, also the first one's."""
+        assert features.second is not None
+        tokens = Tokens.of_global(head(params.hash, features.second))
+        if key is None:
+            return tokens
+        real = l2_normalise(head(params.real, features.patches))
+        return tokens._replace(dense=real[..., None, :])
+
+
+def init_head(key: PRNGKeyArray, dim: int, width: int) -> SelaVprPp:
+    """Draw a head of `width` numbers over features of width `dim`."""
+    first, second = random_init.split(key)
+    exponent = random_init.full((), START)
+    return SelaVprPp(exponent, init_linear(first, dim, dim), init_linear(second, dim, width))
+
+
+def head(params: SelaVprPp, patches: Patches) -> Float[Array, "*batch width"]:
+    """Apply a linear layer, the generalised mean of unit patches and a linear layer.
+
+    The result is float32 at least, and of any length.
+    """
+    mean = gem(linear(params.before, patches), params.p).astype(patches.dtype)
+    return at_least_float32(linear(params.after, mean))

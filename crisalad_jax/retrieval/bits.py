@@ -1,0 +1,140 @@
+"""Binary descriptors: the signs of a descriptor's dimensions, packed eight to a byte.
+
+They are compared by the Hamming distance, exactly and without JAX.
+"""
+
+from collections.abc import Generator, Iterable
+
+import numpy as np
+
+from crisalad_jax.retrieval.chunks import BITS, Block, as_rows, check_rows
+from crisalad_jax.retrieval.neighbours import (
+    QUERY_CHUNK,
+    Neighbours,
+    Products,
+    best_products,
+)
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Float, Float32, UInt8
+
+Bits = UInt8[np.ndarray, "n bytes"]
+"""Packed bits of n images, a row each."""
+_ROWS = 4096
+"""Number of database rows compared at a time."""
+_PIECE = 2**16
+"""Number of pairs whose distances are counted at a time: 512 KiB, which fits a core's cache."""
+
+
+def pack_bits(descriptors: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, "n d/8"]:
+    """Pack the signs of descriptors: a bit is 1 where a number is at least 0.
+
+    The first dimension is the highest bit of the first byte, as of `numpy.packbits`. That 0 gives 1
+    is the rule of SelaVPR++; TeTRA's gives 0 there, and is the same for all other numbers.
+
+    Args:
+        descriptors: of the n images, of d numbers each, of any length; d is a multiple of 8.
+
+    Returns:
+        The packed bits, as `search` takes them.
+
+    Raises:
+        InputError: not a matrix of finite numbers, or d is not a multiple of 8.
+
+    Example:
+        >>> import numpy as np
+        >>> pack_bits(np.array([[0.5, -0.5, 0.0, 0.1, -0.2, -0.3, -0.4, 0.7]])).tolist()
+        [[177]]
+    """
+    rows = as_rows(descriptors, "descriptors")
+    check_packable(rows.shape[1], "descriptors")
+    check_rows(rows, "descriptors", range(len(rows)), unit=False)
+    return np.packbits(rows >= 0, axis=1)
+
+
+def check_packable(length: int, name: str) -> None:
+    """Raise InputError where descriptors of so many numbers do not fill whole bytes."""
+    if length % 8:
+        raise InputError(
+            f"{name}: found descriptors of {length} numbers, expected a multiple of 8 to pack as "
+            "bits"
+        )
+
+
+def sign_vectors(bits: Bits) -> Float32[np.ndarray, "n d"]:
+    """Unpack bits to unit vectors of numbers of one size, whose cosines are the similarities."""
+    size = np.float32(1 / np.sqrt(8 * bits.shape[1]))
+    return np.where(np.unpackbits(bits, axis=1), size, -size)
+
+
+def as_bits(array: np.ndarray, name: str, length: int | None = None) -> Bits:
+    """Check that an array holds packed bits, of descriptors of `length` numbers if that is given.
+
+    Raises:
+        InputError: it is not a matrix of bytes, is empty, or is of another length.
+    """
+    array = np.asanyarray(array)
+    expected = "bytes" if length is None else length // 8
+    fits = array.ndim == 2 and 0 not in array.shape and expected in ("bytes", array.shape[1])
+    if array.dtype != BITS or not fits:
+        raise InputError(
+            f"{name}: found {array.dtype} {array.shape}, expected packed bits, uint8 of shape "
+            f"(images, {expected}), neither zero"
+        )
+    return array
+
+
+def search_bits(database: Bits, queries: Bits, k: int) -> Neighbours:
+    """Find the rows with the most equal bits of each query, exactly; see `retrieval.search`.
+
+    Raises:
+        InputError: arrays that are not packed bits of one length.
+    """
+    database = as_bits(database, "database")
+    queries = as_bits(queries, "queries", 8 * database.shape[1])
+    blocks = (
+        Block(start, database[start : start + _ROWS]) for start in range(0, len(database), _ROWS)
+    )
+    return nearest_bits(blocks, queries, min(k, len(database)))
+
+
+def nearest_bits(stream: Iterable[Block], queries: Bits, k: int) -> Neighbours:
+    """Find the k rows with the most equal bits of each query; of as equal ones the lower indices.
+
+    Args:
+        stream: packed bits in order, at least k rows in all.
+        queries: packed bits.
+        k: neighbours per query.
+
+    Returns:
+        Their similarities are 1 - 2 h / d, where h of the d bits differ: the cosines of the vectors
+        of signs.
+    """
+    return best_products(
+        _compared(stream, _as_words(queries), 8 * queries.shape[1]), len(queries), k
+    )
+
+
+def _compared(
+    stream: Iterable[Block], queries: np.ndarray, bits: int
+) -> Generator[Products, None, None]:
+    """Yield the similarities of all queries and all blocks."""
+    for block in stream:
+        rows = np.ascontiguousarray(_as_words(block.rows).T)
+        step = max(1, _PIECE // rows.shape[1])
+        for first in range(0, len(queries), QUERY_CHUNK):
+            some = queries[first : first + QUERY_CHUNK]
+            differing = np.zeros((len(some), rows.shape[1]), np.int32)
+            for start in range(0, len(some), step):
+                part = differing[start : start + step]
+                for number, words in enumerate(rows):
+                    other = some[start : start + step, number, None] ^ words
+                    part += np.bitwise_count(other)
+            similarities = (1 - differing * np.float64(2 / bits)).astype(np.float32)
+            yield Products(first, similarities.T, block.start + np.arange(rows.shape[1])[:, None])
+
+
+def _as_words(bits: Bits) -> np.ndarray:
+    """View bits as numbers of 64; bytes that are missing are 0 on all sides."""
+    missing = -bits.shape[1] % 8
+    padded = np.pad(bits, ((0, 0), (0, missing))) if missing else np.ascontiguousarray(bits)
+    return padded.view(np.uint64)
