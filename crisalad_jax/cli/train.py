@@ -71,12 +71,12 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     recipe: str | None = None
     """How it trains. As published: crisalad (the paper; the default), crisalad-1e-4 or
     crisalad-step (its Table 2), salad, cricavpr, boq, dino-mix, edtformer, image, supervlad,
-    vlad-buff, selavpr (preset l14), salad-cm (of two sets); over ResNet boq-resnet50, conv-ap,
-    cosplace, mixvpr; over VGG netvlad, patch-netvlad. In part as published: eigenplaces-turns,
-    netvlad-gsv, cosplace-vit, eigenplaces-vit; sage and megaloc (of several sets). From random
-    weights: scratch, the default of tiny. starter: the last run of the model in this package, whose
-    --weights are its first run's (docs/starter.md). RECIPE+PART is a recipe with a registered part
-    in place, such as crisalad+gem."""
+    vlad-buff, selavpr (preset l14), selavprpp, salad-cm (of two sets); over ResNet boq-resnet50,
+    conv-ap, cosplace, mixvpr; over VGG netvlad, patch-netvlad. In part as published:
+    eigenplaces-turns, netvlad-gsv, cosplace-vit, eigenplaces-vit; sage and megaloc (of several
+    sets). From random weights: scratch, the default of tiny. starter: the last run of the model in
+    this package, whose --weights are its first run's (docs/starter.md). RECIPE+PART is a recipe
+    with a registered part in place, such as crisalad+gem."""
     config: pathlib.Path | None = None
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
     max_pixels: int = 2**28

@@ -11,7 +11,7 @@ from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.data.samplers.viewpoints import Viewpoints
 from crisalad_jax.nn.adapters import Adapter
-from crisalad_jax.nn.adapters.bottleneck import SideConfig
+from crisalad_jax.nn.adapters.bottleneck import SideConfig, SideMultiResolutionConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.training.config import MiningConfig, MixtureSet, OptimiserConfig, TrainConfig
@@ -132,6 +132,33 @@ def selavpr(model: ModelConfig, preset: str) -> TrainConfig:
         images_per_place=4,
         epochs=50,
         patience=3,
+    )
+
+
+@register_recipe("selavprpp")
+def selavprpp(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make SelaVPR++'s recipe, of Lu-Feng/SelaVPRplusplus (Lu et al. 2025): its first stage.
+
+    Adapters on a path beside the frozen blocks, the last 16 of preset l14, and the head train. Its
+    data are GSV-Cities and parts of other sets as places of one layout. The second stage, which
+    trains another path for the signs of its numbers, is not here.
+    """
+    is_large = preset == "l14"
+    adapter = SideMultiResolutionConfig(last=16 if is_large else None)
+    return TrainConfig(
+        model=model_of(
+            *(model, preset, _vit(model, adapter=adapter), "selavprpp"),
+            head={"dim": 4096} if is_large else {},
+            compute_dtype="bfloat16",
+            pixels="floats",
+            round_to_patch=True,
+        ),
+        optimiser=dataclasses.replace(ADAM_STEP, learning_rate=4e-4),
+        places_per_batch=120,
+        epochs=25,
+        monitor="R@1+R@5",
+        patience=12,
+        validation_size=validation_size(preset, 322),
     )
 
 
