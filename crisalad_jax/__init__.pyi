@@ -8,6 +8,7 @@ from .checkpoints.export import write_export as write_export
 from .checkpoints.load import load as load
 from .checkpoints.public import convert as convert
 from .checkpoints.public import read_backbone as read_backbone
+from .checkpoints.published import register_published as register_published
 from .checkpoints.weights import save_weights as save_weights
 from .config.classes import ClassesConfig as ClassesConfig
 from .config.plugins import load_plugin as load_plugin
@@ -32,12 +33,13 @@ from .data.samplers import Draw as Draw
 from .data.samplers import Sampler as Sampler
 from .data.samplers import register_sampler as register_sampler
 from .evaluation.calibrate import calibrate as calibrate
+from .evaluation.difference import paired_difference as paired_difference
 from .evaluation.evaluate import evaluate as evaluate
 from .evaluation.operating_point import operating_point as operating_point
 from .evaluation.record import evaluation_record as evaluation_record
 from .experiments.comparison import ComparisonConfig as ComparisonConfig
 from .experiments.comparison import compare as compare
-from .experiments.comparison import paired_difference as paired_difference
+from .experiments.publish import publish as publish
 from .experiments.report import show_attention as show_attention
 from .experiments.report import show_descriptors as show_descriptors
 from .experiments.report import show_gradient_norms as show_gradient_norms

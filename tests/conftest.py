@@ -22,6 +22,8 @@ import jaxtyping
 import numpy as np
 import pytest
 
+from crisalad_jax.checkpoints.formats import families
+from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.config import plugins
 from crisalad_jax.config.io import to_plain
@@ -259,7 +261,12 @@ def own_parts(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
             monkeypatch.setattr(registry, name, dict(getattr(registry, name)))
     monkeypatch.setattr(plugins, "_LOADED", {})
     before = set(sys.modules)
+    named = (families.FORMATS, families.HEADS, families.TABLES, PUBLISHED)
+    copies = [dict(each) for each in named]
     yield
+    for each, copy in zip(named, copies, strict=True):
+        each.clear()
+        each.update(copy)
     for name in set(sys.modules) - before:
         if name.startswith("crisalad_plugin_"):
             del sys.modules[name]
@@ -277,4 +284,4 @@ def describe_single(model: Model, paths: Sequence[pathlib.Path]) -> np.ndarray:
     """Describe images independently, by tokens and their grouping, in batches of `BATCH`."""
     describer = describer_of(model)
     tokens = TokenSet(describer, paths, Reading(batch_size=BATCH, quiet=True))
-    return tokens.describe("single")[0]
+    return tokens.describe(tokens.batches("single", None))

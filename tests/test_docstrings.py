@@ -32,7 +32,7 @@ SLOW = {
     *("Map", "attend_across_images", "build_vocabulary", "convert", "evaluate", "extract"),
     *("evaluation_record", "extract_features", "extract_tokens", "fit", "gradient_norms", "index"),
     *("init_train_state", "transport_masses", "write_report"),
-    *("merge_params", "query", "query_live", "read_backbone", "show_attention"),
+    *("merge_params", "publish", "query", "query_live", "read_backbone", "show_attention"),
     *("show_image_attention", "show_transport", "split_params", "train", "write_export"),
 }
 """Examples that make, train or run a model; `describe` and `make_train_step` stand for them."""

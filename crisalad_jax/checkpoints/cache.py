@@ -13,28 +13,23 @@ from typing import Any
 
 import jax
 
-from crisalad_jax.checkpoints.download import MissingFileError, download
 from crisalad_jax.checkpoints.matlab_io import MATLAB_SUFFIX
 from crisalad_jax.checkpoints.public import read_checkpoint, read_vocabulary
 from crisalad_jax.checkpoints.published import PUBLISHED, Published
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.utils.checksums import sha256_of
+from crisalad_jax.utils.download import OFFLINE, MissingFileError, download, is_offline
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, user_cache, write_json
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.version import VERSION
 
-OFFLINE, MIRROR = "CRISALAD_OFFLINE", "CRISALAD_MIRROR"
-"""Variables of the environment: whether to use no network, and where to look for files by their
-names before their published addresses."""
+MIRROR = "CRISALAD_MIRROR"
+"""Variable of the environment: where to look for files by their names before their published
+addresses."""
 _RECORD = "record.json"
 """File with the weights of a published model in the cache."""
-
-
-def is_offline() -> bool:
-    """Return whether the environment forbids the network."""
-    return os.environ.get(OFFLINE, "").lower() not in ("", "0", "false", "no")
 
 
 def is_cached(model: Published) -> bool:

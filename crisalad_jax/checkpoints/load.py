@@ -1,5 +1,6 @@
 """Load a model from a file, or a published one by its name."""
 
+import dataclasses
 import os
 import pathlib
 from collections.abc import Callable, Sequence
@@ -9,6 +10,7 @@ from crisalad_jax.checkpoints import starter
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.hub import download_file, is_hub, parse_hub
 from crisalad_jax.utils.output import warn
 
 if TYPE_CHECKING:
@@ -16,6 +18,9 @@ if TYPE_CHECKING:
     from crisalad_jax.checkpoints.runtime import Runtime
     from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.model import Model
+
+HUB_FILE = "model.safetensors"
+"""Name of the weights in a repository at the hub, or in a folder for it."""
 
 
 @takes(path=PATH)
@@ -27,6 +32,8 @@ def load(path: str | os.PathLike[str], *, verify: bool = True, quiet: bool = Fal
             DINO-SALAD, CricaVPR or another format in `docs/methods.md`; torch files need torch. Or
             the name of a published model, as `crisalad models` lists them: it is downloaded once
             into the cache. Or "starter", the small model in this package, or "hog", a baseline.
+            Or a folder that `crisalad publish` wrote; or hf://OWNER/NAME for such a folder at
+            Hugging Face's hub, with @REVISION and /FILE where wanted (extra `data`).
         verify: whether to check the bytes of a file of this package against its checksum.
         quiet: no progress of a download.
 
@@ -62,16 +69,18 @@ def find_weights(
     taken instead, with a note.
 
     Args:
-        weights: a path, or a name of `crisalad models`, or None.
+        weights: a path, or a name of `crisalad models`, or None; or hf://OWNER/NAME, where a file
+            is at Hugging Face's hub; or a folder as there are at the hub.
         engine: any but "jax" takes a folder too, of an exported model.
         quiet: no progress bar.
 
     Returns:
-        The path; for a name, a file of this package in the cache.
+        The path; for a name, a file of this package in the cache; of the hub, a file in its cache.
 
     Raises:
-        InputError: what `cached_weights` raises; or there is neither such a file nor such a name.
-            The message has the nearest names. Other missing files are for the reader to tell.
+        InputError: what `cached_weights` and `download_file` raise; or there is neither such a file
+            nor such a name. The message has the nearest names. Other missing files are for the
+            reader to tell.
 
     Example:
         >>> find_weights("megalok")
@@ -88,6 +97,10 @@ def find_weights(
         return starter.FILE
     path = pathlib.Path(weights)
     name = os.fspath(weights)
+    if is_hub(name):
+        address = parse_hub(name)
+        address = dataclasses.replace(address, file=address.file or HUB_FILE)
+        return download_file(address, quiet=quiet)
     if (path.suffix and os.path.isfile(path)) or (engine != "jax" and path.is_dir()):
         return path
     # Imported here: a file needs no table of published models.
@@ -106,6 +119,8 @@ def find_weights(
         for each in (model, *filter(None, [PUBLISHED.get(model.backbone)])):
             warn(f"{each.name}: {each.licence.words} ({each.repository})")
         return cached_weights(model, quiet=quiet)
+    if (path / HUB_FILE).is_file():
+        return path / HUB_FILE
     near = nearest_names(path.stem)
     # A name, or a file that looks like a published model's: MegaLoc.pth.
     is_name = path.parent == pathlib.Path() and (not path.suffix or bool(near))
@@ -153,6 +168,8 @@ def open_model(
     """
     file = find_weights(weights, engine=engine, quiet=quiet)
     short = f"{file.parent.name}/{file.name}" if file.parent.name else file.name
+    if is_hub(weights):  # its cache has folders named by commits
+        short = str(parse_hub(weights))
     name = starter.named(file) if file in starter.FILES.values() else short
     # Imported here: an engine's model is opened without JAX, and JAX's without an engine.
     if engine == "jax":

@@ -10,6 +10,7 @@ from typing import Any
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.output import one_line
 
 GITHUB = "https://github.com/"
 
@@ -64,21 +65,98 @@ class Published:
     """What is not certain of these facts, or has to be done by hand."""
 
 
-def _read() -> Iterator[Published]:
-    table = tomllib.loads(pathlib.Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-    licences = {fields["name"]: Licence(**fields) for fields in table["licence"]}
-    for family in table["family"]:
-        before = family.pop("url", None)
-        for model in family.pop("models"):
-            fields: dict[str, Any] = {**family, **model}
-            fields["repository"] = GITHUB + fields["repository"]
-            fields["licence"] = licences[fields["licence"]]
-            fields.setdefault("url", before and before + fields["file"])
-            yield Published(**fields)
-
-
-PUBLISHED: dict[str, Published] = {model.name: model for model in _read()}
+PUBLISHED: dict[str, Published] = {}
 """Published models by name."""
+_LICENCES: dict[str, Licence] = {}
+
+
+def register_published(text: str) -> None:
+    """Register published models of one's own, and how their files name a model's arrays.
+
+    After that their names stand for them: in `load`, `--weights`, `convert`, `models`, `compare`. A
+    file FILE.py that calls this is all that `--plugin FILE.py` needs; it can register the parts of
+    the model, too.
+
+    Args:
+        text: TOML with the sections of this package's `published.toml` (licence, family) and of its
+            `formats.toml` (chains, tables, backbones, heads, formats). It may use what those two
+            name, and replaces none of it.
+
+    Raises:
+        InputError: it is no such TOML, a name is taken, or a model is of no known format or
+            licence. Nothing is registered then.
+
+    Example:
+        >>> register_published(
+        ...     '''
+        ...     [formats.town-gem]
+        ...     holds = "Town-GeM .pth"
+        ...     backbone = "dinov2 net."
+        ...     head = "cosplace pool."
+        ...     images = "pillow 224 224"
+        ...     [[family]]
+        ...     format = "town-gem"
+        ...     licence = "MIT"
+        ...     repository = "town/gem"
+        ...     paper = "Town et al. 2026"
+        ...     images = "224 x 224, bilinear (Pillow)"
+        ...     url = "https://town.example/"
+        ...     models = [{name="town-gem", descriptor=512, parameters=86973185, file="gem.pth"}]
+        ...     '''
+        ... )
+        >>> published_model("town-gem").url
+        'https://town.example/gem.pth'
+    """
+    # Imported here: names are completed and listed without JAX.
+    from crisalad_jax.checkpoints.formats.families import FORMATS, add_formats
+
+    source = "register_published"
+    try:
+        facts = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{source}: found no TOML: {error}") from error
+    licences, models = _read(facts, source)
+    own = {model.format for model in models} & facts.get("formats", {}).keys()
+    for model in models:
+        if model.format not in own | FORMATS.keys():
+            raise InputError(
+                f"{source}: {model.name}: found format {model.format!r}, expected one of its own "
+                f"or of {', '.join(FORMATS)}"
+            )
+    add_formats(facts, source)
+    _LICENCES.update(licences)
+    PUBLISHED.update({model.name: model for model in models})
+
+
+def _read(facts: dict[str, Any], source: str) -> tuple[dict[str, Licence], list[Published]]:
+    """Take licences and models out of `facts`.
+
+    Raises:
+        InputError: naming `source`, if a field is missing or unknown, or a name is taken.
+    """
+    try:
+        licences = {each["name"]: Licence(**each) for each in facts.pop("licence", [])}
+        models = [
+            model
+            for family in facts.pop("family", [])
+            for model in _models(family, _LICENCES | licences)
+        ]
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{source}: cannot be read: {one_line(error)}") from error
+    names = [*PUBLISHED, *starter.FILES, *(model.name for model in models)]
+    if len(set(names)) < len(names):
+        raise InputError(f"{source}: found {max(names, key=names.count)}, a name that is taken")
+    return licences, models
+
+
+def _models(family: dict[str, Any], licences: dict[str, Licence]) -> Iterator[Published]:
+    before = family.pop("url", None)
+    for model in family.pop("models"):
+        fields: dict[str, Any] = {**family, **model}
+        fields["repository"] = GITHUB + fields["repository"]
+        fields["licence"] = licences[fields["licence"]]
+        fields.setdefault("url", before and before + fields["file"])
+        yield Published(**fields)
 
 
 def published_model(name: str) -> Published:
@@ -113,3 +191,9 @@ def nearest_names(name: str) -> str:
 
 def _plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name.lower())
+
+
+_OWN = pathlib.Path(__file__).with_suffix(".toml")
+_licences, _own = _read(tomllib.loads(_OWN.read_text(encoding="utf-8")), _OWN.name)
+_LICENCES.update(_licences)
+PUBLISHED.update({model.name: model for model in _own})

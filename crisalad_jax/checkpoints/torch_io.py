@@ -1,18 +1,21 @@
 """Read and write files of torch, which runs no code of theirs."""
 
 import collections
+import contextlib
 import pathlib
 import pickle
 import re
+import shutil
+import tempfile
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from crisalad_jax.utils.errors import InputError, few
-from crisalad_jax.utils.files import atomic_path
+from crisalad_jax.utils.files import atomic_path, wrap_os_errors
 
 DECLARED = "crisalad-jax"
 """Key of what a public checkpoint that we write says of its model, in the metadata of its state,
@@ -20,6 +23,14 @@ where no other program looks."""
 HOW = "torch.save(model.state_dict(), FILE) writes a file of the weights alone"
 _UNDER = ("state_dict", "model_state_dict", "model", "teacher")
 """Keys under which files have the state."""
+_PCA = ("mean_", "components_", "explained_variance_")
+"""Arrays of a whitening, which AP-GeM's files have next to the state."""
+_PCA_NAME = "Landmarks_clean"
+"""Name of the published whitening (Revaud et al., ICCV 2019), where a file has several."""
+_PCA_CLASSES = tuple(f"sklearn.decomposition.{module}.PCA" for module in ("pca", "_pca"))
+"""Class of a pickled whitening: before scikit-learn 0.22, and since."""
+_MOST = 100
+"""Largest ratio of an unpacked file's size to that of the zip archive around it."""
 
 
 class Content(NamedTuple):
@@ -33,17 +44,32 @@ class Content(NamedTuple):
     """Red, green and blue that are subtracted from pixels of 0 to 1, where it says so."""
 
 
-class _Unread:
-    """A stand-in for an array of NumPy with the weights, such as the recalls of a training run.
+class _Numpy:
+    """A stand-in for an array of NumPy with the weights, for its type, or for a number.
 
-    Torch refuses a whole file with one, and NumPy itself would run on bytes of the file.
+    Torch refuses a whole file with one, such as the recalls of a training run, and NumPy itself
+    would run on bytes of the file. `array` makes it of what is checked first.
     """
 
-    def __init__(self, *_: Any) -> None:
-        """Take what the array would be made of, and keep nothing."""
+    def __init__(self, *made_of: Any) -> None:
+        self.made_of = made_of
+        self.state: Any = ()
 
-    def __setstate__(self, _: Any) -> None:
-        """Take its numbers, and keep nothing."""
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+    def array(self) -> np.ndarray:
+        """Return an array of float32 or float64.
+
+        Raises:
+            TypeError, ValueError, AttributeError: it is anything else.
+        """
+        _, shape, kind, by_column, data = self.state
+        if kind.made_of[0] not in ("f4", "f8") or not isinstance(data, bytes):
+            raise ValueError("no floats")
+        order = {"<": "<", ">": ">"}[kind.state[1]]
+        flat = np.frombuffer(data, order + kind.made_of[0])
+        return flat.reshape(shape, order="F" if by_column else "C").astype(np.float32)
 
 
 _NUMPY = (
@@ -82,7 +108,7 @@ def read_torch(path: pathlib.Path) -> Content:
     """
     import torch
 
-    state = _load(path)
+    state = whole = _load(path)
     if isinstance(state, Mapping):
         inside = (state[key] for key in _UNDER if isinstance(state.get(key), Mapping))
         state = next(inside, state)
@@ -98,7 +124,43 @@ def read_torch(path: pathlib.Path) -> Content:
         raise InputError(f"{path}: found {found}, expected nothing but tensors by name: {HOW}")
     metadata = getattr(state, "_metadata", None)  # as of any module's state_dict
     declared = metadata.get(DECLARED) if isinstance(metadata, dict) else None
-    return Content({name: _array(path, name, x) for name, x in state.items()}, declared)
+    arrays = {name: _array(path, name, x) for name, x in state.items()}
+    return Content(arrays | _whitening(path, whole), declared)
+
+
+def _whitening(path: pathlib.Path, whole: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the arrays of AP-GeM's whitening, if there is one: an object, or tensors by name.
+
+    Raises:
+        InputError: it is neither; or the options of its network are others than are read here.
+    """
+    found = whole.get("pca")
+    if not isinstance(found, Mapping):
+        return {}
+    options = whole.get("model_options")
+    for name in ("norm_features", "center_bias", "without_fc"):
+        if isinstance(options, Mapping) and options.get(name):
+            raise InputError(f"{path}: model_options: found {name}, expected it to be off")
+    if len(found) != 1 and _PCA_NAME not in found:
+        names = few(sorted(map(str, found)))
+        raise InputError(f"{path}: pca: found {names}, expected {_PCA_NAME}, or one alone")
+    pca = found.get(_PCA_NAME, next(iter(found.values())))
+    of_class = getattr(pca, "stands_for", None)
+    if of_class in _PCA_CLASSES:
+        pca = vars(pca)
+    elif of_class is not None or not isinstance(pca, Mapping):
+        raise InputError(
+            f"{path}: pca: found {of_class or type(pca).__name__}, expected scikit-learn's PCA, or "
+            f"tensors {', '.join(_PCA)}"
+        )
+    try:
+        return {
+            name: x.array() if isinstance(x := pca[name], _Numpy) else _array(path, name, x)
+            for name in _PCA
+        }
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        arrays = ", ".join(_PCA)
+        raise InputError(f"{path}: pca: expected arrays of floats {arrays}: {error!r}") from error
 
 
 def _kind(value: Any) -> str:
@@ -125,16 +187,18 @@ def _load(path: pathlib.Path) -> Any:
 
     others: list[str] = []
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _unpacked(path) as file:
             warnings.simplefilter("ignore")  # about deprecated formats
-            if zipfile.is_zipfile(path):  # as torch's files have been since 1.6
-                _check_uncompressed(path)
-                named = torch.serialization.get_unsafe_globals_in_checkpoint(path)
+            if zipfile.is_zipfile(file):  # as torch's files have been since 1.6
+                _check_uncompressed(file)
+                named = torch.serialization.get_unsafe_globals_in_checkpoint(file)
                 others = sorted(set(named) - set(_NUMPY))
+            else:  # torch tells nothing of what such a file names
+                others = list(_PCA_CLASSES)
             stand_ins: list[Any] = [(_stand_in(name), name) for name in others]
-            stand_ins += [(_Unread, name) for name in _NUMPY]
+            stand_ins += [(_Numpy, name) for name in _NUMPY]
             with torch.serialization.safe_globals(stand_ins):
-                return torch.load(path, map_location="cpu", weights_only=True)
+                return torch.load(file, map_location="cpu", weights_only=True)
     except InputError:
         raise
     except Exception as error:  # a damaged pickle may raise any exception
@@ -148,6 +212,35 @@ def _load(path: pathlib.Path) -> Any:
             what = f"asks for {refused[1]}" if refused else "is no plain pickle of tensors"
             problem = f"refused: it {what}, expected nothing but tensors, which run no code: {HOW}"
         raise InputError(f"{path}: {problem}") from error
+
+
+@contextlib.contextmanager
+def _unpacked(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """Give the one file in a zip archive that is no file of torch's, or else the file itself.
+
+    Raises:
+        InputError: the archive unpacks to far more than its size, or there is no room for it.
+    """
+    with contextlib.ExitStack() as stack:
+        names: list[str] = []
+        if zipfile.is_zipfile(path):
+            archive = stack.enter_context(zipfile.ZipFile(path))
+            # A Mac adds files of its own.
+            names = [n for n in archive.namelist() if not n.endswith("/") and "__MACOSX" not in n]
+        if len(names) != 1:
+            yield path
+            return
+        unpacked, size = archive.getinfo(names[0]).file_size, path.stat().st_size
+        if unpacked > _MOST * size:
+            raise InputError(
+                f"{path}: found an archive of {size} bytes that unpacks to {unpacked}, expected a "
+                f"checkpoint, at most {_MOST} times as large"
+            )
+        folder = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        target = folder / "file"
+        with archive.open(names[0]) as source, wrap_os_errors(target), target.open("wb") as file:
+            shutil.copyfileobj(source, file)
+        yield target
 
 
 def _check_uncompressed(path: pathlib.Path) -> None:
@@ -202,7 +295,8 @@ def write_torch(
         content = collections.OrderedDict(content)
         content._metadata = {DECLARED: declared}
     if under:
-        content = {under: content}
+        whitening = {name: content.pop(name) for name in _PCA if name in content}
+        content = {under: content} | ({"pca": {_PCA_NAME: whitening}} if whitening else {})
     if bare:
         (content,) = content.values()
     # Pass an open file, because torch writes the name of a path into the archive.

@@ -19,7 +19,7 @@ from crisalad_jax.cli.common import (
     show_tables,
 )
 from crisalad_jax.cli.flags import FOLDER, ModelFlags, ReadFlags, SetFlags, TableFlags
-from crisalad_jax.cli.tables import grouping_table, points_table
+from crisalad_jax.cli.tables import grouping_table, leakage_table, points_table
 from crisalad_jax.evaluation.evaluate import check_evaluation, evaluate
 from crisalad_jax.evaluation.record import evaluation_record
 from crisalad_jax.evaluation.similarity import FirstSimilarities
@@ -44,8 +44,11 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     preset: str | None = None
     """Evaluate an untrained model of this size in place of weights: tiny, s14, b14, l14 or g14."""
     grouping: str = ",".join(DEFAULT_GROUPINGS)
-    """Comma-separated: single, shuffled, sequential, window (an image with those just before it,
-    --batch-size in all); QUERIES/DATABASE groups the two sides apart."""
+    """Comma-separated: single, shuffled, sequential, masked (sequential, but no image sees another
+    of its own place), window (an image with those just before it, --batch-size in all);
+    QUERIES/DATABASE groups the two sides apart, and @26 after it makes batches of 26.
+    published:sage, published:cricavpr or published:crisalad: the batches of that evaluation, and
+    then the honest ones."""
     pca: pathlib.Path | None = None
     """Components that `crisalad pca` fitted, for shorter descriptors."""
     dtype: Literal["float32", "bits"] = "float32"
@@ -75,7 +78,7 @@ def run(arguments: Evaluate) -> None:
     """Evaluate the model, print the table, and write the files that are asked for."""
     groupings = arguments.grouping.split(",")
     drawn = pick(arguments, "seed", "seeds", "precision")
-    check_evaluation(groupings, **drawn)
+    kinds = check_evaluation(groupings, **drawn)
     _check_flags(arguments)
     reading = arguments.reading
     rerank = _reranking(arguments)
@@ -83,7 +86,7 @@ def run(arguments: Evaluate) -> None:
     if arguments.preset is not None:
         model, name, file = _untrained(arguments.preset, arguments)
     else:
-        model, name, file = open_flagged(arguments, groupings=groupings)
+        model, name, file = open_flagged(arguments, groupings=kinds)
     config = model.config
     pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
     echo(name)
@@ -100,11 +103,13 @@ def run(arguments: Evaluate) -> None:
         reading=reading,
         **drawn,
     )
-    asked = {"weights": arguments.weights or file} | pick(
+    asked = {"weights": arguments.weights or file, "groupings": groupings} | pick(
         arguments, "batch_size", "seed", "seeds", "pca", "dtype", "rerank", "rerank_weights"
     )
     record = evaluation_record(results, benchmark, config, model_name=name, **asked)
     tables = [grouping_table(results)]
+    if config.cross_image.attends:
+        tables.append(leakage_table(results))
     if points := {each.label: each.operating_point for each in results if each.operating_point}:
         tables.append(points_table(points))
     show_tables(*tables)

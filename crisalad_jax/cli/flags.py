@@ -50,7 +50,7 @@ class PluginFlag:
     """Where custom parts come from."""
 
     plugin: tuple[str, ...] = ()
-    """Files FILE.py or modules that register custom parts; their code is run."""
+    """Files FILE.py or modules that register custom parts or models; their code is run."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -123,7 +123,8 @@ class ModelFlags(ComputeFlags, QuietFlag):
 
     weights: pathlib.Path | None = None
     """By default starter, the small model in this package; or hog, a baseline that learns nothing;
-    or a .safetensors file, or a published model's name (`crisalad models`)."""
+    or a .safetensors file, or a published model's name (`crisalad models`), or hf://OWNER/NAME at
+    Hugging Face's hub."""
     runtime: RuntimeName = "jax"
     """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
     for it once; --weights may be an exported folder."""

@@ -11,7 +11,7 @@ from crisalad_jax.checkpoints.cache import is_cached
 from crisalad_jax.checkpoints.published import PUBLISHED, Published, published_model
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.common import echo, refuse_with, show_tables
-from crisalad_jax.cli.flags import TableFlags
+from crisalad_jax.cli.flags import PluginFlag, TableFlags
 from crisalad_jax.cli.tables import fact_lines, models_table
 from crisalad_jax.utils.files import user_cache
 
@@ -19,7 +19,7 @@ EXAMPLE = "crisalad models salad"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Models(TableFlags):
+class Models(PluginFlag, TableFlags):
     """List the models that others published, which --weights takes by name, or describe one."""
 
     name: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="NAME")] = None

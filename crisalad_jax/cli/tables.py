@@ -5,6 +5,7 @@ from typing import Any
 
 from crisalad_jax.checkpoints.cache import is_cached
 from crisalad_jax.checkpoints.published import GITHUB, Published
+from crisalad_jax.data.sets import CheckedPart, PublishedSet
 from crisalad_jax.evaluation.operating_point import OperatingPoint
 from crisalad_jax.evaluation.results import GroupingResult, Scores, percent
 from crisalad_jax.experiments.tables import NOTHING, Cell, Table
@@ -14,12 +15,12 @@ from crisalad_jax.utils.output import printable
 
 
 def grouping_table(results: Sequence[GroupingResult]) -> Table:
-    """Make a table of results in percent, in the terminal about 97 columns wide.
+    """Make a table of results in percent, in the terminal about 85 columns wide.
 
     Each recall is above its interval, and a mean over shuffles before their spread.
     """
     recall_names = [f"R@{k}\n95 %" for k in results[0].recalls]
-    names = ("same place\nq / db", *recall_names, "AP", "R at\n100 % P")
+    names = (*recall_names, "AP", "R at\n100 % P")
     rows = []
     for result in results:
         spread = result.spread or _NO_SPREAD
@@ -34,13 +35,37 @@ def grouping_table(results: Sequence[GroupingResult]) -> Table:
         rows.append(
             [
                 Cell(result.grouping, f"+ {result.rerank}" if result.rerank else ""),
-                Cell(f"{_or_dash(result.query_share)} / {_or_dash(result.database_share)}"),
                 *recall_cells,
                 Cell(_or_dash(result.average_precision), _spread(spread.average_precision)),
                 Cell(_or_dash(full), _spread(spread.recall_at_full_precision)),
             ]
         )
     return Table(["queries/\ndatabase", *names], rows, stacked=True)
+
+
+def leakage_table(results: Sequence[GroupingResult]) -> Table:
+    """Make a table of what groupings give over images described alone, and of what they leak."""
+    rows = []
+    for result in results:
+        gain = result.over_single
+        points = Cell(NOTHING)
+        if gain is not None:
+            points = Cell(_points(gain.mean), " to ".join(map(_points, gain.interval)))
+        rows.append(
+            [
+                Cell(result.grouping, f"+ {result.rerank}" if result.rerank else ""),
+                Cell(_or_dash(result.recalls.get(1))),
+                points,
+                Cell(f"{_or_dash(result.query_share)} / {_or_dash(result.database_share)}"),
+                Cell(_or_dash(result.mirrored_share)),
+            ]
+        )
+    names = ("R@1", "points over\nsingle, 95 %", "same place\nq / db", "mirrored")
+    return Table(["queries/\ndatabase", *names], rows, stacked=True)
+
+
+def _points(difference: float) -> str:
+    return f"{100 * difference:+.1f}"
 
 
 def points_table(points: Mapping[str, OperatingPoint]) -> Table:
@@ -107,6 +132,42 @@ def models_table(models: Sequence[Published]) -> Table:
     ]
     headers = ["name", "licence", "images", "GitHub", "descriptor", "parameters"]
     return Table(headers, [list(map(Cell, row)) for row in rows], labels=4)
+
+
+def sets_table(sets: Sequence[PublishedSet]) -> Table:
+    """Make a table of public data sets."""
+    rows = []
+    for each in sets:
+        counts = [
+            " + ".join(NOTHING if count is None else f"{count:,}" for count in numbers)
+            for part in each.parts
+            if any(numbers := (part.database, part.queries))
+        ]
+        size = "not known" if each.gigabytes is None else f"{each.gigabytes} GB"
+        fetched = "fetch" if each.is_fetched else "by hand"
+        licence = each.licence or "not known"
+        rows.append([each.name, each.title, fetched, each.host, licence, size, "; ".join(counts)])
+    headers = ["name", "set", "how", "where", "licence", "size", "database + queries"]
+    return Table(headers, [list(map(Cell, row)) for row in rows], labels=5)
+
+
+def checked_table(parts: Sequence[CheckedPart]) -> Table:
+    """Make a table of what a folder is, a row for each part."""
+    rows = []
+    for part in parts:
+        counts = [
+            NOTHING if count is None else f"{count:,}" for count in (part.database, part.queries)
+        ]
+        verdict = (
+            "does not match"
+            if part.problem
+            else "as published"
+            if part.known
+            else "nothing to compare"
+        )
+        rows.append([Cell(each) for each in (part.name, part.known or NOTHING, verdict, *counts)])
+    headers = ["part", "published as", "verdict", "images", "queries or places"]
+    return Table(headers, rows, labels=2 + 1)
 
 
 _MOST = 10

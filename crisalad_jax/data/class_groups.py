@@ -34,7 +34,7 @@ class Views(NamedTuple):
     heading: Float64[np.ndarray, " images"]
     """Heading in degrees clockwise from north, 0 to 360; NaN where unknown."""
     known: Bool[np.ndarray, " cities"]
-    """Whether a city's positions are real; False where all its images have the same position."""
+    """Whether a city's positions are real; False where all its images have the same one."""
 
 
 def views_of(places: Places) -> Views:
@@ -49,7 +49,7 @@ def views_of(places: Places) -> Views:
     ).T
     city = places.place_city[places.image_place]
     east, north = np.empty(count), np.empty(count)
-    known = np.zeros(len(places.cities), bool)
+    known = np.ones(len(places.cities), bool)
     for number in np.unique(city):
         of = city == number
         here = continuous(longitude[of])
@@ -57,7 +57,7 @@ def views_of(places: Places) -> Views:
             raise InputError(
                 f"{places.root}: found the images of {places.cities[number]} over {wide:.0f} "
                 f"degrees of longitude, expected at most {_WIDEST:g}, as cells are of one plane: "
-                "a set of several cities has a table each, or no columns lat,lon"
+                "a set of several cities has a column city, or no columns lat,lon"
             )
         known[number] = np.ptp(latitude[of]) > 0 or np.ptp(here) > 0
         east[of], north[of] = to_metres(latitude[of], here)
@@ -91,7 +91,7 @@ def class_groups(
             fewer classes than a batch asks for.
     """
     chosen: list[list[list[Class]]] = []
-    for classes in _classes(places, config, min_images):
+    for classes in find_classes(places, config, min_images):
         groups: dict[int, list[Class]] = collections.defaultdict(list)
         for each in sorted(classes, key=lambda each: each.group):
             groups[each.group].append(each)
@@ -108,7 +108,7 @@ def class_groups(
     return tuple(_regrouped(places, group) for turn in turns for group in turn)
 
 
-def _classes(places: Places, config: ClassesConfig, min_images: int) -> list[list[Class]]:
+def find_classes(places: Places, config: ClassesConfig, min_images: int) -> list[list[Class]]:
     """Make the sets of classes: one, or the lateral and the frontal one."""
     views = views_of(places)
     if config.kind == "places":

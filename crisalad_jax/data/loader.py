@@ -18,7 +18,7 @@ from crisalad_jax.config.checks import check_count, check_types, require_range, 
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.config.short_repr import brief, with_field_docs
 from crisalad_jax.data.images import OnBadImage, read_pixels
-from crisalad_jax.data.places import Places
+from crisalad_jax.data.places import JoinedPlaces, Places
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.utils.errors import InputError
@@ -323,7 +323,7 @@ def training_batches(
 
 
 def batches_of_groups(
-    files: "Places | QuerySet",
+    files: "Places | JoinedPlaces | QuerySet",
     chosen: Int[np.ndarray, "steps groups images"],
     labels: Int[np.ndarray, "steps groups images"],
     *,

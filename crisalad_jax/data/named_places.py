@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from crisalad_jax.data.benchmarks.msls import MSLS_CITIES, city_folders, read_side
 from crisalad_jax.data.benchmarks.on_disk import find_images, has_sides, has_split, listing
 from crisalad_jax.data.images import OnBadImage, is_image, list_images
 from crisalad_jax.data.metres import comparable
@@ -33,8 +34,10 @@ COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "pa
 """Of a table of GSV-Cities."""
 _IDS_PER_CITY = 10**5
 TABLE = "places.csv"
-_COLUMNS = "name,place[,lat,lon[,heading]]"
-_LAYOUTS = f"the layout of GSV-Cities (Dataframes/, Images/), {TABLE}, or one folder a place"
+_COLUMNS = "name,place[,lat,lon[,heading]][,city]"
+_LAYOUTS = (
+    f"the layout of GSV-Cities (Dataframes/, Images/) or MSLS, {TABLE}, or one folder a place"
+)
 _GROUPED = "--place-radius METRES makes places by positions, --place-frames N of images in order"
 _VIEW = ("lat", "lon", "heading")
 """Columns of where an image was taken."""
@@ -137,13 +140,41 @@ def _read_city(
     return places
 
 
+def read_msls_places(
+    root: pathlib.Path, cities: Sequence[str] | None, on_bad_image: OnBadImage
+) -> tuple[tuple[str, ...], list[FoundPlace]]:
+    """Return the cities of raw MSLS, and their places: the clusters of its tables.
+
+    By default the cities are those of its training set. Images of the database and of the queries
+    are of one place; panoramas are left out.
+
+    Raises:
+        InputError: there are no such cities, or what `read_msls` raises.
+    """
+    folders = city_folders(root, MSLS_CITIES["train"] if cities is None else cities)
+    found: list[FoundPlace] = []
+    for number, folder in enumerate(folders):
+        places: dict[str, dict[str, View | None]] = collections.defaultdict(dict)
+        for part in ("database", "query"):
+            side = read_side(folder / part, on_bad_image, headings=True, clusters=True)
+            views = np.column_stack([side.degrees, side.headings]).tolist()
+            for path, cluster, view in zip(side.images, side.clusters.tolist(), views, strict=True):
+                places[cluster][path.relative_to(root).as_posix()] = view
+        found += [
+            FoundPlace(f"{cluster} of {folder.name}", images, city=number)
+            for cluster, images in places.items()
+        ]
+    return tuple(folder.name for folder in folders), found
+
+
 def read_named_places(
     root: pathlib.Path, on_bad_image: OnBadImage
-) -> tuple[pathlib.Path, list[FoundPlace]]:
+) -> tuple[pathlib.Path, tuple[str, ...], list[FoundPlace]]:
     """Read a table, a folder with a table in it, or a folder with one folder a place.
 
     Returns:
-        The folder that the images' paths are relative to, and the places.
+        The folder that the images' paths are relative to, the cities that the table names, and the
+        places, in the order of these.
 
     Raises:
         InputError: it is none of these; what the table says does not fit; or an image is missing.
@@ -151,8 +182,8 @@ def read_named_places(
     if (root / TABLE).is_file():
         root = root / TABLE
     if root.is_file() and not is_video(root):
-        return root.parent, _read_table(root, on_bad_image)
-    return root, _read_folders(root)
+        return root.parent, *_read_table(root, on_bad_image)
+    return root, (), _read_folders(root)
 
 
 def _read_folders(root: pathlib.Path) -> list[FoundPlace]:
@@ -171,8 +202,10 @@ def _read_folders(root: pathlib.Path) -> list[FoundPlace]:
     return [FoundPlace(name, files) for name, files in images.items()]
 
 
-def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace]:
-    """Read the places of a table; under "skip" a note counts the images that are missing."""
+def _read_table(
+    path: pathlib.Path, on_bad_image: OnBadImage
+) -> tuple[tuple[str, ...], list[FoundPlace]]:
+    """Read the cities and places of a table; under "skip" a note counts the missing images."""
     table = read_table(path, "name")
     given = [column for column in _VIEW if column in table.columns]
     # A heading is of use with a position alone.
@@ -182,10 +215,11 @@ def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace
         )
     rows, root = list(table.named_rows()), path.parent
     paths = find_images(path, [name for name, _ in rows], root, on_bad_image)
-    places: dict[str, dict[str, View | None]] = collections.defaultdict(dict)
+    has_cities = "city" in table.columns
+    places: dict[tuple[str, str], dict[str, View | None]] = collections.defaultdict(dict)
     missing = 0
     for image, (name, row) in zip(paths, rows, strict=True):
-        place = row.text("place")
+        place = row.text("city") if has_cities else "", row.text("place")
         if on_bad_image == "skip" and not image.is_file():
             missing += 1
             continue
@@ -195,7 +229,12 @@ def _read_table(path: pathlib.Path, on_bad_image: OnBadImage) -> list[FoundPlace
         places[place][file] = view if given else None
     if missing:
         warn(f"{path}: left out {missing} of {len(rows)} images, which are missing")
-    return [FoundPlace(name, files) for name, files in places.items()]
+    cities = tuple(sorted({city for city, _ in places}))
+    found = [
+        FoundPlace(f"{name} of {city}" if city else name, files, city=cities.index(city))
+        for (city, name), files in places.items()
+    ]
+    return cities if has_cities else (), sorted(found, key=lambda place: place.city)
 
 
 def places_by_position(

@@ -2,22 +2,26 @@
 
 import dataclasses
 import functools
+import itertools
 import math
 import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.benchmarks.msls import is_msls
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.named_places import COLUMNS as COLUMNS
 from crisalad_jax.data.named_places import (
+    TABLE,
     FoundPlace,
     places_by_order,
     places_by_position,
     read_gsv_cities,
+    read_msls_places,
     read_named_places,
 )
 from crisalad_jax.data.sources import check_rate_used, open_source
@@ -67,6 +71,28 @@ class Places:
         return self.root / self.files[image]
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class JoinedPlaces:
+    """The images of several training sets, numbered from one set to the next."""
+
+    sets: tuple[Places, ...]
+
+    @functools.cached_property
+    def starts(self) -> Int64[np.ndarray, " sets+1"]:
+        """Number of each set's first image, and of all images."""
+        return np.cumsum([0, *(len(each.files) for each in self.sets)], dtype=np.int64)
+
+    @property
+    def files(self) -> Iterator[str]:
+        """All images' paths, each relative to its set's root."""
+        return itertools.chain.from_iterable(each.files for each in self.sets)
+
+    def path(self, image: int | np.integer) -> pathlib.Path:
+        """Return the path of one image."""
+        number = int(np.searchsorted(self.starts, image, side="right")) - 1
+        return self.sets[number].path(image - self.starts[number])
+
+
 @takes(root=PATH)
 def read_places(
     root: str | os.PathLike[str],
@@ -79,14 +105,18 @@ def read_places(
     fps: float | None = None,
     on_bad_image: OnBadImage = "stop",
 ) -> Places:
-    """Read a folder in the layout of GSV-Cities or of your own.
+    """Read a folder in the layout of GSV-Cities, of MSLS or of your own.
 
     Or make places of any source of images, by their positions or their order. Then places that are
     too near to tell apart, `Places.near`, never meet in a batch.
 
     A layout of your own is a folder in which each folder with images is a place; or a table with
-    the columns `name,place`, and `lat,lon` and `heading` in degrees where they are known: a file,
-    or `places.csv` in the folder. Names are relative to the table.
+    the columns `name,place`, and `lat,lon` and `heading` in degrees and `city` where they are
+    known: a file, or `places.csv` in the folder. Names are relative to the table. A table of
+    several cities, or scenes, has the places of each by their own names.
+
+    Places of MSLS are the clusters of its tables (`unique_cluster`), with the images of the
+    database and of the queries, without panoramas.
 
     GSV-Cities' images may end in .jpg or .JPG, and may lie in a folder named by the city id or by
     the CSV file. A row that repeats an earlier one of its place is dropped: no picture is its own
@@ -95,7 +125,8 @@ def read_places(
     Args:
         root: folder that holds `Dataframes/` and `Images/`, or a layout of your own; with
             `place_radius` or `place_frames` a source of images (`open_source`).
-        cities: names of CSV files without the suffix; None reads all, in alphabetical order.
+        cities: names of CSV files without the suffix, or of MSLS's folders; None reads all, of MSLS
+            those of its training set.
         min_images: places with fewer images are left out, and a note counts them.
         place_radius: metres from a place's centre, within which its images are. In the order of the
             images, one that is farther from all centres becomes a centre; then each image is of the
@@ -121,16 +152,17 @@ def read_places(
     """
     root = pathlib.Path(root)
     is_gsv = (root / "Dataframes").is_dir()
+    has_cities = is_gsv or (is_msls(root) and not (root / TABLE).is_file())
     groupings = (place_radius is not None) + (place_frames is not None)
     if (
-        groupings + is_gsv > 1
+        groupings + has_cities > 1
         or (positions is not None and place_radius is None)
         or (fps is not None and not groupings)
-        or (cities is not None and not is_gsv)
+        or (cities is not None and not has_cities)
     ):
         raise InputError(
             f"{root}: found arguments that do not fit each other, expected --cities for the layout "
-            "of GSV-Cities alone; for other images --place-radius, perhaps with --positions, or "
+            "of GSV-Cities or MSLS; for other images --place-radius, perhaps with --positions, or "
             "--place-frames, and --fps with either"
         )
     if place_radius is not None and not 0 < place_radius < math.inf:
@@ -140,6 +172,8 @@ def read_places(
     names: tuple[str, ...] = ()
     if is_gsv:
         names, found = read_gsv_cities(root, cities, on_bad_image)
+    elif has_cities:
+        names, found = read_msls_places(root, cities, on_bad_image)
     elif groupings:
         source = open_source(root, fps=fps, on_bad_image=on_bad_image)
         check_rate_used(fps, source.paths)
@@ -149,7 +183,7 @@ def read_places(
         else:
             found = places_by_order(source, place_frames or 0)
     else:
-        root, found = read_named_places(root, on_bad_image)
+        root, names, found = read_named_places(root, on_bad_image)
     return _places(root, names or (real_path(root).name,), found, min_images)
 
 

@@ -14,15 +14,23 @@ from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count, check_seed, takes
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.evaluation.leakage import SamePlace, by_truth, near, same_place_share
+from crisalad_jax.evaluation.leakage import (
+    SamePlace,
+    by_truth,
+    masked,
+    mirrored_share,
+    near,
+    same_place_share,
+)
 from crisalad_jax.evaluation.operating_point import check_precision
-from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, summarise
+from crisalad_jax.evaluation.protocols import check_groupings, groupings_of
+from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, over_single, summarise
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.bits import check_packable, pack_bits, sign_vectors
 from crisalad_jax.retrieval.chunks import Descriptors
 from crisalad_jax.retrieval.describe import TokenSet
 from crisalad_jax.retrieval.describer import Describer, describer_of
-from crisalad_jax.retrieval.grouping import DEFAULT_GROUPINGS, Grouping, parse_groupings
+from crisalad_jax.retrieval.grouping import DEFAULT_GROUPINGS, MASKED, Batches, Grouping
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, shortened
 from crisalad_jax.retrieval.reranking import Reranker, Reranking
@@ -61,7 +69,8 @@ def evaluate(
     Args:
         model: parameters and configuration, as `load` returns them, or a `Runtime`.
         benchmark: what to evaluate on.
-        groupings: each as `Grouping.parse` reads it.
+        groupings: each as `Grouping.parse` reads it, or `published:NAME` with cricavpr, crisalad or
+            sage: the batches of that paper's evaluation, then the honest ones of as many images.
         seed: draws the first shuffle: the database's, and with the next seed the queries'.
         seeds: shuffles, each from the second seed after the one before.
         pca: shortens the descriptors, fitted to images of other places.
@@ -83,7 +92,8 @@ def evaluate(
         InputError: parameters of another configuration, bits of a length that is not a multiple of
             8, no ground truth, an image cannot be read
             or none of a side, components that are not for this model or make no unit vectors, such
-            a precision, or what `parse_groupings`, `Reranking.check` and `Reranker` raise.
+            a precision, or what `Grouping.parse`, `Reranking.check` and `Reranker` raise; a
+            published grouping whose batches are not known for this set.
 
     Example:
         >>> import jax, shutil
@@ -100,8 +110,9 @@ def evaluate(
         >>> result.recalls[1]
         1.0
     """
-    parsed = check_evaluation(groupings, seed=seed, seeds=seeds, precision=precision)
-    describer = describer_of(model, groupings)
+    kinds = check_evaluation(groupings, seed=seed, seeds=seeds, precision=precision)
+    parsed = groupings_of(groupings, benchmark)
+    describer = describer_of(model, kinds)
     config = describer.config
     length, is_unit = shortened(pca, describer, "model")
     is_bits = dtype == "bits"
@@ -140,8 +151,10 @@ def evaluate(
             drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
             name = str(grouping) if config.cross_image.attends else ANY
             observer = observe and functools.partial(observe, name)
-            ranked = _rank(sides, grouping, drawn, k, observer, unit=is_unit, bits=is_bits)
-            rankings, (database_share, query_share) = ranked
+            ranked = _rank(
+                sides, grouping, drawn, k, positives, observer, unit=is_unit, bits=is_bits
+            )
+            rankings, shares = ranked
             for label, stage in stages.items():
                 result = summarise(
                     name,
@@ -150,28 +163,27 @@ def evaluate(
                     KS,
                     is_random=is_random,
                     precision=precision,
-                    query_share=query_share,
-                    database_share=database_share,
                     rerank=label,
                     skipped=skipped,
+                    **shares,
                 )
                 results.append(result)
-    return results
+    return over_single(results)
 
 
 def check_evaluation(
     groupings: Sequence[str], *, seed: int, seeds: int, precision: float | None
-) -> list[Grouping]:
-    """Check arguments of `evaluate` before any work, and return the groupings parsed.
+) -> list[str]:
+    """Check arguments of `evaluate` before any work, and return the kinds of groupings.
 
     Raises:
-        InputError: what `parse_groupings` raises, or a number out of range.
+        InputError: what `check_groupings` raises, or a number out of range.
     """
     check_seed("seed", seed)
     check_count("seeds", seeds)
     if precision is not None:
         check_precision(precision)
-    return parse_groupings(groupings)
+    return check_groupings(groupings)
 
 
 def _first(neighbours: Neighbours, count: int) -> Neighbours:
@@ -188,11 +200,16 @@ class _Side(NamedTuple):
     """Added to the seed of a shuffle, so that the two sides are never shuffled alike."""
     pca: Pca | None
 
-    def describe(self, kind: str, seed: int) -> tuple[Descriptors, float | None]:
-        """Return descriptors under a grouping, and the share of same-place images in sight."""
-        descriptors, batches = self.tokens.describe(kind, seed + self.offset)
-        short = descriptors if self.pca is None else self.pca.apply(descriptors)
-        return short, same_place_share(batches, self.same)
+    def batches(self, kind: str, batch_size: int | None, seed: int) -> Batches:
+        """Group the images of this side."""
+        if kind == MASKED:
+            return masked(self.tokens.batches("sequential", batch_size), self.same)
+        return self.tokens.batches(kind, batch_size, seed + self.offset)
+
+    def describe(self, batches: Batches) -> Descriptors:
+        """Return the descriptors of images in batches."""
+        descriptors = self.tokens.describe(batches)
+        return descriptors if self.pca is None else self.pca.apply(descriptors)
 
 
 def same_place_rule(benchmark: Benchmark) -> str:
@@ -217,18 +234,19 @@ def _rank(
     grouping: Grouping,
     seeds: Sequence[int],
     k: int,
+    positives: Sequence[Int64[np.ndarray, " _"]],
     observe: Callable[[Descriptors, Descriptors], None] | None,
     *,
     unit: bool,
     bits: bool,
-) -> tuple[dict[int, Neighbours], list[float | None]]:
+) -> tuple[dict[int, Neighbours], dict[str, float | None]]:
     """Rank the k nearest neighbours for each seed; only shuffled sides are described anew.
 
     `observe` is given the descriptors of the first seed. Those that are not unit vectors are ranked
     by Euclidean distance, and bits by the Hamming distance.
 
     Returns:
-        The rankings by seed, and both sides' share of same-place images: the mean over the seeds.
+        The rankings by seed, and what leaks: fields of `GroupingResult`, the mean over the seeds.
     """
 
     def compare(database: Descriptors, queries: Descriptors) -> Neighbours:
@@ -238,17 +256,30 @@ def _rank(
 
     kinds = grouping.database, grouping.queries
     descriptors: dict[int, Descriptors] = {}
-    shares: tuple[list[float], list[float]] = [], []
+    batches: dict[int, Batches] = {}
+    leaks: dict[str, list[float | None]] = {}
     rankings = {}
     for seed in seeds:
         for number, (side, kind) in enumerate(zip(sides, kinds, strict=True)):
             if kind == "shuffled" or seed == seeds[0]:
                 descriptors.pop(number, None)  # makes room
-                found, share = side.describe(kind, seed)
-                descriptors[number] = pack_bits(found) if bits else found
-                shares[number].extend([] if share is None else [share])
+                batches[number] = side.batches(kind, grouping.batch_size, seed)
+                described = side.describe(batches[number])
+                descriptors[number] = pack_bits(described) if bits else described
+        found = {
+            "database_share": same_place_share(batches[0], sides[0].same),
+            "query_share": same_place_share(batches[1], sides[1].same),
+            "mirrored_share": mirrored_share(batches[1], batches[0], positives),
+        }
+        for name, share in found.items():
+            leaks.setdefault(name, []).append(share)
         if observe is not None and seed == seeds[0]:
             pair = descriptors[0], descriptors[1]
             observe(*(map(sign_vectors, pair) if bits else pair))
         rankings[seed] = compare(descriptors[0], descriptors[1])
-    return rankings, [statistics.fmean(each) if each else None for each in shares]
+    return rankings, {name: _mean_known(shares) for name, shares in leaks.items()}
+
+
+def _mean_known(shares: Sequence[float | None]) -> float | None:
+    known = [share for share in shares if share is not None]
+    return statistics.fmean(known) if known else None

@@ -1,4 +1,4 @@
-"""Leakage of a grouping: the share of images in sight of an image that show its own place."""
+"""Leakage of a grouping: what the images in sight of an image tell of its place."""
 
 from collections.abc import Callable, Sequence
 
@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Float64, Int64
 
-from crisalad_jax.retrieval.grouping import Batches
+from crisalad_jax.retrieval.grouping import MASKED, Batches
 
 SamePlace = Callable[
     [Int64[np.ndarray, " pair"], Int64[np.ndarray, " pair"]], Bool[np.ndarray, " pair"]
@@ -35,11 +35,16 @@ def by_truth(
     images if both are right for some query. An image without any positive shares its place with
     no other image, whatever it shows.
     """
+    truth = _truth(positives, database)
+    return _sharing(truth), _sharing(truth.T.tocsr())
+
+
+def _truth(positives: Sequence[Int64[np.ndarray, " _"]], database: int) -> scipy.sparse.csr_array:
+    """Return which database images are right for each query, as a matrix of ones."""
     right = np.concatenate(positives) if positives else np.empty(0, np.int64)
     asking = np.repeat(np.arange(len(positives)), [len(each) for each in positives])
-    entries = np.ones(len(right), np.int8), (asking, right)
-    truth = scipy.sparse.csr_array(entries, shape=(len(positives), database), dtype=bool)
-    return _sharing(truth), _sharing(truth.T.tocsr())
+    entries = np.ones(len(right), np.int32), (asking, right)
+    return scipy.sparse.csr_array(entries, shape=(len(positives), database))
 
 
 def _sharing(owned: scipy.sparse.csr_array) -> SamePlace:
@@ -52,6 +57,60 @@ def _sharing(owned: scipy.sparse.csr_array) -> SamePlace:
         return np.concatenate([np.zeros(0), *counts]) > 0
 
     return same
+
+
+def masked(batches: Batches, same: SamePlace) -> Batches:
+    """Give each image the others of its batch that show other places.
+
+    Each image gets a batch of its own: masked in a batch of all, another image of its place would
+    arrive through a third one in the second layer.
+
+    Args:
+        batches: batches in which every filled place is kept.
+        same: whether two images show the same place.
+    """
+    batch, place = np.nonzero(batches.kept)
+    images, filled = batches.images[batch], batches.filled[batch].copy()
+    own = images[np.arange(len(batch)), place]
+    row, column = np.nonzero(filled)
+    filled[row, column] = ~same(own[row], images[row, column])
+    kept = np.zeros_like(filled)
+    kept[np.arange(len(batch)), place] = True
+    return Batches(images, filled | kept, kept, MASKED)
+
+
+def mirrored_share(
+    queries: Batches, database: Batches, positives: Sequence[Int64[np.ndarray, " _"]]
+) -> float | None:
+    """Measure how far a query's batch is known again in the batch of its right answer, 0 to 1.
+
+    That is the share of the other images in a query's batch that have a positive in the batch of
+    the query's own positive; of several positives the largest share. Where files of both sides are
+    in the same order it is 1: two batches hold the same places, and what they have in common says
+    which stretch of the files this is. It is averaged over the queries with a positive that looked
+    at other images; None where none did, or no database image looked at another.
+    """
+    if "single" in (queries.grouping, database.grouping):
+        return None
+    seen, others = _sight(database), _sight(queries)
+    others.setdiag(0)
+    others.eliminate_zeros()
+    truth = _truth(positives, int(database.kept.sum()))
+    at_answer = (truth @ seen.T).astype(bool).astype(np.int32)  # has a positive in sight of it
+    shares = (others @ at_answer).multiply(truth).max(axis=1).toarray().ravel()
+    counts = np.diff(others.indptr)
+    asked = (counts > 0) & (np.diff(truth.indptr) > 0)
+    return float((shares[asked] / counts[asked]).mean()) if asked.any() else None
+
+
+def _sight(batches: Batches) -> scipy.sparse.csr_array:
+    """Return which images each image sees, itself included, as a matrix of ones."""
+    batch, place = np.nonzero(batches.kept)
+    row, column = np.nonzero(batches.filled[batch])
+    seen = batches.images[batch[row], column]
+    count = len(batch)
+    entries = np.ones(len(row), np.int32), (batches.images[batch, place][row], seen)
+    return scipy.sparse.csr_array(entries, shape=(count, count))
 
 
 def same_place_share(batches: Batches, same: SamePlace) -> float | None:

@@ -9,6 +9,7 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.evaluate import same_place_rule
 from crisalad_jax.evaluation.operating_point import caveats
+from crisalad_jax.evaluation.protocols import protocol_notes
 from crisalad_jax.evaluation.results import ANY, GroupingResult, to_json
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import Grouping, grouping_words
@@ -47,8 +48,8 @@ def evaluation_record(
         config: the model.
         model_name: which weights, for each row.
         **asked: what `crisalad evaluate` was asked for: the files `weights` (None is an untrained
-            model), `pca` and `rerank_weights` (None is the first stage's), `batch_size`, `seed`,
-            `seeds`, `dtype` and `rerank`.
+            model), `pca` and `rerank_weights` (None is the first stage's), `groupings`,
+            `batch_size`, `seed`, `seeds`, `dtype` and `rerank`.
 
     Returns:
         The record, whose settings `write_report` takes.
@@ -108,11 +109,15 @@ def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> 
     parsed = [Grouping.parse(each.grouping) for each in results if each.grouping != ANY]
     kinds = dict.fromkeys(kind for each in parsed for kind in (each.queries, each.database))
     if kinds:
+        sized = "; after @ a size of its own" if any(each.batch_size for each in parsed) else ""
         notes.append(
             "A descriptor of this model depends on the images in its batch of "
-            f"{settings['batch_size']}: {grouping_words(kinds)}. Same place: of the others in "
-            f"sight, those that show the image's own place, told by {settings['same_place']}."
+            f"{settings['batch_size']}{sized}: {grouping_words(kinds)}. Same place: of the others "
+            f"in sight, those that show the image's own place, told by {settings['same_place']}. "
+            "Mirrored: of the others in a query's batch, those whose place is also in the batch of "
+            "its right answer. Of what both see a descriptor knows the stretch of files."
         )
+        notes += protocol_notes(settings.get("groupings", ()))
     else:
         notes.append("No cross-image encoder: no descriptor depends on its batch.")
     if settings.get("dtype") == "bits":

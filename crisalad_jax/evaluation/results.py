@@ -6,10 +6,11 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.evaluation.difference import Difference, paired_difference
 from crisalad_jax.evaluation.metrics import (
     Interval,
     PrecisionRecall,
@@ -71,6 +72,10 @@ class GroupingResult(NamedTuple):
     seeds; None where no query looked at another."""
     database_share: float | None = None
     """The same share for the database images."""
+    mirrored_share: float | None = None
+    """How far a query's batch is known again in its right answer's: `leakage.mirrored_share`."""
+    over_single: Difference | None = None
+    """Recall@1 less that of images described alone; None without such a row, or of it."""
     precision_recall: PrecisionRecall | None = None
     """The curve of the first seed; None where no query has a positive."""
     average_precision: float | None = None
@@ -81,6 +86,8 @@ class GroupingResult(NamedTuple):
     """Sample standard deviation over the seeds; None with fewer than two."""
     by_seed: Mapping[int, Scores] = MappingProxyType({})
     """Scores of each shuffle, by the seed that repeats it alone; empty if nothing is random."""
+    firsts: Bool[np.ndarray, "seed q"] | None = None
+    """Whether the first retrieval was right, for each seed and query."""
     rerank: str | None = None
     """The second stage, as `reranking.parse_reranking` reads it; its scores replace the
     similarities of the retrievals that it re-ranked. None is the first stage alone."""
@@ -142,11 +149,25 @@ def summarise(
         recall_at_full_precision=mean.recall_at_full_precision,
         spread=_over(scores, statistics.stdev) if len(scores) > 1 else None,
         by_seed=dict(zip(rankings, scores, strict=True)) if is_random else {},
+        firsts=np.array([right[:, 0] for right in rights]),
         operating_point=None
         if precision is None
         else operating_point(*first, positives, precision),
         **known,
     )
+
+
+def over_single(results: Sequence[GroupingResult]) -> list[GroupingResult]:
+    """Compare results with that of images described alone, of the same second stage."""
+    alone = {each.rerank: each.firsts for each in results if each.grouping == "single"}
+
+    def difference(result: GroupingResult) -> Difference | None:
+        reference = alone.get(result.rerank)
+        if result.firsts is None or reference is None or result.grouping == "single":
+            return None
+        return paired_difference(result.firsts, reference, same_seeds=False)
+
+    return [each._replace(over_single=difference(each)) for each in results]
 
 
 def _over(scores: Sequence[Scores], combine: Callable[[Sequence[float]], float]) -> Scores:
@@ -168,17 +189,22 @@ def percent(fraction: float) -> str:
 
 def to_json(result: GroupingResult) -> dict[str, Any]:
     """Put a result without its neighbours into JSON values; recalls and shares are fractions."""
-    sides = (ANY, ANY)
+    sides, size, gain = (ANY, ANY), None, result.over_single
     if result.grouping != ANY:
         grouping = Grouping.parse(result.grouping)
-        sides = grouping.queries, grouping.database
+        sides, size = (grouping.queries, grouping.database), grouping.batch_size
     curve, point = result.precision_recall, result.operating_point
     return {
         "grouping": result.grouping,
         "rerank": result.rerank,
         "queries": sides[0],
         "database": sides[1],
+        "batch_size": size,
         "same_place": {"queries": result.query_share, "database": result.database_share},
+        "mirrored": result.mirrored_share,
+        "over_single": None
+        if gain is None
+        else {"R@1": gain.mean, "interval": list(gain.interval)},
         **_scores_json(
             Scores(result.recalls, result.average_precision, result.recall_at_full_precision)
         ),

@@ -13,7 +13,9 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.distributed import is_primary
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import FitResult, fit
+from crisalad_jax.training.run_files import write_data
 from crisalad_jax.training.start import read_inputs
+from crisalad_jax.utils.files import real_path
 
 Path = str | os.PathLike[str]
 
@@ -122,4 +124,5 @@ def train(
     if is_primary() and result.steps:
         out = pathlib.Path(out)
         save_chart(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
+        write_data(out, real_path(pathlib.Path(data)).name, places, benchmark)
     return result

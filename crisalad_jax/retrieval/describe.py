@@ -18,7 +18,7 @@ from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.retrieval.describer import Describer, Rows, describer_of
-from crisalad_jax.retrieval.grouping import Batches, batches_of
+from crisalad_jax.retrieval.grouping import MASKED, Batches, batches_of
 from crisalad_jax.retrieval.pca import Pca
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import progress_bar
@@ -313,13 +313,15 @@ class TokenSet:
         _, self.rows, self.unreadable = _concatenated(list(stream))
         self._describer, self._reading, self._label = describer, reading, label
 
-    def describe(
-        self, grouping: str, seed: int = 0
-    ) -> tuple[Float[np.ndarray, "image descriptor"], Batches]:
-        """Return the descriptors of the readable images under a grouping, and its batches."""
-        batches = batches_of(len(self.rows), grouping, self._reading.batch_size, seed)
+    def batches(self, grouping: str, batch_size: int | None, seed: int = 0) -> Batches:
+        """Group the readable images; by default in the batches in which they were read."""
+        size = batch_size or self._reading.batch_size
+        return batches_of(len(self.rows), grouping, size, seed)
+
+    def describe(self, batches: Batches) -> Float[np.ndarray, "image descriptor"]:
+        """Return the descriptors of the readable images in batches."""
         options = {"label": self._label, "quiet": self._reading.quiet}
-        return group(self._describer, self.rows, batches, **options), batches
+        return group(self._describer, self.rows, batches, **options)
 
 
 def group(
@@ -352,11 +354,11 @@ def grouped(
         quiet: whether to show no progress bar.
     """
     count, size = batches.images.shape
-    # A window gives one descriptor, so as many are computed at a time as it has images.
-    is_window = batches.grouping == "window"
-    step = max(1, min(size, count - first)) if is_window else 1
+    # A batch that gives one descriptor is computed with as many others as it has images.
+    gives_one = batches.grouping in ("window", MASKED)
+    step = max(1, min(size, count - first)) if gives_one else 1
     # The other groupings take little time compared with the backbone: they need no bar.
-    silent = quiet or not is_window
+    silent = quiet or not gives_one
     with progress_bar(f"{label}, {batches.grouping}", count, "images", quiet=silent) as bar:
         for start in range(first, count, step):
             part = batches.part(start, start + step)

@@ -5,6 +5,7 @@ therefore means nothing without its protocol, for queries and for the database.
 """
 
 import dataclasses
+import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -22,13 +23,18 @@ GROUPINGS = {
 }
 """Groupings of the images of one side, queries or database. The two sides never mix."""
 
+MASKED = "masked"
+"""The batches of `sequential`, in which an image does not see the others of its own place. It takes
+the truth, so that only an evaluation has it."""
+_WORDS = GROUPINGS | {MASKED: "as sequential, but no image sees another of its own place"}
+
 DEFAULT_GROUPINGS = ("single", "shuffled", "sequential", "window/single")
 """The last is a robot's: it has its latest frames, and a map of images described alone."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Grouping:
-    """A protocol: one of `GROUPINGS` for the queries and one for the database.
+    """A protocol: one of `GROUPINGS` or `MASKED` for the queries and one for the database.
 
     `window` takes the order of the files for the order in time. That holds for numbered frames, but
     @UTM names are sorted by easting. A database by `window` is a map whose images were described
@@ -37,35 +43,45 @@ class Grouping:
 
     queries: str
     database: str
+    batch_size: int | None = None
+    """Images that attend to each other; None is the batch in which images are read."""
 
     @classmethod
     def parse(cls, text: str) -> "Grouping":
         """Read "window/single", queries and database apart, or "single" for both alike.
 
+        A size may follow, as in "sequential@26".
+
         Raises:
-            InputError: an unknown grouping, or more than two.
+            InputError: an unknown grouping, more than two, or no such size.
         """
-        kinds = text.split("/")
+        names, at, size = text.partition("@")
+        if at and not re.fullmatch("[1-9][0-9]{0,5}", size):
+            raise InputError(
+                f"grouping: found {text!r}, expected a number of images after @, as in {names}@16"
+            )
+        kinds = names.split("/")
         if len(kinds) > 2:
             raise InputError(
                 f"grouping: found {text!r}, expected one for both sides, or QUERIES/DATABASE"
             )
         for kind in kinds:
-            choose("grouping", kind, GROUPINGS)
-        return cls(kinds[0], kinds[-1])
+            choose("grouping", kind, _WORDS)
+        return cls(kinds[0], kinds[-1], int(size) if at else None)
 
     def __str__(self) -> str:
         """Return the text that `parse` reads."""
+        size = "" if self.batch_size is None else f"@{self.batch_size}"
         if self.queries == self.database:
-            return self.queries
-        return f"{self.queries}/{self.database}"
+            return self.queries + size
+        return f"{self.queries}/{self.database}{size}"
 
 
 def grouping_words(groupings: Iterable[str]) -> str:
     """Explain groupings in words, for under a table.
 
     Args:
-        groupings: some of `GROUPINGS`.
+        groupings: some of `GROUPINGS`, or `MASKED`.
 
     Returns:
         A clause for each, in their order.
@@ -74,7 +90,7 @@ def grouping_words(groupings: Iterable[str]) -> str:
         >>> grouping_words(["single"])
         'single = every image alone'
     """
-    return "; ".join(f"{name} = {GROUPINGS[name]}" for name in groupings)
+    return "; ".join(f"{name} = {_WORDS[name]}" for name in groupings)
 
 
 def parse_groupings(texts: Iterable[str]) -> list[Grouping]:
@@ -96,7 +112,7 @@ class Batches(NamedTuple):
     kept: Bool[np.ndarray, "batch place"]
     """Whether a place's descriptor is kept; every image is kept in exactly one batch."""
     grouping: str
-    """Which of `GROUPINGS` this is: under "single" each image attends to itself alone."""
+    """One of `GROUPINGS`, or `MASKED`: under "single" each image attends to itself alone."""
 
     def part(self, start: int, stop: int) -> "Batches":
         """Return batches `start` to `stop`."""

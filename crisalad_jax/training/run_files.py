@@ -36,6 +36,9 @@ from crisalad_jax.utils.temporaries import holds_other_files, made_folder, remov
 SAVE_SECONDS = 300
 """Longest time between saved states; validations and the end of a run save too."""
 
+DATA = "data.json"
+"""Name of what a run records of its data (`write_data`)."""
+
 
 class RunState(NamedTuple):
     """The arrays of a run."""
@@ -267,6 +270,29 @@ def check_run(out: pathlib.Path, config: TrainConfig) -> bool:
         "it, or another folder",
     )
     return existing.epochs < epochs
+
+
+def write_data(
+    out: pathlib.Path, name: str, places: Places | QuerySet, benchmark: Benchmark | None
+) -> None:
+    """Record in a run's folder what it was trained and validated on, for a model card.
+
+    Args:
+        out: the folder.
+        name: of the training data.
+        places: the training data.
+        benchmark: the validation set, if there is one.
+    """
+    if isinstance(places, QuerySet):
+        counts = {"queries": len(places.queries)}
+    else:
+        counts = {"places": len(places.names)}
+    validation = None
+    if benchmark is not None:
+        sides = {"database": len(benchmark.database), "queries": len(benchmark.queries)}
+        validation = {"name": benchmark.name, **sides}
+    training = {"name": name, **counts, "images": len(places.files)}
+    write_json(out / DATA, {"training": training, "validation": validation})
 
 
 def checksum_of_places(places: Places | QuerySet) -> int:

@@ -11,6 +11,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "onnx": ("onnx", "onnxruntime", *_CLI),
     "openvino": ("openvino", "onnx", *_CLI),
     "serve": ("fastapi", "uvicorn", "python_multipart", *_CLI),
+    "data": ("huggingface_hub", "kagglehub", *_CLI),
     "milvus": ("pymilvus", "milvus_lite"),
     "convert": ("torch", *_CLI),
 }

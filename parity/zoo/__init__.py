@@ -32,6 +32,8 @@ CHANGED: tuple[tuple[str, str, float], ...] = (
     ("^sfrs", r"net_vlad\.conv\.weight$", 100.0),
     ("^sfrs", r"net_vlad\.centroids$", 0.4),
     ("^sfrs", r"pca_layer\.bias$", 0.02),
+    ("^apgem", r"layer\d\.\d+\.bn3\.(weight|bias)$", 0.3),
+    ("^apgem", r"^mean_$", 0.05),
     ("^anyloc", r"c_centers$", 0.36),
     ("^transvpr", r"pool\.fc\.1\.bias$", 0.1),
     ("^vladbuff", r"aggregator\.conv\.weight$", 100.0),
@@ -40,7 +42,12 @@ CHANGED: tuple[tuple[str, str, float], ...] = (
 )
 """Weights of another size than the rest: a pattern of models, one of names, and a factor. With them
 a descriptor depends on the image more than on a bias."""
-FIXED = {r"aggregation(_hashing)?\.1\.p$": 3.0, r"aggregator\.ab_params$": (8.0, 7.0, 1.0)}
+POSITIVE = ("^apgem", r"^explained_variance_$", 0.005)
+"""As `CHANGED`, of the size of the draws and a little more: variances."""
+FIXED = {
+    r"(aggregation(_hashing)?\.1|adpool)\.p$": 3.0,
+    r"aggregator\.ab_params$": (8.0, 7.0, 1.0),
+}
 """Weights that are no draws, by a pattern of names: GeM's exponent, VLAD-BuFF's constants."""
 
 
@@ -91,6 +98,9 @@ def _array(model: str, key: str, shape: tuple[int, ...], seed: int) -> np.ndarra
     for models, names, factor in CHANGED:
         if re.search(models, model) and re.search(names, key):
             array *= factor
+    models, names, factor = POSITIVE
+    if re.search(models, model) and re.search(names, key):
+        array = factor * (0.05 + abs(array))
     for names, value in FIXED.items():
         if re.search(names, key):
             array = np.full(shape, value)

@@ -257,7 +257,7 @@ def by_us(both: Sides, batch: int) -> list[Contender]:
             ),
         ):
             tokens = TokenSet(describer, paths, reading)
-        found, _ = tokens.describe("single")
+        found = tokens.describe(tokens.batches("single", None))
         write_descriptors(out, found, names(folder, paths))
 
     def load(folder: pathlib.Path, out: pathlib.Path, watch: Watch) -> None:

@@ -216,32 +216,37 @@ def folder_of(arm: Arm, seed: int, runs: pathlib.Path) -> pathlib.Path:
     return runs / "runs" / "-".join(names)
 
 
+def trained(arm: Arm, seed: int, runs: pathlib.Path) -> Model:
+    """Train an arm with a seed, or go on with its run."""
+    config = dataclasses.replace(arm.config, seed=seed)
+    root = runs / "worlds" / named(arm.world)
+    write_world(root, arm.world)
+    places = read_places(root / "train", min_images=config.min_images)
+    initial = None
+    if arm.start is not None:
+        trained(arm.start, seed, runs)
+        file = folder_of(arm.start, seed, runs) / "last.safetensors"
+        initial = with_backbone_of(
+            init_crisalad(run_keys(seed)[0], config.model), config.model, file
+        )
+    params = fit(config, places, folder_of(arm, seed, runs), initial=initial, quiet=True).params
+    return Model(params, config.model)
+
+
 def run(arm: Arm, seed: int, asked: Mapping[str, Asked], runs: pathlib.Path) -> dict[str, Any]:
     """Recalls of one trained model by set and grouping, and its transport's statistics."""
-    config = dataclasses.replace(arm.config, seed=seed)
-    root, folder = runs / "worlds" / named(arm.world), folder_of(arm, seed, runs)
+    folder = folder_of(arm, seed, runs)
     result = folder / "recalls.json"
     found: dict[str, Any] = json.loads(result.read_text()) if result.exists() else {"contents": {}}
     there = found["contents"]
     left = {name: one for name, one in asked.items() if there.get(name) != one.contents}
     if not left:
         return found
-    write_world(root, arm.world)
-    places = read_places(root / "train", min_images=config.min_images)
-    initial = None
-    if arm.start is not None:
-        run(arm.start, seed, asked, runs)
-        file = folder_of(arm.start, seed, runs) / "last.safetensors"
-        initial = with_backbone_of(
-            init_crisalad(run_keys(seed)[0], config.model), config.model, file
-        )
-    params = fit(config, places, folder, initial=initial, quiet=True).params
-    alone = not config.model.cross_image.attends
+    model = trained(arm, seed, runs)
+    alone = not model.config.cross_image.attends
     groupings = ("single",) if alone else ("single", "shuffled", "sequential")
     for name, one in left.items():
-        results = evaluate(
-            Model(params, config.model), one.data, groupings=groupings, reading=Reading(quiet=True)
-        )
+        results = evaluate(model, one.data, groupings=groupings, reading=Reading(quiet=True))
         there[name] = one.contents
         found[name] = {
             grouping: {f"R@{k}": 100 * each.recalls[k] for k in (1, 5)}

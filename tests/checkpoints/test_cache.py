@@ -20,7 +20,7 @@ import safetensors.numpy
 import torch
 
 import crisalad_jax as cj
-import crisalad_jax.checkpoints.download
+import crisalad_jax.utils.download
 from crisalad_jax.checkpoints import cache
 from crisalad_jax.checkpoints.cache import cached_weights, is_cached
 from crisalad_jax.checkpoints.formats import VOCABULARY, public_shapes
@@ -82,8 +82,8 @@ def model(server: FileServer, tmp_path: pathlib.Path, monkeypatch: pytest.Monkey
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     # The stalls and pauses of the default would last for minutes.
-    monkeypatch.setattr(crisalad_jax.checkpoints.download, "_ATTEMPTS", 2)
-    monkeypatch.setattr(crisalad_jax.checkpoints.download, "_PAUSE", 0.01)
+    monkeypatch.setattr(crisalad_jax.utils.download, "_ATTEMPTS", 2)
+    monkeypatch.setattr(crisalad_jax.utils.download, "_PAUSE", 0.01)
     tiny = Published(
         name="tiny-model",
         format="huggingface",

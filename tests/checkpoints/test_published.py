@@ -49,6 +49,8 @@ STORED = {
     "netvlad-nanne": "zoo/layouts/netvlad_vgg16_nanne",
     "netvlad-hloc": "zoo/layouts/netvlad_vgg16_hloc",
     "netvlad-hloc-tokyo": "zoo/layouts/netvlad_vgg16_hloc",
+    "ap-gem-resnet101": "zoo/layouts/apgem_resnet101",
+    "ap-gem-resnet101-lm18": "zoo/layouts/apgem_resnet101",
     "sage-vitb14": "zoo/layouts/sage_vitb14",
     "sage-vitl14": "zoo/layouts/sage_vitl14",
     "sage-vitl14-crossimage": "zoo/layouts/sage_vitl14_crossimage",
@@ -60,6 +62,8 @@ STORED = {
     "sfrs": "zoo/layouts/sfrs_vgg16_pca4096",
     "patch-netvlad-mapillary-4096": "zoo/layouts/patchnetvlad_mapillary_WPCA4096",
     "patch-netvlad-pittsburgh-512": "zoo/layouts/patchnetvlad_pittsburgh_WPCA512",
+    "tetra-boq": "zoo/layouts/tetra_boq",
+    "tetra-salad": "zoo/layouts/tetra_salad",
     "transvpr-msls": "zoo/layouts/transvpr",
     "transvpr-pitts30k": "zoo/layouts/transvpr",
     "edtformer": "zoo/layouts/edtformer",
@@ -148,6 +152,9 @@ PREPROCESSING: dict[str, tuple[Any, ...]] = {
     "dinov3": ((224, 224), "fixed", *_BYTES),
     # serizba/salad eval.py and cliquemining: Resize of Pillow's image, ToTensor, Normalize.
     "dino-salad": ((322, 322), "fixed", *_BYTES),
+    # OliverGrainge/TeTRA-VPR: the same.
+    "tetra-boq": ((322, 322), "fixed", *_BYTES),
+    "tetra-salad": ((322, 322), "fixed", *_BYTES),
     # Ahmedest61/VLAD-BuFF eval.py, input_transform: the same.
     "vlad-buff": ((322, 322), "fixed", *_BYTES),
     # amaralibey/MixVPR and gsv-cities, their data loaders; Conv-AP's demo.py of 4,096 is bicubic.
@@ -156,7 +163,8 @@ PREPROCESSING: dict[str, tuple[Any, ...]] = {
     "conv-ap-4096": ((320, 320), "fixed", "bicubic", True, "bytes", False, IMAGENET),
     # QVPR/Patch-NetVLAD: Resize of Pillow's image.
     "patch-netvlad": ((480, 640), "fixed", *_BYTES),
-    # gmberton/CosPlace and EigenPlaces, Indoor-VPR, Nanne/pytorch-NetVlad: not resized.
+    # gmberton/CosPlace and EigenPlaces, Indoor-VPR, Nanne/pytorch-NetVlad, AP-GeM: not resized.
+    "ap-gem": ((512, 512), "native", *_BYTES),
     "cosplace": ((512, 512), "native", *_BYTES),
     "netvlad": ((480, 640), "native", *_BYTES),
     # amaralibey/Bag-of-Queries: the tensor is resized, bicubic and antialiased.

@@ -292,6 +292,9 @@ def test_a_run_from_the_command_line_and_the_same_command_again(
     assert "8 places, 24 images; validation on town/test (@UTM, 25 m)" in out
     assert f"{STEPS} steps, best R@5" in out
     assert (tmp_path / "run" / "curves.png").stat().st_size > 0
+    recorded = json.loads((tmp_path / "run" / "data.json").read_text())  # for a model card
+    assert recorded["training"] == {"name": "city", "places": 8, "images": 24}
+    assert recorded["validation"] == {"name": benchmark.name, "database": 7, "queries": 5}
     found, expected = (
         load_weights(folder / "last.safetensors") for folder in (tmp_path / "run", run)
     )

@@ -23,8 +23,13 @@ def test_the_page_holds_the_numbers_of_the_json(shared, tmp_path, capfd, weights
     for result in results:
         for value in result["recalls"].values():
             assert next(cells).startswith(f"{100 * value:.1f}")
-        for share in result["same_place"].values():
+        for share in (*result["same_place"].values(), result["mirrored"]):
             assert next(cells) == ("\N{EN DASH}" if share is None else f"{100 * share:.1f}")
+        gain = result["over_single"]
+        points = [100 * number for number in (gain["R@1"], *gain["interval"])] if gain else []
+        assert next(cells) == (
+            "{:+.1f}{:+.1f} to {:+.1f}".format(*points) if gain else "\N{EN DASH}"
+        )
         for name in ("average_precision", "recall_at_full_precision"):
             assert next(cells) == f"{100 * result[name]:.1f}"
         point = result["operating_point"]

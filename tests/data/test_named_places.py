@@ -264,6 +264,33 @@ def test_a_table_names_places(folders, by_file):
     assert not views_of(places).known.any()
 
 
+def test_a_table_may_be_of_several_cities(folders):
+    """Far from each other, with places of the same names; in the order of the cities."""
+    rows = [
+        *(
+            ("bridge/1.JPG", 1, 60.0, 170.0, "Nome"),
+            ("north/park/b.png", 1, -20.0, -40.0, "Anchieta"),
+        ),
+        *(
+            ("bridge/2.jpg", 1, 60.1, 170.0, "Nome"),
+            ("north/park/a.png", 2, -20.0, -40.1, "Anchieta"),
+        ),
+    ]
+    _write_table(folders / "places.csv", "name,place,lat,lon,city", rows)
+    places = read_places(folders, min_images=1)
+    assert places.cities == ("Anchieta", "Nome")
+    assert places.names == ("1 of Anchieta", "2 of Anchieta", "1 of Nome")
+    assert places.files == ("north/park/b.png", "north/park/a.png", "bridge/1.JPG", "bridge/2.jpg")
+    assert places.place_city.tolist() == [0, 0, 1]
+    # 0.1 degrees of longitude and of latitude, each in its city's zone.
+    views = views_of(places)
+    assert abs(views.east[0] - views.east[1]) == pytest.approx(10_460, rel=1e-2)
+    assert abs(views.north[2] - views.north[3]) == pytest.approx(11_140, rel=1e-2)
+    _write_table(folders / "places.csv", "name,place,lat,lon", [row[:4] for row in rows])
+    with refused("expected at most 60, .* a set of several cities has a column city"):
+        views_of(read_places(folders, min_images=1))
+
+
 def test_a_table_with_positions_makes_classes(folders):
     names = ("bridge/1.JPG", "bridge/2.jpg", "north/park/a.png", "north/park/b.png")
     # 0.001 degrees of latitude are 111 m: two cells of 10 m that are no neighbours.

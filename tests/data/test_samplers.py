@@ -2,16 +2,18 @@
 
 import dataclasses
 import pathlib
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 
+from crisalad_jax.data.class_groups import focal_points, views_of
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.samplers import SAMPLERS, Sampler
 from crisalad_jax.data.samplers.base import epoch_batches, labels_of
-from crisalad_jax.data.samplers.cliques import Cliques
+from crisalad_jax.data.samplers.cliques import Cliques, GeoVisual
 from crisalad_jax.data.samplers.hard import HardNegatives
+from crisalad_jax.data.samplers.viewpoints import Viewpoints
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.utils.errors import InputError
@@ -160,6 +162,71 @@ def test_cliques_come_from_places_that_look_alike():
         together.add(frozenset(places.image_place[batch[:, 0]].tolist()))
     # From the third place the second is nearer, and the first the farthest.
     assert together == {frozenset({0, 1}), frozenset({1, 2})}
+
+
+def test_a_neighbourhood_grows_by_what_is_most_like_all_of_it():
+    """Against a greedy choice by the angles of a circle, from each place; and from the anchor."""
+    places = cloud(1, [4] * 6, width=2)
+    spread = np.repeat(np.arange(6), 4)[:, None] * [0.01, 0, 0]
+    places = dataclasses.replace(places, views=places.views + spread)
+    angles = np.deg2rad([0.0, 20, -21, 40, 120, 190])
+    cosines = np.cos(angles[:, None] - angles)
+
+    def grown(first: int) -> list[int]:
+        chosen = [first]
+        while len(chosen) < 3:
+            rest = [each for each in range(6) if each not in chosen]
+            chosen.append(max(rest, key=lambda each: cosines[each, chosen].sum()))
+        return chosen
+
+    # From 0 it goes on to 20 degrees, and then to 40, though -21 is nearer to 0.
+    assert grown(0) == [0, 1, 3]
+    circle = np.column_stack([np.cos(angles), np.sin(angles)])
+    options = {"places_per_batch": 3, "describe": descriptors_of(circle)}
+
+    def drawn(sampler: Sampler, seed: int) -> set[frozenset[int]]:
+        batches = draw(places, sampler, seed=seed, **options)
+        return {frozenset(batch[:, 0].tolist()) for batch in batches // 4}
+
+    one, all_of_them = GeoVisual(similar=2, anchors=1), GeoVisual(similar=2, anchors=6)
+    found = set().union(*(drawn(one, seed) for seed in range(20)))
+    assert found == {frozenset(grown(first)) for first in range(6)}
+    # 20 degrees is most like two others: twice cos(20 degrees).
+    assert set().union(*(drawn(all_of_them, seed) for seed in range(5))) == {frozenset(grown(1))}
+
+
+@pytest.mark.parametrize("side", ["lateral", "frontal"])
+def test_viewpoints_are_of_one_cell_and_look_at_one_point(side: Literal["lateral", "frontal"]):
+    generator = np.random.default_rng(4)
+    metres = generator.uniform(0, 90, (1500, 2))
+    views = np.column_stack(
+        [
+            0.001 + metres[:, 1] / METRES,
+            -40.5 + metres[:, 0] / METRES,
+            generator.uniform(0, 360, 1500),
+        ]
+    )
+    places = places_of(views, [1] * 1500)
+    batches = draw(places, Viewpoints(side=side), places_per_batch=3)
+    assert len(batches) > 4
+    own = views_of(places)
+    points = np.column_stack([own.east, own.north])
+    cells = np.floor(points / 15).astype(int)
+    for batch in batches:
+        # Of one of nine groups: classes of a batch are two cells apart, and no neighbours.
+        assert len(np.unique(cells[batch.ravel()] % 3, axis=0)) == 1
+        assert len(np.unique(cells[batch[:, 0]], axis=0)) == 3
+        for group in batch:
+            (cell,) = np.unique(cells[group], axis=0)
+            within = points[(cells == cell).all(axis=1)]
+            looks = []
+            for point in focal_points(within, 10.0)[("lateral", "frontal").index(side)]:
+                east, north = (point - points[group]).T
+                turn = np.rad2deg(np.arctan2(east, north)) - own.heading[group]
+                looks.append((np.cos(np.deg2rad(turn)) >= np.sqrt(0.5) - 1e-9).all())
+            assert any(looks)
+    with pytest.raises(InputError, match=r"found no headings, .* for sampler viewpoints"):
+        draw(some_places(5), Viewpoints(side=side))
 
 
 def test_an_order_may_repeat_places():

@@ -85,7 +85,10 @@ def test_an_unreadable_image_is_seen_by_none(params, benchmark, images, folder, 
     paths = [*benchmark.database[:2], bad, *benchmark.database[2:4]]
     found = tokens_of(params, paths, on_bad_image="skip")
     assert (len(found.rows), found.unreadable.tolist()) == (4, [2])
-    alike(found.describe("sequential")[0], np.asarray(describe(params, images[:4], MODEL)))
+    alike(
+        found.describe(found.batches("sequential", None)),
+        np.asarray(describe(params, images[:4], MODEL)),
+    )
     with pytest.raises(InputError, match=f"^{bad}: "):
         tokens_of(params, paths)
 
@@ -249,3 +252,36 @@ def test_recalls_are_those_of_a_flat_faiss_index_on_the_same_descriptors(params,
             for row, wanted in zip(ranking, benchmark.positives, strict=True)
         ]
         assert recall == np.mean(right)
+
+
+def test_masked_images_are_described_with_their_batch_less_their_own_place(params, benchmark):
+    """Of three to a batch, image 1 of the database is at the place of image 0."""
+    moved = benchmark.database_positions.copy()
+    moved[:] = np.arange(len(moved))[:, None] * 1000.0
+    moved[1] = moved[0]
+    seen = {}
+    evaluate(
+        Model(params, MODEL),
+        dataclasses.replace(benchmark, database_positions=moved),
+        groupings=["masked@3"],
+        observe=lambda name, database, queries: seen.update({name: database}),
+        reading=READING,
+    )
+    images = pictures(benchmark.database)
+    # The image itself first.
+    groups = [[0, 2], [1, 2], [2, 0, 1], [3, 4, 5], [4, 3, 5], [5, 3, 4], [6]]
+    expected = [np.asarray(describe(params, images[group], MODEL))[0] for group in groups]
+    alike(seen["masked@3"], np.stack(expected))
+
+
+def test_a_published_grouping_is_its_size_in_file_order_and_the_honest_ones(params, benchmark):
+    named = dataclasses.replace(benchmark, name="sped")
+    model = Model(params, MODEL)
+    found = evaluate(model, named, groupings=["published:sage"], seeds=1, reading=READING)
+    assert [each.grouping for each in found] == ["sequential@2", "single", "shuffled@2", "masked@2"]
+    alone = evaluate(
+        model, named, groupings=["sequential"], reading=Reading(batch_size=2, quiet=True)
+    )
+    np.testing.assert_array_equal(found[0].neighbours.indices, alone[0].neighbours.indices)
+    assert found[0].over_single.mean == found[0].recalls[1] - found[1].recalls[1]
+    assert found[1].over_single is found[1].mirrored_share is None

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from crisalad_jax.evaluation import leakage as same_place
-from crisalad_jax.evaluation.leakage import by_truth, near, same_place_share
+from crisalad_jax.evaluation.leakage import (
+    by_truth,
+    masked,
+    mirrored_share,
+    near,
+    same_place_share,
+)
 from crisalad_jax.retrieval.grouping import GROUPINGS, batches_of
 
 
@@ -68,3 +74,58 @@ def test_the_share_agrees_with_a_loop(monkeypatch, grouping, chunk):
         # Sums of two dozen fractions in another order.
         assert found == pytest.approx(np.mean(shares), rel=1e-13)
         assert 0 < found < 1
+
+
+def test_masked_images_see_their_batch_without_their_own_place():
+    places = np.array([0, 0, 1, 2, 1, 1, 0])
+    same = near(np.stack([places, places], axis=1).astype(float), 0.0)
+    found = masked(batches_of(7, "sequential", 3), same)
+    assert found.grouping == "masked"
+    assert found.images[found.kept].tolist() == list(range(7))
+    seen = [sorted(images[filled].tolist()) for images, filled in zip(*found[:2], strict=True)]
+    assert seen == [[0, 2], [1, 2], [0, 1, 2], [3, 4, 5], [3, 4], [3, 5], [6]]
+    assert same_place_share(found, same) == 0
+
+
+def test_the_mirrored_share_by_hand():
+    positives = [np.array([0]), np.array([1]), np.array([2]), np.array([3]), np.array([], int)]
+    queries = batches_of(5, "sequential", 2)
+    # The same order on both sides: each other image is also there.
+    assert mirrored_share(queries, batches_of(4, "sequential", 2), positives) == 1
+    # By threes (0 1 2) (3): query 3 has no other of its place there, and query 4 no positive.
+    assert mirrored_share(queries, batches_of(4, "sequential", 3), positives) == (1 + 1 + 0 + 0) / 4
+    assert mirrored_share(queries, batches_of(4, "single", 3), positives) is None
+    # Of several positives the one whose batch is most alike counts.
+    positives[2] = np.array([0, 2])
+    assert mirrored_share(queries, batches_of(4, "sequential", 3), positives) == 0.5
+    positives[3] = np.array([1, 3])
+    assert mirrored_share(queries, batches_of(4, "sequential", 3), positives) == 1
+
+
+@pytest.mark.parametrize("sides", [("shuffled", "sequential"), ("window", "shuffled")])
+def test_the_mirrored_share_agrees_with_a_loop(sides):
+    rng = np.random.default_rng(5)
+    positives = [rng.permutation(17)[: rng.integers(0, 4)] for _ in range(23)]
+    queries, database = (
+        batches_of(count, grouping, 5, seed=2)
+        for count, grouping in zip((23, 17), sides, strict=True)
+    )
+    sight = []
+    for side in (queries, database):
+        own = {}
+        for images, filled, kept in zip(*side[:3], strict=True):
+            own |= {int(image): set(images[filled].tolist()) for image in images[kept]}
+        sight.append(own)
+    shares = []
+    for query, right in enumerate(positives):
+        others = sight[0][query] - {query}
+        if len(right) and others:
+            shares.append(
+                max(
+                    np.mean([bool(set(positives[o].tolist()) & sight[1][int(a)]) for o in others])
+                    for a in right
+                )
+            )
+    # Sums of some twenty fractions in another order.
+    assert mirrored_share(queries, database, positives) == pytest.approx(np.mean(shares), rel=1e-13)
+    assert 0 < np.mean(shares) < 1

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from crisalad_jax.cli.tables import grouping_table
+from crisalad_jax.cli.tables import grouping_table, leakage_table
+from crisalad_jax.evaluation.difference import paired_difference
 from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
-from crisalad_jax.evaluation.results import ANY, GroupingResult, summarise, to_json
+from crisalad_jax.evaluation.results import ANY, GroupingResult, over_single, summarise, to_json
 from crisalad_jax.retrieval.neighbours import Neighbours
 
 KS = (1, 2)
@@ -38,7 +39,7 @@ def summary(grouping: str, rankings, **known) -> GroupingResult:
 def results() -> list[GroupingResult]:
     return [
         summary("single", {3: RANKINGS[3]}),
-        summary("shuffled", RANKINGS, query_share=0.25, database_share=1.0),
+        summary("shuffled", RANKINGS, query_share=0.25, database_share=1.0, mirrored_share=0.5),
         summary("window/single", {3: RANKINGS[5]}, query_share=0.5),
     ]
 
@@ -83,10 +84,10 @@ def test_without_a_positive_there_is_no_curve():
     assert result.spread.recall_at_full_precision is None
 
 
-def cells_of(results, width: int) -> list[list[str]]:
+def cells_of(results, width: int, table=grouping_table) -> list[list[str]]:
     console = Console(width=width, color_system=None, force_terminal=False)
     with console.capture() as capture:
-        console.print(grouping_table(results).terminal())
+        console.print(table(results).terminal())
     return [
         [cell.strip() for cell in line.strip("│┃").replace("┃", "│").split("│")]
         for line in capture.get().splitlines()
@@ -97,15 +98,33 @@ def cells_of(results, width: int) -> list[list[str]]:
 def test_the_table_has_these_cells(results):
     lines = cells_of(results, 100)
     assert lines == [
-        ["queries/", "same place", "R@1", "R@2", "", "R at"],
-        ["database", "q / db", "95 %", "95 %", "AP", "100 % P"],
-        ["single", "- / -", "60.0", "80.0", "75.0", "75.0"],
-        ["", "", "20.0-100.0", "40.0-100.0", "", ""],
-        ["shuffled", "25.0 / 100.0", "50.0 ±14.1", "80.0 ±0.0", "58.3", "50.0"],
-        ["", "", "10.0-90.0", "40.0-100.0", "±23.6", "±35.4"],
-        ["window/single", "50.0 / -", "40.0", "80.0", "41.7", "25.0"],
-        ["", "", "0.0-80.0", "40.0-100.0", "", ""],
+        ["queries/", "R@1", "R@2", "", "R at"],
+        ["database", "95 %", "95 %", "AP", "100 % P"],
+        ["single", "60.0", "80.0", "75.0", "75.0"],
+        ["", "20.0-100.0", "40.0-100.0", "", ""],
+        ["shuffled", "50.0 ±14.1", "80.0 ±0.0", "58.3", "50.0"],
+        ["", "10.0-90.0", "40.0-100.0", "±23.6", "±35.4"],
+        ["window/single", "40.0", "80.0", "41.7", "25.0"],
+        ["", "0.0-80.0", "40.0-100.0", "", ""],
     ]
+
+
+def test_what_a_grouping_gives_over_images_alone(results):
+    alone = np.array([[1, 1, 1, 0, 0]], bool)
+    np.testing.assert_array_equal(results[0].firsts, alone)
+    compared = over_single([*results, results[2]._replace(rerank="transvpr:2")])
+    single, shuffled, window, reranked = (each.over_single for each in compared)
+    assert single is reranked is None  # of another second stage than any row alone
+    hits = np.array([[1, 1, 1, 0, 0], [1, 1, 0, 0, 0]], bool)
+    assert shuffled == paired_difference(hits, alone, same_seeds=False)
+    assert window.mean == pytest.approx(-1 / 5, rel=1e-14)
+    assert cells_of(compared[:3], 100, leakage_table)[:4] == [
+        ["queries/", "", "points over", "same place", ""],
+        ["database", "R@1", "single, 95 %", "q / db", "mirrored"],
+        ["single", "60.0", "-", "- / -", "-"],
+        ["shuffled", "50.0", "-10.0", "25.0 / 100.0", "50.0"],
+    ]
+    assert to_json(compared[2])["over_single"]["R@1"] == window.mean
 
 
 def test_the_table_of_four_recalls_fits_a_hundred_columns():
@@ -120,8 +139,8 @@ def test_the_table_of_four_recalls_fits_a_hundred_columns():
         recall_at_full_precision=0.5,
     )
     (row, below) = cells_of([result], 100)[2:]
-    assert row[:3] == ["window/single", "12.3 / 12.3", "12.3"]
-    assert below[2:6] == ["10.1-99.9"] * 4
+    assert row[:2] == ["window/single", "12.3"]
+    assert below[1:5] == ["10.1-99.9"] * 4
 
 
 def test_json_has_everything_but_the_neighbours(results):

@@ -12,7 +12,7 @@ from crisalad_jax.config.registry import make_part
 from crisalad_jax.nn.aggregators import AGGREGATORS, Aggregator
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig, ClassTokenConfig
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
-from crisalad_jax.nn.aggregators.gem import CosPlaceConfig, GemConfig, GemPyramidConfig
+from crisalad_jax.nn.aggregators.gem import ApGemConfig, CosPlaceConfig, GemConfig, GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
 from crisalad_jax.nn.aggregators.queries import BoqConfig, EdtFormerConfig
 from crisalad_jax.nn.aggregators.sage import SageConfig
@@ -53,6 +53,7 @@ PARTS: dict[str, Aggregator] = {
     "netvlad": NetVladConfig(clusters=4),
     "conv-ap": ConvApConfig(channels=16),
     "cosplace": CosPlaceConfig(dim=16),
+    "ap-gem": ApGemConfig(dim=16),
     "mixvpr": MixVprConfig(channels=16, rows=2, depth=2),
     "anyloc": AnyLocConfig(clusters=4, layer=-1),
     "boq": BoqConfig(channels=16, queries=3, rows=2),

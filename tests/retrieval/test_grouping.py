@@ -65,13 +65,15 @@ def test_batches_keep_their_shape():
         ("single", "single", "single"),
         ("window/single", "window", "single"),
         ("shuffled/sequential", "shuffled", "sequential"),
+        ("masked/single@26", "masked", "single"),
     ],
 )
 def test_a_grouping_is_written_as_it_is_read(text, queries, database):
     grouping = Grouping.parse(text)
     assert (grouping.queries, grouping.database) == (queries, database)
+    assert grouping.batch_size == (26 if "@" in text else None)
     assert str(grouping) == text
-    assert Grouping.parse(f"{queries}/{database}") == grouping
+    assert Grouping.parse(f"{queries}/{database}{'@26' * ('@' in text)}") == grouping
 
 
 def test_groupings_come_once_and_in_their_order():
@@ -85,9 +87,15 @@ def test_groupings_come_once_and_in_their_order():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("sorted", "^grouping: found 'sorted', expected one of sequential, shuffled, single, win"),
+        ("sorted", "^grouping: found 'sorted', expected one of masked, sequential, shuffled, si"),
         ("", "^grouping: found ''"),
         ("single/", "^grouping: found '', expected one of"),
+        (
+            "single@",
+            "^grouping: found 'single@', expected a number of images after @",
+        ),
+        ("single@0", "^grouping: found 'single@0', expected a number"),
+        ("single@-3", "^grouping: found 'single@-3', expected a number"),
         ("single/window/single", "^grouping: found 'single/window/single', .* QUERIES/DATABASE"),
     ],
 )

@@ -15,6 +15,7 @@ import numpy as np
 from crisalad_jax.checkpoints.formats.format import BackboneNames, Format, Head, parts_of
 from crisalad_jax.checkpoints.formats.rows import SAME, Extra, Row, Rows, read_table, read_tables
 from crisalad_jax.checkpoints.formats.sizes import Reader, State, square_side
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.io import from_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
@@ -24,7 +25,7 @@ from crisalad_jax.nn.backbones import BACKBONES
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.output import one_line, warn
 from crisalad_jax.utils.pytree import named_leaves
 
 VOCABULARY = "anyloc-words"
@@ -108,32 +109,60 @@ class _Reference(Format):
         return True
 
 
-_FACTS = tomllib.loads(pathlib.Path(__file__).with_name("formats.toml").read_text(encoding="utf-8"))
-_CHAINS = {
-    name: from_plain(PreprocessingConfig, fields, source=f"formats.toml (chains.{name})")
-    for name, fields in _FACTS["chains"].items()
-}
-TABLES = read_tables(_FACTS["tables"])
+TABLES: dict[str, Rows] = read_tables({}, {})
 """Tables of layers by name."""
-_BACKBONES = {
-    name: BackboneNames(
-        tuple(BACKBONES.find(kind) for kind in facts["kinds"]),
-        read_table(facts["rows"], TABLES),
-        tuple(facts["marks"]),
-    )
-    for name, facts in _FACTS["backbones"].items()
-}
-HEADS = {
-    name: Head(
-        AGGREGATORS.find(facts.get("aggregator", name)),
-        read_table(facts["rows"], TABLES),
-        facts.get("sizes", {}),
-        facts.get("mark"),
-        facts.get("prefix", "aggregator."),
-    )
-    for name, facts in _FACTS["heads"].items()
-}
+_CHAINS: dict[str, PreprocessingConfig] = {}
+_BACKBONES: dict[str, BackboneNames] = {}
+HEADS: dict[str, Head] = {}
 """Heads by name: the aggregator's, where it has names of its own in the reference."""
+FORMATS: dict[str, Format] = {}
+"""Formats by name, in the order in which they try to detect a state."""
+
+
+def add_formats(facts: Mapping[str, Any], source: str) -> None:
+    """Add the chains, tables, backbones, heads and formats of one file, or none of them.
+
+    Raises:
+        InputError: naming `source`, if a name is there already, or what it says cannot be read.
+    """
+    known = {"chains": _CHAINS, "tables": TABLES, "backbones": _BACKBONES, "heads": HEADS}
+    known["formats"] = FORMATS
+    for section, entries in facts.items():
+        require(section in known, f"{source}: found [{section}], expected {', '.join(known)}")
+        if taken := entries.keys() & known[section].keys():
+            raise InputError(f"{source}: found {section}.{min(taken)}, a name that is taken")
+    before = {section: dict(entries) for section, entries in known.items()}
+    try:
+        _add(facts, source)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        for section, entries in known.items():
+            entries.clear()
+            entries.update(before[section])
+        words = "" if isinstance(error, InputError) else "cannot be read: "
+        raise InputError(f"{source}: {words}{one_line(error)}") from error
+
+
+def _add(facts: Mapping[str, Any], source: str) -> None:
+    for name, fields in facts.get("chains", {}).items():
+        where = f"{source} (chains.{name})"
+        _CHAINS[name] = from_plain(PreprocessingConfig, fields, source=where)
+    TABLES.update(read_tables(facts.get("tables", {}), TABLES))
+    for name, fields in facts.get("backbones", {}).items():
+        _BACKBONES[name] = BackboneNames(
+            tuple(BACKBONES.find(kind) for kind in fields["kinds"]),
+            read_table(fields["rows"], TABLES),
+            tuple(fields["marks"]),
+        )
+    for name, fields in facts.get("heads", {}).items():
+        HEADS[name] = Head(
+            AGGREGATORS.find(fields.get("aggregator", name)),
+            read_table(fields["rows"], TABLES),
+            fields.get("sizes", {}),
+            fields.get("mark"),
+            fields.get("prefix", "aggregator."),
+        )
+    for name, fields in facts.get("formats", {}).items():
+        FORMATS[name] = _format(name, dict(fields))
 
 
 def _backbone(text: str) -> BackboneNames:
@@ -183,5 +212,5 @@ def _format(name: str, facts: dict[str, Any]) -> Format:
     )
 
 
-FORMATS = {name: _format(name, facts) for name, facts in _FACTS["formats"].items()}
-"""Formats by name, in the order in which they try to detect a state."""
+_OWN = pathlib.Path(__file__).with_name("formats.toml")
+add_formats(tomllib.loads(_OWN.read_text(encoding="utf-8")), _OWN.name)

@@ -122,6 +122,14 @@ def _blank_mask(config: Any) -> np.ndarray:
     return np.zeros((1, config.backbone.dim), np.float32)
 
 
+def _ones(config: Any) -> np.ndarray:
+    return np.ones(config.backbone.dim, np.float32)
+
+
+def _zeros(config: Any) -> np.ndarray:
+    return np.zeros(config.backbone.dim, np.float32)
+
+
 def _blank_branch(number: int) -> Callable[[Any], np.ndarray]:
     """Make the arrays of SAGE's unused branch: two layers, as wide as published."""
 
@@ -144,6 +152,8 @@ EXTRAS = {
     "extra-zero": Extra(lambda config: np.zeros((), np.float32)),
     "extra-levels": Extra(lambda config: np.zeros(config.aggregator.levels, np.float32)),
     "extra-mask": Extra(_blank_mask),
+    "extra-ones": Extra(_ones),
+    "extra-zeros": Extra(_zeros),
     "extra-first-mask": Extra(_blank_mask, FIRST),
     "extra-periods": Extra(_published_periods),
     **{f"extra-branch-{number}": Extra(_blank_branch(number)) for number in range(4)},
@@ -157,12 +167,13 @@ ABSENT = {
 """What files lack, by name."""
 
 
-def read_tables(texts: Mapping[str, str]) -> dict[str, Rows]:
+def read_tables(texts: Mapping[str, str], known: Mapping[str, Rows]) -> dict[str, Rows]:
     """Read tables that have rows of one another, the later ones of the earlier ones."""
     bias = Row(("bias",), ("bias",), SAME)
     tables: dict[str, Rows] = {
         name: (Row(("weight",), ("weight",), form), bias) for name, form in _LAYERS.items()
     }
+    tables |= known
     for name, text in texts.items():
         tables[name] = read_table(text, tables)
     return tables

@@ -12,6 +12,7 @@ from crisalad_jax.nn.adapters import ADAPTERS, Adapter
 from crisalad_jax.nn.backbones.base import Backbone
 from crisalad_jax.nn.backbones.dinov3 import rotary_periods
 from crisalad_jax.nn.backbones.resnet import BLOCKS, STEM_SIDE, ResNetConfig
+from crisalad_jax.nn.backbones.tetra import TetraVitConfig
 from crisalad_jax.nn.backbones.transvpr import TransVprNetConfig
 from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.backbones.vit import VisionTransformer
@@ -85,6 +86,8 @@ def infer_backbone(kinds: tuple[type[Any], ...], rows: Rows, read: Reader) -> Ba
         return _infer_vit(kinds[0], theirs, read)
     if kinds[0] is TransVprNetConfig:
         return _infer_transvpr(read)
+    if kinds[0] is TetraVitConfig:
+        return _infer_tetra(read)
     stem = next(iter(theirs.values()))
     is_vgg = ResNetConfig not in kinds or (VggConfig in kinds and read.size(stem, 2) != STEM_SIDE)
     return VggConfig() if is_vgg else _infer_resnet(theirs, read)
@@ -191,6 +194,18 @@ def _infer_transvpr(read: Reader) -> TransVprNetConfig:
         depth=read.count("blocks."),
         heads=max(1, dim // _HEAD_WIDTH),
         hidden=read.size("blocks.0.linear1.weight", 0),
+    )
+
+
+def _infer_tetra(read: Reader) -> TetraVitConfig:
+    dim, positions = read.size("cls_token", 2), read.size("pos_embedding", 1)
+    words = f"found {positions} position embeddings, expected 1 and a square number"
+    return TetraVitConfig(
+        dim=dim,
+        depth=read.count("transformer.layers."),
+        heads=max(1, dim // _HEAD_WIDTH),
+        hidden=read.size("transformer.layers.0.1.net.1.bias", 0),
+        position_grid=square_side(positions - 1, words),
     )
 
 

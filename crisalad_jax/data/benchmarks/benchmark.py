@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import pathlib
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -94,7 +95,14 @@ def leave_out_unreadable(benchmark: Benchmark, *, quiet: bool = False) -> Benchm
     Raises:
         InputError: what `Benchmark.of_readable` raises.
     """
-    paths = (*benchmark.queries, *benchmark.database)
+    readable = readable_images((*benchmark.queries, *benchmark.database), quiet=quiet)
+    return benchmark.of_readable(*np.split(readable, [len(benchmark.queries)]))
+
+
+def readable_images(
+    paths: Sequence[pathlib.Path], *, quiet: bool = False
+) -> Bool[np.ndarray, " images"]:
+    """Decode images, and return which of them can be read."""
     readable = np.empty(len(paths), bool)
     with (
         progress_bar("reading", len(paths), "images", quiet=quiet) as bar,
@@ -103,7 +111,7 @@ def leave_out_unreadable(benchmark: Benchmark, *, quiet: bool = False) -> Benchm
         for number, whole in enumerate(pool.map(_is_readable, paths)):
             readable[number] = whole
             bar.advance(1)
-    return benchmark.of_readable(*np.split(readable, [len(benchmark.queries)]))
+    return readable
 
 
 def _is_readable(path: pathlib.Path) -> bool:

@@ -77,17 +77,11 @@ def read_msls(
     if limit is not None and not 0 <= limit <= 180:
         raise InputError(f"max heading difference: found {limit}, expected degrees from 0 to 180")
     cities = choose("split", split or "val", MSLS_CITIES)
-    parent = root / "train_val" if (root / "train_val").is_dir() else root
-    folders = [parent / city for city in cities if (parent / city).is_dir()]
-    if not folders:
-        raise InputError(
-            f"{parent}: found {listing(parent)}, expected some of "
-            f"{shown(f'{city}/' for city in cities)} for {split or 'val'}"
-        )
+    folders = city_folders(root, cities)
     database, queries, positives = [], [], []
     for folder in folders:
         there, asked = (
-            _read_side(folder / part, on_bad_image, headings=limit is not None, subtask=subtask)
+            read_side(folder / part, on_bad_image, headings=limit is not None, subtask=subtask)
             for part in ("database", "query")
         )
         near = within(there.metres, asked.metres, radius)
@@ -120,6 +114,18 @@ def read_msls(
     return Benchmark(name, root, images, asking, tuple(positives), rule, places, asked, radius)
 
 
+def city_folders(root: pathlib.Path, cities: Collection[str]) -> list[pathlib.Path]:
+    """Find the folders of these cities; raises InputError where there is none of them."""
+    parent = root / "train_val" if (root / "train_val").is_dir() else root
+    folders = [parent / city for city in cities if (parent / city).is_dir()]
+    if not folders:
+        raise InputError(
+            f"{parent}: found {listing(parent)}, expected some of "
+            f"{shown(f'{city}/' for city in cities)}"
+        )
+    return folders
+
+
 class _Side(NamedTuple):
     """The database or the queries of a city."""
 
@@ -131,6 +137,8 @@ class _Side(NamedTuple):
     """Latitude and longitude."""
     headings: Float64[np.ndarray, " images"]
     """Compass angles in degrees; 0 where nothing asks for them."""
+    clusters: np.ndarray
+    """Texts of the place that each image is of, in the city; empty where nothing asks for them."""
 
 
 def _positions(sides: list[_Side]) -> Float64[np.ndarray, "images axis"]:
@@ -153,13 +161,19 @@ def is_msls(root: pathlib.Path) -> bool:
     return (root / "train_val").is_dir() or real_path(root).name == "train_val"
 
 
-def _read_side(
-    folder: pathlib.Path, on_bad_image: OnBadImage, *, headings: bool, subtask: bool
+def read_side(
+    folder: pathlib.Path,
+    on_bad_image: OnBadImage,
+    *,
+    headings: bool,
+    subtask: bool = False,
+    clusters: bool = False,
 ) -> _Side:
     """Read a folder's images that are not panoramas, in the order of the tables."""
     columns = ("lat", "lon", *["ca"] * headings)
     raw = list(read_table(folder / "raw.csv", "key", "pano", *columns).rows())
-    placed = list(read_table(folder / "postprocessed.csv", "key", "easting", "northing").rows())
+    needed = ("key", "easting", "northing", *["unique_cluster"] * clusters)
+    placed = list(read_table(folder / "postprocessed.csv", *needed).rows())
     marked = list(read_table(folder / "subtask_index.csv", "all").rows()) if subtask else raw
     keys = [row.fields["key"] for row in raw]
     for name, rows in {"postprocessed.csv": placed, "subtask_index.csv": marked}.items():
@@ -181,4 +195,5 @@ def _read_side(
     metres = np.array([[place.number("easting"), place.number("northing")] for _, place in kept])
     numbers = np.array([[row.number(column) for column in columns] for row, _ in kept])
     angles = numbers[:, 2] if headings else np.zeros(len(kept))
-    return _Side(np.array(images, object), metres, numbers[:, :2], angles)
+    of_place = [place.text("unique_cluster") if clusters else "" for _, place in kept]
+    return _Side(np.array(images, object), metres, numbers[:, :2], angles, np.array(of_place))

@@ -1,4 +1,4 @@
-"""CliqueMining: places made of images that stand close together, in streets that look alike.
+"""CliqueMining, and SAGE's: places made of images that are close together, in alike streets.
 
 Written from the paper (Izquierdo and Civera, "Close, But Not There: Boosting Geographic Distance
 Sensitivity in Visual Place Recognition", ECCV 2024). There an earlier model describes the clusters
@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from crisalad_jax.config.checks import NonNegativeInt, PositiveFloat, require
+from crisalad_jax.config.checks import NonNegativeInt, PositiveFloat, PositiveInt, require
 from crisalad_jax.data.class_groups import Views, views_of
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.samplers.base import SAMPLERS, Draw, Sampler
@@ -68,7 +68,7 @@ class Cliques(Sampler):
         """City -> positions of its groups' images."""
         while left.any():
             some = in_new_city if in_new_city.any() else left
-            first = draw.generator.choice(np.flatnonzero(some))
+            first = self._first(np.flatnonzero(some), places, draw)
             city = int(places.place_city[first])
             in_city = places.place_city == city
             in_new_city &= ~in_city
@@ -87,6 +87,10 @@ class Cliques(Sampler):
                     return np.array(groups)
         return None
 
+    def _first(self, among: Int[np.ndarray, " place"], places: Places, draw: Draw) -> int:
+        """Draw the place that a city's part of a batch begins with."""
+        return draw.generator.choice(among)
+
     def _similar(
         self, first: int, others: Int[np.ndarray, " place"], draw: Draw
     ) -> Int[np.ndarray, " place"]:
@@ -104,6 +108,50 @@ class Cliques(Sampler):
             return np.array([first])
         shares = likeness / likeness.sum()
         return np.append(draw.generator.choice(others, count, replace=False, p=shares), first)
+
+
+@SAMPLERS.register("geo-visual")
+@dataclasses.dataclass(frozen=True)
+class GeoVisual(Cliques):
+    """Cliques of a neighbourhood that grows greedily from a place that looks like many others.
+
+    Written from the abstract of SAGE (Chen et al., ICLR 2026), whose code of training is not
+    published: its graph is made anew before each epoch, of where images are and how alike they look
+    to the model as it is; clusters begin at anchors of high affinity, and expand by a greedy
+    weighted clique. The numbers here are ours.
+    """
+
+    anchors: PositiveInt = 16
+    """Number of random places of which that of the highest affinity begins: the mean likeness to
+    the `similar` places of its city that are most like it."""
+
+    def _first(self, among: Int[np.ndarray, " place"], places: Places, draw: Draw) -> int:
+        drawn = draw.generator.choice(among, min(self.anchors, len(among)), replace=False)
+        affinities = []
+        for place in drawn:
+            others = np.flatnonzero(places.place_city == places.place_city[place])
+            alike = _alike(draw, others[others != place], int(place))
+            affinities.append(np.sort(alike)[::-1][: self.similar].sum())
+        return int(drawn[np.argmax(affinities)])
+
+    def _similar(
+        self, first: int, others: Int[np.ndarray, " place"], draw: Draw
+    ) -> Int[np.ndarray, " place"]:
+        """Add the place that is most like all that are chosen, one after the other."""
+        others = others[others != first]
+        chosen, total = [first], np.zeros(len(others))
+        for _ in range(min(self.similar, len(others))):
+            total += _alike(draw, others, chosen[-1])
+            chosen.append(int(others[total.argmax()]))
+            total[total.argmax()] = -np.inf
+        return np.array(chosen)
+
+
+def _alike(
+    draw: Draw, others: Int[np.ndarray, " place"], place: int
+) -> Float[np.ndarray, " place"]:
+    """Return the likeness of places to one, from -1 to 1; -1 where an image cannot be read."""
+    return np.nan_to_num(draw.descriptors[others] @ draw.descriptors[place], nan=-1.0)
 
 
 def _cliques(

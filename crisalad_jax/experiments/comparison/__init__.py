@@ -11,10 +11,8 @@ from crisalad_jax.experiments.comparison.plan import ComparisonConfig as Compari
 from crisalad_jax.experiments.comparison.plan import Prepared as Prepared
 from crisalad_jax.experiments.comparison.plan import names_to_compare as names_to_compare
 from crisalad_jax.experiments.comparison.plan import prepare as prepare
-from crisalad_jax.experiments.comparison.results import Difference as Difference
 from crisalad_jax.experiments.comparison.results import Recall as Recall
 from crisalad_jax.experiments.comparison.results import Row as Row
 from crisalad_jax.experiments.comparison.results import Summary as Summary
-from crisalad_jax.experiments.comparison.results import paired_difference as paired_difference
 from crisalad_jax.experiments.comparison.results import summarise as summarise
 from crisalad_jax.experiments.comparison.runner import compare as compare

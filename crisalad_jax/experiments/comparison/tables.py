@@ -6,9 +6,10 @@ import pathlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from crisalad_jax.evaluation.difference import Difference
 from crisalad_jax.evaluation.results import percent
 from crisalad_jax.experiments.comparison.costs import AdapterCost
-from crisalad_jax.experiments.comparison.results import KS, Difference, Row, Summary
+from crisalad_jax.experiments.comparison.results import KS, Row, Summary
 from crisalad_jax.experiments.report.page import PAGE, render
 from crisalad_jax.experiments.report.style import (
     COLOURS,

@@ -202,6 +202,8 @@ def _table(groupings: Sequence[GroupingResult]) -> Table:
         **{f"R@{k}": [_recall(g, k) for g in groupings] for k in ks},
         "same place, queries": [cell(g.query_share) for g in groupings],
         "same place, database": [cell(g.database_share) for g in groupings],
+        "mirrored": [cell(g.mirrored_share) for g in groupings],
+        "R@1 over single": [_gain(g) for g in groupings],
         "AP": [cell(g.average_precision) for g in groupings],
         "recall at 100 % precision": [cell(g.recall_at_full_precision) for g in groupings],
         f"answered right at {100 * asked:g} %": [_point(g.operating_point) for g in groupings],
@@ -223,6 +225,13 @@ def _recall(grouping: GroupingResult, k: int) -> Cell:
     if k in grouping.intervals:
         notes.append(_DASH.join(map(percent, grouping.intervals[k])))
     return Cell(percent(grouping.recalls[k]), "\n".join(notes))
+
+
+def _gain(grouping: GroupingResult) -> Cell:
+    if grouping.over_single is None:
+        return Cell(_DASH)
+    mean, interval, _ = grouping.over_single
+    return Cell(f"{100 * mean:+.1f}", " to ".join(f"{100 * end:+.1f}" for end in interval))
 
 
 def _point(point: OperatingPoint | None) -> Cell:

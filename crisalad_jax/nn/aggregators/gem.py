@@ -1,4 +1,4 @@
-"""Generalised means of patches (GeM): of an image, of a pyramid of regions, and CosPlace's head."""
+"""Generalised means of patches (GeM): of an image, of a pyramid, and heads with a linear layer."""
 
 import dataclasses
 import itertools
@@ -116,6 +116,57 @@ class CosPlaceConfig(Aggregator):
         return Tokens.of_global(at_least_float32(linear(params.fc, mean)))
 
 
+@pytree_dataclass
+class Whitening:
+    """Principal components of descriptors, as scikit-learn's `PCA` stores them."""
+
+    mean: Float[Array, " dim"]
+    components: Float[Array, "dim dim"]
+    """Orthonormal rows."""
+    variance: Float[Array, " dim"]
+    """Of the fitted descriptors along the components."""
+
+
+@pytree_dataclass
+class ApGem:
+    """The exponent of the generalised mean, the linear layer after it, and the whitening."""
+
+    p: Float[Array, ""]
+    fc: Linear
+    whitening: Whitening
+
+
+@AGGREGATORS.register("ap-gem", tiny={"dim": 256})
+@dataclasses.dataclass(frozen=True)
+class ApGemConfig(CosPlaceConfig):
+    """The head of AP-GeM (Revaud et al., ICCV 2019), with its whitening."""
+
+    dim: PositiveInt = 2048
+    """Width of the linear layer and of the descriptor."""
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> ApGem:
+        """Draw as CosPlace's, with a whitening that changes nothing."""
+        head, zeros, ones = super().init(key, backbone, grid), random_init.zeros, random_init.ones
+        whitening = Whitening(zeros(self.dim), jnp.diag(ones(self.dim)), ones(self.dim))
+        return ApGem(head.p, head.fc, whitening)
+
+    def apply(self, params: ApGem, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+        """Return the whitened unit output of a linear layer of the mean of patches as they are.
+
+        The whitening is measured, not learnt: no gradient changes it.
+        """
+        patches = features.patches
+        mean = generalised_mean(log_floored(patches), params.p, axes=(-2,)).astype(patches.dtype)
+        unit = l2_normalise(at_least_float32(linear(params.fc, mean)))
+        return Tokens.of_global(whiten(jax.lax.stop_gradient(params.whitening), unit))
+
+
+def whiten(params: Whitening, x: Float[Array, "*batch dim"]) -> Float[Array, "*batch dim"]:
+    """Divide components by the variance to the 1/4, as the public code's evaluation does."""
+    components = jnp.matmul(x - params.mean, params.components.T, precision="highest")
+    return components * params.variance**-0.25
+
+
 def gem(patches: Patches, p: Float[Array, ""]) -> Float[Array, "*batch dim"]:
     """Compute the generalised mean of all unit patches, in float32 at least."""
     return generalised_mean(log_units(patches), p, axes=(-2,))
@@ -127,7 +178,12 @@ def log_units(patches: Patches) -> Patches:
     Unit length and floor are those of CosPlace, CricaVPR and the benchmark of Berton et al. (CVPR
     2022). The result is float32 at least.
     """
-    return jnp.log(jnp.maximum(l2_normalise(at_least_float32(patches)), GEM_FLOOR))
+    return log_floored(l2_normalise(at_least_float32(patches)))
+
+
+def log_floored(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Compute logarithms of numbers raised to the floor, in float32 at least."""
+    return jnp.log(jnp.maximum(at_least_float32(x), GEM_FLOOR))
 
 
 def generalised_mean(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from crisalad_jax.experiments.comparison import paired_difference
+from crisalad_jax.evaluation.difference import paired_difference
 from crisalad_jax.experiments.comparison.results import recall_of
 from crisalad_jax.utils.errors import InputError
 

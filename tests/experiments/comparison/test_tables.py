@@ -6,9 +6,10 @@ import types
 
 import pytest
 
+from crisalad_jax.evaluation.difference import Difference
 from crisalad_jax.evaluation.metrics import Interval
 from crisalad_jax.experiments.comparison import AdapterCost, Recall, Row, Summary, tables
-from crisalad_jax.experiments.comparison.results import Difference, Spread
+from crisalad_jax.experiments.comparison.results import Spread
 from crisalad_jax.utils.errors import InputError
 
 ONE = Recall(0.625, 0.125, Interval(0.4, 0.8), (0.75, 0.5))

@@ -15,6 +15,8 @@ from crisalad_jax.utils.files import read_json, wrap_os_errors, write_json
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.version import VERSION
 
+OFFLINE = "CRISALAD_OFFLINE"
+"""Variable of the environment: whether to use no network."""
 _CHUNK = 2**18
 _MEGABYTE = 1e6
 _PARTIAL, _NO_SUCH_RANGE = 206, 416
@@ -27,6 +29,11 @@ _ATTEMPTS = 5
 """Attempts in a row that bring less than a megabyte."""
 _PAUSE = 1.0
 """Seconds before the second attempt; each further one waits twice as long."""
+
+
+def is_offline() -> bool:
+    """Return whether the environment forbids the network."""
+    return os.environ.get(OFFLINE, "").lower() not in ("", "0", "false", "no")
 
 
 class MissingFileError(InputError):

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from crisalad_jax.checkpoints import download as downloads
-from crisalad_jax.checkpoints.download import MissingFileError, download
+from crisalad_jax.utils import download as downloads
+from crisalad_jax.utils.download import MissingFileError, download
 from crisalad_jax.utils.errors import InputError
 from tests.file_server import FileServer, file_server
 

@@ -1,0 +1,86 @@
+"""The difference of two recalls on the same queries, and how sure it is."""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+
+from crisalad_jax.evaluation.metrics import Interval
+from crisalad_jax.utils.errors import InputError
+
+RESAMPLES = 10_000
+"""Number of resamples: the ends of an interval then vary by about a hundredth of its width."""
+
+
+class Difference(NamedTuple):
+    """A method's recall less the reference's, as fractions of the same queries."""
+
+    mean: float
+    """Difference of the means over the seeds."""
+    interval: Interval
+    """95 % interval of it over queries and seeds."""
+
+    verdict: Literal["better", "worse", "not told apart"]
+    """What the interval decides: "better" or "worse" where it excludes 0."""
+
+
+def paired_difference(
+    hits: Bool[np.ndarray, "seed q"],
+    reference: Bool[np.ndarray, "other_seed q"],
+    *,
+    same_seeds: bool = True,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> Difference:
+    """Compute the difference of two recalls, and its percentile bootstrap's 95 % interval.
+
+    A resample draws as many queries with replacement, the same ones for both methods, and as many
+    seeds. Runs of one seed share initial values and batches, so that the same seeds are drawn for
+    both methods; what a seed does to both cancels. Queries with the same hits are drawn together,
+    by a multinomial distribution, which is exact and takes no more time for more queries.
+
+    Args:
+        hits: whether each query was a hit, for each seed of the method.
+        reference: the same of the reference, on the same queries.
+        same_seeds: whether row i of both is a run of the same seed. If not, as for a model from a
+            file, the seeds of each method are drawn independently.
+        resamples: number of resamples.
+        seed: of the resampling; the same one gives the same interval.
+
+    Returns:
+        The difference, positive where the method recalls more.
+
+    Raises:
+        InputError: no queries or seeds, other queries than the reference's, or another number of
+            seeds although they are the same.
+
+    Example:
+        >>> first, second = np.array([[True, True, True, False]]), np.array([[False] * 4])
+        >>> paired_difference(first, second).mean
+        0.75
+    """
+    fits = hits.size and hits.shape[1] == reference.shape[1]
+    if not fits or (same_seeds and len(hits) != len(reference)):
+        raise InputError(
+            f"hits: found shapes {hits.shape} and {reference.shape}, expected (seeds, queries) of "
+            "the same queries, and as many seeds unless same_seeds=False"
+        )
+    generator = np.random.default_rng(seed)
+    queries = hits.shape[1]
+    patterns, counts = np.unique(np.concatenate([hits, reference]), axis=1, return_counts=True)
+    drawn = generator.multinomial(queries, counts / queries, size=resamples)
+    recalls = drawn @ patterns.T.astype(float) / queries
+    ours, theirs = recalls[:, : len(hits)], recalls[:, len(hits) :]
+    weights = _drawn_seeds(generator, resamples, len(hits))
+    other = weights if same_seeds else _drawn_seeds(generator, resamples, len(reference))
+    differences = (weights * ours).sum(axis=1) - (other * theirs).sum(axis=1)
+    # Sums that are equal in exact arithmetic must not differ by their rounding.
+    low, high = np.quantile(differences.round(12), (0.025, 0.975))
+    verdict = "better" if low > 0 else "worse" if high < 0 else "not told apart"
+    mean = float(hits.mean() - reference.mean())
+    return Difference(mean, Interval(float(low), float(high)), verdict)
+
+
+def _drawn_seeds(generator: np.random.Generator, resamples: int, seeds: int) -> np.ndarray:
+    """Draw seeds with replacement; return the share of each in each resample."""
+    return generator.multinomial(seeds, [1 / seeds] * seeds, size=resamples) / seeds

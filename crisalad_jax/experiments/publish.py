@@ -1,0 +1,306 @@
+"""Write a run as the hub's users expect a model: weights, configuration, and a model card."""
+
+import contextlib
+import json
+import os
+import pathlib
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from crisalad_jax.checkpoints.load import HUB_FILE
+from crisalad_jax.checkpoints.weights import read_weights
+from crisalad_jax.config.checks import PATH, require, takes
+from crisalad_jax.config.io import read_config, to_plain
+from crisalad_jax.data.benchmarks.on_disk import listing
+from crisalad_jax.evaluation.metrics import bootstrap_interval
+from crisalad_jax.evaluation.results import percent
+from crisalad_jax.experiments.tables import Cell, Table, write_text
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.log import read_metrics
+from crisalad_jax.training.run_files import DATA
+from crisalad_jax.training.summary import model_words
+from crisalad_jax.training.validation import MONITORED
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import atomic_folder, read_json, real_path, write_json
+from crisalad_jax.utils.hub import is_hub, parse_hub, upload_folder
+from crisalad_jax.utils.output import counted, warn
+from crisalad_jax.utils.version import VERSION
+
+WEIGHTS = ("best.safetensors", "last.safetensors")
+"""Files of a run's weights; the first that is there is published."""
+CARD, CONFIG = "README.md", "config.json"
+_LIBRARY = "crisalad-jax"
+_TAGS = ["visual-place-recognition", "image-retrieval", "geo-localization", "jax"]
+
+
+@takes(run=PATH)
+def publish(
+    run: str | os.PathLike[str],
+    to: str | os.PathLike[str],
+    *,
+    licence: str,
+    data: str | None = None,
+    evaluations: Sequence[str | os.PathLike[str]] = (),
+    quiet: bool = False,
+) -> str:
+    """Write a run's model to a new folder, or to a repository at Hugging Face's hub.
+
+    It has `model.safetensors`, `config.json` and `README.md`, a model card written from the run:
+    what it is, the data and the recipe of its training, recalls with their intervals, its licence,
+    and how to use it. `load` reads the folder, and hf://OWNER/NAME.
+
+    Args:
+        run: the run's folder, with best.safetensors or last.safetensors.
+        to: a new or empty folder, or hf://OWNER/NAME of a repository without these files.
+        licence: the weights' licence by the hub's name for it, such as apache-2.0 or
+            cc-by-nc-4.0; what they were started from and trained on may limit it.
+        data: what it was trained on, in words; None is what the run recorded.
+        evaluations: files that `crisalad evaluate --json` wrote for this model.
+        quiet: whether to show no progress bar.
+
+    Returns:
+        The folder, or the address of the repository's page.
+
+    Raises:
+        InputError: the run has no weights; a file is missing or damaged; the folder has files, or
+            the repository; no such name of a licence; or what `upload_folder` raises.
+        ModuleNotFoundError: huggingface_hub is not installed, and `to` is at the hub.
+
+    Example:
+        >>> import dataclasses
+        >>> import crisalad_jax as cj
+        >>> config = dataclasses.replace(cj.recipe("tiny"), epochs=1, places_per_batch=4)
+        >>> _ = cj.train(config, places, folder / "run", quiet=True)
+        >>> _ = publish(folder / "run", folder / "mine", licence="apache-2.0")
+        >>> cj.load(folder / "mine").config == config.model
+        True
+    """
+    run = pathlib.Path(run)
+    require(
+        re.fullmatch(r"[a-z0-9][a-z0-9.-]*", licence) is not None,
+        f"licence: found {licence!r}, expected the hub's name for one, such as apache-2.0",
+    )
+    address = parse_hub(to) if is_hub(to) else None
+    require(address is None or address.file is None, f"{to}: found a file, expected a repository")
+    found = _read_run(run)
+    rows = [*_validation(found), *(row for file in evaluations for row in _rows(file, found))]
+    name = str(address or real_path(pathlib.Path(to)).name)
+    card = _card(found, rows, name=name, licence=licence, data=data)
+    with contextlib.ExitStack() as stack:
+        if address is None:
+            folder = stack.enter_context(atomic_folder(to))
+        else:
+            folder = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        shutil.copyfile(found.weights, folder / HUB_FILE)
+        model = to_plain(found.config.model)
+        about = {"library_name": _LIBRARY, "version": VERSION, "model": model}
+        write_json(folder / CONFIG, about | {"training": to_plain(found.config)})
+        write_text(folder / CARD, card)
+        if address is None:
+            return os.fspath(to)
+        return upload_folder(folder, address, f"Publish {run.name}", quiet=quiet)
+
+
+class _Run(NamedTuple):
+    """What is read of a run."""
+
+    weights: pathlib.Path
+    config: TrainConfig
+    metrics: list[dict[str, Any]]
+    data: dict[str, Any] | None
+    """What it recorded of its data; None of a run that `fit` made without `train`."""
+
+
+class _Row(NamedTuple):
+    """Recalls of a table."""
+
+    benchmark: str
+    how: str
+    recalls: Mapping[str, float]
+    intervals: Mapping[str, Sequence[float]]
+
+
+def _read_run(run: pathlib.Path) -> _Run:
+    """Read a run, and check its weights.
+
+    Raises:
+        InputError: it has none, or something is damaged.
+    """
+    there = [run / name for name in WEIGHTS if (run / name).is_file()]
+    if not there:
+        raise InputError(f"{run}: found {listing(run)}, expected a run with {' or '.join(WEIGHTS)}")
+    config = read_config(TrainConfig, run / CONFIG)
+    read_weights(there[0])
+    log, data = run / "metrics.jsonl", run / DATA
+    metrics = read_metrics(log) if log.is_file() else []
+    return _Run(
+        there[0], config, metrics, read_json(data, "a run's data") if data.is_file() else None
+    )
+
+
+def _validation(run: _Run) -> Iterator[_Row]:
+    """Yield the recalls of the validation that chose these weights, where there was one."""
+    ranks = [f"R@{k}" for k in MONITORED[run.config.monitor]]
+    validations = [each for each in run.metrics if all(rank in each for rank in ranks)]
+    if not validations:
+        return
+    last = run.weights.name == WEIGHTS[1]
+    # Of equal recalls the first counts as the best; the last weights are of the last one.
+    best = max(validations, key=lambda each: sum(each[rank] for rank in ranks))
+    chosen = validations[-1] if last else best
+    recalls = {name: value for name, value in chosen.items() if re.fullmatch(r"R@\d+", name)}
+    known = (run.data or {}).get("validation")
+    intervals = {}
+    if known is not None:
+        for name, value in recalls.items():
+            hits = np.zeros(known["queries"], np.int64)
+            hits[: round(value * known["queries"])] = 1
+            intervals[name] = list(bootstrap_interval(hits))
+    name = known["name"] if known is not None else "the run's validation set"
+    yield _Row(name, f"validation at step {chosen['step']:,}, single", recalls, intervals)
+
+
+def _rows(file: str | os.PathLike[str], run: _Run) -> Iterator[_Row]:
+    """Yield the results of an evaluation.
+
+    Raises:
+        InputError: it is none, or of another model.
+    """
+    values = read_json(file, "what `crisalad evaluate --json` wrote", sealed=False)
+    try:
+        benchmark, weights = values["benchmark"], values["weights"]
+        rows = [
+            _Row(
+                benchmark,
+                row["grouping"] + (f" + {row['rerank']}" if row["rerank"] else ""),
+                row["recalls"],
+                row["intervals"],
+            )
+            for row in values["results"]
+        ]
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"{file}: found no {error}, expected what `crisalad evaluate --json` wrote"
+        ) from error
+    if weights is None or real_path(weights) != real_path(run.weights):
+        warn(f"{file}: found an evaluation of {weights}; {run.weights} is what is published")
+    yield from rows
+
+
+def _card(run: _Run, rows: Sequence[_Row], *, name: str, licence: str, data: str | None) -> str:
+    """Write the model card: a YAML header for the hub, and a page for people."""
+    config = run.config
+    short = name.rpartition("/")[2].partition("@")[0]
+    header: dict[str, Any] = {
+        "license": licence,
+        "library_name": _LIBRARY,
+        "pipeline_tag": "image-feature-extraction",
+        "tags": _TAGS,
+    }
+    if rows:
+        header["model-index"] = [{"name": short, "results": [_result(row) for row in rows]}]
+    # JSON is YAML too, and quotes all that a name may hold.
+    lines = [f"{key}: {json.dumps(value)}" for key, value in header.items()]
+    loss, optimiser = config.loss, config.optimiser
+    parts = [
+        ["---", *lines, "---", "", f"# {short}"],
+        [
+            "A model for visual place recognition: it makes a descriptor of an image, and images "
+            f"of one place have similar ones. Written by crisalad-jax {VERSION}."
+        ],
+        ["## Use", "", "```python", *_example(name), "```"],
+        [f"`pip install 'crisalad-jax[data]'` installs all that this needs. {_limits(config)}"],
+        ["## Model", "", f"- {model_words(config.model)}", f"- {config.model.images_in_words}"],
+        ["## Training", "", f"- Data: {data or _data_words(run.data)}."],
+        ["## Recalls", "", _table(rows)],
+        ["## Licence", "", f"The weights: {licence}. The package is under Apache-2.0."],
+    ]
+    parts[5] += [
+        f"- Loss: {loss.kind.part_name}; optimiser {optimiser.kind.part_name}, learning rate "
+        f"{optimiser.learning_rate:g}, schedule {optimiser.schedule.part_name}.",
+        f"- Batches: {config.places_per_batch} places of {config.images_per_place} images; "
+        f"{counted(config.epochs, 'epoch')}; seed {config.seed}; trained: {config.trainable}.",
+        f"- `{CONFIG}` has all settings.",
+    ]
+    return "\n\n".join("\n".join(part) for part in parts) + "\n"
+
+
+def _example(name: str) -> list[str]:
+    return [
+        "import crisalad_jax as cj",
+        "",
+        f'model = cj.load("{name}")',
+        'found = cj.extract(model, "photos", "descriptors.npy")  # a folder of images',
+        "print(cj.search(found.descriptors, found.descriptors, 2).indices)  # who is like whom",
+    ]
+
+
+def _limits(config: TrainConfig) -> str:
+    if config.model.cross_image.attends:
+        return (
+            "Its descriptors depend on the images that are described together "
+            "(`docs/evaluation.md`): the recalls below say how they were grouped."
+        )
+    return "A descriptor depends on its own image alone."
+
+
+def _data_words(data: Mapping[str, Any] | None) -> str:
+    if data is None:
+        return "the run has no record of it"
+    training = data["training"]
+    counts = ", ".join(
+        f"{training[each]:,} {each}" for each in ("places", "queries", "images") if each in training
+    )
+    validation = data["validation"]
+    on = "" if validation is None else f"; validated on {validation['name']}"
+    return f"{training['name']} ({counts}){on}"
+
+
+def _table(rows: Sequence[_Row]) -> str:
+    if not rows:
+        return "The run has no validation, and no evaluation was given."
+    names = sorted({name for row in rows for name in row.recalls}, key=lambda n: int(n[2:]))
+    cells = [
+        [
+            Cell(row.benchmark),
+            Cell(row.how),
+            *(
+                Cell(percent(row.recalls[name]), _interval(row, name))
+                if name in row.recalls
+                else Cell("-")
+                for name in names
+            ),
+        ]
+        for row in rows
+    ]
+    table = Table(["data set", "grouping", *names], cells, labels=2).markdown()
+    return (
+        f"{table}\nPercent of all queries; in brackets the 95 % interval by bootstrap over the "
+        "queries, as if they were independent. A validation chose the weights: its recalls are "
+        "high by that."
+    )
+
+
+def _interval(row: _Row, name: str) -> str:
+    if name not in row.intervals:
+        return ""
+    return f"[{'-'.join(percent(end) for end in row.intervals[name])}]"
+
+
+def _result(row: _Row) -> dict[str, Any]:
+    """Put a row into the form of the hub's `model-index`, recalls in percent."""
+    kind = re.sub(r"[^a-z0-9]+", "-", row.benchmark.lower()).strip("-")
+    metrics = [
+        {"type": f"recall_at_{name[2:]}", "name": f"{name}, {row.how}", "value": 100 * value}
+        for name, value in row.recalls.items()
+    ]
+    return {
+        "task": {"type": "image-feature-extraction", "name": "Visual place recognition"},
+        "dataset": {"type": kind, "name": row.benchmark},
+        "metrics": metrics,
+    }

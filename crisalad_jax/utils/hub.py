@@ -1,0 +1,233 @@
+"""Files at Hugging Face's hub and at Kaggle, through their own clients."""
+
+import contextlib
+import dataclasses
+import os
+import pathlib
+import re
+import sys
+from collections.abc import Iterator
+
+from crisalad_jax.utils.download import OFFLINE, is_offline
+from crisalad_jax.utils.errors import InputError
+
+PREFIX = "hf://"
+_KAGGLE_CACHE = "KAGGLEHUB_CACHE"
+"""Variable of the environment: where Kaggle's client stores what it downloads."""
+_ADDRESS = re.compile(
+    # A `Path` has one slash in the place of two.
+    r"hf:/{1,2}(?P<repository>[\w.-]+/[\w.-]+)(@(?P<revision>[^/@]+))?(/(?P<file>.+))?/?"
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class HubAddress:
+    """A repository at Hugging Face's hub, or a file in it."""
+
+    repository: str
+    """As OWNER/NAME."""
+    revision: str | None = None
+    """Branch, tag or commit; None is the main branch."""
+    file: str | None = None
+
+    def __str__(self) -> str:
+        """Write it as a user does."""
+        at = f"@{self.revision}" if self.revision else ""
+        return f"{PREFIX}{self.repository}{at}{f'/{self.file}' if self.file else ''}"
+
+
+def is_hub(address: object) -> bool:
+    """Return whether a path or a text is an address at the hub.
+
+    Example:
+        >>> is_hub("hf://owner/name"), is_hub("owner/name")
+        (True, False)
+    """
+    return str(address).startswith("hf:/")
+
+
+def parse_hub(address: object) -> HubAddress:
+    """Read an address at the hub: hf://OWNER/NAME, with @REVISION and /FILE where wanted.
+
+    Raises:
+        InputError: it is none.
+
+    Example:
+        >>> parse_hub("hf://owner/name@v1/model.safetensors")
+        HubAddress(repository='owner/name', revision='v1', file='model.safetensors')
+    """
+    found = _ADDRESS.fullmatch(str(address))
+    if found is None:
+        raise InputError(
+            f"{address}: found no address at the hub, expected hf://OWNER/NAME[@REVISION][/FILE]"
+        )
+    return HubAddress(found["repository"], found["revision"], found["file"])
+
+
+def download_file(
+    address: HubAddress,
+    *,
+    is_dataset: bool = False,
+    folder: pathlib.Path | None = None,
+    quiet: bool = False,
+) -> pathlib.Path:
+    """Download a file from the hub, or find it in the hub's cache.
+
+    Args:
+        address: the repository and the file.
+        is_dataset: whether it is a repository of data.
+        folder: where the file goes, under its path there; None is the hub's cache.
+        quiet: whether to show no progress bar.
+
+    Returns:
+        The file.
+
+    Raises:
+        InputError: there is no such repository, revision or file; it may not be read; the hub does
+            not answer; or the network is forbidden and the cache has no such file.
+        ModuleNotFoundError: huggingface_hub is not installed.
+    """
+    import huggingface_hub
+
+    with _told(address), _bars(quiet):
+        return pathlib.Path(
+            huggingface_hub.hf_hub_download(
+                address.repository,
+                str(address.file),
+                repo_type="dataset" if is_dataset else "model",
+                revision=address.revision,
+                local_dir=folder,
+                local_files_only=is_offline(),
+            )
+        )
+
+
+def upload_folder(
+    folder: pathlib.Path, address: HubAddress, message: str, *, quiet: bool = False
+) -> str:
+    """Upload a folder to a new repository of models, or to one that has no files yet.
+
+    Args:
+        folder: the folder.
+        address: the repository.
+        message: of the commit.
+        quiet: whether to show no progress bar.
+
+    Returns:
+        The address of the repository's page.
+
+    Raises:
+        InputError: the repository has a model; the user is not logged in or may not write there;
+            or the hub does not answer.
+        ModuleNotFoundError: huggingface_hub is not installed.
+    """
+    import huggingface_hub
+
+    if is_offline():
+        raise InputError(f"{address}: {OFFLINE} forbids the network")
+    interface = huggingface_hub.HfApi()
+    with _told(address), _bars(quiet):
+        made = interface.create_repo(address.repository, exist_ok=True)
+        there = interface.list_repo_files(address.repository, revision=address.revision)
+        if taken := sorted(set(there) & {path.name for path in folder.iterdir()}):
+            raise InputError(
+                f"{address}: found a repository with {', '.join(taken)}, expected a new or empty "
+                "one"
+            )
+        interface.upload_folder(
+            repo_id=address.repository,
+            folder_path=folder,
+            commit_message=message,
+            revision=address.revision,
+        )
+    return str(made)
+
+
+def download_kaggle(handle: str, folder: pathlib.Path, *, quiet: bool = False) -> pathlib.Path:
+    """Download a data set from Kaggle, unpacked.
+
+    Args:
+        handle: as OWNER/NAME.
+        folder: a folder for its client's cache, from which the next call resumes.
+        quiet: whether to show no progress bar.
+
+    Returns:
+        The folder with the set's files, in the cache.
+
+    Raises:
+        InputError: there is no such set, the user has no token, or Kaggle does not answer.
+        ModuleNotFoundError: kagglehub is not installed.
+    """
+    import kagglehub
+
+    before = os.environ.get(_KAGGLE_CACHE)
+    # An output folder that is not empty is refused, so that nothing there would be resumed.
+    os.environ[_KAGGLE_CACHE] = str(folder)
+    try:
+        with (
+            open(os.devnull, "w") as nothing,
+            contextlib.redirect_stderr(nothing if quiet else sys.stderr),
+        ):
+            return pathlib.Path(kagglehub.dataset_download(handle))
+    except Exception as error:  # its client has errors of several packages
+        raise InputError(
+            f"kaggle: {handle}: found {_first_line(error)}, expected the data set (a token: "
+            "https://www.kaggle.com/settings; the same command resumes)"
+        ) from error
+    finally:
+        del os.environ[_KAGGLE_CACHE]
+        if before is not None:
+            os.environ[_KAGGLE_CACHE] = before
+
+
+@contextlib.contextmanager
+def _told(address: HubAddress) -> Iterator[None]:
+    """Tell of the hub's errors in one line, without what its client says of tokens."""
+    from huggingface_hub import errors
+
+    try:
+        yield
+    except errors.GatedRepoError as error:
+        what = "a repository with terms, expected you to accept them at its page, and a token"
+        raise InputError(f"{address}: found {what} (`hf auth login`)") from error
+    except errors.RepositoryNotFoundError as error:
+        what = "found no such repository, or a private one, expected one that you may read"
+        raise InputError(f"{address}: {what} (`hf auth login`)") from error
+    except errors.RevisionNotFoundError as error:
+        raise InputError(f"{address}: found no such revision, expected one") from error
+    except errors.LocalEntryNotFoundError as error:
+        reason = f"{OFFLINE} forbids the network" if is_offline() else "the hub does not answer"
+        raise InputError(f"{address}: found none in the hub's cache: {reason}") from error
+    except errors.EntryNotFoundError as error:
+        raise InputError(f"{address}: found no {address.file} there, expected it") from error
+    except errors.LocalTokenNotFoundError as error:
+        raise InputError(f"{address}: found no token, expected one: `hf auth login`") from error
+    except errors.HfHubHTTPError as error:
+        response = error.response
+        said = f"HTTP {response.status_code} {response.reason_phrase}"
+        advice = " (`hf auth login`)" if response.status_code in (401, 403) else ""
+        raise InputError(f"{address}: found {said}, expected an answer{advice}") from error
+    except InputError:
+        raise
+    except Exception as error:  # its client has errors of several packages
+        raise InputError(f"{address}: found {_first_line(error)}, expected an answer") from error
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0].rstrip(".") if lines else type(error).__name__
+
+
+@contextlib.contextmanager
+def _bars(quiet: bool) -> Iterator[None]:
+    """Let the clients show no progress bars while the block runs."""
+    from huggingface_hub import utils
+
+    if not quiet or utils.are_progress_bars_disabled():
+        yield
+        return
+    utils.disable_progress_bars()
+    try:
+        yield
+    finally:
+        utils.enable_progress_bars()

@@ -1,0 +1,97 @@
+"""How many images published models describe a second, as a share of MegaLoc's, on one device.
+
+    python scripts/bench/bench_claims.py [--out docs/claims] [--batch 16] [--rounds 5]
+
+One model of each architecture of `docs/claims/claims.toml`, with random weights: the time does not
+depend on them. Images have the size that the model is published for, in bfloat16 products. Every
+round times all models once, MegaLoc first; a share is the median over rounds of those of one round.
+What is timed is `describe`, pixels on the device to descriptors, each image alone. A second stage
+is not in it.
+"""
+
+import argparse
+import dataclasses
+import json
+import pathlib
+import statistics
+import time
+import tomllib
+
+import jax
+import jax.numpy as jnp
+
+from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.nn.model import describe, init_crisalad
+from tests.checkpoints.test_published import inferred
+
+REFERENCE = "megaloc"
+CLAIMS = pathlib.Path(__file__).parents[2] / "docs" / "claims" / "claims.toml"
+SHOWN = "docs/claims"
+
+
+def published() -> dict[str, ModelConfig]:
+    """The configurations of the models, each architecture once, by the first name that has it."""
+    rows = tomllib.loads(CLAIMS.read_text(encoding="utf-8"))["row"]
+    names = dict.fromkeys([REFERENCE, *(row["models"][0] for row in rows if "models" in row)])
+    return {name: inferred(name)[1] for name in names}
+
+
+def program(config: ModelConfig, batch: int):
+    """A call that describes a batch and waits for it."""
+    config = dataclasses.replace(config, compute_dtype="bfloat16")
+    params = jax.jit(lambda: init_crisalad(jax.random.key(0), config))()
+    images = jnp.zeros((batch, *config.image_size, 3), jnp.uint8)
+    alone = jnp.eye(batch, dtype=bool)
+    run = jax.jit(lambda params, images: describe(params, images, config, mask=alone))
+    compiled = run.lower(params, images).compile()
+    return lambda: jax.block_until_ready(compiled(params, images))
+
+
+def seconds(call, calls: int) -> float:
+    """The median of some calls."""
+    call()
+    times = []
+    for _ in range(calls):
+        started = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - started)
+    return statistics.median(times)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(SHOWN))
+    parser.add_argument("--batch", type=int, default=16)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--calls", type=int, default=10)
+    arguments = parser.parse_args()
+    calls = {}
+    for name, config in published().items():
+        calls[name] = program(config, arguments.batch)
+        print(f"compiled {name}", flush=True)
+    rounds = [
+        {name: seconds(call, arguments.calls) for name, call in calls.items()}
+        for _ in range(arguments.rounds)
+    ]
+    shares = {name: [each[REFERENCE] / each[name] for each in rounds] for name in calls}
+    device = jax.devices()[0]
+    found = {
+        "device": device.device_kind,
+        "jax": jax.__version__,
+        "batch": arguments.batch,
+        "images_per_second": {
+            name: arguments.batch / statistics.median(each[name] for each in rounds)
+            for name in calls
+        },
+        "times_megaloc": {name: statistics.median(values) for name, values in shares.items()},
+        "range": {name: [min(values), max(values)] for name, values in shares.items()},
+    }
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    (arguments.out / "speed.json").write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    print(json.dumps(found, indent=2))
+
+
+if __name__ == "__main__":
+    main()

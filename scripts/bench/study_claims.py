@@ -1,0 +1,202 @@
+"""Tables of what is claimed and how it was measured, for `docs/claims.md` and the README.
+
+    python scripts/bench/study_claims.py [--page docs/claims.md] [claims] [leakage]
+
+claims: every row of `docs/claims/claims.toml`, with licence, length and parameters from the table
+of published models, and the speed that `bench_claims.py` measured. leakage: what images in a batch
+tell under the published evaluations of models whose images attend to each other, computed from
+their rules alone: which frames are right, in which order they come, how many are in a batch.
+"""
+
+import json
+import pathlib
+import tomllib
+from typing import Any, NamedTuple
+
+import numpy as np
+from tables import Study, Table, flags, leave, put, read_some
+
+from crisalad_jax.checkpoints.published import PUBLISHED
+from crisalad_jax.evaluation.leakage import masked, mirrored_share, near, same_place_share
+from crisalad_jax.evaluation.protocols import PROTOCOLS
+from crisalad_jax.retrieval.grouping import Batches, batches_of
+
+ROOT = pathlib.Path(__file__).parents[2]
+FOLDER = ROOT / "docs" / "claims"
+README = ROOT / "README.md"
+SETS = ("pitts30k", "msls", "nordland", "tokyo")
+HEADERS = ("Pitts30k", "MSLS-val", "Nordland", "Tokyo 24/7")
+BEST = 10
+DASH = "\N{EN DASH}"
+
+
+def rows() -> list[dict[str, Any]]:
+    text = (FOLDER / "claims.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)["row"]
+
+
+def recall(row: dict[str, Any], name: str) -> str:
+    """The printed recall on a set; of Nordland also those of other splits, with a mark."""
+    found = [f"{row[name]:.1f}"] if name in row else []
+    if name == "nordland":
+        found += [f"{row['nordland_bench']:.1f}*"] if "nordland_bench" in row else []
+        found += [f"{row['nordland_other']:.1f}†"] if "nordland_other" in row else []
+    return ", ".join(found) or DASH
+
+
+def facts(row: dict[str, Any], speeds: dict[str, float]) -> tuple[str, str, str, str]:
+    """Licence, length of a descriptor, millions of parameters, and images a second."""
+    if "models" not in row:
+        return DASH, f"{row['descriptor']:,}", DASH, DASH
+    model = PUBLISHED[row["models"][0]]
+    speed = speeds.get(model.name)
+    licence = model.licence.name
+    if model.licence.commercial is False:
+        licence += ", not for commerce"
+    millions = f"{model.parameters / 1e6:,.0f}"
+    return licence, f"{model.descriptor:,}", millions, DASH if speed is None else f"{speed:.2f}"
+
+
+def command(row: dict[str, Any]) -> str:
+    """What reproduces a row, after `crisalad evaluate --data SET`."""
+    if "command" in row:
+        return f"`{row['command']}`"
+    words = [f"--weights {' | '.join(row['models'])}", *([row["flags"]] if "flags" in row else [])]
+    return f"`{' '.join(words)}`".replace(" | ", "`, `")
+
+
+def claims() -> Study:
+    path = FOLDER / "speed.json"
+    measured = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    speeds = measured.get("times_megaloc", {})
+    header = (
+        "model",
+        *HEADERS,
+        "measured",
+        "printed in",
+        "licence",
+        "numbers",
+        "million parameters",
+    )
+    found = []
+    for row in rows():
+        licence, *sizes, speed = facts(row, speeds)
+        cells = [row["title"], *(recall(row, name) for name in SETS), row["how"], row["source"]]
+        found.append((*cells, licence, *sizes, speed, command(row)))
+    device = f" on one {measured['device']}" if measured else ""
+    caption = (
+        "R@1 in percent, as printed. \\* VPR-Bench's lists of Nordland; † another split, see "
+        f'"measured". Speed: images described a second{device}, as a multiple of MegaLoc\'s, at '
+        "its own image size, in bfloat16. The last column follows `crisalad evaluate --data SET`."
+    )
+    return Study(Table((*header, "speed", "reproduces"), found, caption, 1), found)
+
+
+def best() -> str:
+    """The rows with the highest mean of Pitts30k and MSLS, of images described alone."""
+    alone = [
+        row
+        for row in rows()
+        if {"pitts30k", "msls"} <= row.keys()
+        and "published:" not in row.get("flags", "")
+        and "models" in row
+    ]
+    alone.sort(key=lambda row: -(row["pitts30k"] + row["msls"]))
+    lines = [
+        "| model | Pitts30k | MSLS-val | Nordland | name |",
+        "| --- | ---: | ---: | ---: | --- |",
+    ]
+    for row in alone[:BEST]:
+        cells = (recall(row, name) for name in SETS[:3])
+        lines.append(f"| {row['title']} | {' | '.join(cells)} | `{row['models'][0]}` |")
+    return "\n" + "\n".join(lines) + "\n"
+
+
+class Rules(NamedTuple):
+    """A set as its evaluation has it: where images are, in any unit, in the order of names."""
+
+    name: str
+    queries: np.ndarray
+    database: np.ndarray
+    radius: float
+
+    @property
+    def positives(self) -> list[np.ndarray]:
+        order = np.argsort(self.database, kind="stable")
+        ordered = self.database[order]
+        starts = np.searchsorted(ordered, self.queries - self.radius, "left")
+        ends = np.searchsorted(ordered, self.queries + self.radius, "right")
+        return [order[start:end] for start, end in zip(starts, ends, strict=True)]
+
+
+def known_rules() -> list[Rules]:
+    """Sets whose rules alone say which images come next to each other.
+
+    Nordland: frame i of winter is right for frames i - 10 to i + 10 of summer. SPED and AmsterTime:
+    one image for each. Pitts30k: 24 views of a panorama have one position, by which names are
+    sorted; panoramas are taken to be further apart than 25 m, so that the shares are the least.
+    """
+    frames = np.arange(27_592.0)
+    return [
+        Rules("Nordland", frames, frames, 10),
+        Rules("SPED", np.arange(607.0), np.arange(607.0), 0),
+        Rules("AmsterTime", np.arange(1231.0), np.arange(1231.0), 0),
+        Rules("Pitts30k", np.arange(6816) // 24 * 1.0, np.arange(10_000) // 24 * 1.0, 0),
+    ]
+
+
+def batches(positions: np.ndarray, grouping: str, size: int, radius: float, seed: int) -> Batches:
+    if grouping != "masked":
+        return batches_of(len(positions), grouping, size, seed)
+    return masked(batches_of(len(positions), "sequential", size), near(flat(positions), radius))
+
+
+def flat(positions: np.ndarray) -> np.ndarray:
+    return np.stack([positions, np.zeros(len(positions))], axis=1)
+
+
+def leakage() -> Study:
+    found, values = [], []
+    for rules in known_rules():
+        name = rules.name.lower()
+        sizes: dict[int, list[str]] = {}
+        for method, protocol in PROTOCOLS.items():
+            known = [n for key, n in protocol.sizes.items() if key in name] or [protocol.otherwise]
+            if known[0]:
+                sizes.setdefault(known[0], []).append(method)
+        for size, methods in sizes.items():
+            for grouping in ("sequential", "shuffled", "masked"):
+                sides = [
+                    (positions, batches(positions, grouping, size, rules.radius, seed))
+                    for seed, positions in enumerate((rules.queries, rules.database))
+                ]
+                shares = [
+                    same_place_share(each, near(flat(at), rules.radius)) for at, each in sides
+                ]
+                mirrored = mirrored_share(sides[0][1], sides[1][1], rules.positives)
+                row = [*shares, mirrored]
+                values.append([rules.name, size, methods, grouping, *row])
+                cells = (DASH if each is None else f"{100 * each:.1f}" for each in row)
+                of = ", ".join(methods) if grouping == "sequential" else ""
+                found.append((rules.name, str(size), grouping, of, *cells))
+    header = ("set", "images", "batches", "of", "same place, queries", "database", "mirrored")
+    caption = (
+        "Percent of the other images in a batch: those of an image's own place, and those whose "
+        "place is also in the batch of the query's right answer."
+    )
+    return Study(Table(header, found, caption, 4), values)
+
+
+STUDIES = {"claims": claims, "leakage": leakage}
+
+
+def main() -> None:
+    arguments = read_some(flags("Tabulate; see the top.", "docs/claims"), STUDIES)
+    for name in arguments.studies:
+        leave(name, STUDIES[name](), arguments)
+    if arguments.page is not None and "claims" in arguments.studies:
+        put(README, "best", best())
+
+
+if __name__ == "__main__":
+    main()
