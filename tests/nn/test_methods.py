@@ -85,7 +85,7 @@ def pictures(*seeds: int) -> np.ndarray:
 
 def model(aggregator: str) -> tuple[Crisalad, ModelConfig]:
     backbone = SMALL.backbone
-    if PARTS[aggregator].features(backbone.depth).second:
+    if PARTS[aggregator].features(backbone.depth).path:
         adapter = make_part("adapter", "side-multi-resolution", paths=2)
         backbone = dataclasses.replace(backbone, adapter=adapter)
     config = dataclasses.replace(SMALL, backbone=backbone, aggregator=PARTS[aggregator])
