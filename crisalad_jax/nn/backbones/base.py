@@ -101,6 +101,10 @@ class Backbone(Part, abc.ABC):
     """Whether its features can have the class token's attention, or facets of attention."""
     exposes_levels: ClassVar[bool] = True
     """Whether its features can be those after other blocks than the last."""
+    local_features: ClassVar[str | None] = None
+    """Features that photographs become on the host, in place of pixels: "sift" or "orb"."""
+    binary: ClassVar[bool] = False
+    """Whether the numbers of its features have two values, as those of visual words then have."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray) -> Any:
@@ -127,6 +131,11 @@ class Backbone(Part, abc.ABC):
         Raises:
             InputError: while tracing, for a request that this backbone cannot meet.
         """
+
+    @property
+    def encoded_size(self) -> tuple[int, int] | None:
+        """Height and width of the bytes of `local_features`; None where it takes pixels."""
+        return None
 
     @property
     def side_paths(self) -> int:

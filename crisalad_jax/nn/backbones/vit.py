@@ -813,11 +813,19 @@ def interpolate_positions(
     registers use torch's bicubic (a = -0.75) with the scale (size + 0.1) / grid. Models with
     registers use its antialiased one (a = -0.5) at the exact scale, but see `position_resize`.
     """
+    antialias = config.registers and config.position_resize == "dinov2"
+    return resize_grid(positions, grid, _antialias_weights if antialias else bicubic_weights)
+
+
+def resize_grid(
+    positions: Float[Array, "grid grid dim"],
+    grid: Grid,
+    weights: Callable[[int, int], Float[np.ndarray, "target source"]],
+) -> Float[Array, "rows columns dim"]:
+    """Resize a square grid by the weights of each side."""
     side = positions.shape[0]
     if grid == (side, side):
         return positions
-    antialias = config.registers and config.position_resize == "dinov2"
-    weights = _antialias_weights if antialias else _bicubic_weights
     rows, columns = (jnp.asarray(weights(side, size), positions.dtype) for size in grid)
     return jnp.einsum("ri,cj,ijd->rcd", rows, columns, positions, precision="highest")
 
@@ -831,9 +839,12 @@ def _cubic(x: np.ndarray, a: float) -> np.ndarray:
 
 
 @functools.cache
-def _bicubic_weights(source: int, target: int) -> np.ndarray:
-    """Compute (target, source) weights of torch's bicubic upsampling, with replicated borders."""
-    scale = source / (target + 0.1)
+def bicubic_weights(source: int, target: int, more: float = 0.1) -> np.ndarray:
+    """Compute (target, source) weights of torch's bicubic upsampling, with replicated borders.
+
+    The scale is that of a target longer by `more`, as DINOv2 has it.
+    """
+    scale = source / (target + more)
     centres = (np.arange(target) + 0.5) * scale - 0.5
     weights = np.zeros((target, source))
     for row, centre in enumerate(centres):
