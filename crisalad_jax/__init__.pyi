@@ -100,6 +100,7 @@ from .retrieval.pca import save_pca as save_pca
 from .retrieval.reranking import Reranker as Reranker
 from .retrieval.reranking import Reranking as Reranking
 from .retrieval.search import search as search
+from .retrieval.seqslam import SeqSlam as SeqSlam
 from .retrieval.sequence import BayesFilter as BayesFilter
 from .retrieval.serve import serve_map as serve_map
 from .sinkhorn import SinkhornConfig as SinkhornConfig
@@ -112,6 +113,7 @@ from .training.callbacks import StopTraining as StopTraining
 from .training.callbacks import register_callback as register_callback
 from .training.classifier import load_loss as load_loss
 from .training.config import MiningConfig as MiningConfig
+from .training.config import MixtureSet as MixtureSet
 from .training.config import OptimiserConfig as OptimiserConfig
 from .training.config import TrainConfig as TrainConfig
 from .training.gradients import gradient_norms as gradient_norms

@@ -24,6 +24,7 @@ from crisalad_jax.nn.aggregators.gem import gem, generalised_mean, log_floored
 from crisalad_jax.nn.aggregators.queries import decode
 from crisalad_jax.nn.aggregators.sage import pooled, weighted
 from crisalad_jax.nn.aggregators.selavpr import local_features
+from crisalad_jax.nn.aggregators.selavprpp import SelaVprPpConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLoc, nearest_words
 from crisalad_jax.nn.backbones import Features
 from crisalad_jax.nn.backbones.vit import embed, run_blocks
@@ -204,29 +205,30 @@ def tetra(params: Crisalad, features: Features, config: Any) -> dict[str, jax.Ar
 
 
 def selavprpp(params: Crisalad, features: Features, config: Any) -> dict[str, jax.Array]:
-    """Steps of the branch of real numbers, and the bits of the other."""
-    own, patches = params.aggregator, features.patches
-    mixed = linear(own.real.before, patches)
-    tokens = jnp.concatenate([features.class_token[:, None], patches], axis=1)
-    images = zoo.golden("selavprpp_base_rerank")["images"]
-    described = np.asarray(describe(params, images, config))
+    """The bits of the branch that the model describes by, and steps of the one that ranks again."""
+    images, own = zoo.golden("selavprpp_base_rerank")["images"], params.aggregator.real
+    real = dataclasses.replace(params, aggregator=own)
+    floats = dataclasses.replace(config, aggregator=SelaVprPpConfig(config.aggregator.dim))
+    features = extract_features(real, images, floats)
+    tokens = jnp.concatenate([features.class_token[:, None], features.patches], axis=1)
+    mixed = linear(own.before, features.patches)
     return {
         "adapter0": side_update(params, images, config)[:, ::4, ::8],
         "features": tokens[:, ::2, ::8],
         "linear1": mixed.reshape(2, 11, 11, -1)[:, ::3, ::3, ::8],
-        "pooled": gem(mixed, own.real.p),
-        "hash_bits": pack_bits(described),
-        "descriptor": np.asarray(matching.describe_selavprpp(params, images, config))[:, 0],
+        "pooled": gem(mixed, own.p),
+        "hash_bits": jnp.asarray(pack_bits(np.asarray(describe(params, images, config)))),
+        "descriptor": matching.describe_selavprpp(params, images, config)[:, 0],
     }
 
 
 def side_update(params: Crisalad, images: np.ndarray, config: Any) -> jax.Array:
-    """What the first block's adapter adds to the first path, which starts from the same tokens."""
+    """What the first block's adapter adds to its path, which starts from the same tokens."""
     prepare = functools.partial(normalise, how=config.preprocessing)
     tokens = embed(params.backbone, jax.vmap(prepare)(jnp.asarray(images)), config.backbone)
     grid = config.backbone.grid(images.shape[1:3])
-    sides, _ = run_blocks([params.backbone.blocks], tokens, grid, config.backbone, count=1)
-    return sides[0] - tokens
+    side, _ = run_blocks([params.backbone.blocks], tokens, grid, config.backbone, count=1)
+    return side - tokens
 
 
 def vladbuff(params: Crisalad, features: Features, config: Any) -> dict[str, jax.Array]:

@@ -31,9 +31,9 @@ def load(path: str | os.PathLike[str], *, verify: bool = True, quiet: bool = Fal
         path: a .safetensors file of this package or Hugging Face, or a torch file of DINOv2,
             DINO-SALAD, CricaVPR or another format in `docs/methods.md`; torch files need torch. Or
             the name of a published model, as `crisalad models` lists them: it is downloaded once
-            into the cache. Or "starter", the small model in this package, or "hog", a baseline.
-            Or a folder that `crisalad publish` wrote; or hf://OWNER/NAME for such a folder at
-            Hugging Face's hub, with @REVISION and /FILE where wanted (extra `data`).
+            into the cache. Or "starter", the small model in this package, or a baseline, "hog" or
+            "thumbnail". Or a folder that `crisalad publish` wrote; or hf://OWNER/NAME for such a
+            folder at Hugging Face's hub, with @REVISION and /FILE where wanted (extra `data`).
         verify: whether to check the bytes of a file of this package against its checksum.
         quiet: no progress of a download.
 
@@ -63,8 +63,8 @@ def find_weights(
 ) -> pathlib.Path:
     """Return the file that is meant by a path, or by the name of a published model.
 
-    None is the small model in this package, with a note; it has a name, too, "starter". Another
-    name is "hog", histograms of oriented gradients, a baseline. A published model is downloaded the
+    None is the small model in this package, with a note; it has a name, too, "starter". Other names
+    are "hog" and "thumbnail", baselines that learn nothing. A published model is downloaded the
     first time, and its licence told each time, or once where it forbids commerce: its file says it
     too. A file of such a name in the working directory is taken instead, with a note.
 

@@ -1,5 +1,6 @@
 """Matches of two images' patches, and the scores of SelaVPR and TransVPR that count them."""
 
+import dataclasses
 import functools
 import math
 
@@ -10,11 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from crisalad_jax.nn.aggregators.selavpr import SelaVpr, SelaVprConfig, local_features
-from crisalad_jax.nn.aggregators.selavprpp import SelaVprPpHash, SelaVprPpHashConfig, head
+from crisalad_jax.nn.aggregators.selavprpp import (
+    SelaVprPpConfig,
+    SelaVprPpHash,
+    SelaVprPpHashConfig,
+)
 from crisalad_jax.nn.aggregators.transvpr import TransVpr, TransVprConfig, key_features
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.layers import l2_normalise
-from crisalad_jax.nn.model import AnyArray, Crisalad, Images, extract_features
+from crisalad_jax.nn.model import AnyArray, Crisalad, Images, describe, extract_features
 from crisalad_jax.utils import compiler
 
 Features = Float[np.ndarray, "*candidate feature dim"]
@@ -133,8 +137,10 @@ def describe_selavprpp(
 ) -> Float[Array, "image 1 dim"]:
     """Compute SelaVPR++'s descriptor of real numbers of every image, a unit vector."""
     assert isinstance(params.aggregator, SelaVprPpHash)
-    patches = extract_features(params, images, config).patches
-    return l2_normalise(head(params.aggregator.real, patches))[:, None]
+    assert isinstance(config.aggregator, SelaVprPpHashConfig)
+    params = dataclasses.replace(params, aggregator=params.aggregator.real)
+    config = dataclasses.replace(config, aggregator=SelaVprPpConfig(config.aggregator.dim))
+    return describe(params, images, config)[:, None]
 
 
 def nearness(query: Features, candidates: Features, config: ModelConfig) -> Scores:

@@ -9,6 +9,7 @@ import pytest
 from ott.geometry.pointcloud import PointCloud
 from ott.tools.sinkhorn_divergence import sinkhorn_divergence as ott_divergence
 
+from crisalad_jax.config.registry import make_part
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.resize import resize_image
@@ -16,6 +17,7 @@ from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.aggregators.pair_vpr import PairVprConfig
 from crisalad_jax.nn.aggregators.salad import FolConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
+from crisalad_jax.nn.aggregators.selavprpp import SelaVprPpHashConfig
 from crisalad_jax.nn.aggregators.transvpr import TransVprConfig
 from crisalad_jax.nn.aggregators.vlad import NetVladConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -56,11 +58,18 @@ NETVLAD = dataclasses.replace(
 PAIRVPR = dataclasses.replace(
     PLAIN, aggregator=PairVprConfig(dim=16, width=16, layers=2, hidden=8, positions=16)
 )
+SIDES = make_part("adapter", "side-multi-resolution", paths=2)
+SELAVPRPP = dataclasses.replace(
+    PLAIN,
+    backbone=dataclasses.replace(PLAIN.backbone, adapter=SIDES),
+    aggregator=SelaVprPpHashConfig(dim=24, bits=16),
+)
 OWN = {
     "fol": FOL,
     "pair-vpr": PAIRVPR,
     "transvpr": TRANSVPR,
     "selavpr": SELAVPR,
+    "selavprpp": SELAVPRPP,
     "sinkhorn-divergence": PLAIN,
 }
 
@@ -209,6 +218,32 @@ def test_an_evaluation_has_a_row_without_and_a_row_with(benchmark) -> None:
     # Any order of the first three has as many right ones among them as they had.
     assert both[1].recalls[5] == plain[0].recalls[5]
     assert both[1].intervals.keys() == plain[0].intervals.keys()
+
+
+def test_bits_are_searched_first_and_floats_rank_again(benchmark) -> None:
+    model = Model(*model_of("selavprpp"))
+    first, second = evaluate(
+        model, benchmark, dtype="bits", rerank=Reranking("selavprpp", 4), reading=QUIET
+    )
+    assert set(np.unique(first.neighbours.similarities * 8)) <= set(range(-8, 9))  # of 16 bits
+    floats = [
+        np.concatenate(
+            [
+                np.asarray(matching.describe_selavprpp(model.params, image[None], model.config))
+                for image in (resize_image(read_image(p), model.config.image_size) for p in paths)
+            ]
+        )[:, 0]
+        for paths in (benchmark.queries, benchmark.database)
+    ]
+    distances = np.linalg.norm(floats[0][:, None] - floats[1][None], axis=2)
+    assert second.rerank == "selavprpp:4"
+    for query, row in enumerate(first.neighbours.indices[:, :4]):
+        kept = row[np.argsort(distances[query, row], kind="stable")]
+        np.testing.assert_array_equal(second.neighbours.indices[query, :4], kept)
+        # Of single images: the program of another batch size rounds differently.
+        np.testing.assert_allclose(
+            second.neighbours.similarities[query, :4], -distances[query, kept], atol=1e-5
+        )
 
 
 @pytest.mark.parametrize("name", ["transvpr", "patch-netvlad-ransac"])
