@@ -148,7 +148,7 @@ def nearness(query: Features, candidates: Features, config: ModelConfig) -> Scor
     return -np.linalg.norm(candidates[:, 0] - query[0], axis=1)
 
 
-def transvpr_shape(config: ModelConfig) -> tuple[int, int]:
+def patch_shape(config: ModelConfig) -> tuple[int, int]:
     """Return the number of patches of an image, and the length of a patch's feature."""
     return config.patches, config.backbone.dim
 

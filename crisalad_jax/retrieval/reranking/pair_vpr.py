@@ -11,11 +11,6 @@ from crisalad_jax.nn.model import AnyArray, Crisalad, Images, extract_features
 from crisalad_jax.utils import compiler
 
 
-def shape(config: ModelConfig) -> tuple[int, int]:
-    """Return the number of patches of an image, and the length of a patch's feature."""
-    return config.patches, config.backbone.dim
-
-
 @functools.partial(compiler.jit, static_argnames="config")
 def describe(
     params: Crisalad, images: Images, config: ModelConfig

@@ -59,7 +59,7 @@ _PATCH_NETVLAD = Method(
 )
 _METHODS: Mapping[str, Method] = {
     "fol": Method("fol", fol.shape, fol.describe, _by_features(fol.count_matches)),
-    "pair-vpr": Method("pair-vpr", pair_vpr.shape, pair_vpr.describe, pair_vpr.scores),
+    "pair-vpr": Method("pair-vpr", matching.patch_shape, pair_vpr.describe, pair_vpr.scores),
     "patch-netvlad": _PATCH_NETVLAD,
     "patch-netvlad-ransac": dataclasses.replace(
         _PATCH_NETVLAD, score=_by_features(patch_netvlad.inlier_scores)
@@ -84,7 +84,7 @@ _METHODS: Mapping[str, Method] = {
     ),
     "transvpr": Method(
         "transvpr",
-        matching.transvpr_shape,
+        matching.patch_shape,
         matching.describe_transvpr,
         _by_features(matching.count_inliers),
     ),
