@@ -113,6 +113,7 @@ from .training.callbacks import StopTraining as StopTraining
 from .training.callbacks import register_callback as register_callback
 from .training.classifier import load_loss as load_loss
 from .training.config import MiningConfig as MiningConfig
+from .training.config import MixtureSet as MixtureSet
 from .training.config import OptimiserConfig as OptimiserConfig
 from .training.config import TrainConfig as TrainConfig
 from .training.gradients import gradient_norms as gradient_norms

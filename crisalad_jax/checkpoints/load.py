@@ -11,7 +11,7 @@ from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.hub import download_file, is_hub, parse_hub
-from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.output import warn, warn_once
 
 if TYPE_CHECKING:
     from crisalad_jax.checkpoints.engines import EngineName
@@ -65,8 +65,8 @@ def find_weights(
 
     None is the small model in this package, with a note; it has a name, too, "starter". Other names
     are "hog" and "thumbnail", baselines that learn nothing. A published model is downloaded the
-    first time, and its licence told each time. A file of such a name in the working directory is
-    taken instead, with a note.
+    first time, and its licence told each time, or once where it forbids commerce: its file says it
+    too. A file of such a name in the working directory is taken instead, with a note.
 
     Args:
         weights: a path, or a name of `crisalad models`, or None; or hf://OWNER/NAME, where a file
@@ -117,7 +117,10 @@ def find_weights(
         from crisalad_jax.checkpoints.cache import cached_weights
 
         for each in (model, *filter(None, [PUBLISHED.get(model.backbone)])):
-            warn(f"{each.name}: {each.licence.words} ({each.repository})")
+            if each.restriction:
+                warn_once(each.name, each.notice)
+            else:
+                warn(f"{each.name}: {each.notice}")
         return cached_weights(model, quiet=quiet)
     if (path / HUB_FILE).is_file():
         return path / HUB_FILE

@@ -56,8 +56,9 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     (docs/maps.md)."""
     rerank: str | None = None
     """NAME:TOPK puts the first TOPK retrievals in a new order by local features: patch-netvlad,
-    patch-netvlad-ransac or patch-netvlad-sum, of a model with NetVLAD, selavpr, selavprpp or
-    transvpr (docs/methods.md). Adds a row to each of the table."""
+    patch-netvlad-ransac or patch-netvlad-sum, of a model with NetVLAD; fol, pair-vpr, selavpr,
+    selavprpp or transvpr, of one of that method; sinkhorn-divergence, of any local tokens
+    (docs/methods.md). Adds a row to each of the table."""
     rerank_weights: pathlib.Path | None = None
     """Model that makes these features, as --weights; by default the first stage's."""
     precision: float | None = None

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import pathlib
+import re
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
@@ -11,9 +12,11 @@ from crisalad_jax.checkpoints.runtime import read_model
 from crisalad_jax.cli.common import console, pick, refuse_with, refuse_without
 from crisalad_jax.cli.flags import FOLDER, JsonFlag, PluginFlag, QuietFlag
 from crisalad_jax.cli.help import asked_for
-from crisalad_jax.config.flags import find_flag, parse_settings, with_settings
+from crisalad_jax.config.checks import require
+from crisalad_jax.config.flags import find_flag, flag_values, parse_settings, with_settings
 from crisalad_jax.config.io import read_config
 from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.mixture import with_sets
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.errors import InputError
@@ -30,10 +33,12 @@ EXAMPLE = "crisalad train --data gsv --out runs/a --val pitts30k_val.mat --backb
 class Train(JsonFlag, PluginFlag, QuietFlag):
     """Train on places, each with several images; go on with the run if OUT holds one."""
 
-    data: pathlib.Path
+    data: tuple[pathlib.Path, ...]
     """Folder with one folder a place, a table name,place[,lat,lon[,heading]] (places.csv in the
     folder, or the file), or Dataframes/ and Images/ of GSV-Cities; for netvlad, patch-netvlad and
-    selavpr, which mine tuples, a training set of queries in any layout that `evaluate` reads."""
+    selavpr, which mine tuples, a training set of queries in any layout that `evaluate` reads. Or
+    several sets of places, as NAME=DIR NAME=DIR: each step takes a sub-batch of each, as
+    --mixture.NAME.sampler, loss, share and weight say."""
     out: Annotated[pathlib.Path, FOLDER]
     """Folder of the run."""
     settings: Any
@@ -66,11 +71,12 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     recipe: str | None = None
     """How it trains. As published: crisalad (the paper; the default), crisalad-1e-4 or
     crisalad-step (its Table 2), salad, cricavpr, boq, dino-mix, edtformer, image, supervlad,
-    vlad-buff, selavpr (preset l14); over ResNet boq-resnet50, conv-ap, cosplace, mixvpr; over
-    VGG netvlad, patch-netvlad. In part as published: eigenplaces-turns, netvlad-gsv, cosplace-vit,
-    eigenplaces-vit. From random weights: scratch, the default of tiny. starter: the last run of the
-    model in this package, whose --weights are its first run's (docs/starter.md). RECIPE+PART is a
-    recipe with a registered part in place, such as crisalad+gem."""
+    vlad-buff, selavpr (preset l14), selavprpp, salad-cm (of two sets); over ResNet boq-resnet50,
+    conv-ap, cosplace, mixvpr; over VGG netvlad, patch-netvlad. In part as published:
+    eigenplaces-turns, netvlad-gsv, cosplace-vit, eigenplaces-vit; sage and megaloc (of several
+    sets). From random weights: scratch, the default of tiny. starter: the last run of the model in
+    this package, whose --weights are its first run's (docs/starter.md). RECIPE+PART is a recipe
+    with a registered part in place, such as crisalad+gem."""
     config: pathlib.Path | None = None
     """Configuration of an earlier run (its config.json) to start from instead of a preset."""
     max_pixels: int = 2**28
@@ -152,20 +158,41 @@ def defaults(arguments: Sequence[str]) -> TrainConfig:
     """Read the configuration that flags start from.
 
     It is that of --config; or of --preset and --recipe, with the model of --weights if there
-    is such a file (`prepare` finds it).
+    is such a file (`prepare` finds it). Where --data names sets, it is of these.
 
     Raises:
         InputError: both are given, or one names nothing.
     """
-    given = find_flag(arguments, "--config")
+    given, data = find_flag(arguments, "--config"), flag_values(arguments, "--data")
+    require(len(data) < 2, "--data: found twice, expected all sets after one: NAME=DIR NAME=DIR")
+    sets = _data(data[0]) if data else None
+    names = list(sets) if isinstance(sets, dict) else []
     if given is not None:
         given_too = {name: find_flag(arguments, f"--{name}") for name in ("preset", "recipe")}
         refuse_with("--config", **given_too)
-        return read_config(TrainConfig, pathlib.Path(given))
+        return with_sets(read_config(TrainConfig, pathlib.Path(given)), names)
     weights = find_flag(arguments, "--weights")
     model = read_model(weights) if weights is not None and os.path.isfile(weights) else None
     preset = find_flag(arguments, "--preset") or "b14"
-    return recipe(preset, find_flag(arguments, "--recipe"), model=model)
+    return with_sets(recipe(preset, find_flag(arguments, "--recipe"), model=model), names)
+
+
+def _data(given: Sequence[str]) -> dict[str, pathlib.Path] | pathlib.Path:
+    """Read --data: one path, or several by name.
+
+    Raises:
+        InputError: none, several without names, or a name twice.
+    """
+    pairs = [re.fullmatch(r"([A-Za-z_]\w*)=(.+)", each, re.ASCII) for each in given]
+    if len(given) == 1 and pairs[0] is None:
+        return pathlib.Path(given[0])
+    named = {pair[1]: pathlib.Path(pair[2]) for pair in pairs if pair}
+    require(
+        len(named) == len(given) > 0,
+        f"--data: found {' '.join(given) or 'none'}, expected one set, or "
+        "NAME=DIR of each, each name once",
+    )
+    return named
 
 
 def run(arguments: Train) -> dict[str, Any] | None:
@@ -182,7 +209,7 @@ def run(arguments: Train) -> dict[str, Any] | None:
     config: TrainConfig = arguments.settings
     result = train(
         config,
-        arguments.data,
+        _data([str(path) for path in arguments.data]),
         arguments.out,
         images=arguments.data_images,
         validation=arguments.val,

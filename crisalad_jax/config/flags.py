@@ -12,11 +12,11 @@ import itertools
 import os
 import re
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import tyro
 
-from crisalad_jax.config.part import Part
+from crisalad_jax.config.part import NAME, Part
 from crisalad_jax.config.registry import Registry
 from crisalad_jax.config.short_repr import field_docs
 from crisalad_jax.utils.errors import InputError, locate_errors
@@ -53,17 +53,31 @@ def flags_of(config: Any, arguments: Sequence[str], preset: str, path: str = "")
         fields.append(("part_name", hint, config.part_name))
     kind = type(config)
     hints, docs = get_type_hints(kind), field_docs(kind)
+    namespace: dict[str, Any] = {"__doc__": kind.__doc__, _KIND: kind}
     for field in dataclasses.fields(kind):
         value = getattr(config, field.name)
+        where = f"{path}.{field.name}".strip(".")
         if dataclasses.is_dataclass(value):
-            value = flags_of(value, arguments, preset, f"{path}.{field.name}".strip("."))
+            value = flags_of(value, arguments, preset, where)
             hint = type(value)
+        elif isinstance(value, tuple) and dataclasses.is_dataclass(get_args(hints[field.name])[0]):
+            value = _flags_of_each(value, arguments, preset, where)
+            hint = type(value)
+        elif field.name == NAME:
+            namespace[NAME] = value
+            continue
         else:
             hint = Annotated[hints[field.name], tyro.conf.arg(help=docs.get(field.name))]
         fields.append((field.name, hint, dataclasses.field(default=value)))
-    namespace = {"__doc__": kind.__doc__, _KIND: kind}
     made = dataclasses.make_dataclass(kind.__name__, fields, frozen=True, namespace=namespace)
     return made()
+
+
+def _flags_of_each(configs: Sequence[Any], arguments: Sequence[str], preset: str, path: str) -> Any:
+    """Make a stand-in for a tuple of configurations, whose flags have their names."""
+    made = {each.name: flags_of(each, arguments, preset, f"{path}.{each.name}") for each in configs}
+    fields = [(name, type(each), dataclasses.field(default=each)) for name, each in made.items()]
+    return dataclasses.make_dataclass("Each", fields, frozen=True, namespace={_KIND: tuple})()
 
 
 def config_of(flags: Any) -> Any:
@@ -73,11 +87,12 @@ def config_of(flags: Any) -> Any:
         InputError: what the configuration's own checks raise.
     """
     kind = getattr(flags, _KIND)
-    given = {field.name: getattr(flags, field.name) for field in dataclasses.fields(kind)}
+    fields = dataclasses.fields(flags if kind is tuple else kind)
+    given = {field.name: getattr(flags, field.name) for field in fields}
     values = {
         name: config_of(value) if hasattr(value, _KIND) else value for name, value in given.items()
     }
-    return kind(**values)
+    return tuple(values.values()) if kind is tuple else kind(**values)
 
 
 def flag_values(arguments: Sequence[str], name: str) -> list[list[str]]:

@@ -86,9 +86,13 @@ else:
 def parts_of(config: Any, prefix: str = "") -> dict[str, Part]:
     """Return all parts in a configuration by the dotted names of their fields."""
     parts: dict[str, Part] = {prefix: config} if isinstance(config, Part) else {}
-    for field in dataclasses.fields(config) if dataclasses.is_dataclass(config) else ():
-        name = f"{prefix}.{field.name}".removeprefix(".")
-        parts |= parts_of(getattr(config, field.name), name)
+    inner: Mapping[Any, Any] = {}
+    if dataclasses.is_dataclass(config):
+        inner = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    elif isinstance(config, tuple):
+        inner = dict(enumerate(config))
+    for name, each in inner.items():
+        parts |= parts_of(each, f"{prefix}.{name}".removeprefix("."))
     return parts
 
 

@@ -206,7 +206,8 @@ def _card(run: _Run, rows: Sequence[_Row], *, name: str, licence: str, data: str
         header["model-index"] = [{"name": short, "results": [_result(row) for row in rows]}]
     # JSON is YAML too, and quotes all that a name may hold.
     lines = [f"{key}: {json.dumps(value)}" for key, value in header.items()]
-    loss, optimiser = config.loss, config.optimiser
+    losses = dict.fromkeys(each.loss.kind.part_name for each in config.alone)
+    optimiser = config.optimiser
     parts = [
         ["---", *lines, "---", "", f"# {short}"],
         [
@@ -221,7 +222,7 @@ def _card(run: _Run, rows: Sequence[_Row], *, name: str, licence: str, data: str
         ["## Licence", "", f"The weights: {licence}. The package is under Apache-2.0."],
     ]
     parts[5] += [
-        f"- Loss: {loss.kind.part_name}; optimiser {optimiser.kind.part_name}, learning rate "
+        f"- Loss: {', '.join(losses)}; optimiser {optimiser.kind.part_name}, learning rate "
         f"{optimiser.learning_rate:g}, schedule {optimiser.schedule.part_name}.",
         f"- Batches: {config.places_per_batch} places of {config.images_per_place} images; "
         f"{counted(config.epochs, 'epoch')}; seed {config.seed}; trained: {config.trainable}.",

@@ -2,10 +2,11 @@
 
 import os
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.data.images import OnBadImage
+from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.experiments.report import save_chart, training_curves
 from crisalad_jax.training.callbacks import Callback
@@ -20,10 +21,10 @@ from crisalad_jax.utils.files import real_path
 Path = str | os.PathLike[str]
 
 
-@takes(config=TrainConfig, data=PATH, out=PATH)
+@takes(config=TrainConfig, data=(*PATH, Mapping), out=PATH)
 def train(
     config: TrainConfig,
-    data: Path,
+    data: Path | Mapping[str, Path],
     out: Path,
     *,
     place_radius: float | None = None,
@@ -46,8 +47,9 @@ def train(
 
     Args:
         config: how to train.
-        data: places, in a layout that `read_places` reads; for a recipe that mines tuples, a set
-            that `open_benchmark` reads, such as pitts30k_train.mat.
+        data: places, in a layout that `read_places` reads; the sets of `config.mixture` by name,
+            in such layouts; for a recipe that mines tuples, a set that `open_benchmark` reads, such
+            as pitts30k_train.mat.
         place_radius: metres within which images of a source with positions are a place; see
             `read_places`, as for the three that follow.
         place_frames: number of consecutive images that are a place.
@@ -103,12 +105,14 @@ def train(
             "Note: no --weights or --backbone, so the frozen part of the model "
             f"({config.trainable} trains) is random. --trainable all trains everything."
         )
-    if isinstance(places, QuerySet):
-        groups = f"{len(places.queries)} queries with positives"
-    else:
-        groups = f"{len(places.names)} places"
     on = "" if benchmark is None else f"; validation on {benchmark.name}"
-    say(f"{data}: {groups}, {len(places.files)} images{on}")
+    roots = data if isinstance(data, Mapping) else {"": data}
+    for name, each in (places if isinstance(places, Mapping) else {"": places}).items():
+        groups = f"{len(each.names)} places" if isinstance(each, Places) else ""
+        if isinstance(each, QuerySet):
+            groups = f"{len(each.queries)} queries with positives"
+        say(f"{name}{': ' if name else ''}{roots[name]}: {groups}, {len(each.files)} images{on}")
+        on = ""
     result = fit(
         config,
         places,
@@ -124,5 +128,6 @@ def train(
     if is_primary() and result.steps:
         out = pathlib.Path(out)
         save_chart(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
-        write_data(out, real_path(pathlib.Path(data)).name, places, benchmark)
+        names = [real_path(pathlib.Path(root)).name for root in roots.values()]
+        write_data(out, ", ".join(names), places, benchmark)
     return result

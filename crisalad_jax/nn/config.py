@@ -72,7 +72,7 @@ class ModelConfig:
             (attends, request.facet != "token", "facets of attention, as vit's"),
             (inserts, request.insertion is not None, "blocks that take tokens, such as vit"),
             (backbone.exposes_levels, several, "features of other blocks than the last"),
-            (backbone.side_paths > 1, request.second, "adapters on two side paths"),
+            (backbone.side_paths > request.path, True, "adapters on two side paths"),
         ):
             require(
                 has or not is_asked,

@@ -7,7 +7,7 @@ import contextlib
 import dataclasses
 import functools
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
@@ -723,6 +723,7 @@ def describe_training_batch(
     measured: Bool[Array, " image"] | None,
     key: Key[Array, ""] | None,
     micro_batch: int | None = None,
+    sub_batches: Sequence[int] = (),
 ) -> tuple[Float[Array, "image descriptor"], Tokens, Crisalad | None]:
     """Describe a batch in the trace of a training step.
 
@@ -734,6 +735,7 @@ def describe_training_batch(
         measured: images that batch norms take their statistics of; None takes the stored ones.
         key: draws the dropout; None is without.
         micro_batch: see `extract_tokens`.
+        sub_batches: numbers of images that attend to each other, one after the other; none are one.
 
     Returns:
         (descriptors, tokens, statistics), the last as `tokens_and_statistics` returns them. The
@@ -744,6 +746,9 @@ def describe_training_batch(
         params, images, config, valid=measured, key=tokens_key, micro_batch=micro_batch
     )
     mask = valid_mask(valid)
+    if sub_batches:
+        of_image = np.repeat(np.arange(len(sub_batches)), sub_batches)
+        mask &= of_image[:, None] == of_image
     descriptors = attend_across_images(params, tokens, config, mask=mask, key=cross_key)
     if not config.unit_length:
         descriptors = l2_normalise(descriptors)

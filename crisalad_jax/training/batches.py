@@ -1,16 +1,27 @@
-"""The batches of a training set of places, epoch by epoch."""
+"""The batches of a training set of places, or of a mixture of sets, epoch by epoch."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from crisalad_jax.data.class_groups import class_groups
 from crisalad_jax.data.loader import ImageBatch, batches_of_groups
-from crisalad_jax.data.places import Places
+from crisalad_jax.data.places import JoinedPlaces, Places
+from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.data.samplers.base import Describe, epoch_batches, labels_of
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.utils.shapes import Int, Int32
+
+TrainingSet = Places | QuerySet | Mapping[str, Places]
+"""What a run trains on: places, queries of which tuples are mined, or a mixture's sets by name."""
+
+
+def sets_of(places: TrainingSet) -> tuple[Places | QuerySet, ...]:
+    """Return the sets of a mixture in the order of their names, or the one without a name."""
+    if isinstance(places, Mapping):
+        return tuple(places[name] for name in sorted(places))
+    return (places,)
 
 
 def prepared_as(config: TrainConfig) -> dict[str, Any]:
@@ -31,44 +42,54 @@ class Drawn(NamedTuple):
 
 
 class PlaceBatches:
-    """The batches of places, or of groups of classes that epochs take in turn."""
+    """The batches of places, of one set or of a mixture, or of groups of classes in turn.
 
-    def __init__(self, config: TrainConfig, places: Places, **reading: Any) -> None:
+    The images of a mixture are numbered from one set to the next, and the sub-batches of a batch
+    follow each other.
+    """
+
+    def __init__(
+        self, config: TrainConfig, places: Places | Mapping[str, Places], **reading: Any
+    ) -> None:
         """Divide the places into groups where the loss classifies, and count the steps.
 
         Args:
             config: the run's.
-            places: the training set.
+            places: the training set, or those of the mixture by name.
             **reading: how images are read; see `batches_of_groups`.
 
         Raises:
             InputError: there are too few places, classes or images, or positions are missing.
         """
         self._reading = prepared_as(config) | reading
-        self._groups: Sequence[Places] = (places,)
+        self._runs = config.alone
+        sets = (places,) if isinstance(places, Places) else [places[m.name] for m in config.mixture]
+        self._turns = (JoinedPlaces(tuple(sets)),)
+        """What epochs train in turn: all sets, or a group of classes."""
         self.classes: tuple[int, ...] = ()
         """Number of classes of each group, where the loss classifies."""
         grouping = config.loss.kind.grouping
         if grouping is not None:
-            self._groups = class_groups(
+            (places,) = sets
+            groups = class_groups(
                 places,
                 grouping,
                 min_images=config.min_images,
                 places_per_batch=config.places_per_batch,
             )
-            self.classes = tuple(len(group.names) for group in self._groups)
-        self._config = config
+            self._turns = tuple(JoinedPlaces((group,)) for group in groups)
+            self.classes = tuple(len(group.names) for group in groups)
         self.mined: Drawn | None = None
         """The epoch that trains now, where it was drawn by descriptors; a run saves it."""
-        if config.sampler.describes:
-            config.sampler.check(places)
-            steps = max(1, len(places.names) // config.places_per_batch)
+        # Every set draws once, to find out before the run whether it can. The first has the epoch.
+        each_set = zip(self._runs, *(turn.sets for turn in self._turns), strict=True)
+        steps, *_ = [_steps(run, *groups) for run, *groups in each_set]
+        if grouping is not None and grouping.steps is not None:
+            steps = grouping.steps
+        self.steps_per_epoch = self.steps_per_round = steps
+        if any(run.sampler.describes for run in self._runs):
             shape = steps, config.places_per_batch, config.images_per_place
             self.mined = Drawn(np.array(-1, np.int32), np.zeros(shape, np.int32))
-        else:
-            steps = None if grouping is None else grouping.steps
-            steps = steps or max(len(self._draw(group, 0)) for group in self._groups)
-        self.steps_per_epoch = self.steps_per_round = steps
 
     def is_due(self, step: int) -> bool:
         """Return whether an epoch begins with this step, whose batches take descriptors."""
@@ -85,45 +106,69 @@ class PlaceBatches:
         Returns:
             What was done, for the user.
         """
-        chosen = self._draw(
-            self._groups[0], step // self.steps_per_epoch, self.steps_per_epoch, describe
-        )
+        chosen = self._draw(step // self.steps_per_epoch, describe)
         self.mined = Drawn(np.array(step, np.int32), chosen.astype(np.int32))
-        sampler = self._config.sampler.part_name
-        return f"drew {len(chosen)} batches by descriptors (sampler {sampler})"
+        names = [run.sampler.part_name for run in self._runs if run.sampler.describes]
+        return f"drew {len(chosen)} batches by descriptors (sampler {', '.join(names)})"
 
     def batches(self, step: int) -> Iterator[ImageBatch]:
         """Yield the batches from `step` to the end of its epoch; see `batches_of_groups`."""
         epoch, start_step = divmod(step, self.steps_per_epoch)
-        places = self._groups[epoch % len(self._groups)]
-        if self.mined is None:
-            chosen = self._draw(places, epoch, self.steps_per_epoch)
-        else:
-            chosen = self.mined.images
+        chosen = self._draw(epoch) if self.mined is None else self.mined.images
+        joined = self._turns[epoch % len(self._turns)]
+        ends = np.cumsum([run.places_per_batch for run in self._runs])
+        parts = np.split(chosen, ends[:-1], axis=1)
+        labels = [
+            labels_of(places, run.sampler, part - start)
+            for run, places, start, part in zip(
+                self._runs, joined.sets, joined.starts[:-1], parts, strict=True
+            )
+        ]
         return batches_of_groups(
-            places,
+            joined,
             chosen,
-            labels_of(places, self._config.sampler, chosen),
-            seed=(self._config.seed, epoch),
+            np.concatenate(labels, axis=1),
+            seed=(self._runs[0].seed, epoch),
             start_step=start_step,
             **self._reading,
         )
 
     def _draw(
-        self,
-        places: Places,
-        epoch: int,
-        steps: int | None = None,
-        describe: Describe | None = None,
+        self, epoch: int, describe: Describe | None = None
     ) -> Int[np.ndarray, "steps places images"]:
-        config = self._config
-        return epoch_batches(
-            places,
-            sampler=config.sampler,
-            places_per_batch=config.places_per_batch,
-            images_per_place=config.images_per_place,
-            seed=config.seed,
-            epoch=epoch,
-            steps=steps,
-            describe=describe,
-        )
+        """Draw the batches of an epoch from all sets."""
+        joined = self._turns[epoch % len(self._turns)]
+        drawn = [
+            _draw(run, places, epoch, self.steps_per_epoch, describe) + start
+            for run, places, start in zip(self._runs, joined.sets, joined.starts[:-1], strict=True)
+        ]
+        return np.concatenate(drawn, axis=1)
+
+
+def _draw(
+    run: TrainConfig,
+    places: Places,
+    epoch: int,
+    steps: int | None = None,
+    describe: Describe | None = None,
+) -> Int[np.ndarray, "steps places images"]:
+    """Draw the sub-batches of an epoch from one set."""
+    return epoch_batches(
+        places,
+        sampler=run.sampler,
+        places_per_batch=run.places_per_batch,
+        images_per_place=run.images_per_place,
+        seed=run.seed,
+        epoch=epoch,
+        steps=steps,
+        describe=describe,
+    )
+
+
+def _steps(run: TrainConfig, *groups: Places) -> int:
+    """Count the steps that take each place of a set about once; of groups, of the longest."""
+    if run.sampler.describes:
+        (places,) = groups
+        run.sampler.check(places)
+        return max(1, len(places.names) // run.places_per_batch)
+    return max(len(_draw(run, group, 0)) for group in groups)

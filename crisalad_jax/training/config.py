@@ -2,10 +2,14 @@
 
 import dataclasses
 import math
-from typing import Literal
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
 
 from crisalad_jax.config.checks import (
     check_seed,
+    require,
     require_field,
     require_fraction,
     require_positive,
@@ -21,6 +25,7 @@ from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.optimisers import OPTIMISERS, Optimiser
 from crisalad_jax.training.schedules import SCHEDULES, LinearSchedule, Schedule
 from crisalad_jax.training.trainable import ADAPTERS, ADAPTERS_AND_HEAD, terms_of
+from crisalad_jax.utils.errors import locate_errors
 
 
 @short_repr()
@@ -113,6 +118,36 @@ class MiningConfig:
         require_field(self, "positive_radius", fits, f"metres above 0, and at most {most}")
 
 
+@short_repr("name")
+@dataclasses.dataclass(frozen=True)
+class MixtureSet:
+    """One of several training sets that are trained on together: its sub-batch of each step.
+
+    Example:
+        >>> MixtureSet("msls", sampler="cliques", weight=0.5)
+        MixtureSet(name='msls', sampler='cliques', weight=0.5)
+    """
+
+    name: str
+    """Name of the set, with which its data are given, and its loss is logged: letters, digits and
+    underscores."""
+    sampler: OrName[Sampler] = part_field(SAMPLERS, "within-city")
+    """Which of its places make a sub-batch; a registered sampler, or its name."""
+    loss: LossConfig = LossConfig()
+    """Loss of the sub-batch, of pairs within it alone."""
+    share: int = 1
+    """Part of the batch's places, relative to the other sets' shares."""
+    weight: float = 1.0
+    """Factor of its loss in the sum of all."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges of the fields."""
+        resolve_names(self)
+        require_positive(self, "share", "weight")
+        is_name = self.name.isidentifier() and self.name.isascii()
+        require_field(self, "name", is_name, "letters, digits and underscores")
+
+
 @short_repr("model", "loss")
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
@@ -156,6 +191,10 @@ class TrainConfig:
     batch, each of `images_per_place` images: a query, a positive, and the negatives."""
     sampler: OrName[Sampler] = part_field(SAMPLERS, "within-city")
     """Which places make a batch; a registered sampler, or its name."""
+    mixture: tuple[MixtureSet, ...] = ()
+    """Several training sets, in the place of one with `sampler` and `loss`. Each step takes a
+    sub-batch of each, computes the loss of each by itself, and adds them. Images attend to those of
+    their sub-batch. An epoch is one of the first set."""
     cities: tuple[str, ...] | None = None
     """Which cities; None takes all."""
     epochs: int = 8
@@ -180,6 +219,8 @@ class TrainConfig:
         resolve_names(self)
         require_positive(self, "places_per_batch", "images_per_place", "epochs")
         require_positive(self, "validate_every", "save_top_k", "patience")
+        check_seed("TrainConfig.seed", self.seed)
+        self._check_mixture()
         loss, images, accumulate = self.loss.kind, self.images_per_place, self.optimiser.accumulate
         batch, size = self.places_per_batch * images, 2 + self.mining.negatives
         is_tuple = images == size or not self.mines
@@ -205,7 +246,65 @@ class TrainConfig:
             require_field(config, name, fits, expected)
         if self.validation_size is not None:
             self.model.check_image_size(self.validation_size)
-        check_seed("TrainConfig.seed", self.seed)
+
+    def _check_mixture(self) -> None:
+        """Check the sets of the mixture, each as a run of its own, and what they share."""
+        names = [each.name for each in self.mixture]
+        require(
+            len(set(names)) == len(names),
+            f"TrainConfig.mixture: found {', '.join(names)}, expected each name once",
+        )
+        if not names:
+            return
+        shares = sum(each.share for each in self.mixture)
+        of_set = f"as by default with a mixture, whose sets have their own (mixture.{names[0]}"
+        default = self.sampler == DEFAULT_SAMPLER
+        divides = self.places_per_batch % shares == 0
+        for config, name, fits, expected in (
+            (self, "sampler", default, f"{DEFAULT_SAMPLER.part_name}, {of_set}.sampler)"),
+            (self, "loss", self.loss == LossConfig(), f"{LossConfig()}, {of_set}.loss)"),
+            (self, "places_per_batch", divides, f"a multiple of {shares}, the sum of the shares"),
+            (self, "cities", self.cities is None, "None with a mixture"),
+            (self.mining, "kind", not self.mines, "'none' for a mixture"),
+        ):
+            require_field(config, name, fits, expected)
+        for each, alone in zip(self.mixture, self.alone, strict=True):
+            kind = alone.loss.kind
+            fits = kind.grouping is None and kind.reads_tokens is None
+            with locate_errors(f"mixture.{each.name}: "):
+                require_field(alone.loss, "kind", fits, "a loss of pairs of descriptors")
+
+    @property
+    def alone(self) -> tuple["TrainConfig", ...]:
+        """Each set of the mixture as a run of its own; without a mixture the run itself."""
+        shares = sum(each.share for each in self.mixture)
+        found = []
+        for number, each in enumerate(self.mixture):
+            # Sets of the same places draw other batches.
+            words = np.random.SeedSequence(self.seed, spawn_key=(number,)).generate_state(1)
+            with locate_errors(f"mixture.{each.name}: "):
+                one = dataclasses.replace(
+                    self,
+                    mixture=(),
+                    sampler=each.sampler,
+                    loss=each.loss,
+                    places_per_batch=self.places_per_batch * each.share // shares,
+                    micro_batch=None,
+                    seed=int(words[0]) if number else self.seed,
+                )
+            found.append(one)
+        return tuple(found) or (self,)
+
+    def with_each(self, **changes: Callable[[Any], Any]) -> "TrainConfig":
+        """Change the sampler or the loss by functions: the run's, or those of every set."""
+
+        def changed(each: Any) -> Any:
+            values = {name: change(getattr(each, name)) for name, change in changes.items()}
+            return dataclasses.replace(each, **values)
+
+        if not self.mixture:
+            return changed(self)
+        return dataclasses.replace(self, mixture=tuple(map(changed, self.mixture)))
 
     @property
     def mines(self) -> bool:
@@ -218,6 +317,9 @@ class TrainConfig:
         grouping = self.loss.kind.grouping
         to_classes = grouping is not None and grouping.kind != "places"
         return 1 if to_classes or self.sampler.regroups else self.min_images
+
+
+DEFAULT_SAMPLER = SAMPLERS.make("within-city")
 
 
 def has_adapters(model: ModelConfig) -> bool:

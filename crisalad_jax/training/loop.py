@@ -8,7 +8,7 @@ import os
 import pathlib
 import time
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -25,10 +25,11 @@ from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad, init_crisalad
 from crisalad_jax.training import distributed
-from crisalad_jax.training.batches import PlaceBatches
+from crisalad_jax.training.batches import PlaceBatches, TrainingSet, sets_of
 from crisalad_jax.training.callbacks import Callback, Callbacks
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.mining import Miner
+from crisalad_jax.training.mixture import check_names
 from crisalad_jax.training.run_files import (
     RunFiles,
     RunRecord,
@@ -63,10 +64,10 @@ class FitResult(NamedTuple):
     """Number of unreadable images that were masked out, counted each time they came up."""
 
 
-@takes(config=TrainConfig, places=(Places, QuerySet), out=PATH)
+@takes(config=TrainConfig, places=(Places, QuerySet, Mapping), out=PATH)
 def fit(
     config: TrainConfig,
-    places: Places | QuerySet,
+    places: TrainingSet,
     out: str | os.PathLike[str],
     *,
     validation: Benchmark | None = None,
@@ -93,7 +94,8 @@ def fit(
 
     Args:
         config: everything but the files.
-        places: training images; a `QuerySet` where `config.mining` mines tuples.
+        places: training images; a `QuerySet` where `config.mining` mines tuples; or the sets of
+            `config.mixture`, by name.
         out: folder of the run.
         validation: evaluated every `config.validate_every` epochs, for early stopping.
         initial: parameters to start from; None starts from `init_crisalad` with the run's seed.
@@ -123,12 +125,14 @@ def fit(
         >>> fit(config, read_places(places, min_images=3), folder / "run", quiet=True).steps
         2
     """
+    check_names("places", places if isinstance(places, Mapping) else (), config)
     expected = QuerySet if config.mines else Places
-    require(
-        isinstance(places, expected),
-        f"places: found {type(places).__name__} with mining {config.mining.kind!r}, expected "
-        f"{expected.__name__}",
-    )
+    for each in sets_of(places):
+        require(
+            isinstance(each, expected),
+            f"places: found {type(each).__name__} with mining {config.mining.kind!r}, expected "
+            f"{expected.__name__}",
+        )
     threads = THREADS if num_threads is None else num_threads
     require(threads >= 0, f"num_threads: found {threads}, expected at least 0")
     called = Callbacks(callbacks)

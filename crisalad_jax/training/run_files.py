@@ -19,11 +19,10 @@ from crisalad_jax.config.checks import require
 from crisalad_jax.config.io import differences, read_config, to_plain
 from crisalad_jax.config.plugins import changed_sources
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.nn.model import Crisalad, Model
 from crisalad_jax.training import distributed
-from crisalad_jax.training.batches import Drawn
+from crisalad_jax.training.batches import Drawn, TrainingSet, sets_of
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import MetricsLog
 from crisalad_jax.training.mining import Mined
@@ -273,7 +272,7 @@ def check_run(out: pathlib.Path, config: TrainConfig) -> bool:
 
 
 def write_data(
-    out: pathlib.Path, name: str, places: Places | QuerySet, benchmark: Benchmark | None
+    out: pathlib.Path, name: str, places: TrainingSet, benchmark: Benchmark | None
 ) -> None:
     """Record in a run's folder what it was trained and validated on, for a model card.
 
@@ -283,20 +282,23 @@ def write_data(
         places: the training data.
         benchmark: the validation set, if there is one.
     """
-    if isinstance(places, QuerySet):
-        counts = {"queries": len(places.queries)}
-    else:
-        counts = {"places": len(places.names)}
+    counts = {"places": 0, "queries": 0, "images": 0}
+    for each in sets_of(places):
+        kind = "queries" if isinstance(each, QuerySet) else "places"
+        counts[kind] += len(each.queries if isinstance(each, QuerySet) else each.names)
+        counts["images"] += len(each.files)
     validation = None
     if benchmark is not None:
         sides = {"database": len(benchmark.database), "queries": len(benchmark.queries)}
         validation = {"name": benchmark.name, **sides}
-    training = {"name": name, **counts, "images": len(places.files)}
+    training = {"name": name} | {what: count for what, count in counts.items() if count}
     write_json(out / DATA, {"training": training, "validation": validation})
 
 
-def checksum_of_places(places: Places | QuerySet) -> int:
+def checksum_of_places(places: TrainingSet) -> int:
     """Compute the CRC of all images' names, and of their places or of the queries' positives."""
+    if isinstance(places, Mapping):
+        return checksum(map(checksum_of_places, sets_of(places)))
     if isinstance(places, QuerySet):
         names = (pathlib.Path(file).name for file in places.files)
         return checksum([_text(names), places.queries, *places.positives, *places.near])

@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -16,7 +17,9 @@ from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.data.query_set import QuerySet, read_query_set
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.training import distributed
+from crisalad_jax.training.batches import TrainingSet, sets_of
 from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.mixture import check_names
 from crisalad_jax.training.run_files import check_run
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.training.vocabulary import with_vocabulary
@@ -25,13 +28,13 @@ from crisalad_jax.utils.output import warn
 Path = str | os.PathLike[str]
 
 
-RunInputs = tuple[Places | QuerySet, Benchmark | None, Crisalad | None]
+RunInputs = tuple[TrainingSet, Benchmark | None, Crisalad | None]
 """The training set, the validation set, and the parameters to start from, as `fit` takes them."""
 
 
 def read_inputs(
     config: TrainConfig,
-    data: Path,
+    data: Path | Mapping[str, Path],
     out: Path,
     *,
     images: Path | None = None,
@@ -50,7 +53,7 @@ def read_inputs(
 
     Args:
         config: the run's.
-        data: the training set.
+        data: the training set, or those of `config.mixture` by name.
         out: folder of the run, which is checked first.
         images: folder of the images that a file of queries names.
         validation: evaluation set.
@@ -91,32 +94,45 @@ def read_inputs(
 
 def _read_set(
     config: TrainConfig,
-    data: Path,
+    data: Path | Mapping[str, Path],
     images: Path | None,
     on_bad_image: OnBadImage,
     grouping: dict[str, Any],
-) -> Places | QuerySet:
-    """Read the training set: places, or queries of which tuples are mined."""
-    unused = grouping if config.mines else {"data_images": images}
+) -> TrainingSet:
+    """Read the training set: places, of one set or several, or queries whose tuples are mined."""
+    named = data if isinstance(data, Mapping) else {}
+    check_names("--data", named, config)
+    unused, what = {"data_images": images}, "trains on places"
+    if config.mines:
+        unused, what = grouping, "mines tuples of queries"
+    elif named:
+        unused, what = unused | grouping, "mixes several sets"
     given = [f"--{name.replace('_', '-')}" for name, value in unused.items() if value is not None]
-    what = "mines tuples of queries" if config.mines else "trains on places"
     expected = f"found for a recipe that {what}, expected no such flag"
     require(not given, f"{', '.join(given)}: {expected}")
+
+    def places_at(root: Any, run: TrainConfig) -> Places:
+        return read_places(
+            root,
+            cities=run.cities,
+            min_images=run.min_images_of_place,
+            on_bad_image=on_bad_image,
+            **grouping,
+        )
+
     if config.mines:
+        root: Any = data
         return read_query_set(
-            data,
+            root,
             positive_radius=config.mining.positive_radius,
             negative_radius=config.mining.negative_radius,
             images=images,
             on_bad_image=on_bad_image,
         )
-    return read_places(
-        data,
-        cities=config.cities,
-        min_images=config.min_images_of_place,
-        on_bad_image=on_bad_image,
-        **grouping,
-    )
+    if named:
+        sets = zip(config.mixture, config.alone, strict=True)
+        return {each.name: places_at(named[each.name], run) for each, run in sets}
+    return places_at(data, config)
 
 
 def read_start(
@@ -164,7 +180,7 @@ def read_start(
 def with_vocabulary_of(
     initial: Crisalad | None,
     config: TrainConfig,
-    places: Places | QuerySet,
+    places: TrainingSet,
     *,
     on_bad_image: OnBadImage = "stop",
     quiet: bool = False,
@@ -191,8 +207,12 @@ def with_vocabulary_of(
         return initial
     if initial is None:
         initial = init_crisalad(jax.random.key(config.seed), config.model)
-    count = places.database if isinstance(places, QuerySet) else len(places.files)
-    model, paths = Model(initial, config.model), [places.path(image) for image in range(count)]
+    paths = [
+        each.path(image)
+        for each in sets_of(places)
+        for image in range(each.database if isinstance(each, QuerySet) else len(each.files))
+    ]
+    model = Model(initial, config.model)
     images, seed = config.model.aggregator.centroid_images, config.seed
     how: Any = {"on_bad_image": on_bad_image, "quiet": quiet}
     fitted = distributed.raise_together(

@@ -22,7 +22,7 @@ from crisalad_jax.nn.pixels import check_pixels
 from crisalad_jax.nn.tokens import TransportStatistics
 from crisalad_jax.training import distributed
 from crisalad_jax.training.classifier import Classifiers, init_classifiers, update_classifiers
-from crisalad_jax.training.config import OptimiserConfig, TrainConfig
+from crisalad_jax.training.config import MixtureSet, OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig, LossResult, metric_loss, tuple_pairs
 from crisalad_jax.training.losses.base import GivenLoss
 from crisalad_jax.training.optimiser import (
@@ -126,6 +126,13 @@ class StepConfig:
     """See `TrainConfig.batch_norm`."""
     tuples: bool = False
     """Whether labels are those of mined tuples (`tuple_labels`), not of places."""
+    mixture: tuple[MixtureSet, ...] = ()
+    """Sets whose sub-batches have their own losses, in the place of `loss`."""
+
+    def sub_batches(self, images: int) -> tuple[int, ...]:
+        """Return how many of a step's images are each set's, in their order."""
+        shares = [each.share for each in self.mixture]
+        return tuple(images * share // sum(shares) for share in shares)
 
     def learning_rate(self, step: Int[Array, ""]) -> Float[Array, ""] | None:
         """Compute the learning rate of a step, from 0; None if the optimiser is passed in."""
@@ -204,6 +211,12 @@ def init_train_state(
         optimiser = config.make_optimiser().init(chosen)
         dim = config.model.descriptor_dim
         classifiers = init_classifiers(key, config.loss.kind, config.classes, dim)
+        for each in config.mixture:
+            require(
+                init_classifiers(key, each.loss.kind, (), dim) is None,
+                f"mixture.{each.name}.loss: found {each.loss.kind.part_name}, which has parameters "
+                "of its own, expected a loss without",
+            )
         if statistics is not None:
             chosen = eqx.combine(chosen, statistics)
         return TrainState(jnp.zeros((), jnp.int32), chosen, optimiser, classifiers), frozen
@@ -244,6 +257,9 @@ def step_config(
         100
     """
     given = None if loss is None else LossConfig(kind=GivenLoss(loss), miner="none")
+    mixture = config.mixture
+    if given is not None:
+        mixture = tuple(dataclasses.replace(each, loss=given) for each in mixture)
     return StepConfig(
         model=config.model,
         loss=given or config.loss,
@@ -255,6 +271,7 @@ def step_config(
         classes=classes,
         batch_norm=config.batch_norm,
         tuples=config.mines,
+        mixture=mixture,
     )
 
 
@@ -430,6 +447,7 @@ def loss_and_gradient(
             measured=valid if updates_statistics else None,
             key=key,
             micro_batch=config.micro_batch,
+            sub_batches=config.sub_batches(len(all_labels)),
         )
         descriptors = devices.gather_images(descriptors)
         compared = config.loss.kind.reads_tokens
@@ -486,7 +504,9 @@ def _loss(
     group: Int[Array, ""],
     config: StepConfig,
 ) -> LossResult:
-    """Compute the loss of a batch, of places or of mined tuples."""
+    """Compute the loss of a batch, of places or of mined tuples, or of its sub-batches."""
+    if config.mixture:
+        return _mixed_loss(descriptors, labels, valid, config)
     return metric_loss(
         descriptors,
         labels,
@@ -497,3 +517,24 @@ def _loss(
         pairs=tuple_pairs(labels, valid=valid) if config.tuples else None,
         tokens=tokens,
     )
+
+
+def _mixed_loss(
+    descriptors: Float[Array, "image descriptor"],
+    labels: Int[Array, " image"],
+    valid: Bool[Array, " image"],
+    config: StepConfig,
+) -> LossResult:
+    """Add the weighted losses of the sub-batches, each of its own images alone."""
+    ends = np.cumsum(config.sub_batches(len(labels)))[:-1]
+    parts = zip(*(jnp.split(each, ends) for each in (descriptors, labels, valid)), strict=True)
+    numbers: dict[str, Array] = {}
+    losses, easy = [], []
+    for each, (rows, of_rows, are_valid) in zip(config.mixture, parts, strict=True):
+        found = metric_loss(rows, of_rows, each.loss, valid=are_valid)
+        numbers[each.name] = found.loss
+        numbers |= {f"{each.name}.{name}": one for name, one in (found.numbers or {}).items()}
+        losses.append(each.weight * found.loss)
+        easy.append(found.easy_anchor_fraction * are_valid.sum())
+    easy_anchors = sum(easy) / jnp.maximum(valid.sum(), 1)
+    return LossResult(jnp.stack(losses).sum(), easy_anchors, numbers=numbers)

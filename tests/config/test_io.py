@@ -20,7 +20,9 @@ CHANGED = dataclasses.replace(
 )
 VIT = {"name": "vit"}
 CONFIGS = {"changed": CHANGED} | {preset: recipe(preset) for preset in PRESETS}
-CONFIGS |= {name: recipe("b14", name) for name in sorted({*RECIPES, *AGGREGATORS, *LOSSES})}
+# One head needs a backbone with two side paths.
+NAMES = {*RECIPES, *AGGREGATORS, *LOSSES} - {"selavprpp-hash"}
+CONFIGS |= {name: recipe("b14", name) for name in sorted(NAMES)}
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)

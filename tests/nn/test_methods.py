@@ -14,6 +14,7 @@ from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig,
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.gem import ApGemConfig, CosPlaceConfig, GemConfig, GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.aggregators.pair_vpr import PairVprConfig
 from crisalad_jax.nn.aggregators.queries import BoqConfig, EdtFormerConfig
 from crisalad_jax.nn.aggregators.sage import SageConfig
 from crisalad_jax.nn.aggregators.salad import FolConfig
@@ -69,6 +70,7 @@ PARTS: dict[str, Aggregator] = {
     "selavprpp": SelaVprPpConfig(dim=16),
     "selavprpp-hash": SelaVprPpHashConfig(dim=16, bits=24),
     "sage": SageConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16, weighting_hidden=8),
+    "pair-vpr": PairVprConfig(dim=16, width=16, layers=2, hidden=8, positions=16),
     "fol": FolConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16, local_hidden=8, local=4),
 }
 RELATED = CrossImageConfig(layers=1, heads=2, feedforward=16, dropout=0.0)
@@ -83,7 +85,7 @@ def pictures(*seeds: int) -> np.ndarray:
 
 def model(aggregator: str) -> tuple[Crisalad, ModelConfig]:
     backbone = SMALL.backbone
-    if PARTS[aggregator].features(backbone.depth).second:
+    if PARTS[aggregator].features(backbone.depth).path:
         adapter = make_part("adapter", "side-multi-resolution", paths=2)
         backbone = dataclasses.replace(backbone, adapter=adapter)
     config = dataclasses.replace(SMALL, backbone=backbone, aggregator=PARTS[aggregator])

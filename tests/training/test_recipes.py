@@ -3,14 +3,16 @@
 import dataclasses
 import pathlib
 
+import jax
 import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.data.places import read_places
 from crisalad_jax.experiments.train import train
-from crisalad_jax.nn.model import Model
+from crisalad_jax.nn.model import Model, init_crisalad, parameter_shapes
 from crisalad_jax.training.recipes import recipe
+from crisalad_jax.training.schedules import RunSteps
 from crisalad_jax.training.start import with_vocabulary_of
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import random_params
@@ -62,3 +64,27 @@ def test_a_recipe_trains_its_own_parts_from_its_own_start(
     # Two steps of Adam at some 5e-5 move a number by 1e-4 at most: the start was this.
     for key in head:
         np.testing.assert_allclose(after[key], before[key], rtol=0, atol=2e-4)
+
+
+def test_selavprpp_has_the_sizes_and_the_start_of_its_code() -> None:
+    """Of the facts of Lu-Feng/SelaVPRplusplus; nothing but adapters and head trains."""
+    for preset, dim, adapters in (("b14", 2048, 12), ("l14", 4096, 16)):
+        config = recipe(preset, "selavprpp")
+        assert config.model.descriptor_dim == dim
+        shapes = named_leaves(parameter_shapes(config.model))
+        down = next(leaf for name, leaf in shapes.items() if name.endswith("adapter.down.weight"))
+        assert down.shape == (adapters, config.model.backbone.dim, config.model.backbone.dim // 2)
+        batch = config.places_per_batch, config.images_per_place, config.epochs, config.patience
+        assert batch == (120, 4, 25, 12)
+    # Halved after three epochs of ten steps.
+    rates = [config.optimiser.schedule.apply(step, 4e-4, RunSteps(250, 10, 0)) for step in (29, 30)]
+    assert [float(rate) for rate in rates] == pytest.approx([4e-4, 2e-4], rel=1e-6)
+    tiny = recipe("tiny", "selavprpp")
+    start = named_leaves(init_crisalad(jax.random.key(0), tiny.model))
+    adapter = {name: leaf for name, leaf in start.items() if ".adapter." in name}
+    for name, leaf in adapter.items():
+        if ".up." in name:
+            assert not leaf.any(), name
+        elif ".conv." in name:
+            np.testing.assert_array_equal(leaf, np.float32(1e-5), err_msg=name)
+    assert tiny.trainable == "adapters,head"

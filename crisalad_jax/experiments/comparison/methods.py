@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.flags import parse_changes
 from crisalad_jax.data.augmentations import Augmentation
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
@@ -16,6 +17,7 @@ from crisalad_jax.training.recipes import (
     find_part,
     from_scratch,
     mines_tuples,
+    mixes_sets,
     recipe,
     split_name,
     with_part,
@@ -80,6 +82,12 @@ def method_of(name: str, preset: str, what: str = "--methods") -> ComparedMethod
         ('CriSALAD + GeM', 'crisalad+step:newton')
     """
     whole = name
+    base, part = split_name(name)
+    require(
+        not mixes_sets(base or name),
+        f"{what}: found {name}, which trains on several sets, expected one that trains on one, as "
+        "all others do (`crisalad train` has the recipe)",
+    )
     if mines_tuples(name):
         warn(
             f"{what}: found {name}, whose own recipe mines tuples of queries: it is crisalad+"
@@ -87,7 +95,6 @@ def method_of(name: str, preset: str, what: str = "--methods") -> ComparedMethod
         )
         whole = f"crisalad+{name}"
     elif name not in METHODS and name not in RECIPES:
-        base, part = split_name(name)
         find_part(part, preset, what=what, others={*METHODS, *ABLATIONS, *RECIPES})
         whole = f"{base or 'crisalad'}+{part}"
     return METHODS.get(whole, ComparedMethod(whole, whole))
@@ -103,7 +110,8 @@ def is_method(name: str) -> bool:
         (True, True, False)
     """
     named = name in METHODS or name in RECIPES
-    return (named and not mines_tuples(name)) or "+" in name or ":" in name
+    own = mines_tuples(name) or mixes_sets(name)
+    return (named and not own) or "+" in name or ":" in name
 
 
 def method_training(name: str, preset: str, *, from_nothing: bool) -> TrainConfig:

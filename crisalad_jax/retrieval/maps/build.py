@@ -184,6 +184,12 @@ def index(
     else:
         with open_for_appending(out, metadata, components) as target:
             result = work.into(target)
+    if result.added == result.images and describer.config.cross_image.attends:
+        warn(
+            f"{out}: a map describes each image alone, and this model attends across images: "
+            "recalls that are published for batches are not the map's (`crisalad evaluate "
+            "--grouping single` measures those of single images)"
+        )
     return result if table is not None else result._replace(stay=0)
 
 

@@ -13,6 +13,7 @@ from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.backbones import BACKBONES
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig, has_adapters
+from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.optimisers import AdamW
 from crisalad_jax.training.schedules import LinearSchedule
 from crisalad_jax.training.trainable import ADAPTERS, ADAPTERS_AND_HEAD, ALL, HEAD, terms_of
@@ -186,6 +187,11 @@ def mines_tuples(name: str) -> bool:
     return name in RECIPES and recipe("b14", name).mines
 
 
+def mixes_sets(name: str) -> bool:
+    """Return whether a name is that of a recipe that trains on a mixture of sets."""
+    return name in RECIPES and bool(recipe("b14", name).mixture)
+
+
 def find_part(
     name: str, preset: str, *, what: str = "recipe", others: Iterable[str] = RECIPES
 ) -> Part:
@@ -243,16 +249,21 @@ def with_part(config: TrainConfig, part: Any) -> TrainConfig:
         InputError: the part does not fit, or the recipe has no place for it.
     """
     kind, model = part.registry.kind, config.model
-    if kind in ("augmentation", "sampler"):
-        return dataclasses.replace(config, **{kind: part})
+    if kind == "augmentation":
+        return dataclasses.replace(config, augmentation=part)
+    if kind == "sampler":
+        return config.with_each(sampler=lambda _: part)
     if kind in ("optimiser", "schedule"):
         field = "kind" if kind == "optimiser" else "schedule"
         optimiser = dataclasses.replace(config.optimiser, **{field: part})
         return dataclasses.replace(config, optimiser=optimiser)
     if kind == "loss":
-        miner = "none" if part.ranks_all else config.loss.miner
-        loss = dataclasses.replace(config.loss, kind=part, miner=miner)
-        return dataclasses.replace(config, loss=loss)
+
+        def changed(loss: LossConfig) -> LossConfig:
+            miner = "none" if part.ranks_all else loss.miner
+            return dataclasses.replace(loss, kind=part, miner=miner)
+
+        return config.with_each(loss=changed)
     if kind == "backbone":
         model = dataclasses.replace(model, backbone=part)
         trainable = config.trainable if has_adapters(model) else HEAD
@@ -296,7 +307,8 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
 
     The recipe's model and kind of loss are kept, for they make its method. The optimiser, the
     loss's constants, the augmentation and the batches are those of `scratch`, in float32. All of
-    the model trains. A plug-in's augmentation is kept, and so are batches of mined tuples.
+    the model trains. A plug-in's augmentation is kept, and so are batches of mined tuples, and of a
+    mixture of sets.
 
     Args:
         config: the recipe.
@@ -313,10 +325,12 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
         augmentation = LightAugmentConfig(colour=0.4, gamma=0.5, illumination=0.6)
     places = TrainConfig.places_per_batch
     batches = {"places_per_batch": places, "images_per_place": 2, "min_images": 2}
+    order = {} if config.mixture else {"sampler": "shuffled"}
     return dataclasses.replace(
-        config,
+        config.with_each(
+            loss=lambda loss: dataclasses.replace(loss, kind=loss.kind.from_scratch())
+        ),
         model=dataclasses.replace(config.model, compute_dtype="float32"),
-        loss=dataclasses.replace(config.loss, kind=config.loss.kind.from_scratch()),
         optimiser=OptimiserConfig(
             kind=AdamW(b2=0.99),
             learning_rate=1e-3,
@@ -327,8 +341,8 @@ def from_scratch(config: TrainConfig) -> TrainConfig:
         ),
         trainable="all",
         augmentation=augmentation,
-        **({} if config.mines else batches),
-        sampler="shuffled",
+        **({} if config.mines or config.mixture else batches),
+        **order,
         epochs=150,
         validate_every=10,
         patience=None,

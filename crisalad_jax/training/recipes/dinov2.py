@@ -9,14 +9,17 @@ from typing import Any
 
 from crisalad_jax.data.augmentations import NoAugmentation
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
+from crisalad_jax.data.samplers.viewpoints import Viewpoints
 from crisalad_jax.nn.adapters import Adapter
-from crisalad_jax.nn.adapters.bottleneck import SideConfig
+from crisalad_jax.nn.adapters.bottleneck import SideConfig, SideMultiResolutionConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.training.config import MiningConfig, OptimiserConfig, TrainConfig
+from crisalad_jax.nn.projection import ProjectionConfig
+from crisalad_jax.training.config import MiningConfig, MixtureSet, OptimiserConfig, TrainConfig
 from crisalad_jax.training.losses import LossConfig
 from crisalad_jax.training.losses.pairwise import SelaVprLoss
 from crisalad_jax.training.recipes.base import model_of, register_recipe, validation_size
 from crisalad_jax.training.schedules import MilestonesSchedule, StepSchedule
+from crisalad_jax.training.trainable import ADAPTERS_AND_HEAD
 
 ADAM_STEP = OptimiserConfig(kind="adam", learning_rate=5e-5, schedule="step", weight_decay=0.0)
 """Of CricaVPR's code, and of those that grew from it."""
@@ -132,6 +135,33 @@ def selavpr(model: ModelConfig, preset: str) -> TrainConfig:
     )
 
 
+@register_recipe("selavprpp")
+def selavprpp(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make SelaVPR++'s recipe, of Lu-Feng/SelaVPRplusplus (Lu et al. 2025): its first stage.
+
+    Adapters on a path beside the frozen blocks, the last 16 of preset l14, and the head train. Its
+    data are GSV-Cities and parts of other sets as places of one layout. The second stage, which
+    trains another path for the signs of its numbers, is not here.
+    """
+    is_large = preset == "l14"
+    adapter = SideMultiResolutionConfig(last=16 if is_large else None)
+    return TrainConfig(
+        model=model_of(
+            *(model, preset, _vit(model, adapter=adapter), "selavprpp"),
+            head={"dim": 4096} if is_large else {},
+            compute_dtype="bfloat16",
+            pixels="floats",
+            round_to_patch=True,
+        ),
+        optimiser=dataclasses.replace(ADAM_STEP, learning_rate=4e-4),
+        places_per_batch=120,
+        epochs=25,
+        monitor="R@1+R@5",
+        patience=12,
+        validation_size=validation_size(preset, 322),
+    )
+
+
 @register_recipe("edtformer")
 def edtformer(model: ModelConfig, preset: str) -> TrainConfig:
     """Make EDTformer's recipe, of Tong-Jin01/EDTformer (Jin et al. 2025).
@@ -242,4 +272,71 @@ def dino_mix(model: ModelConfig, preset: str) -> TrainConfig:
         epochs=60,
         monitor="R@1",
         patience=None,
+    )
+
+
+@register_recipe("salad-cm")
+def salad_cm(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make SALAD-CM's recipe, of serizba/cliquemining (Izquierdo and Civera, ECCV 2024).
+
+    It is SALAD's, but half of the places are cliques of MSLS: `--data gsv=DIR msls=DIR`. The code
+    describes MSLS once, by a trained SALAD, and draws its cliques in advance; here the model that
+    trains describes it again before each epoch.
+    """
+    sets = MixtureSet("gsv"), MixtureSet("msls", sampler="cliques")
+    return dataclasses.replace(salad(model, preset), mixture=sets)
+
+
+@register_recipe("sage")
+def sage(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make a recipe for SAGE (Chen et al., ICLR 2026), whose code of training is not published.
+
+    The model, a frozen backbone and the kind of sampler are its paper's: a graph of where images
+    are and how alike they look, made anew by the model before each epoch, and cliques that grow in
+    it (`geo-visual`). All else is decided here, as SALAD-CM's: the sets (`--data gsv=DIR
+    msls=DIR`), the batches, the loss, the optimiser and the size of training. `sage+sage-encoder`
+    has the cross-image encoder.
+    """
+    backbone = _vit(model, adapter="dynamic-power")
+    whole = model_of(model, preset, backbone, "sage", antialias=False, pixels="floats")
+    return dataclasses.replace(
+        salad(model, preset),
+        model=dataclasses.replace(whole, compute_dtype="bfloat16"),
+        trainable=ADAPTERS_AND_HEAD,
+        mixture=(MixtureSet("gsv"), MixtureSet("msls", sampler="geo-visual")),
+        validation_size=validation_size(preset, 322),
+    )
+
+
+@register_recipe("megaloc")
+def megaloc(model: ModelConfig, preset: str) -> TrainConfig:
+    """Make an open recipe for MegaLoc (Berton and Masone 2025), whose code is not published.
+
+    Its paper adds the losses of six sub-batches of 32 places: of GSV-Cities, MSLS (cliques),
+    MegaScenes, ScanNet, and San Francisco XL twice (EigenPlaces' lateral and frontal classes), as
+    `--data gsv=DIR msls=DIR megascenes=DIR scannet=DIR lateral=DIR frontal=DIR`, or some of them.
+    Quadruplets of MegaScenes and ScanNet are chosen there by views that overlap; here they are
+    places of a table. The optimiser, what trains and the epochs are SALAD's.
+    """
+    whole = model_of(
+        *(model, preset, _vit(model), "salad"),
+        head={} if preset == "tiny" else {"cluster_dim": 256},
+        compute_dtype="bfloat16",
+        pixels="floats",
+        round_to_patch=True,
+    )
+    projection = ProjectionConfig(dim=256 if preset == "tiny" else 8448)
+    return dataclasses.replace(
+        salad(model, preset),
+        model=dataclasses.replace(whole, projection=projection),
+        mixture=(
+            MixtureSet("gsv"),
+            MixtureSet("msls", sampler="cliques"),
+            MixtureSet("megascenes", sampler="shuffled"),
+            MixtureSet("scannet", sampler="shuffled"),
+            MixtureSet("lateral", sampler=Viewpoints()),
+            MixtureSet("frontal", sampler=Viewpoints(side="frontal")),
+        ),
+        places_per_batch=6 * 32,
+        validation_size=validation_size(preset, 322),
     )

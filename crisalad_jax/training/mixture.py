@@ -1,0 +1,65 @@
+"""The training sets of a mixture, by their names."""
+
+import dataclasses
+from collections.abc import Collection, Sequence
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.training.config import DEFAULT_SAMPLER, MixtureSet, TrainConfig
+from crisalad_jax.training.losses import LossConfig
+
+
+def with_sets(config: TrainConfig, names: Sequence[str]) -> TrainConfig:
+    """Fit a configuration to the training sets that are given.
+
+    Of a mixture those sets are kept, with as many places each. Without one the sets make one: each
+    has the configuration's sampler and loss, and as many places as the others.
+
+    Args:
+        config: a recipe's, or an earlier run's.
+        names: names of the sets; none leave it as it is.
+
+    Raises:
+        InputError: the mixture has no such set, or the configuration's loss is not one of pairs.
+    """
+    if not names:
+        return config
+    places = config.places_per_batch
+    if config.mixture:
+        check_names("--data", names, config, least=1)
+        shares = sum(each.share for each in config.mixture)
+        mixture = tuple(each for each in config.mixture if each.name in names)
+        places = places // shares * sum(each.share for each in mixture)
+    else:
+        mixture = tuple(MixtureSet(name, config.sampler, config.loss) for name in names)
+        places = max(1, places // len(mixture)) * len(mixture)
+    return dataclasses.replace(
+        config,
+        mixture=mixture,
+        places_per_batch=places,
+        sampler=DEFAULT_SAMPLER,
+        loss=LossConfig(),
+    )
+
+
+def check_names(
+    what: str, names: Collection[str], config: TrainConfig, *, least: int | None = None
+) -> None:
+    """Check the names of training sets.
+
+    Args:
+        what: the argument that gives them.
+        names: those of the sets that are given.
+        config: the run's; without a mixture no set has a name.
+        least: smallest number of the mixture's sets; None is all.
+
+    Raises:
+        InputError: one is not of the mixture, or too few are given.
+    """
+    expected = [each.name for each in config.mixture]
+    fits = set(names) <= set(expected) and len(names) >= (len(expected) if least is None else least)
+    words = f"{'all' if least is None else 'some'} of {', '.join(expected)}, by their names"
+    require(
+        fits,
+        f"{what}: found {', '.join(names) or 'one set without a name'}, expected "
+        f"{words if expected else 'one set without a name'}",
+    )
