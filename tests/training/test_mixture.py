@@ -16,7 +16,7 @@ import pytest
 
 from crisalad_jax.cli.train import parse
 from crisalad_jax.config.flags import refusals
-from crisalad_jax.config.io import from_plain, read_config, to_plain
+from crisalad_jax.config.io import differences, from_plain, read_config, to_plain
 from crisalad_jax.config.plugins import sources_of
 from crisalad_jax.config.registry import make_part
 from crisalad_jax.data.loader import training_batches
@@ -214,6 +214,8 @@ def test_flags_of_each_set_are_flags_of_the_command(tmp_path: pathlib.Path):
     assert [run.places_per_batch for run in found.alone] == [20, 40]
     assert from_plain(TrainConfig, to_plain(found), source="here") == found
     assert sources_of(found)["mixture.1.sampler"][0] == "cliques"
+    other = dataclasses.replace(found, mixture=(gsv, dataclasses.replace(msls, weight=0.5)))
+    assert differences(other, found) == ["mixture.msls.weight: found 0.5, expected 1.0"]
     # Of a recipe's mixture the sets that there are, in sub-batches of the same size.
     words = "--data megascenes=A gsv=B --out O --preset tiny --recipe megaloc"
     found = parse("crisalad train", words.split()).settings
