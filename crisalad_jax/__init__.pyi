@@ -100,6 +100,7 @@ from .retrieval.pca import save_pca as save_pca
 from .retrieval.reranking import Reranker as Reranker
 from .retrieval.reranking import Reranking as Reranking
 from .retrieval.search import search as search
+from .retrieval.seqslam import SeqSlam as SeqSlam
 from .retrieval.sequence import BayesFilter as BayesFilter
 from .retrieval.serve import serve_map as serve_map
 from .sinkhorn import SinkhornConfig as SinkhornConfig

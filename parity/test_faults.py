@@ -30,9 +30,9 @@ FORWARD = {"forward"}
 @pytest.fixture(autouse=True)
 def fresh_constants() -> Iterator[None]:
     """Constants that are kept would not know of a fault; nor, later, of its end."""
-    vit._bicubic_weights.cache_clear()
+    vit.bicubic_weights.cache_clear()
     yield
-    vit._bicubic_weights.cache_clear()
+    vit.bicubic_weights.cache_clear()
 
 
 @pytest.fixture(autouse=True, scope="module")

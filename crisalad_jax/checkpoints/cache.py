@@ -184,7 +184,8 @@ def _convert(
             f"{published}: found descriptors of {found[0]} numbers and {found[1]} parameters "
             f"({checkpoint.format}), expected {model.descriptor} and {model.parameters}"
         )
-    save_weights(_weights(model), checkpoint.model, extras=checkpoint.extras)
+    extras, restriction = checkpoint.extras, model.restriction
+    save_weights(_weights(model), checkpoint.model, extras=extras, restriction=restriction)
     url = address or record.get("url")
     known = {"url": url, "file": model.file, "sha256": digest, "version": VERSION}
     write_json(_folder(model) / _RECORD, known)

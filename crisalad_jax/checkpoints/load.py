@@ -11,7 +11,7 @@ from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.hub import download_file, is_hub, parse_hub
-from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.output import warn, warn_once
 
 if TYPE_CHECKING:
     from crisalad_jax.checkpoints.engines import EngineName
@@ -31,9 +31,9 @@ def load(path: str | os.PathLike[str], *, verify: bool = True, quiet: bool = Fal
         path: a .safetensors file of this package or Hugging Face, or a torch file of DINOv2,
             DINO-SALAD, CricaVPR or another format in `docs/methods.md`; torch files need torch. Or
             the name of a published model, as `crisalad models` lists them: it is downloaded once
-            into the cache. Or "starter", the small model in this package, or "hog", a baseline.
-            Or a folder that `crisalad publish` wrote; or hf://OWNER/NAME for such a folder at
-            Hugging Face's hub, with @REVISION and /FILE where wanted (extra `data`).
+            into the cache. Or "starter", the small model in this package, or a baseline, "hog" or
+            "thumbnail". Or a folder that `crisalad publish` wrote; or hf://OWNER/NAME for such a
+            folder at Hugging Face's hub, with @REVISION and /FILE where wanted (extra `data`).
         verify: whether to check the bytes of a file of this package against its checksum.
         quiet: no progress of a download.
 
@@ -63,10 +63,10 @@ def find_weights(
 ) -> pathlib.Path:
     """Return the file that is meant by a path, or by the name of a published model.
 
-    None is the small model in this package, with a note; it has a name, too, "starter". Another
-    name is "hog", histograms of oriented gradients, a baseline. A published model is downloaded the
-    first time, and its licence told each time. A file of such a name in the working directory is
-    taken instead, with a note.
+    None is the small model in this package, with a note; it has a name, too, "starter". Other names
+    are "hog" and "thumbnail", baselines that learn nothing. A published model is downloaded the
+    first time, and its licence told each time, or once where it forbids commerce: its file says it
+    too. A file of such a name in the working directory is taken instead, with a note.
 
     Args:
         weights: a path, or a name of `crisalad models`, or None; or hf://OWNER/NAME, where a file
@@ -117,7 +117,10 @@ def find_weights(
         from crisalad_jax.checkpoints.cache import cached_weights
 
         for each in (model, *filter(None, [PUBLISHED.get(model.backbone)])):
-            warn(f"{each.name}: {each.licence.words} ({each.repository})")
+            if each.restriction:
+                warn_once(each.name, each.notice)
+            else:
+                warn(f"{each.name}: {each.notice}")
         return cached_weights(model, quiet=quiet)
     if (path / HUB_FILE).is_file():
         return path / HUB_FILE
@@ -168,6 +171,8 @@ def open_model(
     """
     file = find_weights(weights, engine=engine, quiet=quiet)
     short = f"{file.parent.name}/{file.name}" if file.parent.name else file.name
+    if is_hub(weights):  # its cache has folders named by commits
+        short = str(parse_hub(weights))
     name = starter.named(file) if file in starter.FILES.values() else short
     # Imported here: an engine's model is opened without JAX, and JAX's without an engine.
     if engine == "jax":

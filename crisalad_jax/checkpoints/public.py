@@ -24,6 +24,7 @@ from crisalad_jax.checkpoints.formats import (
     to_state,
 )
 from crisalad_jax.checkpoints.matlab_io import MATLAB_SUFFIX, read_matlab
+from crisalad_jax.checkpoints.published import restriction_of
 from crisalad_jax.checkpoints.safetensors_io import (
     read_metadata,
     read_safetensors,
@@ -56,6 +57,7 @@ from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, check_target, is_html, parse_json
+from crisalad_jax.utils.output import warn_once
 
 SUFFIXES = {"torch": (".pth", ".pt", ".ckpt"), "safetensors": (".safetensors",)}
 """Suffixes of files that can be written, by `Format.stored`."""
@@ -113,7 +115,9 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
     state = {key: _float32(key, array, source) for key, array in state.items()}
     params, extras = to_params(state, config, name, source=source)
     params = with_metadata(jax.tree.map(jnp.asarray, params), config, own, source)
-    return Checkpoint(params, config, extras, name)
+    if restriction := restriction_of(name):
+        warn_once(source, restriction)
+    return Checkpoint(params, config, extras, name, restriction=restriction)
 
 
 def _float32(name: str, array: np.ndarray, source: str) -> np.ndarray:
@@ -286,7 +290,8 @@ def convert(
             "this package, in full precision"
         )
     check_target(target, ".safetensors")
-    save_weights(target, checkpoint.model, extras=checkpoint.extras, half=half)
+    extras, restriction = checkpoint.extras, checkpoint.restriction
+    save_weights(target, checkpoint.model, extras=extras, half=half, restriction=restriction)
     return Conversion(found, None, config)
 
 

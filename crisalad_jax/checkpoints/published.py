@@ -64,6 +64,16 @@ class Published:
     note: str = ""
     """What is not certain of these facts, or has to be done by hand."""
 
+    @property
+    def notice(self) -> str:
+        """The licence in words, and whose it is."""
+        return f"{self.licence.words} ({self.repository})"
+
+    @property
+    def restriction(self) -> str:
+        """The notice of a licence that forbids commerce; otherwise empty."""
+        return self.notice if self.licence.commercial is False else ""
+
 
 PUBLISHED: dict[str, Published] = {}
 """Published models by name."""
@@ -175,6 +185,12 @@ def published_model(name: str) -> Published:
             f"{nearest_names(name)}"
         )
     return PUBLISHED[name]
+
+
+def restriction_of(format: str) -> str:
+    """Return the `Published.restriction` that all published models of a format share, or ""."""
+    notices = {model.restriction for model in PUBLISHED.values() if model.format == format}
+    return notices.pop() if len(notices) == 1 else ""
 
 
 def nearest_names(name: str) -> str:

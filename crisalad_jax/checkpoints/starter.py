@@ -1,8 +1,9 @@
-"""The models in this package, there before any download: a small one, and a baseline.
+"""The models in this package, there before any download: a small one, and baselines.
 
 docs/starter.md says how the small one was trained, on rendered pictures alone, and what it recalls.
-The baseline, histograms of oriented gradients, has no parameters: its file is a configuration. They
-are no published models: their files are part of the package, and their licence the package's.
+Histograms of oriented gradients and SeqSLAM's thumbnails have no parameters: their files are a
+configuration. They are no published models: their files are part of the package, and their licence
+the package's.
 """
 
 import os
@@ -13,7 +14,7 @@ from crisalad_jax.utils.files import real_path
 NAME = "starter"
 """Its name, for `--weights` and `load`."""
 FILE = pathlib.Path(__file__).with_name(f"{NAME}.safetensors")
-FILES = {NAME: FILE, "hog": FILE.with_stem("hog")}
+FILES = {NAME: FILE, "hog": FILE.with_stem("hog"), "thumbnail": FILE.with_stem("thumbnail")}
 """The files of all models in this package by their names."""
 BEST = "megaloc"
 """The published model that recalls the most, which a note names."""

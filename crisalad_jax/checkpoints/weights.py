@@ -25,7 +25,7 @@ from crisalad_jax.nn.model import Crisalad, Model, check_params, params_of
 from crisalad_jax.utils.checksums import ChangedFileError
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import user_cache
-from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.output import warn, warn_once
 from crisalad_jax.utils.pytree import named_leaves
 from crisalad_jax.utils.version import VERSION
 
@@ -50,6 +50,8 @@ class Header:
     """The `model_hash` of the parameters."""
     loss: dict = dataclasses.field(default_factory=dict)
     """The run's loss, a `LossConfig` as JSON values, where the file has its parameters."""
+    restriction: str = ""
+    """Notice of a licence that forbids commerce; empty otherwise."""
 
 
 @brief
@@ -66,6 +68,8 @@ class Checkpoint(NamedTuple):
     """The `model_hash` of the parameters, where a file of this package says it."""
     loss: tuple[dict, dict[str, np.ndarray]] | None = None
     """`Header.loss` and the loss's parameters by name, where the file has them."""
+    restriction: str = ""
+    """`Header.restriction`, or that of the public format."""
 
     @property
     def model(self) -> Model:
@@ -81,6 +85,7 @@ def save_weights(
     extras: Mapping[str, np.ndarray] | None = None,
     half: bool = False,
     loss: tuple[Any, Any] | None = None,
+    restriction: str = "",
 ) -> None:
     """Write parameters under their dotted names, and the configuration in the file's metadata.
 
@@ -92,6 +97,7 @@ def save_weights(
             are float32 again when they are read.
         loss: the `LossConfig` of a run, and what the loss learnt, for `load_loss`. The model and
             its digest do not depend on it.
+        restriction: notice of a licence that forbids commerce, which is said at load.
 
     Raises:
         InputError: parameters that `load_weights` would refuse; the folder cannot be made, or the
@@ -126,6 +132,7 @@ def save_weights(
         "aggregator": config.aggregator.metadata(params.aggregator),
         "model_sha256": model_hash(params, config),
         **({} if loss is None else {"loss": to_plain(loss[0])}),
+        **({"restriction": restriction} if restriction else {}),
     }
     write_sealed(path, arrays, FORMAT, header)
 
@@ -209,7 +216,10 @@ def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkp
             "with; descriptors may differ"
         )
     loss = (header.loss, learnt) if header.loss else None
-    return Checkpoint(params, config, extras, None, header.model_sha256, loss)
+    restriction = header.restriction
+    if restriction:
+        warn_once(str(path), restriction)
+    return Checkpoint(params, config, extras, None, header.model_sha256, loss, restriction)
 
 
 def with_metadata(

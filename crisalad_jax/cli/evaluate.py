@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import pathlib
-from typing import Annotated
+from typing import Annotated, Literal
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.weights import load_weights
@@ -32,7 +32,7 @@ from crisalad_jax.utils.locks import staged_folder
 
 COMMON = (
     "data weights preset image-size resize grouping batch-size split images queries radius "
-    "precision pca rerank report out json on-bad-image seeds quiet"
+    "precision pca dtype rerank report out json on-bad-image seeds quiet"
 )
 EXAMPLE = "crisalad evaluate --data pitts30k_test.mat --weights salad --report pitts30k"
 
@@ -51,10 +51,14 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     then the honest ones."""
     pca: pathlib.Path | None = None
     """Components that `crisalad pca` fitted, for shorter descriptors."""
+    dtype: Literal["float32", "bits"] = "float32"
+    """What descriptors are compared as: bits are their signs, by the Hamming distance
+    (docs/maps.md)."""
     rerank: str | None = None
     """NAME:TOPK puts the first TOPK retrievals in a new order by local features: patch-netvlad,
-    patch-netvlad-ransac or patch-netvlad-sum, of a model with NetVLAD, selavpr, selavprpp or
-    transvpr (docs/methods.md). Adds a row to each of the table."""
+    patch-netvlad-ransac or patch-netvlad-sum, of a model with NetVLAD; fol, pair-vpr, selavpr,
+    selavprpp or transvpr, of one of that method; sinkhorn-divergence, of any local tokens
+    (docs/methods.md). Adds a row to each of the table."""
     rerank_weights: pathlib.Path | None = None
     """Model that makes these features, as --weights; by default the first stage's."""
     precision: float | None = None
@@ -94,13 +98,14 @@ def run(arguments: Evaluate) -> None:
         benchmark,
         groupings=groupings,
         pca=pca,
+        dtype=arguments.dtype,
         observe=None if arguments.report is None else similarities,
         rerank=rerank,
         reading=reading,
         **drawn,
     )
     asked = {"weights": arguments.weights or file, "groupings": groupings} | pick(
-        arguments, "batch_size", "seed", "seeds", "pca", "rerank", "rerank_weights"
+        arguments, "batch_size", "seed", "seeds", "pca", "dtype", "rerank", "rerank_weights"
     )
     record = evaluation_record(results, benchmark, config, model_name=name, **asked)
     tables = [grouping_table(results)]

@@ -122,9 +122,9 @@ class ModelFlags(ComputeFlags, QuietFlag):
     """Which model describes images, and how."""
 
     weights: pathlib.Path | None = None
-    """By default starter, the small model in this package; or hog, a baseline that learns nothing;
-    or a .safetensors file, or a published model's name (`crisalad models`), or hf://OWNER/NAME at
-    Hugging Face's hub."""
+    """By default starter, the small model in this package; or hog or thumbnail, which learn
+    nothing; or a .safetensors file, or a published model's name (`crisalad models`), or
+    hf://OWNER/NAME at Hugging Face's hub."""
     runtime: RuntimeName = "jax"
     """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
     for it once; --weights may be an exported folder."""

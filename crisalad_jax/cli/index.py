@@ -41,8 +41,9 @@ class Index(ReadFlags, ModelFlags, JsonFlag):
     store: str | None = None
     """files, in the map's folder, or milvus:URI, a file name.db or http://host:port; by default the
     map's, and of a new map files."""
-    dtype: Literal["float32", "float16"] | None = None
-    """What files keep descriptors as, by default the map's, and in a new map float32."""
+    dtype: Literal["float32", "float16", "bits"] | None = None
+    """What files keep descriptors as, by default the map's, and in a new map float32; bits are
+    their signs (docs/maps.md)."""
     pca: pathlib.Path | None = None
     """Components of `crisalad pca`, for shorter descriptors; the map keeps a copy, which queries
     use."""
@@ -95,8 +96,8 @@ def _words(result: Indexed, config: ModelConfig) -> list[str]:
         words.append(
             f"{len(result.unreadable)} unreadable left out, {result.unreadable[0]} the first"
         )
-    length, store = metadata.descriptor_length, metadata.store
-    words.append(f"{counted(result.images, 'descriptor')} of {length} numbers ({store})")
+    length, store = metadata.length_words, metadata.store
+    words.append(f"{counted(result.images, 'descriptor')} of {length} ({store})")
     if result.recall is not None:
         words.append(
             f"approximate search finds {100 * result.recall:.1f} % of the exact {NEIGHBOURS} "

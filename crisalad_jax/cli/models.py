@@ -42,7 +42,8 @@ def run(arguments: Models) -> dict[str, Any]:
         f"{starter.NAME}: the small model in this package, which extract, index and evaluate take "
         "by default"
     )
-    echo("hog: histograms of oriented gradients, a baseline without parameters, by its name too")
+    for name in ("hog", "thumbnail"):
+        echo(f"{name}: {_NOTES[name]}, by its name too")
     echo("crisalad models NAME prints all of one: its images, paper, file and address")
     return {"cache": str(user_cache()), "models": [_facts(model) for model in models]}
 
@@ -56,6 +57,7 @@ def _facts(model: Published) -> dict[str, Any]:
 _NOTES = {
     starter.NAME: f"trained on rendered pictures alone (docs/{starter.NAME}.md)",
     "hog": "a baseline that learns nothing: histograms of oriented gradients",
+    "thumbnail": "a baseline that learns nothing: SeqSLAM's small grey images",
 }
 
 

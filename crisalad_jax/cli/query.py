@@ -17,6 +17,8 @@ from crisalad_jax.data.live import Camera, FolderWatch
 from crisalad_jax.retrieval.maps.live import latency_words, query_live
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, json_rows, query, write_answers
+from crisalad_jax.retrieval.maps.tracking import SequenceSearch
+from crisalad_jax.retrieval.seqslam import SeqSlam
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.files import atomic_path, real_path
 from crisalad_jax.utils.output import counted, printable
@@ -64,12 +66,14 @@ class Query(ReadFlags, JsonFlag):
     min_similarity: float | None = None
     """A query to which no image is that similar is of an unknown place; by default what `crisalad
     calibrate` measured for this map. -1 answers every query."""
-    sequence: Literal["bayes"] | None = None
-    """The queries are consecutive frames of one camera: bayes, a filter, weighs those so far
-    (docs/maps.md)."""
+    sequence: Literal["bayes", "seqslam"] | None = None
+    """The queries are consecutive frames of one camera: bayes, a filter, weighs those so far;
+    seqslam searches lines through the last ones (docs/maps.md)."""
     sequence_reach: float | None = None
     """How many times as fast as the map's camera this one moves, at most; by default 2. Where names
     say no times or positions, images of the map a frame."""
+    sequence_length: int | None = None
+    """Frames that seqslam's lines go through; by default 10."""
     exact: bool = False
     """Search exactly, although the map has an approximate search."""
     json: Annotated[pathlib.Path | None, Target((".json", ".jsonl"))] = None
@@ -149,9 +153,13 @@ def _check_files(arguments: Query) -> None:
     )
 
 
-def _sequence_of(arguments: Query) -> BayesFilter | None:
-    """Make the filter that the flags ask for; None where they ask for none."""
-    reach = arguments.sequence_reach
+def _sequence_of(arguments: Query) -> SequenceSearch | None:
+    """Make the search that the flags ask for; None where they ask for none."""
+    reach, length = arguments.sequence_reach, arguments.sequence_length
+    if arguments.sequence == "seqslam":
+        refuse_with("--sequence seqslam", sequence_reach=reach)
+        return SeqSlam() if length is None else SeqSlam(length=length)
+    refuse_without("--sequence seqslam", None, sequence_length=length)
     refuse_without("--sequence bayes", arguments.sequence, sequence_reach=reach)
     if arguments.sequence is None:
         return None

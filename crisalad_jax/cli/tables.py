@@ -158,7 +158,13 @@ def checked_table(parts: Sequence[CheckedPart]) -> Table:
         counts = [
             NOTHING if count is None else f"{count:,}" for count in (part.database, part.queries)
         ]
-        verdict = "does not match" if part.problem else "as published" if part.known else "own data"
+        verdict = (
+            "does not match"
+            if part.problem
+            else "as published"
+            if part.known
+            else "nothing to compare"
+        )
         rows.append([Cell(each) for each in (part.name, part.known or NOTHING, verdict, *counts)])
     headers = ["part", "published as", "verdict", "images", "queries or places"]
     return Table(headers, rows, labels=2 + 1)

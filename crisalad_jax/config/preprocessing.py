@@ -13,6 +13,10 @@ Size = tuple[int, int]
 """Height and width in pixels."""
 BitDepth = Literal["high-byte", "contrast-stretch"]
 """How more than 8 bits a colour become 8."""
+LocalFeatures = Literal["sift", "orb"]
+"""What photographs may become in place of pixels."""
+FEATURE_BYTES: Mapping[str, int] = {"sift": 129, "orb": 33}
+"""Bytes of a local feature: its descriptor's, and a last one that is 0 where there is none."""
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 

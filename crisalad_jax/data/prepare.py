@@ -7,7 +7,13 @@ from typing import Any, Self
 
 import numpy as np
 
-from crisalad_jax.config.preprocessing import BitDepth, PreprocessingConfig, Size
+from crisalad_jax.config.preprocessing import (
+    BitDepth,
+    LocalFeatures,
+    PreprocessingConfig,
+    Size,
+)
+from crisalad_jax.data.local_features import encode_local_features
 from crisalad_jax.data.resize import Pixels, resize_image
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
@@ -103,6 +109,10 @@ class Preparation:
         default=None, compare=False, repr=False
     )
     """Raises InputError for a height and width that the model cannot describe."""
+    local_features: LocalFeatures | None = None
+    """What photographs become in place of pixels, if anything."""
+    encoded_size: Size | None = None
+    """Height and width of the bytes of local features."""
 
     def __post_init__(self) -> None:
         """Check the size."""
@@ -115,7 +125,12 @@ class Preparation:
     def of(cls, model: Any) -> Self:
         """Return how the photographs of a model are prepared, as its configuration says."""
         return cls(
-            model.image_size, model.preprocessing, model.side_multiple, model.check_image_size
+            model.image_size,
+            model.preprocessing,
+            model.side_multiple,
+            model.check_image_size,
+            model.backbone.local_features,
+            model.backbone.encoded_size,
         )
 
     @property
@@ -125,6 +140,8 @@ class Preparation:
 
     def size_of(self, size: Size) -> Size:
         """Return the height and width that an image of `size` gets."""
+        if self.encoded_size is not None:
+            return self.encoded_size
         first = self.preprocessing.target_size(size, self.image_size)
         return self.preprocessing.rounded_size(first, self.side_multiple)
 
@@ -136,7 +153,7 @@ class Preparation:
             name: the image's, for messages.
 
         Returns:
-            8-bit pixels, or normalised float32.
+            8-bit pixels, or normalised float32; or the bytes of local features.
 
         Raises:
             InputError: the image is no array of pixels, or what `check_size` raises.
@@ -157,6 +174,8 @@ class Preparation:
             )
         if last != first:
             image = resize_image(image, last, pixels=how.pixels)
+        if self.local_features is not None and self.encoded_size is not None:
+            return encode_local_features(image, self.local_features, self.encoded_size[0])
         return image if how.pixels == "bytes" else normalised(image, how)
 
 

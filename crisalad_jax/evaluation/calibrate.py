@@ -79,6 +79,7 @@ def calibrate(
         benchmark,
         groupings=["single"],
         pca=places.components,
+        dtype="bits" if places.metadata.is_bits else "float32",
         precision=precision,
         reading=reading,
     )

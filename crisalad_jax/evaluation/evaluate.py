@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import statistics
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Int64
@@ -26,6 +26,7 @@ from crisalad_jax.evaluation.operating_point import check_precision
 from crisalad_jax.evaluation.protocols import check_groupings, groupings_of
 from crisalad_jax.evaluation.results import ANY, GroupingResult, Skipped, over_single, summarise
 from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.bits import check_packable, pack_bits, sign_vectors
 from crisalad_jax.retrieval.chunks import Descriptors
 from crisalad_jax.retrieval.describe import TokenSet
 from crisalad_jax.retrieval.describer import Describer, describer_of
@@ -51,6 +52,7 @@ def evaluate(
     seed: int = 0,
     seeds: int = 3,
     pca: Pca | None = None,
+    dtype: Literal["float32", "bits"] = "float32",
     observe: Observe | None = None,
     rerank: Reranking | None = None,
     precision: float | None = None,
@@ -72,7 +74,10 @@ def evaluate(
         seed: draws the first shuffle: the database's, and with the next seed the queries'.
         seeds: shuffles, each from the second seed after the one before.
         pca: shortens the descriptors, fitted to images of other places.
-        observe: is given the descriptors of each grouping, of its first seed.
+        dtype: what descriptors are compared as; "bits" are their signs (`pack_bits`), compared by
+            the Hamming distance.
+        observe: is given the descriptors of each grouping, of its first seed; of bits, unit vectors
+            of the signs.
         rerank: a second stage; each grouping has a result without and then one with it.
         precision: asks each result for its `operating_point`: the similarity from which first
             retrievals are correct with this precision, and the recall that is left.
@@ -84,7 +89,8 @@ def evaluate(
         A result for each grouping, and with `rerank` a second one.
 
     Raises:
-        InputError: parameters of another configuration, no ground truth, an image cannot be read
+        InputError: parameters of another configuration, bits of a length that is not a multiple of
+            8, no ground truth, an image cannot be read
             or none of a side, components that are not for this model or make no unit vectors, such
             a precision, or what `Grouping.parse`, `Reranking.check` and `Reranker` raise; a
             published grouping whose batches are not known for this set.
@@ -108,7 +114,10 @@ def evaluate(
     parsed = groupings_of(groupings, benchmark)
     describer = describer_of(model, kinds)
     config = describer.config
-    _, is_unit = shortened(pca, describer, "model")
+    length, is_unit = shortened(pca, describer, "model")
+    is_bits = dtype == "bits"
+    if is_bits:
+        check_packable(length, "dtype")
     if rerank is not None:
         rerank.check(config, len(benchmark.database))
         if rerank.model is None:
@@ -142,7 +151,9 @@ def evaluate(
             drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
             name = str(grouping) if config.cross_image.attends else ANY
             observer = observe and functools.partial(observe, name)
-            ranked = _rank(sides, grouping, drawn, k, positives, observer, is_unit=is_unit)
+            ranked = _rank(
+                sides, grouping, drawn, k, positives, observer, unit=is_unit, bits=is_bits
+            )
             rankings, shares = ranked
             for label, stage in stages.items():
                 result = summarise(
@@ -226,19 +237,20 @@ def _rank(
     positives: Sequence[Int64[np.ndarray, " _"]],
     observe: Callable[[Descriptors, Descriptors], None] | None,
     *,
-    is_unit: bool,
+    unit: bool,
+    bits: bool,
 ) -> tuple[dict[int, Neighbours], dict[str, float | None]]:
     """Rank the k nearest neighbours for each seed; only shuffled sides are described anew.
 
     `observe` is given the descriptors of the first seed. Those that are not unit vectors are ranked
-    by Euclidean distance.
+    by Euclidean distance, and bits by the Hamming distance.
 
     Returns:
         The rankings by seed, and what leaks: fields of `GroupingResult`, the mean over the seeds.
     """
 
     def compare(database: Descriptors, queries: Descriptors) -> Neighbours:
-        if not is_unit:
+        if not unit and not bits:
             database, queries = to_unit_vectors(database, queries)
         return search(database, queries, k=k)
 
@@ -252,7 +264,8 @@ def _rank(
             if kind == "shuffled" or seed == seeds[0]:
                 descriptors.pop(number, None)  # makes room
                 batches[number] = side.batches(kind, grouping.batch_size, seed)
-                descriptors[number] = side.describe(batches[number])
+                described = side.describe(batches[number])
+                descriptors[number] = pack_bits(described) if bits else described
         found = {
             "database_share": same_place_share(batches[0], sides[0].same),
             "query_share": same_place_share(batches[1], sides[1].same),
@@ -261,7 +274,8 @@ def _rank(
         for name, share in found.items():
             leaks.setdefault(name, []).append(share)
         if observe is not None and seed == seeds[0]:
-            observe(descriptors[0], descriptors[1])
+            pair = descriptors[0], descriptors[1]
+            observe(*(map(sign_vectors, pair) if bits else pair))
         rankings[seed] = compare(descriptors[0], descriptors[1])
     return rankings, {name: _mean_known(shares) for name, shares in leaks.items()}
 

@@ -49,7 +49,7 @@ def evaluation_record(
         model_name: which weights, for each row.
         **asked: what `crisalad evaluate` was asked for: the files `weights` (None is an untrained
             model), `pca` and `rerank_weights` (None is the first stage's), `groupings`,
-            `batch_size`, `seed`, `seeds` and `rerank`.
+            `batch_size`, `seed`, `seeds`, `dtype` and `rerank`.
 
     Returns:
         The record, whose settings `write_report` takes.
@@ -120,6 +120,11 @@ def table_notes(results: Sequence[GroupingResult], settings: dict[str, Any]) -> 
         notes += protocol_notes(settings.get("groupings", ()))
     else:
         notes.append("No cross-image encoder: no descriptor depends on its batch.")
+    if settings.get("dtype") == "bits":
+        notes.append(
+            "Bits: descriptors are compared by their signs. With h of d bits that differ the "
+            "similarity is 1 - 2 h / d."
+        )
     if "shuffled" in kinds and settings["seeds"] > 1:
         notes.append(
             f"Shuffled: mean of {settings['seeds']} seeds ± their standard deviation; the interval "

@@ -28,7 +28,7 @@ from crisalad_jax.training.validation import MONITORED
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_folder, read_json, real_path, write_json
 from crisalad_jax.utils.hub import is_hub, parse_hub, upload_folder
-from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.output import counted, warn
 from crisalad_jax.utils.version import VERSION
 
 WEIGHTS = ("best.safetensors", "last.safetensors")
@@ -225,7 +225,7 @@ def _card(run: _Run, rows: Sequence[_Row], *, name: str, licence: str, data: str
         f"- Loss: {', '.join(losses)}; optimiser {optimiser.kind.part_name}, learning rate "
         f"{optimiser.learning_rate:g}, schedule {optimiser.schedule.part_name}.",
         f"- Batches: {config.places_per_batch} places of {config.images_per_place} images; "
-        f"{config.epochs} epochs; seed {config.seed}; trained: {config.trainable}.",
+        f"{counted(config.epochs, 'epoch')}; seed {config.seed}; trained: {config.trainable}.",
         f"- `{CONFIG}` has all settings.",
     ]
     return "\n\n".join("\n".join(part) for part in parts) + "\n"

@@ -72,7 +72,7 @@ class ModelConfig:
             (attends, request.facet != "token", "facets of attention, as vit's"),
             (inserts, request.insertion is not None, "blocks that take tokens, such as vit"),
             (backbone.exposes_levels, several, "features of other blocks than the last"),
-            (backbone.side_paths > 1, request.second, "adapters on two side paths"),
+            (backbone.side_paths > request.path, True, "adapters on two side paths"),
         ):
             require(
                 has or not is_asked,
@@ -81,6 +81,9 @@ class ModelConfig:
         fits = self.preprocessing.size_rule == "fixed" or not self.aggregator.fixed_grid
         words = f"fixed: {aggregator} has parameters for every patch, of images of one size alone"
         require_field(self.preprocessing, "size_rule", fits, words)
+        kind, pixels = self.backbone.local_features, self.preprocessing.pixels
+        fits = kind is None or pixels == "bytes"
+        require_field(self.preprocessing, "pixels", fits, f"bytes, in which {kind} finds features")
         self.check_image_size(self.input_size)
         encoder, (global_dim, tokens, dim) = self.cross_image, self.token_shape
         if not encoder.attends:
@@ -142,9 +145,10 @@ class ModelConfig:
     def input_size(self) -> Size:
         """Height and width of the network's input: `image_size`, rounded where that is asked for.
 
-        Training, an export and costs are of this size, whatever `PreprocessingConfig.size_rule`.
+        Training, an export and costs are of this size, whatever `PreprocessingConfig.size_rule`. Of
+        local features it is that of their bytes.
         """
-        return self.rounded_size(self.image_size)
+        return self.backbone.encoded_size or self.rounded_size(self.image_size)
 
     def rounded_size(self, size: Size) -> Size:
         """Return the height and width of the network's input for an image resized to `size`."""

@@ -7,7 +7,14 @@ from collections.abc import Generator, Iterable
 
 import numpy as np
 
-from crisalad_jax.retrieval.chunks import BITS, Block, as_rows, check_rows
+from crisalad_jax.retrieval.chunks import (
+    BITS,
+    Block,
+    Descriptors,
+    as_rows,
+    check_rows,
+    joined,
+)
 from crisalad_jax.retrieval.neighbours import (
     QUERY_CHUNK,
     Neighbours,
@@ -45,9 +52,24 @@ def pack_bits(descriptors: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, "n d/8
         >>> pack_bits(np.array([[0.5, -0.5, 0.0, 0.1, -0.2, -0.3, -0.4, 0.7]])).tolist()
         [[177]]
     """
-    rows = as_rows(descriptors, "descriptors")
-    check_packable(rows.shape[1], "descriptors")
-    check_rows(rows, "descriptors", range(len(rows)), unit=False)
+    return _packed(as_rows(descriptors, "descriptors"), "descriptors")
+
+
+def to_bits(array: np.ndarray, name: str, length: int) -> Bits:
+    """Pack descriptors of `length` numbers, or check those that are packed.
+
+    Raises:
+        InputError: what `pack_bits` and `as_bits` raise.
+    """
+    is_packed = np.asanyarray(array).dtype == BITS
+    return (
+        as_bits(array, name, length) if is_packed else _packed(as_rows(array, name, length), name)
+    )
+
+
+def _packed(rows: Descriptors, name: str) -> Bits:
+    check_packable(rows.shape[1], name)
+    check_rows(rows, name, range(len(rows)), unit=False)
     return np.packbits(rows >= 0, axis=1)
 
 
@@ -91,17 +113,14 @@ def search_bits(database: Bits, queries: Bits, k: int) -> Neighbours:
     """
     database = as_bits(database, "database")
     queries = as_bits(queries, "queries", 8 * database.shape[1])
-    blocks = (
-        Block(start, database[start : start + _ROWS]) for start in range(0, len(database), _ROWS)
-    )
-    return nearest_bits(blocks, queries, min(k, len(database)))
+    return nearest_bits([database], queries, min(k, len(database)))
 
 
-def nearest_bits(stream: Iterable[Block], queries: Bits, k: int) -> Neighbours:
+def nearest_bits(database: Iterable[Bits], queries: Bits, k: int) -> Neighbours:
     """Find the k rows with the most equal bits of each query; of as equal ones the lower indices.
 
     Args:
-        stream: packed bits in order, at least k rows in all.
+        database: packed bits, part by part, at least k rows in all.
         queries: packed bits.
         k: neighbours per query.
 
@@ -109,15 +128,23 @@ def nearest_bits(stream: Iterable[Block], queries: Bits, k: int) -> Neighbours:
         Their similarities are 1 - 2 h / d, where h of the d bits differ: the cosines of the vectors
         of signs.
     """
-    return best_products(
-        _compared(stream, _as_words(queries), 8 * queries.shape[1]), len(queries), k
-    )
+
+    def blocks() -> Generator[Block, None, None]:
+        count = 0
+        for part in database:
+            for start in range(0, len(part), _ROWS):
+                yield Block(count + start, part[start : start + _ROWS])
+            count += len(part)
+
+    compared = _compared(joined(blocks(), _ROWS), _as_words(queries), 8 * queries.shape[1])
+    return best_products(compared, len(queries), k)
 
 
 def _compared(
     stream: Iterable[Block], queries: np.ndarray, bits: int
 ) -> Generator[Products, None, None]:
     """Yield the similarities of all queries and all blocks."""
+    similarities = (1 - 2 * np.arange(bits + 1) / bits).astype(np.float32)
     for block in stream:
         rows = np.ascontiguousarray(_as_words(block.rows).T)
         step = max(1, _PIECE // rows.shape[1])
@@ -129,8 +156,9 @@ def _compared(
                 for number, words in enumerate(rows):
                     other = some[start : start + step, number, None] ^ words
                     part += np.bitwise_count(other)
-            similarities = (1 - differing * np.float64(2 / bits)).astype(np.float32)
-            yield Products(first, similarities.T, block.start + np.arange(rows.shape[1])[:, None])
+            yield Products(
+                first, similarities[differing].T, block.start + np.arange(rows.shape[1])[:, None]
+            )
 
 
 def _as_words(bits: Bits) -> np.ndarray:

@@ -9,7 +9,7 @@ is another one.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -79,6 +79,8 @@ class BayesFilter:
         array([1, 2, 3])
     """
 
+    counts_images: ClassVar[bool] = False
+    """Whether motion is in images of the map whatever is known of times and positions."""
     reach: float = 2.0
     jump: float = 0.01
     sharpness: float = 2.0
@@ -106,7 +108,7 @@ class BayesFilter:
             InputError: no places, a similarity that is not finite, or `along` of another length,
                 or that decreases.
         """
-        common = _checked("common", common, (max(1, np.size(common)),))
+        common = checked("common", common, (max(1, np.size(common)),))
         count = len(common)
         along = (
             np.arange(count, dtype=np.float64) if along is None else np.asarray(along, np.float64)
@@ -156,7 +158,7 @@ class BayesFilter:
         """
         if not moved >= 0:
             raise InputError(f"moved: found {moved}, expected at least 0")
-        row = _checked("similarities", similarities, state.common.shape)
+        row = checked("similarities", similarities, state.common.shape)
         seen, frames = state.seen + row, state.frames + 1
         if self.adapt:
             mean = (seen + _PRIOR_FRAMES * state.common) / (frames + _PRIOR_FRAMES)
@@ -211,7 +213,7 @@ class Followed(NamedTuple):
     """Probability that the camera is there; images beside it share what they have in common."""
 
 
-def _checked(name: str, values: PerPlace, shape: tuple[int, ...]) -> PerPlace:
+def checked(name: str, values: PerPlace, shape: tuple[int, ...]) -> PerPlace:
     """Return finite numbers of this shape, in float64; raise InputError where they are others."""
     if np.shape(values) != shape or not np.isfinite(values).all():
         found = f"shape {np.shape(values)}" if np.shape(values) != shape else "NaN or infinity"

@@ -95,7 +95,8 @@ def with_vocabulary(
         "for each cluster",
     )
     reading = Reading(batch_size=batch_size, on_bad_image=on_bad_image).fitted(len(paths))
-    features = _read_features(model, paths, reading, seed, quiet=quiet)
+    by_image = _read_features(model, paths, reading, seed, quiet=quiet)
+    features = np.concatenate([np.empty((0, config.backbone.dim), np.float32), *by_image])
     require(
         len(features) >= clusters and bool(np.isfinite(features).all()),
         f"images: found {len(features)} features in those that can be read, expected at least "
@@ -104,8 +105,12 @@ def with_vocabulary(
     with compiler.number_types():
         there = jnp.asarray(features)
         reduced = np.asarray(aggregator.centroid_features(there))
-        means = _k_means(reduced, clusters, seed, spherical=aggregator.spherical_centroids)
+        if config.backbone.binary:
+            means = k_majority(reduced, clusters, seed)
+        else:
+            means = _k_means(reduced, clusters, seed, spherical=aggregator.spherical_centroids)
         learnt = aggregator.from_centroids(jnp.asarray(means), there)
+        learnt = aggregator.with_frequencies(learnt, by_image)
     learnt = aggregator.attach_backbone_hash(learnt, params.backbone)
     return dataclasses.replace(params, aggregator=learnt)
 
@@ -244,26 +249,64 @@ def _check_vocabulary(config: ModelConfig) -> None:
 
 def _read_features(
     model: Model, paths: Sequence[pathlib.Path], reading: Reading, seed: int, *, quiet: bool
-) -> Float32[np.ndarray, "feature dim"]:
-    """Read unit features of the images, of `PATCHES` patches of each."""
+) -> list[Float32[np.ndarray, "feature dim"]]:
+    """Read unit features of each image, of `PATCHES` patches; those of zeros are left out."""
     config = model.config
     devices = devices_for(reading.batch_size)
     params = devices.replicate(cast_params(model.params, config))
     generator = np.random.default_rng(seed)
-    parts = [np.empty((0, config.backbone.dim), np.float32)]
+    parts: list[np.ndarray] = []
     unreadable: list[pathlib.Path] = []
     with progress_bar("vocabulary", len(paths), "images", quiet=quiet) as bar:
         for batch in reading.batches(paths, Preparation.of(config)):
             features = unit_features(params, devices.shard_batch(batch.images), config)
             for image in jax.device_get(features)[batch.valid]:
-                chosen = np.sort(generator.permutation(len(image))[:PATCHES])
-                parts.append(image[chosen].astype(np.float32))
+                found = image[image.any(axis=1)]
+                chosen = np.sort(generator.permutation(len(found))[:PATCHES])
+                parts.append(found[chosen].astype(np.float32))
             there = batch.indices >= 0
             unreadable += [paths[i] for i in batch.indices[there & ~batch.valid]]
             bar.advance(int(there.sum()))
     if unreadable:
         warn(f"images: {len(unreadable)} unreadable left out, {unreadable[0]} the first")
-    return np.concatenate(parts)
+    return parts
+
+
+def k_majority(
+    features: Float[np.ndarray, "feature dim"], clusters: int, seed: int
+) -> Float32[np.ndarray, "cluster dim"]:
+    """Cluster binary features by the bits that differ; a centroid has the majority's bits.
+
+    It is the clustering of Galvez-Lopez and Tardos (T-RO 2012), without a tree: the first centroids
+    are drawn as k-means++ draws them, and what has no majority keeps its bit.
+
+    Args:
+        features: of two values, as `Backbone.binary` says.
+        clusters: number of centroids.
+        seed: draws the first ones.
+    """
+    size = np.abs(features).max()
+    bits = np.sign(features).astype(np.float32)
+    generator = np.random.default_rng(seed)
+    chosen = [int(generator.integers(len(bits)))]
+    away = np.full(len(bits), np.inf)
+    while len(chosen) < clusters:
+        away = np.minimum(away, (bits.shape[1] - bits @ bits[chosen[-1]]) / 2)
+        weights = np.square(away)
+        # Once all features are a centroid, the rest are drawn alike.
+        shares = weights / weights.sum() if weights.any() else None
+        chosen.append(int(generator.choice(len(bits), p=shares)))
+    centroids, nearest = bits[chosen], np.zeros(len(bits), int)
+    for _ in range(_ROUNDS):
+        before, nearest = nearest, (bits @ centroids.T).argmax(axis=1)
+        order = np.argsort(nearest, kind="stable")
+        there, starts = np.unique(nearest[order], return_index=True)
+        sums = np.zeros_like(centroids)
+        sums[there] = np.add.reduceat(bits[order], starts)
+        centroids = np.where(sums == 0, centroids, np.sign(sums))
+        if (nearest == before).all():
+            break
+    return (size * centroids).astype(np.float32)
 
 
 def _k_means(

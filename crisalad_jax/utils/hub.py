@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 from crisalad_jax.utils.download import OFFLINE, is_offline
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.extras import missing_extra
 
 PREFIX = "hf://"
 _KAGGLE_CACHE = "KAGGLEHUB_CACHE"
@@ -87,7 +88,8 @@ def download_file(
             not answer; or the network is forbidden and the cache has no such file.
         ModuleNotFoundError: huggingface_hub is not installed.
     """
-    import huggingface_hub
+    with _extra(address):
+        import huggingface_hub
 
     with _told(address), _bars(quiet):
         return pathlib.Path(
@@ -121,10 +123,11 @@ def upload_folder(
             or the hub does not answer.
         ModuleNotFoundError: huggingface_hub is not installed.
     """
-    import huggingface_hub
-
     if is_offline():
         raise InputError(f"{address}: {OFFLINE} forbids the network")
+    with _extra(address):
+        import huggingface_hub
+
     interface = huggingface_hub.HfApi()
     with _told(address), _bars(quiet):
         made = interface.create_repo(address.repository, exist_ok=True)
@@ -158,7 +161,8 @@ def download_kaggle(handle: str, folder: pathlib.Path, *, quiet: bool = False) -
         InputError: there is no such set, the user has no token, or Kaggle does not answer.
         ModuleNotFoundError: kagglehub is not installed.
     """
-    import kagglehub
+    with _extra(f"kaggle: {handle}"):
+        import kagglehub
 
     before = os.environ.get(_KAGGLE_CACHE)
     # An output folder that is not empty is refused, so that nothing there would be resumed.
@@ -181,36 +185,42 @@ def download_kaggle(handle: str, folder: pathlib.Path, *, quiet: bool = False) -
 
 
 @contextlib.contextmanager
+def _extra(what: object) -> Iterator[None]:
+    """Say which extra has a client that is not installed."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(missing_extra(error, str(what)), name=error.name) from error
+
+
+@contextlib.contextmanager
 def _told(address: HubAddress) -> Iterator[None]:
     """Tell of the hub's errors in one line, without what its client says of tokens."""
     from huggingface_hub import errors
 
+    absent = f"{OFFLINE} forbids the network" if is_offline() else "the hub does not answer"
+    known = {  # the first that fits: some are kinds of others
+        errors.GatedRepoError: "a repository with terms, expected you to accept them at its page",
+        errors.RepositoryNotFoundError: "no such repository, or a private one, expected one",
+        errors.RevisionNotFoundError: "no such revision, expected one",
+        errors.LocalEntryNotFoundError: f"none in the hub's cache: {absent}",
+        errors.EntryNotFoundError: f"no {address.file} there, expected it",
+        errors.LocalTokenNotFoundError: "no token, expected one",
+    }
     try:
         yield
-    except errors.GatedRepoError as error:
-        what = "a repository with terms, expected you to accept them at its page, and a token"
-        raise InputError(f"{address}: found {what} (`hf auth login`)") from error
-    except errors.RepositoryNotFoundError as error:
-        what = "found no such repository, or a private one, expected one that you may read"
-        raise InputError(f"{address}: {what} (`hf auth login`)") from error
-    except errors.RevisionNotFoundError as error:
-        raise InputError(f"{address}: found no such revision, expected one") from error
-    except errors.LocalEntryNotFoundError as error:
-        reason = f"{OFFLINE} forbids the network" if is_offline() else "the hub does not answer"
-        raise InputError(f"{address}: found none in the hub's cache: {reason}") from error
-    except errors.EntryNotFoundError as error:
-        raise InputError(f"{address}: found no {address.file} there, expected it") from error
-    except errors.LocalTokenNotFoundError as error:
-        raise InputError(f"{address}: found no token, expected one: `hf auth login`") from error
-    except errors.HfHubHTTPError as error:
-        response = error.response
-        said = f"HTTP {response.status_code} {response.reason_phrase}"
-        advice = " (`hf auth login`)" if response.status_code in (401, 403) else ""
-        raise InputError(f"{address}: found {said}, expected an answer{advice}") from error
     except InputError:
         raise
     except Exception as error:  # its client has errors of several packages
-        raise InputError(f"{address}: found {_first_line(error)}, expected an answer") from error
+        words = next((words for kind, words in known.items() if isinstance(error, kind)), None)
+        if words is None and isinstance(error, errors.HfHubHTTPError):
+            code, reason = error.response.status_code, error.response.reason_phrase
+            words = f"HTTP {code} {reason}, expected an answer"
+        words = words or f"{_first_line(error)}, expected an answer"
+        response = getattr(error, "response", None)
+        denied = response is not None and response.status_code in (401, 403)
+        advice = " (`hf auth login`)" if denied or "token" in words else ""
+        raise InputError(f"{address}: found {words}{advice}") from error
 
 
 def _first_line(error: Exception) -> str:

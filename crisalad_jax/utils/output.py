@@ -28,6 +28,17 @@ def warn(message: str) -> None:
     warnings.warn(message, Note, stacklevel=level)
 
 
+_SAID: set[str] = set()
+"""What `warn_once` has said."""
+
+
+def warn_once(about: str, message: str) -> None:
+    """Warn of `about: message`, unless this process has said the message before, of anything."""
+    if message not in _SAID:
+        _SAID.add(message)
+        warn(f"{about}: {message}")
+
+
 @contextlib.contextmanager
 def print_notes() -> Iterator[None]:
     """Print notes in one line on standard error; other warnings stay as Python shows them."""

@@ -26,6 +26,7 @@ CHANGED: tuple[tuple[str, str, float], ...] = (
     ("netvlad", r"(pool\.conv|score_proj)\.weight$", 100.0),
     ("netvlad", r"(pool\.centroids|netvlad\.centers)$", 0.4),
     ("netvlad", r"(whiten|WPCA\.0)\.bias$", 0.02),
+    ("^fol", r"aggregator\.score\.3\.weight$", 5.0),
     ("^sage", r"encoder\.layers\.\d\.self_attn\.(in_proj_bias|out_proj\.bias)$", 0.02),
     ("^selavprpp", r"linear[24]\.bias$", 0.05),
     ("^sfrs", r"base_model\.base\.\d+\.weight$", 2**0.5),

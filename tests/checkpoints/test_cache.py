@@ -11,6 +11,7 @@ import re
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Iterator
 
 import jax
@@ -25,11 +26,20 @@ from crisalad_jax.checkpoints import cache
 from crisalad_jax.checkpoints.cache import cached_weights, is_cached
 from crisalad_jax.checkpoints.formats import VOCABULARY, public_shapes
 from crisalad_jax.checkpoints.load import find_weights
-from crisalad_jax.checkpoints.public import read_checkpoint
-from crisalad_jax.checkpoints.published import PUBLISHED, Licence, Published
+from crisalad_jax.checkpoints.public import read_checkpoint, write_checkpoint
+from crisalad_jax.checkpoints.published import (
+    PUBLISHED,
+    Licence,
+    Published,
+    published_model,
+    restriction_of,
+)
+from crisalad_jax.checkpoints.safetensors_io import read_header
 from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.nn.aggregators.pair_vpr import PairVprConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import parameter_shapes
+from crisalad_jax.utils import output
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import CACHE, user_cache
 from crisalad_jax.utils.output import Note
@@ -140,7 +150,6 @@ def test_a_name_loads_what_its_file_holds_and_downloads_once(model, server, tmp_
     ("licence", "words"),
     [
         (MIT, "licence MIT"),
-        (Licence("CC-BY-NC-4.0", False), "licence CC-BY-NC-4.0: no commercial use"),
         (GPL, "licence GPL-3.0: copyleft, which what you publish may inherit"),
         (NO_LICENCE, "no licence file: its authors have not said who may use it"),
     ],
@@ -153,6 +162,50 @@ def test_the_licence_is_told_each_time(model, monkeypatch, licence, words):
             cj.load("tiny-model")
         # Python shows a warning once for each line of a program: the caller's, not one of ours.
         assert {pathlib.Path(each.filename).name for each in caught} == {"test_cache.py"}
+
+
+def test_a_licence_that_forbids_commerce_is_said_once(model, monkeypatch, tmp_path):
+    """By the name that is loaded, and in another process by its file or a copy of it."""
+    monkeypatch.setattr(output, "_SAID", said := set())
+    register(model, monkeypatch, licence=Licence("CC-BY-NC-4.0", False))
+    words = "licence CC-BY-NC-4.0: no commercial use (https://example.org/tiny)"
+
+    def notes(path) -> list[str]:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            cj.load(path)
+        return [str(each.message) for each in caught if issubclass(each.category, Note)]
+
+    assert notes("tiny-model") == [f"tiny-model: {words}"]
+    assert notes("tiny-model") == []
+    file, copy = find_weights("tiny-model"), tmp_path / "half.safetensors"
+    cj.convert(file, copy, half=True)
+    for path in (file, copy):
+        assert notes(path) == []
+        said.clear()
+        assert notes(path) == [f"{path}: {words}"]
+
+
+def test_a_format_forbids_commerce_where_all_its_models_do(monkeypatch, tmp_path):
+    monkeypatch.setattr(output, "_SAID", set())
+    assert published_model("pairvpr-vitb14").restriction == restriction_of("pair-vpr")
+    assert restriction_of("pair-vpr") == (
+        "licence CSIRO non-commercial: no commercial use "
+        "(https://github.com/csiro-robotics/Pair-VPR)"
+    )
+    forbidding = {name for name, each in PUBLISHED.items() if each.restriction}
+    assert forbidding == {"pairvpr-vitb14"}
+    assert restriction_of("dinov2") == restriction_of("fol") == restriction_of("reference") == ""
+    config = dataclasses.replace(
+        CONFIG, aggregator=PairVprConfig(dim=16, width=64, layers=1, hidden=8, positions=16)
+    )
+    public, ours = tmp_path / "public.pth", tmp_path / "ours.safetensors"
+    shapes = parameter_shapes(config)
+    blank = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+    write_checkpoint(public, blank, config, "pair-vpr", {})
+    with pytest.warns(Note, match=re.escape(f"{public}: licence CSIRO non-commercial: no ")):
+        cj.convert(public, ours)
+    assert read_header(ours)["restriction"] == restriction_of("pair-vpr")
 
 
 def test_a_file_of_the_same_name_is_taken(model, server, tmp_path):

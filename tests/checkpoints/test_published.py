@@ -5,7 +5,6 @@ import functools
 import json
 import pathlib
 import re
-from collections.abc import Callable
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -60,6 +59,7 @@ STORED = {
         for kind in ("", "-rerank")
     },
     "sfrs": "zoo/layouts/sfrs_vgg16_pca4096",
+    "pairvpr-vitb14": "zoo/layouts/pairvpr_vitb",
     "patch-netvlad-mapillary-4096": "zoo/layouts/patchnetvlad_mapillary_WPCA4096",
     "patch-netvlad-pittsburgh-512": "zoo/layouts/patchnetvlad_pittsburgh_WPCA512",
     "tetra-boq": "zoo/layouts/tetra_boq",
@@ -80,37 +80,9 @@ STORED = {
         for name in PUBLISHED
         if "-indoor-" in name
     },
-    "fol-large": "layouts/dinov2_vitl14",
-    "fol-base": "layouts/dinov2_vitb14",
+    "fol-large": "zoo/layouts/fol_vitl14",
+    "fol-base": "zoo/layouts/fol_vitb14",
 }
-
-
-def fol(backbone: dict[str, list[int]]) -> dict[str, Any]:
-    """FoL's names: the backbone's, SALAD's for its width, and the transposed convolutions'."""
-    width = backbone["cls_token"][2]
-    salad = json.loads((PARITY / "layouts/dino_salad.json").read_text(encoding="utf-8"))
-    head = {key: shape for key, shape in salad.items() if key.startswith("aggregator.")}
-    return {
-        **{f"backbone.model.{key}": shape for key, shape in backbone.items()},
-        **{key: [width if side == 768 else side for side in head[key]] for key in head},
-        "upconv.weight": [width, 256, 3, 3],
-        "upconv.bias": [256],
-        "upconv2.weight": [256, 128, 3, 3],
-        "upconv2.bias": [128],
-    }
-
-
-def within_model(shapes: dict[str, Any]) -> dict[str, Any]:
-    """Indoor-VPR's names, which are another file's within a module `model`."""
-    return {f"model.{key}": shape for key, shape in shapes.items()}
-
-
-MADE: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
-    "fol-large": fol,
-    "fol-base": fol,
-    **{name: within_model for name in PUBLISHED if "-indoor-" in name},
-}
-"""Functions that make a file's shapes of those that are stored of a part of it."""
 CHANGED: dict[str, dict[str, tuple[int, ...] | None]] = {
     # The README's one cluster and two ghosts.
     "supervlad-1-cluster": {"aggregation.conv.weight": (3, 768, 1, 1)},
@@ -155,6 +127,8 @@ PREPROCESSING: dict[str, tuple[Any, ...]] = {
     # OliverGrainge/TeTRA-VPR: the same.
     "tetra-boq": ((322, 322), "fixed", *_BYTES),
     "tetra-salad": ((322, 322), "fixed", *_BYTES),
+    # csiro-robotics/Pair-VPR: the same.
+    "pair-vpr": ((322, 322), "fixed", *_BYTES),
     # Ahmedest61/VLAD-BuFF eval.py, input_transform: the same.
     "vlad-buff": ((322, 322), "fixed", *_BYTES),
     # amaralibey/MixVPR and gsv-cities, their data loaders; Conv-AP's demo.py of 4,096 is bicubic.
@@ -206,7 +180,8 @@ def stored(name: str) -> tuple[str, ModelConfig]:
     """The layout and configuration of a published file."""
     shapes = json.loads((PARITY / f"{STORED[name]}.json").read_text(encoding="utf-8"))
     plain = {key.rpartition("/")[2].removeprefix("module."): shapes[key] for key in shapes}
-    plain = MADE.get(name, lambda shapes: shapes)(plain)
+    if "-indoor-" in name:  # another file's names, within a module `model`
+        plain = {f"model.{key}": shape for key, shape in plain.items()}
     plain |= CHANGED.get(name, {})
     plain = {key: shape for key, shape in plain.items() if shape is not None}
     return infer(blank(plain), source=name)

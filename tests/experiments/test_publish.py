@@ -14,6 +14,7 @@ import pytest
 import scipy.stats
 
 import crisalad_jax as cj
+from crisalad_jax.checkpoints.load import open_model
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.data.places import read_places
 from crisalad_jax.experiments.publish import publish
@@ -154,6 +155,8 @@ def test_a_model_goes_to_the_hub_and_comes_back_and_stays_without_the_network(
     monkeypatch.setenv(OFFLINE, "1")
     hub.asked.clear()
     assert cj.load("hf://me/mine").config == RECIPE.model
+    opened = open_model("hf://me/mine", "jax", lambda config: config)
+    assert opened.name == "hf://me/mine"  # not that of a folder in the cache
     assert hub.asked == []
     monkeypatch.delenv(OFFLINE)
     with pytest.raises(InputError, match="expected a new or empty one"):

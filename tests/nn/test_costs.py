@@ -15,6 +15,7 @@ from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig,
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.gem import CosPlaceConfig, GemConfig, GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.aggregators.pair_vpr import PairVprConfig
 from crisalad_jax.nn.aggregators.queries import BoqConfig, EdtFormerConfig
 from crisalad_jax.nn.aggregators.salad import FolConfig
 from crisalad_jax.nn.aggregators.selavpr import SelaVprConfig
@@ -177,6 +178,8 @@ AGGREGATORS: dict[str, tuple[Any, int]] = {
     ),
     # A descriptor needs no local features.
     "selavpr": (SelaVprConfig(hidden=8, local=4), 0),
+    # Nor the decoder: one linear layer.
+    "pair-vpr": (PairVprConfig(dim=24, width=16, layers=2), DIM * 24),
     # SALAD's; the dustbin comes from the backbone.
     "fol": (
         FolConfig(clusters=8, cluster_dim=32, token_dim=64, hidden=128),

@@ -14,6 +14,7 @@ from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig,
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.gem import ApGemConfig, CosPlaceConfig, GemConfig, GemPyramidConfig
 from crisalad_jax.nn.aggregators.mixvpr import MixVprConfig
+from crisalad_jax.nn.aggregators.pair_vpr import PairVprConfig
 from crisalad_jax.nn.aggregators.queries import BoqConfig, EdtFormerConfig
 from crisalad_jax.nn.aggregators.sage import SageConfig
 from crisalad_jax.nn.aggregators.salad import FolConfig
@@ -26,6 +27,7 @@ from crisalad_jax.nn.aggregators.vlad import (
     SuperVladConfig,
     VladBuffConfig,
 )
+from crisalad_jax.nn.aggregators.words import BowConfig, HardVladConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import (
@@ -54,6 +56,8 @@ PARTS: dict[str, Aggregator] = {
     "conv-ap": ConvApConfig(channels=16),
     "cosplace": CosPlaceConfig(dim=16),
     "ap-gem": ApGemConfig(dim=16),
+    "vlad": HardVladConfig(clusters=4),
+    "bow": BowConfig(clusters=12),
     "mixvpr": MixVprConfig(channels=16, rows=2, depth=2),
     "anyloc": AnyLocConfig(clusters=4, layer=-1),
     "boq": BoqConfig(channels=16, queries=3, rows=2),
@@ -66,6 +70,7 @@ PARTS: dict[str, Aggregator] = {
     "selavprpp": SelaVprPpConfig(dim=16),
     "selavprpp-hash": SelaVprPpHashConfig(dim=16, bits=24),
     "sage": SageConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16, weighting_hidden=8),
+    "pair-vpr": PairVprConfig(dim=16, width=16, layers=2, hidden=8, positions=16),
     "fol": FolConfig(clusters=4, cluster_dim=8, token_dim=16, hidden=16, local_hidden=8, local=4),
 }
 RELATED = CrossImageConfig(layers=1, heads=2, feedforward=16, dropout=0.0)
@@ -80,7 +85,7 @@ def pictures(*seeds: int) -> np.ndarray:
 
 def model(aggregator: str) -> tuple[Crisalad, ModelConfig]:
     backbone = SMALL.backbone
-    if PARTS[aggregator].features(backbone.depth).second:
+    if PARTS[aggregator].features(backbone.depth).path:
         adapter = make_part("adapter", "side-multi-resolution", paths=2)
         backbone = dataclasses.replace(backbone, adapter=adapter)
     config = dataclasses.replace(SMALL, backbone=backbone, aggregator=PARTS[aggregator])
@@ -112,13 +117,14 @@ def test_descriptors_of_every_method(aggregator: str) -> None:
     assert half.dtype == jnp.float32
     np.testing.assert_allclose(jnp.linalg.norm(half, axis=1), 1, atol=1e-6)
     # 8 bits of mantissa through two blocks and a head: each rounding turns a vector by 2^-9.
-    assert (half * described).sum(axis=1).min() > 0.999
+    # Of a bag, one of 12 patches may move to another word.
+    assert (half * described).sum(axis=1).min() > (0.9 if aggregator == "bow" else 0.999)
     assert np.abs(half - described).max() > 1e-5  # it did compute in bfloat16
 
 
 # A method with a global token alone, and one without.
 @pytest.mark.parametrize(
-    "aggregator", slow_unless({"gem", "boq"}, sorted(PARTS.keys() - {"anyloc"}))
+    "aggregator", slow_unless({"gem", "boq"}, sorted(PARTS.keys() - {"anyloc", "bow", "vlad"}))
 )
 def test_with_the_encoder_images_look_at_each_other(aggregator: str) -> None:
     """Tokens of every method that trains fit it; under `self_mask` it leaves them to themselves."""

@@ -2,6 +2,7 @@
 
 import pathlib
 import re
+import sys
 from collections.abc import Iterator
 
 import huggingface_hub.constants
@@ -123,6 +124,24 @@ def test_nothing_is_uploaded_without_the_network(hub, tmp_path, monkeypatch):
     with pytest.raises(InputError, match=f"{OFFLINE} forbids the network"):
         upload_folder(tmp_path, parse_hub("hf://me/mine"), "")
     assert hub.asked == []
+
+
+@pytest.mark.parametrize(
+    ("module", "call"),
+    [
+        ("huggingface_hub", lambda folder: download_file(HubAddress("a/b", None, "w"))),
+        ("huggingface_hub", lambda folder: upload_folder(folder, HubAddress("a/b"), "")),
+        ("kagglehub", lambda folder: download_kaggle("a/b", folder)),
+    ],
+)
+def test_a_client_that_is_not_installed_is_named_with_its_extra(
+    monkeypatch, tmp_path, module, call
+):
+    monkeypatch.delenv(OFFLINE, raising=False)
+    monkeypatch.setitem(sys.modules, module, None)
+    words = f"a/b.*: found no module {module}, expected it with the extra data: pip install"
+    with pytest.raises(ModuleNotFoundError, match=words):
+        call(tmp_path)
 
 
 def test_kaggle_stores_in_the_given_folder_and_its_errors_are_one_line(tmp_path, monkeypatch):

@@ -60,8 +60,8 @@ class Format:
     encoder_rows: Rows
     projection: Row | None = None
     """Row of the projection, with {dim} for its width; None without one."""
-    head_first: bool = False
-    """Whether the head's first row is before the backbone's."""
+    head_first: int = 0
+    """Number of the head's first rows that are before the backbone's."""
     encoder_first: bool = False
     """Whether the cross-image encoder is before the head."""
     adapter: str = "none"

@@ -34,6 +34,8 @@ class Extra(NamedTuple):
     initial: Callable[[Any], np.ndarray]
     """Function of the model's configuration that makes it, where no such file was read."""
     form: Form = SAME
+    optional: bool = False
+    """Whether files may be without it, so that it is written only where it was read."""
 
 
 class Absent(NamedTuple):
@@ -88,6 +90,10 @@ FORMS = {
     ),
     "qkv": Form(lambda q, k, v: (np.concatenate([q, k, v]).T,), lambda w: np.split(w.T, 3)),
     "qkv-bias": Form(lambda q, k, v: (np.concatenate([q, k, v]),), lambda b: np.split(b, 3)),
+    "qkv-layers": Form(
+        lambda *x: (np.concatenate(x[::2]).T, np.concatenate(x[1::2])),
+        lambda w, b: [*itertools.chain(*zip(np.split(w.T, 3), np.split(b, 3), strict=True))],
+    ),
     "qv-bias": Form(
         lambda q, v: (np.concatenate([q, np.zeros_like(q), v]),),
         lambda b: (b[: len(b) // 3], b[2 * len(b) // 3 :]),
@@ -118,27 +124,21 @@ _LAYERS = {
 """Forms of the weights of layers, which may have a bias, by the layer's name."""
 
 
-def _blank_mask(config: Any) -> np.ndarray:
-    return np.zeros((1, config.backbone.dim), np.float32)
+def _zeros(shape: Callable[[Any], tuple[int, ...]], form: Form = SAME) -> Extra:
+    """Return an array that is zero where no file was read, of a shape by the configuration."""
+    return Extra(lambda config: np.zeros(shape(config), np.float32), form)
 
 
-def _ones(config: Any) -> np.ndarray:
-    return np.ones(config.backbone.dim, np.float32)
+def _width(config: Any) -> tuple[int, ...]:
+    return (config.backbone.dim,)
 
 
-def _zeros(config: Any) -> np.ndarray:
-    return np.zeros(config.backbone.dim, np.float32)
+def _mask_shape(config: Any) -> tuple[int, ...]:
+    return (1, config.backbone.dim)
 
 
-def _blank_branch(number: int) -> Callable[[Any], np.ndarray]:
-    """Make the arrays of SAGE's unused branch: two layers, as wide as published."""
-
-    def blank(config: Any) -> np.ndarray:
-        hidden, dim = config.aggregator.hidden, config.backbone.dim
-        shapes = (hidden, dim, 1, 1), (hidden,), (192, hidden, 1, 1), (192,)
-        return np.zeros(shapes[number], np.float32)
-
-    return blank
+def _patch_numbers(config: Any) -> int:
+    return 3 * config.backbone.patch_size**2
 
 
 def _published_periods(config: Any) -> np.ndarray:
@@ -149,14 +149,26 @@ def _published_periods(config: Any) -> np.ndarray:
 
 EXTRAS = {
     "extra-count": Extra(lambda config: np.zeros((), np.int64)),
-    "extra-zero": Extra(lambda config: np.zeros((), np.float32)),
-    "extra-levels": Extra(lambda config: np.zeros(config.aggregator.levels, np.float32)),
-    "extra-mask": Extra(_blank_mask),
-    "extra-ones": Extra(_ones),
-    "extra-zeros": Extra(_zeros),
-    "extra-first-mask": Extra(_blank_mask, FIRST),
+    "extra-dustbin": _zeros(lambda config: ())._replace(optional=True),
+    "extra-levels": _zeros(lambda config: (config.aggregator.levels,)),
+    "extra-mask": _zeros(_mask_shape),
+    "extra-ones": Extra(lambda config: np.ones(_width(config), np.float32)),
+    "extra-zeros": _zeros(_width),
+    "extra-first-mask": _zeros(_mask_shape, FIRST),
     "extra-periods": Extra(_published_periods),
-    **{f"extra-branch-{number}": Extra(_blank_branch(number)) for number in range(4)},
+    # SAGE's unused branch: two layers, as wide as published.
+    "extra-branch-0": _zeros(lambda config: (config.aggregator.hidden, config.backbone.dim, 1, 1)),
+    "extra-branch-1": _zeros(lambda config: (config.aggregator.hidden,)),
+    "extra-branch-2": _zeros(lambda config: (192, config.aggregator.hidden, 1, 1)),
+    "extra-branch-3": _zeros(lambda config: (192,)),
+    # What Pair-VPR's first stage of training predicts masked pixels by, and positions with a row
+    # for the class token, which its code makes of the others.
+    "extra-decoder-mask": _zeros(lambda config: (1, 1, config.aggregator.width)),
+    "extra-decoder-positions": _zeros(
+        lambda config: (1 + config.aggregator.positions, config.aggregator.width)
+    ),
+    "extra-pixels-weight": _zeros(lambda config: (_patch_numbers(config), config.aggregator.width)),
+    "extra-pixels-bias": _zeros(lambda config: (_patch_numbers(config),)),
 }
 """What files have and no descriptor needs, by name."""
 ABSENT = {

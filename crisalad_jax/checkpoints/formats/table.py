@@ -94,7 +94,7 @@ def public_shapes(config: ModelConfig, name: str) -> dict[str, tuple[int, ...]]:
 
 
 def _blank_state(config: ModelConfig, name: str) -> dict[str, np.ndarray]:
-    return _theirs(_blank(config), table(config, name), config, {})
+    return _theirs(_blank(config), table(config, name), config, None)
 
 
 def to_params(
@@ -109,7 +109,7 @@ def to_params(
         InputError: naming `source` and the first names that are missing, unknown or misshaped.
     """
     lines, blank = table(config, name), _blank(config)
-    shapes = {name: array.shape for name, array in _theirs(blank, lines, config, {}).items()}
+    shapes = {name: array.shape for name, array in _theirs(blank, lines, config, None).items()}
     extras = {row.theirs[0] for row in lines if isinstance(row.form, Extra)}
     problems = [f"{theirs} missing" for theirs in shapes.keys() - state.keys() - extras]
     problems += [f"{theirs} unknown" for theirs in state.keys() - shapes.keys()]
@@ -149,14 +149,17 @@ def to_state(
 
 
 def _theirs(
-    leaves: State, lines: list[Row], config: ModelConfig, extras: State
+    leaves: State, lines: list[Row], config: ModelConfig, extras: State | None
 ) -> dict[str, np.ndarray]:
+    """Return their arrays; without extras, all that a file may have, with their initial values."""
     ours, state = _numbered(leaves), {}
     for row in lines:
         if isinstance(row.form, Form):
             state |= zip(row.theirs, row.form.theirs(*map(ours.get, row.ours)), strict=True)
         elif isinstance(row.form, Extra):
-            extra = extras.get(row.ours[0])
+            extra = (extras or {}).get(row.ours[0])
+            if extra is None and extras is not None and row.form.optional:
+                continue
             array = row.form.initial(config) if extra is None else extra
             (state[row.theirs[0]],) = row.form.form.theirs(array)
     return state

@@ -21,6 +21,9 @@ from crisalad_jax.utils.locks import lock
 _ROOM = 2.1
 """Room on the disk by the size of the download: the archive, and what it holds."""
 
+_LAYOUTS = ("images", "train_val")
+"""Folders that belong to a layout, where others around a set do not."""
+
 
 @takes(to=PATH)
 def fetch_set(name: str, to: str | os.PathLike[str], *, quiet: bool = False) -> pathlib.Path:
@@ -56,8 +59,8 @@ def fetch_set(name: str, to: str | os.PathLike[str], *, quiet: bool = False) -> 
     )
     check_new_folder(to)
     require(not is_offline(), f"{name}: {OFFLINE} forbids the network")
-    _check_room(published, to)
     work = to.with_name(f"{to.name}.part")
+    _check_room(published, to, work)
     with locate_errors(before=f"{name}: "), lock(work):
         made = work / "made"
         with wrap_os_errors(work):
@@ -69,10 +72,15 @@ def fetch_set(name: str, to: str | os.PathLike[str], *, quiet: bool = False) -> 
     return to
 
 
-def _check_room(published: PublishedSet, to: pathlib.Path) -> None:
-    """Check that the disk has room for the files and what they hold, where their size is known."""
+def _check_room(published: PublishedSet, to: pathlib.Path, work: pathlib.Path) -> None:
+    """Check that the disk has room for the files and what they hold, where their size is known.
+
+    What an earlier call has brought takes its room already.
+    """
     nearest = next(each for each in to.absolute().parents if each.exists())
-    free, needed = shutil.disk_usage(nearest).free / 1e9, (published.gigabytes or 0) * _ROOM
+    there = sum(path.stat().st_size for path in work.rglob("*") if path.is_file())
+    free = (shutil.disk_usage(nearest).free + there) / 1e9
+    needed = (published.gigabytes or 0) * _ROOM
     require(
         free > needed,
         f"{to}: found {free:.1f} GB of free disk, expected {needed:.1f} GB for {published.name} "
@@ -120,7 +128,7 @@ def _rsync(address: str, folder: pathlib.Path, *, quiet: bool) -> None:
     """Copy a folder by the program rsync, which resumes where it was cut off."""
     require(shutil.which("rsync") is not None, f"{address}: found no program rsync, expected one")
     shown = ["--quiet"] if quiet else ["--info=progress2"]
-    command = ["rsync", "-rz", "--partial", *shown, f"{address}/", str(folder)]
+    command = ["rsync", "-rtz", "--partial", *shown, f"{address}/", str(folder)]
     done = subprocess.run(command, check=False, stderr=subprocess.PIPE, text=True)
     if done.returncode:
         said = (done.stderr.strip().splitlines() or ["no words"])[-1]
@@ -181,7 +189,7 @@ def _top(folder: pathlib.Path) -> pathlib.Path:
     """Return the folder that holds a set: archives have one around it, or none."""
     while True:
         there = [path for path in folder.iterdir() if not path.name.startswith((".", "__MACOSX"))]
-        if len(there) != 1 or not there[0].is_dir():
+        if len(there) != 1 or not there[0].is_dir() or there[0].name in _LAYOUTS:
             return folder
         folder = there[0]
 

@@ -105,7 +105,10 @@ def _read() -> Iterator[PublishedSet]:
     path = pathlib.Path(__file__).with_name("sets.toml")
     table = tomllib.loads(path.read_text(encoding="utf-8"))
     for fields in table["set"]:
-        known = {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}
+        known: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in fields.items()
+        }
         known["files"] = tuple(SetFile(**each) for each in fields.get("files", ()))
         known["parts"] = tuple(SetPart(**each) for each in fields.get("parts", ()))
         known["sources"] = tuple(table["sources"].get(each, each) for each in fields["sources"])

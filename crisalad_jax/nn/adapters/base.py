@@ -56,7 +56,7 @@ class Adapter(Part, abc.ABC):
     """Number of the last blocks that have an adapter, with parameters; None is all blocks."""
     paths = 1  # the same
     """Number of side paths, of an adapter with a `side_path`. Where it is above 1, `init` returns a
-    tuple: the parameters of each path. The features of the second are `Features.second`."""
+    tuple: the parameters of each path. `FeatureSpec.path` says which one runs."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray, shape: BlockShape) -> Any:

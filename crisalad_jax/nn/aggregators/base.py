@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import jax
@@ -129,6 +129,15 @@ class Aggregator(Part, abc.ABC):
             features: unit features.
         """
         raise NotImplementedError
+
+    def with_frequencies(self, params: Any, images: Sequence[Any]) -> Any:
+        """Return parameters with weights by how many images have each centroid; by default none.
+
+        Args:
+            params: of `from_centroids`.
+            images: unit features of each image, (feature, dim).
+        """
+        return params
 
     def centroid_features(self, features: FeatureRows) -> Float[Array, "feature reduced"]:
         """Return what k-means makes its centroids of; by default the unit features themselves."""

@@ -208,7 +208,7 @@ class Fol(Salad):
     """SALAD's parameters, and two transposed convolutions of 3 x 3 for local features."""
 
     upconv1: Conv = dataclasses.field(kw_only=True)
-    """Part of the public files, as `upconv2`; no descriptor needs it."""
+    """Makes local features for re-ranking, with `upconv2`; no descriptor needs it."""
     upconv2: Conv = dataclasses.field(kw_only=True)
 
 

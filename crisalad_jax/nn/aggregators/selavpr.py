@@ -9,6 +9,7 @@ from crisalad_jax.config.checks import PositiveInt
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.gem import START, gem
+from crisalad_jax.nn.aggregators.salad import Fol
 from crisalad_jax.nn.backbones.base import Backbone, Features, Grid, Patches
 from crisalad_jax.nn.convolutions import Map
 from crisalad_jax.nn.layers import (
@@ -77,7 +78,7 @@ class SelaVprConfig(Aggregator):
 
 
 def local_features(
-    params: SelaVpr, patches: Patches, grid: Grid
+    params: SelaVpr | Fol, patches: Patches, grid: Grid
 ) -> Float[Array, "*batch rows columns local"]:
     """Upsample the patch grid twice, with a ReLU between, to unit features in float32 at least.
 

@@ -13,7 +13,7 @@ from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.aggregators.gem import START, gem
 from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
-from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise, linear
+from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, linear
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -84,8 +84,8 @@ class SelaVprPpHashConfig(SelaVprPpConfig):
     """Width of the descriptor, and so number of its bits."""
 
     def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches of both side paths."""
-        return FeatureSpec(second=True)
+        """Request the last patches of the second side path."""
+        return FeatureSpec(path=1)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of a global token."""
@@ -101,13 +101,8 @@ class SelaVprPpHashConfig(SelaVprPpConfig):
     def apply(
         self, params: SelaVprPpHash, features: Features, grid: Grid, *, key: Keys | None
     ) -> Tokens:
-        """Return the second path's output; in training, for a loss, also the first one's."""
-        assert features.second is not None
-        tokens = Tokens.of_global(head(params.hash, features.second))
-        if key is None:
-            return tokens
-        real = l2_normalise(head(params.real, features.patches))
-        return tokens._replace(dense=real[..., None, :])
+        """Return the output of the second path's head, which is scaled to unit length later."""
+        return Tokens.of_global(head(params.hash, features.patches))
 
 
 def init_head(key: PRNGKeyArray, dim: int, width: int) -> SelaVprPp:

@@ -35,8 +35,6 @@ class Features(NamedTuple):
     class_attention: Float[Array, "*batch patch"] | None = None
     """Share of each patch in the class token's attention, summed over the last block's heads, in
     float32 at least; None where `FeatureSpec.class_attention` does not ask for it."""
-    second: Patches | None = None
-    """`patches` of the second of two side paths; None where the adapters have no such path."""
 
 
 @short_repr()
@@ -56,8 +54,8 @@ class FeatureSpec:
     """Whether the class token is used, which not every backbone has."""
     class_attention: bool = False
     """Whether the class token's attention in the last block is used."""
-    second: bool = False
-    """Whether the patches of a second side path are used, which adapters of two have."""
+    path: int = 0
+    """Number of the adapters' side path, from 0, whose tokens are the features."""
     insertion: int | None = None
     """Number of blocks after which the aggregator's own tokens are put in front of all others.
     None where it has none."""
@@ -103,6 +101,10 @@ class Backbone(Part, abc.ABC):
     """Whether its features can have the class token's attention, or facets of attention."""
     exposes_levels: ClassVar[bool] = True
     """Whether its features can be those after other blocks than the last."""
+    local_features: ClassVar[str | None] = None
+    """Features that photographs become on the host, in place of pixels: "sift" or "orb"."""
+    binary: ClassVar[bool] = False
+    """Whether the numbers of its features have two values, as those of visual words then have."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray) -> Any:
@@ -129,6 +131,11 @@ class Backbone(Part, abc.ABC):
         Raises:
             InputError: while tracing, for a request that this backbone cannot meet.
         """
+
+    @property
+    def encoded_size(self) -> tuple[int, int] | None:
+        """Height and width of the bytes of `local_features`; None where it takes pixels."""
+        return None
 
     @property
     def side_paths(self) -> int:

@@ -302,7 +302,7 @@ class VisionTransformer(Backbone):
             if not is_whole and len(ends) == len(stacks) == 1:
                 part, count = stacks, end
             tokens, statistics = run_blocks(
-                part, tokens, grid, self, remat=remat, valid=valid, count=count
+                part, tokens, grid, self, remat=remat, valid=valid, count=count, path=request.path
             )
             measured += statistics
             if end in levels:
@@ -319,16 +319,11 @@ class VisionTransformer(Backbone):
                 attended = _class_attention(_block_at(stacks, end), tokens, grid, self)
         if request.norm:
             outputs = [layer_norm(params.norm, x, epsilon=self.norm_epsilon) for x in outputs]
-        second = None
-        if self.adapter.paths > 1:
-            (outputs[-1], second), start = outputs[-1], 1 + self.registers
-            second = second[:, start:]
         features = Features(
             outputs[-1][:, front],
             jnp.concatenate([x[:, front + 1 + self.registers :] for x in outputs], axis=-1),
             None if request.inserted is None else outputs[-1][:, :front],
             attended,
-            second,
         )
         return features, params if valid is None else _statistics(params, measured)
 
@@ -596,10 +591,11 @@ def run_blocks(
     remat: str = "dots",
     valid: Valid = None,
     count: int | None = None,
-) -> tuple[Float[Array, "*path image token dim"], list[Block]]:
+    path: int = 0,
+) -> tuple[TokenBatch, list[Block]]:
     """Run stacks of blocks in turn, each with one compiled body.
 
-    An adapter may have paths of its own, from which the tokens then come (`Adapter.side_path`), or
+    An adapter may have a path of its own, from which the tokens then come (`Adapter.side_path`), or
     put prompts in front, which are dropped in the end.
     Between the first and the last block the tokens are padded
     as `attention` needs them on this platform.
@@ -613,10 +609,10 @@ def run_blocks(
         valid: see `VisionTransformer.apply`.
         count: number of first blocks of a single stack that are run; None is all. They are indexed,
             because a slice of the stack would copy its weights.
+        path: number of the adapters' side path that is run.
 
     Returns:
-        (tokens, statistics): with several side paths the first has a leading axis of these; the
-        second has a stack of running statistics for each of `stacks`.
+        (tokens, statistics): the second has a stack of running statistics for each of `stacks`.
     """
     front = 0
     if config.adapter.has_prompts:
@@ -630,29 +626,30 @@ def run_blocks(
     length = real if padding else None
     tokens = jnp.pad(tokens, ((0, 0), (0, padding), (0, 0))) if padding else tokens
 
-    def body(carry: tuple[Array, tuple[Array, ...]], layer: Block) -> tuple[Any, Block]:
-        tokens, sides = carry
+    def body(carry: tuple[Array, Array | None], layer: Block) -> tuple[Any, Block]:
+        tokens, side = carry
         if front:
             tokens = _with_prompts(tokens, layer, config)
         tokens, statistics = block(layer, tokens, grid, config, length=length, valid=valid)
-        if sides:
-            several, layer = len(sides) > 1, merge_statistics(statistics, layer)
+        if side is not None:
+            layer = merge_statistics(statistics, layer)
+            own = layer.adapter if config.adapter.paths == 1 else layer.adapter[path]
             with jax.named_scope("adapter"):
-                found = [
-                    config.adapter.side_path(own, side, tokens, grid, length=length, valid=valid)
-                    for own, side in zip(
-                        layer.adapter if several else (layer.adapter,), sides, strict=True
-                    )
-                ]
-            after, updated = zip(*found, strict=True)
-            expect_like(f"adapter {config.adapter.part_name}", after, sides)
-            layer = dataclasses.replace(layer, adapter=updated if several else updated[0])
-            sides, (statistics, _) = after, split_statistics(layer)
-        return (tokens, sides), statistics
+                after, updated = config.adapter.side_path(
+                    own, side, tokens, grid, length=length, valid=valid
+                )
+            expect_like(f"adapter {config.adapter.part_name}", after, side)
+            if config.adapter.paths > 1:
+                updated = (*layer.adapter[:path], updated, *layer.adapter[path + 1 :])
+            side, (statistics, _) = (
+                after,
+                split_statistics(dataclasses.replace(layer, adapter=updated)),
+            )
+        return (tokens, side), statistics
 
     # prevent_cse=False: inside a scan, CSE cannot undo the remat.
     body = jax.checkpoint(body, prevent_cse=False, policy=_POLICIES[remat])
-    sides, statistics = (), []
+    side, statistics = None, []
     with jax.named_scope("blocks"):
         for stack in stacks:
             size, first = len(stack.ls1), _unadapted(stack)
@@ -662,24 +659,20 @@ def run_blocks(
                 if start >= stop:
                     continue
                 part = dataclasses.replace(stack, adapter=None) if start < first else stack
-                if start == first and config.adapter.has_side_path and not sides:
-                    sides = (tokens,) * config.adapter.paths
+                if start == first and config.adapter.has_side_path and side is None:
+                    side = tokens
                 if is_whole:
-                    (tokens, sides), measured = jax.lax.scan(body, (tokens, sides), part)
+                    (tokens, side), measured = jax.lax.scan(body, (tokens, side), part)
                 else:
                     # Slices of a stack would copy its weights.
-                    (tokens, sides), measured = jax.lax.scan(
+                    (tokens, side), measured = jax.lax.scan(
                         lambda carry, at, part=part: body(carry, _layer_at(part, at)),
-                        (tokens, sides),
+                        (tokens, side),
                         jnp.arange(start, stop),
                     )
                 if start == first:
                     statistics.append(measured)
-    if len(sides) > 1:
-        tokens = jnp.stack(sides)
-    elif sides:
-        (tokens,) = sides
-    return tokens[..., front:length, :], statistics
+    return (tokens if side is None else side)[:, front:length], statistics
 
 
 def _with_prompts(tokens: TokenBatch, layer: Block, config: VisionTransformer) -> TokenBatch:
@@ -820,11 +813,19 @@ def interpolate_positions(
     registers use torch's bicubic (a = -0.75) with the scale (size + 0.1) / grid. Models with
     registers use its antialiased one (a = -0.5) at the exact scale, but see `position_resize`.
     """
+    antialias = config.registers and config.position_resize == "dinov2"
+    return resize_grid(positions, grid, _antialias_weights if antialias else bicubic_weights)
+
+
+def resize_grid(
+    positions: Float[Array, "grid grid dim"],
+    grid: Grid,
+    weights: Callable[[int, int], Float[np.ndarray, "target source"]],
+) -> Float[Array, "rows columns dim"]:
+    """Resize a square grid by the weights of each side."""
     side = positions.shape[0]
     if grid == (side, side):
         return positions
-    antialias = config.registers and config.position_resize == "dinov2"
-    weights = _antialias_weights if antialias else _bicubic_weights
     rows, columns = (jnp.asarray(weights(side, size), positions.dtype) for size in grid)
     return jnp.einsum("ri,cj,ijd->rcd", rows, columns, positions, precision="highest")
 
@@ -838,9 +839,12 @@ def _cubic(x: np.ndarray, a: float) -> np.ndarray:
 
 
 @functools.cache
-def _bicubic_weights(source: int, target: int) -> np.ndarray:
-    """Compute (target, source) weights of torch's bicubic upsampling, with replicated borders."""
-    scale = source / (target + 0.1)
+def bicubic_weights(source: int, target: int, more: float = 0.1) -> np.ndarray:
+    """Compute (target, source) weights of torch's bicubic upsampling, with replicated borders.
+
+    The scale is that of a target longer by `more`, as DINOv2 has it.
+    """
+    scale = source / (target + more)
     centres = (np.arange(target) + 0.5) * scale - 0.5
     weights = np.zeros((target, source))
     for row, centre in enumerate(centres):

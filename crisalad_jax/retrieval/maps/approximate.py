@@ -106,13 +106,15 @@ def stale_kind(folder: pathlib.Path, additions: Additions) -> str | None:
     return found[0].stem.rpartition("-")[0]
 
 
-def check_search(kind: str, store: str) -> None:
+def check_search(kind: str, store: str, dtype: str) -> None:
     """Check that the descriptors in a store can be searched so.
 
     Raises:
-        InputError: an unknown kind, or an approximate search of descriptors in Milvus.
+        InputError: an unknown kind, or an approximate search of bits or of descriptors in Milvus.
     """
     choose("search", kind, SEARCHES)
+    if kind != "exact" and dtype == "bits":
+        raise InputError(f"search: found {kind} of bits, expected exact, which takes them alone")
     if kind != "exact" and store != "files":
         raise InputError(f"search: found {kind}, expected exact, as {store} is searched by Milvus")
 

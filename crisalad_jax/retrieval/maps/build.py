@@ -101,7 +101,7 @@ def index(
     fps: float | None = None,
     positions: Positions | str | os.PathLike[str] | None = None,
     store: str | None = None,
-    dtype: Literal["float32", "float16"] | None = None,
+    dtype: Literal["float32", "float16", "bits"] | None = None,
     pca: Pca | str | os.PathLike[str] | None = None,
     search: Literal["exact", "hnsw", "ivf-pq"] | None = None,
     share: str | None = None,
@@ -124,7 +124,8 @@ def index(
             is a table; else what @UTM names say; else what the EXIF data of JPEGs says. Names of
             several zones of UTM give degrees, or metres of the map's zone.
         store: "files", or "milvus:URI". None is the map's, and of a new map "files".
-        dtype: type of the stored descriptors. None is the map's, and of a new map "float32".
+        dtype: type of the stored descriptors; "bits" stores their signs (`pack_bits`), which are
+            searched by the Hamming distance. None is the map's, and of a new map "float32".
         pca: components that shorten the descriptors, or a file of them, of which the map stores a
             copy. None is the map's, and of a new map none.
         search: the approximate search that is built from the map's descriptors; "exact" removes
@@ -173,7 +174,7 @@ def index(
         _check_settings(metadata, out, describer.config, dtype, store, components)
         components = read_components(out, metadata)
     if search is not None:
-        check_search(search, metadata.store)
+        check_search(search, metadata.store, metadata.dtype)
     if table is None and not known.of:
         known = None
     fitted = reading.fitted(len(source.paths))
@@ -183,6 +184,12 @@ def index(
     else:
         with open_for_appending(out, metadata, components) as target:
             result = work.into(target)
+    if result.added == result.images and describer.config.cross_image.attends:
+        warn(
+            f"{out}: a map describes each image alone, and this model attends across images: "
+            "recalls that are published for batches are not the map's (`crisalad evaluate "
+            "--grouping single` measures those of single images)"
+        )
     return result if table is not None else result._replace(stay=0)
 
 

@@ -7,7 +7,16 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from crisalad_jax.retrieval.chunks import Block, Descriptors, Queries, blocks, gathered, joined
+from crisalad_jax.retrieval.bits import Bits, nearest_bits
+from crisalad_jax.retrieval.chunks import (
+    BITS,
+    Block,
+    Descriptors,
+    Queries,
+    blocks,
+    gathered,
+    joined,
+)
 from crisalad_jax.retrieval.neighbours import QUERY_CHUNK, Neighbours, nearest
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source, npy_header, write_npy
@@ -71,8 +80,11 @@ class FileStore:
         # Without what a `memmap` does at each indexing.
         return np.memmap(path, self._dtype, "r", len(header), shape).view(np.ndarray)
 
-    def search(self, queries: Queries, k: int, count: int) -> Neighbours:
+    def search(self, queries: Queries | Bits, k: int, count: int) -> Neighbours:
         """Find the k most similar descriptors of each query; see `Store.search`."""
+        if self._dtype == BITS:
+            parts = (self._open(first) for first in self._counts if first < count)
+            return nearest_bits(parts, queries, k)
         size = max(1, _BLOCK // max(self._length, min(len(queries), QUERY_CHUNK)))
 
         def files() -> Iterator[Block]:

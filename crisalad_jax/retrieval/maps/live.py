@@ -21,7 +21,7 @@ from crisalad_jax.retrieval.maps.query import (
     json_rows,
     json_text,
 )
-from crisalad_jax.retrieval.sequence import BayesFilter
+from crisalad_jax.retrieval.maps.tracking import SequenceSearch
 from crisalad_jax.utils.output import counted
 
 if TYPE_CHECKING:  # answers are searched without JAX
@@ -55,7 +55,7 @@ def query_live(
     k: int = 5,
     window: int = 1,
     min_similarity: float | None = None,
-    sequence: BayesFilter | None = None,
+    sequence: SequenceSearch | None = None,
     ready: Callable[[], None] = lambda: None,
     check: Callable[[], None] = lambda: None,
 ) -> Iterator[LiveAnswer]:

@@ -26,6 +26,7 @@ from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import AXES, Positions
+from crisalad_jax.retrieval.bits import sign_vectors, to_bits
 from crisalad_jax.retrieval.chunks import Descriptors, Queries, as_unit_rows
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import (
@@ -84,7 +85,7 @@ class Answer(NamedTuple):
     rank: int
     """Rank from 1, the most similar."""
     similarity: float
-    """Cosine of the two descriptors."""
+    """Cosine of the two descriptors; of bits 1 - 2 h / d, where h of the d bits differ."""
     image: MapImage
     """The image: its name, and where it was taken."""
     probability: float | None = None
@@ -196,16 +197,17 @@ class Map:
 
     @classmethod
     def _opened(cls, folder: pathlib.Path, metadata: MapMetadata) -> Self:
+        length, dtype = metadata.row
         store = open_store(
             metadata.store,
             folder,
             collection=metadata.collection,
-            length=metadata.descriptor_length,
-            dtype=metadata.dtype,
+            length=length,
+            dtype=dtype,
             new=not has_images(folder),
         )
         try:
-            return cls(folder, metadata, Segments(folder / SEGMENTS, store, metadata.dtype))
+            return cls(folder, metadata, Segments(folder / SEGMENTS, store, dtype))
         except BaseException:
             store.close()
             raise
@@ -220,8 +222,8 @@ class Map:
 
     def __repr__(self) -> str:
         """Return one line for a notebook."""
-        length = self.metadata.descriptor_length
-        return f"Map({str(self.folder)!r}: {len(self)} images, {length} numbers each)"
+        length = self.metadata.length_words
+        return f"Map({str(self.folder)!r}: {len(self)} images, {length} each)"
 
     def __len__(self) -> int:
         """Return the number of images."""
@@ -279,11 +281,13 @@ class Map:
     def search(self, queries: Queries, k: int, *, exact: bool = False) -> Neighbours:
         """Find the k most similar images of each query, best first; all where there are fewer.
 
-        Search is exact, by inner product; of equal similarities the earlier image stands first.
+        Search is exact, by inner product, or by equal bits in a map of these; of equal similarities
+        the earlier image stands first.
         A map with an approximate search finds nearly all of them. Their similarities are exact.
 
         Args:
-            queries: unit descriptors, of the map's model, shortened by its `components`.
+            queries: unit descriptors, of the map's model, shortened by its `components`. A map of
+                bits takes those of any length, and packed bits.
             k: neighbours per query.
             exact: whether to search exactly although the map has an approximate search.
 
@@ -292,7 +296,7 @@ class Map:
                 below 1; or the store is damaged or gone.
         """
         check_count("k", k)
-        queries = self._unit_rows("queries", queries)
+        queries = self._rows("queries", queries)
         k = min(k, len(self))
         if self._approximate is not None and not exact:
             return self._approximate.search(queries, k, len(self))
@@ -324,9 +328,9 @@ class Map:
             an exact search.
 
         Raises:
-            InputError: an unknown kind, too few images, or a map in Milvus.
+            InputError: an unknown kind, too few images, or a map of bits or in Milvus.
         """
-        check_search(kind, self.metadata.store)
+        check_search(kind, self.metadata.store, self.metadata.dtype)
         self._approximate = build_approximate(self.folder, kind, self._segments, quiet=quiet)
         return None if self._approximate is None else self._approximate.recall
 
@@ -381,17 +385,20 @@ class Map:
         """Compute the similarities of queries to all images, in the order of the images.
 
         Args:
-            queries: unit descriptors, of the map's model.
+            queries: as `search` takes them.
 
         Raises:
             InputError: as `search`.
         """
-        queries = self._unit_rows("queries", queries)
+        queries = self._rows("queries", queries)
+        queries = sign_vectors(queries) if self.metadata.is_bits else queries
         parts = [queries @ part.astype(np.float32, copy=False).T for part in self.descriptors]
         return np.concatenate(parts, axis=1)
 
-    def _unit_rows(self, name: str, rows: Descriptors) -> Float32[np.ndarray, "n d"]:
-        return as_unit_rows(rows, name, self.metadata.descriptor_length)
+    def _rows(self, name: str, rows: Descriptors) -> Any:
+        """Check descriptors, and return them as they are compared: unit vectors or packed bits."""
+        convert = to_bits if self.metadata.is_bits else as_unit_rows
+        return convert(rows, name, self.metadata.descriptor_length)
 
     def fitted(self, names: Iterable[str], positions: Positions | None) -> Positions | None:
         """Return the positions of new images in the map's axes; None where none of them has one.
@@ -418,7 +425,7 @@ class Map:
         Args:
             names: relative to `root`, none of which the map has.
             sizes: of their files, in bytes.
-            descriptors: unit vectors; kept as the map's type.
+            descriptors: unit vectors, or what else `search` takes; stored as the map's type.
             root: the folder of these images.
             positions: where they were taken, as far as that is known; those of another zone of UTM
                 become the map's.
@@ -430,7 +437,7 @@ class Map:
         """
         if not self.exists:
             raise InputError(f"{self.folder}: found the opened map gone, expected it in this place")
-        descriptors = self._unit_rows("descriptors", descriptors)
+        descriptors = self._rows("descriptors", descriptors)
         if twice := len(names) - len(set(names) - self._numbers.keys()):
             raise InputError(
                 f"{self.folder}: found {twice} of {len(names)} names twice, or in the map already, "
@@ -453,8 +460,9 @@ class Map:
 
     @property
     def descriptors(self) -> Iterator[Descriptors]:
-        """Descriptors in order, one array for each addition."""
-        return self._segments.blocks()
+        """Descriptors in order, one array for each addition; of bits, unit vectors of the signs."""
+        blocks = self._segments.blocks()
+        return map(sign_vectors, blocks) if self.metadata.is_bits else blocks
 
     def verify(self) -> None:
         """Read all descriptors, and compare them with the digests in the records.
@@ -486,7 +494,7 @@ class Map:
             "axes": self.axes,
             **contents(self),
             "zone": self.zone and str(self.zone),
-            "descriptor": f"{metadata.descriptor_length} numbers, {metadata.dtype}",
+            "descriptor": f"{metadata.length_words}, {metadata.dtype}",
             "image_size": list(self.config.image_size),
             "resize": self.config.images_in_words,
             "grouping": metadata.grouping,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from crisalad_jax.checkpoints.runtime import read_header
 from crisalad_jax.checkpoints.starter import FILES, recorded, resolved
 from crisalad_jax.config.io import from_plain, to_plain
+from crisalad_jax.retrieval.bits import check_packable
 from crisalad_jax.retrieval.maps.store import check_store, store_name
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened
 from crisalad_jax.utils.errors import InputError
@@ -50,7 +51,7 @@ class MapMetadata:
     store: str = "files"
     """Where descriptors are stored; see `store.store_name`."""
     dtype: str = "float32"
-    """Type of the stored descriptors."""
+    """Type of the stored descriptors, of `store.DTYPES`."""
     grouping: str = "single"
     """Every image is described independently, so that no descriptor depends on neighbours."""
     collection: str = dataclasses.field(default="", compare=False)
@@ -65,6 +66,22 @@ class MapMetadata:
     def __post_init__(self) -> None:
         """Check the store."""
         check_store(self.store, self.dtype)
+
+    @property
+    def is_bits(self) -> bool:
+        """Whether descriptors are stored, and compared, as bits."""
+        return self.dtype == "bits"
+
+    @property
+    def row(self) -> tuple[int, str]:
+        """Length and type of a descriptor's row in the store."""
+        length = self.descriptor_length
+        return (length // 8, "uint8") if self.is_bits else (length, self.dtype)
+
+    @property
+    def length_words(self) -> str:
+        """Length of a descriptor in words."""
+        return f"{self.descriptor_length} {'bits' if self.is_bits else 'numbers'}"
 
 
 def model_config(metadata: MapMetadata, folder: str | os.PathLike[str]) -> "ModelConfig":
@@ -91,10 +108,13 @@ def new_metadata(
 
     Raises:
         InputError: the model's descriptors are not unit vectors, or its components make none or are
-            of another length; what `check_store` raises.
+            of another length; bits of a length that is not a multiple of 8; what `check_store`
+            raises.
     """
     check_store(store, dtype)
-    length, _ = shortened(pca, describer, str(weights), unit=True)
+    length, _ = shortened(pca, describer, str(weights), unit=dtype != "bits")
+    if dtype == "bits":
+        check_packable(length, "dtype")
     return MapMetadata(
         model=describer.digest,
         weights=recorded(weights),

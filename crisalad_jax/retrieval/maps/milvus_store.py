@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from crisalad_jax.retrieval.bits import Bits
 from crisalad_jax.retrieval.chunks import Descriptors, Queries
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
@@ -162,7 +163,7 @@ class MilvusStore:
             found |= {row["id"]: row["descriptor"] for row in part}
         return np.array([found[number] for number in range(first, first + count)], np.float32)
 
-    def search(self, queries: Queries, k: int, count: int) -> Neighbours:
+    def search(self, queries: Queries | Bits, k: int, count: int) -> Neighbours:
         """Find the k most similar descriptors of each query; see `Store.search`."""
         if k > _MOST:
             raise InputError(f"k: found {k}, expected at most {_MOST}, of which Milvus gives")

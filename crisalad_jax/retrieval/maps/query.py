@@ -24,9 +24,8 @@ from crisalad_jax.retrieval.describe import (
 )
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage, ranked
-from crisalad_jax.retrieval.maps.tracking import SequenceTracker, TrackResult
+from crisalad_jax.retrieval.maps.tracking import SequenceSearch, SequenceTracker, TrackResult
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.shapes import Bool, Float32, Float64
 
@@ -104,7 +103,7 @@ def query(
     window: int = 1,
     exact: bool = False,
     min_similarity: float | None = None,
-    sequence: BayesFilter | None = None,
+    sequence: SequenceSearch | None = None,
     reading: Reading = Reading(),
 ) -> Answers:
     """Find the images of a map that are most similar to others.
@@ -174,7 +173,7 @@ Ask = Callable[[Float32[np.ndarray, "query d"], Sequence[pathlib.Path]], Neighbo
 """Finds the answers to described images, given their names too."""
 
 
-def asking(places: Map, k: int, sequence: BayesFilter | None, *, exact: bool = False) -> Ask:
+def asking(places: Map, k: int, sequence: SequenceSearch | None, *, exact: bool = False) -> Ask:
     """Return what asks a map for k answers: its search, or a filter over consecutive frames."""
     if sequence is None:
         return lambda descriptors, _: places.search(descriptors, k, exact=exact)

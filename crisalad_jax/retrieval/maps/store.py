@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from crisalad_jax.retrieval.bits import Bits
 from crisalad_jax.retrieval.chunks import Descriptors, Queries
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.milvus_store import MilvusStore, check_address
@@ -19,8 +20,8 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.shapes import Float
 
-DTYPES = ("float32", "float16")
-"""Types that descriptors may be stored as."""
+DTYPES = ("float32", "float16", "bits")
+"""Types that descriptors may be stored as; bits are their signs (`retrieval.bits`)."""
 _MILVUS = "milvus:"
 
 
@@ -37,8 +38,10 @@ class Store(Protocol):
         """Read the descriptors that were added together as numbers `first` and on."""
         ...
 
-    def search(self, queries: Queries, k: int, count: int) -> Neighbours:
-        """Find the k nearest of numbers below `count`, exactly, by inner product; 1 <= k <= count.
+    def search(self, queries: Queries | Bits, k: int, count: int) -> Neighbours:
+        """Find the k nearest of numbers below `count`, exactly; 1 <= k <= count.
+
+        They are compared by inner product, packed bits by those that are equal.
 
         Of equal similarities the lower number stands first, also at the k-th place.
         """
@@ -85,8 +88,8 @@ def open_store(
         name: the store.
         folder: the map's.
         collection: what Milvus keeps this map's descriptors under.
-        length: numbers in a descriptor.
-        dtype: of the files.
+        length: numbers in a stored row.
+        dtype: of the files, "uint8" of packed bits.
         new: whether the store is made anew, in place of one that a kill left unfinished.
 
     Raises:

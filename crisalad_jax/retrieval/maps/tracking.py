@@ -1,10 +1,10 @@
-"""Answers of a map to consecutive frames of one camera, by a filter over its images in order."""
+"""Answers of a map to consecutive frames of one camera, by a search over its images in order."""
 
 import itertools
 import math
 import pathlib
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,10 +13,13 @@ from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.positions import AXES, utm_positions
 from crisalad_jax.data.video import moment_of
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.retrieval.sequence import BayesFilter, SequenceState
+from crisalad_jax.retrieval.seqslam import SeqSlam
+from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float32, Float64, Int64
 
+SequenceSearch = BayesFilter | SeqSlam
+"""What finds a camera by its frames so far."""
 _NUMBERS = 2**25
 """Similarities computed at a time: 128 MiB."""
 _GAP = 1e9
@@ -41,13 +44,14 @@ class TrackResult(NamedTuple):
 class SequenceTracker:
     """A camera that is followed through a map, a few frames at a time."""
 
-    def __init__(self, places: Map, bayes: BayesFilter) -> None:
+    def __init__(self, places: Map, search: SequenceSearch) -> None:
         """Begin a sequence in a map, whose descriptors are read twice."""
-        self._map, self._filter = places, bayes
+        self._map = places
+        self._filter: Any = search
         total = sum(part.sum(axis=0, dtype=np.float64) for part in places.descriptors)
         mean = total / len(places)
         common = [part.astype(np.float64) @ mean for part in places.descriptors]
-        self.state: SequenceState = bayes.start(np.concatenate(common))
+        self.state = self._filter.start(np.concatenate(common))
         self._read: Callable[[str], _Spot | None] | None = None
         self._before: _Spot | None = None
 
@@ -71,7 +75,7 @@ class SequenceTracker:
         Raises:
             InputError: what `Map.similarities` raises.
         """
-        if self.state.frames == 0:
+        if self.state.frames == 0 and not self._filter.counts_images:
             self._choose_unit(frames)
         found = []
         step = max(1, _NUMBERS // len(self._map))

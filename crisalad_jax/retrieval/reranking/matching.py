@@ -1,5 +1,6 @@
 """Matches of two images' patches, and the scores of SelaVPR and TransVPR that count them."""
 
+import dataclasses
 import functools
 import math
 
@@ -10,11 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from crisalad_jax.nn.aggregators.selavpr import SelaVpr, SelaVprConfig, local_features
-from crisalad_jax.nn.aggregators.selavprpp import SelaVprPpHash, SelaVprPpHashConfig, head
+from crisalad_jax.nn.aggregators.selavprpp import (
+    SelaVprPpConfig,
+    SelaVprPpHash,
+    SelaVprPpHashConfig,
+)
 from crisalad_jax.nn.aggregators.transvpr import TransVpr, TransVprConfig, key_features
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.layers import l2_normalise
-from crisalad_jax.nn.model import AnyArray, Crisalad, Images, extract_features
+from crisalad_jax.nn.model import AnyArray, Crisalad, Images, describe, extract_features
 from crisalad_jax.utils import compiler
 
 Features = Float[np.ndarray, "*candidate feature dim"]
@@ -28,12 +32,12 @@ _LEAST_MATCHES = 4
 
 
 def mutual_matches(
-    query: Float[AnyArray, "m d"], candidate: Float[AnyArray, "n d"]
+    query: Float[AnyArray, "m d"], candidate: Float[AnyArray, "n d"], above: float = -math.inf
 ) -> Int[Array, " m"]:
     """Match patches that are each other's nearest: for each of the query's, the candidate's.
 
     The nearest patch has the largest inner product; of equal ones it is the first. The result is
-    -1 where there is no match. Patches of zeros match nothing.
+    -1 where there is no match of a product larger than `above`. Patches of zeros match nothing.
     """
     query, candidate = query.astype(jnp.float32), candidate.astype(jnp.float32)
     products = jnp.matmul(query, candidate.T, precision=jax.lax.Precision.HIGHEST)
@@ -41,7 +45,7 @@ def mutual_matches(
     products = jnp.where(ours[:, None] & theirs, products, -jnp.inf)
     forward, backward = products.argmax(axis=1), products.argmax(axis=0)
     mutual = backward[forward] == jnp.arange(len(query))
-    return jnp.where(mutual & ours & theirs[forward], forward, -1)
+    return jnp.where(mutual & (products.max(axis=1) > above), forward, -1)
 
 
 def spatial_score(matches: Int[Array, " m"], grid: tuple[int, int]) -> Float[Array, ""]:
@@ -87,12 +91,15 @@ def inliers(matches: Int[np.ndarray, " m"], grid: tuple[int, int]) -> int:
     return 0 if mask is None else int(np.count_nonzero(mask))
 
 
-@compiler.jit
-def _match_all(
-    query: Float[AnyArray, "m d"], candidates: Float[AnyArray, "candidate n d"]
+@functools.partial(compiler.jit, static_argnames="above")
+def match_all(
+    query: Float[AnyArray, "m d"],
+    candidates: Float[AnyArray, "candidate n d"],
+    above: float = -math.inf,
 ) -> Int[Array, "candidate m"]:
+    """Match a query's patches with those of each candidate; see `mutual_matches`."""
     # One after the other: the products of a pair of SelaVPR's images of 224 x 224 are 55 MB.
-    return jax.lax.map(functools.partial(mutual_matches, query), candidates)
+    return jax.lax.map(functools.partial(mutual_matches, query, above=above), candidates)
 
 
 def selavpr_shape(config: ModelConfig) -> tuple[int, int]:
@@ -114,7 +121,7 @@ def describe_selavpr(
 
 def count_matches(query: Features, candidates: Features, config: ModelConfig) -> Scores:
     """Count the mutual matches (SelaVPR, section 3.4)."""
-    matches = np.asarray(_match_all(query, candidates))
+    matches = np.asarray(match_all(query, candidates))
     return (matches >= 0).sum(axis=1).astype(np.float32)
 
 
@@ -130,8 +137,10 @@ def describe_selavprpp(
 ) -> Float[Array, "image 1 dim"]:
     """Compute SelaVPR++'s descriptor of real numbers of every image, a unit vector."""
     assert isinstance(params.aggregator, SelaVprPpHash)
-    patches = extract_features(params, images, config).patches
-    return l2_normalise(head(params.aggregator.real, patches))[:, None]
+    assert isinstance(config.aggregator, SelaVprPpHashConfig)
+    params = dataclasses.replace(params, aggregator=params.aggregator.real)
+    config = dataclasses.replace(config, aggregator=SelaVprPpConfig(config.aggregator.dim))
+    return describe(params, images, config)[:, None]
 
 
 def nearness(query: Features, candidates: Features, config: ModelConfig) -> Scores:
@@ -157,5 +166,5 @@ def describe_transvpr(
 
 def count_inliers(query: Features, candidates: Features, config: ModelConfig) -> Scores:
     """Count the mutual matches that are inliers of RANSAC (TransVPR, section 3.3)."""
-    matches = np.asarray(_match_all(query, candidates))
+    matches = np.asarray(match_all(query, candidates))
     return np.array([inliers(each, config.grid) for each in matches], np.float32)

@@ -18,7 +18,7 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, cast_params
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.retrieval.reranking import divergence, matching, patch_netvlad
+from crisalad_jax.retrieval.reranking import divergence, fol, matching, pair_vpr, patch_netvlad
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import Bar, progress_bar
@@ -35,7 +35,7 @@ class Method:
     """Returns the number of an image's features, and their length."""
     describe: Callable[[Crisalad, Any, ModelConfig], Any]
     """Computes the features of a batch of images."""
-    score: Callable[[Any, Any, ModelConfig], Any]
+    score: Callable[[Crisalad, Any, Any, ModelConfig], Any]
     """Scores any number of a query's candidates, each by itself: one score, or one of each part."""
     fuse: Callable[[np.ndarray, ModelConfig], Float[np.ndarray, " candidate"]] = (
         lambda scores, config: scores
@@ -45,31 +45,48 @@ class Method:
     """Type of the features in the temporary file."""
 
 
+def _by_features(score: Callable[[Any, Any, ModelConfig], Any]) -> Callable[..., Any]:
+    """Score features without the model's parameters."""
+    return lambda params, *rest: score(*rest)
+
+
 _PATCH_NETVLAD = Method(
     "netvlad",
     patch_netvlad.shape,
     patch_netvlad.describe,
-    patch_netvlad.spatial_scores,
+    _by_features(patch_netvlad.spatial_scores),
     patch_netvlad.standardised_sum,
 )
 _METHODS: Mapping[str, Method] = {
+    "fol": Method("fol", fol.shape, fol.describe, _by_features(fol.count_matches)),
+    "pair-vpr": Method("pair-vpr", pair_vpr.shape, pair_vpr.describe, pair_vpr.scores),
     "patch-netvlad": _PATCH_NETVLAD,
-    "patch-netvlad-ransac": dataclasses.replace(_PATCH_NETVLAD, score=patch_netvlad.inlier_scores),
+    "patch-netvlad-ransac": dataclasses.replace(
+        _PATCH_NETVLAD, score=_by_features(patch_netvlad.inlier_scores)
+    ),
     "patch-netvlad-sum": dataclasses.replace(_PATCH_NETVLAD, fuse=patch_netvlad.weighted_sum),
-    "sinkhorn-divergence": Method(None, divergence.shape, divergence.describe, divergence.scores),
+    "sinkhorn-divergence": Method(
+        None, divergence.shape, divergence.describe, _by_features(divergence.scores)
+    ),
     "selavpr": Method(
-        "selavpr", matching.selavpr_shape, matching.describe_selavpr, matching.count_matches
+        "selavpr",
+        matching.selavpr_shape,
+        matching.describe_selavpr,
+        _by_features(matching.count_matches),
     ),
     # One feature an image: float32 takes little, and ranks as the authors' code does.
     "selavprpp": Method(
         "selavprpp-hash",
         matching.selavprpp_shape,
         matching.describe_selavprpp,
-        matching.nearness,
+        _by_features(matching.nearness),
         dtype=np.float32,
     ),
     "transvpr": Method(
-        "transvpr", matching.transvpr_shape, matching.describe_transvpr, matching.count_inliers
+        "transvpr",
+        matching.transvpr_shape,
+        matching.describe_transvpr,
+        _by_features(matching.count_inliers),
     ),
 }
 _AT_ONCE = 16
@@ -89,9 +106,9 @@ class Reranking:
     """
 
     name: str
-    """patch-netvlad, patch-netvlad-ransac or patch-netvlad-sum, by a model with NetVLAD; selavpr or
-    transvpr, by one with that aggregator; selavprpp, by one with selavprpp-hash;
-    sinkhorn-divergence, by one with local tokens."""
+    """patch-netvlad, patch-netvlad-ransac or patch-netvlad-sum, by a model with NetVLAD; fol,
+    pair-vpr, selavpr or transvpr, by one with that aggregator; selavprpp, by one with
+    selavprpp-hash; sinkhorn-divergence, by one with local tokens."""
     top: int
     """Number of a query's first retrievals that are re-ranked; the later ones keep their places."""
     model: Model | None = None
@@ -268,7 +285,8 @@ class Reranker:
             # The last part is padded, so that all have one shape and compile once.
             filled = np.resize(part, step)
             ours, theirs = self._queries.features[query], self._database.features[filled]
-            found = self._method.score(np.asarray(ours), np.asarray(theirs), self._config)
+            pairs = np.asarray(ours), np.asarray(theirs)
+            found = self._method.score(self._params, *pairs, self._config)
             values = np.asarray(found)[: len(part)]
             self._scores |= {(query, int(c)): s for c, s in zip(part, values.tolist(), strict=True)}
         scores = np.array([self._scores[query, int(c)] for c in candidates])

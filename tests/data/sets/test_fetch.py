@@ -6,7 +6,11 @@ import io
 import os
 import pathlib
 import shutil
+import signal
+import subprocess
+import sys
 import tarfile
+import time
 import zipfile
 from collections.abc import Iterator
 
@@ -114,6 +118,33 @@ def test_a_cut_is_resumed_and_the_folder_appears_whole(pairs, server, tmp_path):
     assert server.asked == [("/versions/4", f"bytes={size // 2}-")]
     assert os.listdir(tmp_path) == ["to"]
     assert len(open_benchmark(tmp_path / "to").database) == 3
+
+
+KILLED = """
+import sys
+from crisalad_jax.data.sets import SETS, PublishedSet, fetch_set
+from crisalad_jax.data.sets.table import SetFile
+file = SetFile(sys.argv[1], "data.zip")
+known = {"host": "http", "page": "", "title": "", "command": "", "sources": ()}
+SETS["tiny"] = PublishedSet("tiny", files=(file,), **known)
+fetch_set("tiny", sys.argv[2], quiet=True)
+"""
+
+
+def test_a_killed_download_is_resumed(pairs, server, tmp_path):
+    server.stalls = 1  # after ten bytes
+    given = [sys.executable, "-c", KILLED, server.url("/versions/4"), str(tmp_path / "to")]
+    part = tmp_path / "to.part" / "archives" / "data.zip.part"
+    with subprocess.Popen(given) as child:
+        while child.poll() is None and not (part.exists() and part.stat().st_size == 10):
+            time.sleep(0.05)
+        child.kill()
+    assert child.returncode == -signal.SIGKILL
+    assert os.listdir(tmp_path) == ["to.part"]
+    server.asked.clear()
+    fetch_set("tiny", tmp_path / "to", quiet=True)
+    assert server.asked == [("/versions/4", "bytes=10-")]
+    assert os.listdir(tmp_path) == ["to"]
 
 
 def test_lists_get_the_names_that_evaluate_reads(server, monkeypatch, tmp_path):
@@ -225,6 +256,10 @@ def test_rsync_is_asked_for_a_folder(monkeypatch, tmp_path):
     (tmp_path / "remote" / "map.png").write_bytes(b"")
     to = fetch_set("tiny", tmp_path / "to", quiet=True)
     assert sorted(os.listdir(to)) == ["images", "map.png"]
+    (tmp_path / "remote" / "map.png").unlink()
+    (tmp_path / "remote" / "images" / "test" / "database").mkdir(parents=True)
+    to = fetch_set("tiny", tmp_path / "bare", quiet=True)
+    assert os.listdir(to) == ["images"]  # which is the set's, not a folder around it
 
 
 def test_what_cannot_begin_writes_nothing(pairs, server, monkeypatch, tmp_path):

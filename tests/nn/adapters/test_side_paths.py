@@ -77,7 +77,10 @@ def test_two_paths_equal_torchs(trains: bool) -> None:
             sides[number] += convolved(t, z, trains=trains).numpy()
             measured.append(t.branch3[1].norm.running_var.numpy())
     valid = jnp.ones(2, bool) if trains else None
-    found, statistics = run_blocks([params.blocks], tokens, GRID, SIDES, valid=valid)
+    walked = [
+        run_blocks([params.blocks], tokens, GRID, SIDES, valid=valid, path=path) for path in (0, 1)
+    ]
+    found = [tokens for tokens, _ in walked]
     # Sums of up to 400 numbers of order 10, two blocks deep.
     for ours, theirs in zip(found, sides, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-4)
@@ -85,22 +88,19 @@ def test_two_paths_equal_torchs(trains: bool) -> None:
     assert np.abs(sides[0] - trunk).max() > 0.1
     for number, expected in enumerate(measured):
         which, layer = number % 2, number // 2
-        own = statistics[0].adapter[which].branch3[1].norm
+        own = walked[which][1][0].adapter[which].branch3[1].norm
         assert own.weight is None
         np.testing.assert_allclose(own.running_var[layer], expected, rtol=1e-4)
 
 
-def test_the_second_path_is_a_feature_of_its_own() -> None:
+def test_a_path_is_what_it_is_alone() -> None:
     params = drawn(0)
     pixels = jax.random.normal(jax.random.key(3), (2, 28, 42, 3))
-    features, _ = SIDES.apply(params, pixels, FeatureSpec(second=True))
-    assert features.second is not None
-    assert features.second.shape == features.patches.shape == (2, 6, 32)
     one = dataclasses.replace(SIDES, adapter=dataclasses.replace(SIDES.adapter, paths=1))
-    for number, expected in enumerate((features.patches, features.second)):
-        own = dataclasses.replace(params.blocks, adapter=params.blocks.adapter[number])
+    for path in (0, 1):
+        features, _ = SIDES.apply(params, pixels, FeatureSpec(path=path))
+        own = dataclasses.replace(params.blocks, adapter=params.blocks.adapter[path])
         alone, _ = one.apply(dataclasses.replace(params, blocks=own), pixels)
-        np.testing.assert_allclose(alone.patches, expected, rtol=1e-5, atol=1e-5)
-        assert alone.second is None
+        np.testing.assert_allclose(alone.patches, features.patches, rtol=1e-5, atol=1e-5)
     with pytest.raises(cj.InputError, match=r"for aggregator selavprpp-hash, .* two side paths"):
         cj.ModelConfig(backbone=one, aggregator="selavprpp-hash", cross_image="none")

@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 import shutil
+import warnings
 
 import numpy as np
 import pyproj
@@ -171,7 +172,23 @@ def test_a_folder_of_unreadable_images_makes_no_map(params, tmp_path):
     assert not (tmp_path / "map").exists()
 
 
-@pytest.mark.filterwarnings("error::crisalad_jax.utils.output.Note")
+def test_a_new_map_of_a_model_that_attends_across_images_says_so(params, database, tmp_path):
+    """Once: not where it grows, and not of a model that describes images alone."""
+
+    def said(params, images: pathlib.Path, **options: object) -> int:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            index_folder(tmp_path / f"map{len(options)}", params, images, **options)
+        words = ": a map describes each image alone, and this model attends across images: recalls"
+        return sum(words in str(each.message) for each in caught)
+
+    first = list_images(database)[0]
+    assert [said(params, images) for images in (first, database)] == [1, 0]
+    alone = dataclasses.replace(params, cross_image=None)
+    assert said(alone, first, config=dataclasses.replace(MODEL, cross_image="none")) == 0
+
+
+@pytest.mark.filterwarnings("error:.* several zones")
 def test_images_of_several_zones_make_a_map_of_degrees(params, database, tmp_path):
     """Zones 31 and 32 at their edge: both are near 48.85, 6.0, whatever their numbers."""
     names = ("@0719985.00@5415018.00@31@U@.png", "@0280015.00@5415018.00@32@U@.png")

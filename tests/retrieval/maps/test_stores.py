@@ -294,7 +294,7 @@ def test_more_neighbours_than_milvus_gives_are_an_error(in_milvus):
         ("milvus:map", "float32", "found 'map' after milvus:, expected a file name.db"),
         ("milvus:http://me:secret@host", "float32", "in the environment variable CRISALAD_MILVUS_"),
         ("milvus:x.db", "float16", "dtype: found 'float16', expected float32 in milvus:x.db"),
-        ("files", "int8", "dtype: found 'int8', expected float32 or float16 in files"),
+        ("files", "int8", "dtype: found 'int8', expected float32 or float16 or bits in files"),
     ],
 )
 def test_a_store_that_is_none_is_refused_by_its_name(name, dtype, words):

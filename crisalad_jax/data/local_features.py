@@ -1,0 +1,36 @@
+"""Hand-made local features of a photograph by OpenCV, as rows of bytes that travel like pixels."""
+
+import cv2
+import numpy as np
+
+from crisalad_jax.config.preprocessing import FEATURE_BYTES, LocalFeatures
+from crisalad_jax.utils.shapes import UInt8
+
+
+def encode_local_features(
+    image: UInt8[np.ndarray, "h w 3"], kind: LocalFeatures, count: int
+) -> UInt8[np.ndarray, "count third 3"]:
+    """Find the strongest local features of a photograph, by OpenCV's defaults.
+
+    Args:
+        image: RGB.
+        kind: "sift" (Lowe, IJCV 2004), of 128 numbers of 0 to 255; or "orb" (Rublee et al., ICCV
+            2011), of 256 bits.
+        count: number of rows; those without a feature are 0.
+
+    Returns:
+        A row of `FEATURE_BYTES` for each feature, strongest first, in the shape of an RGB image.
+    """
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    if kind == "sift":
+        detector: cv2.Feature2D = cv2.SIFT_create(nfeatures=count)
+    else:
+        detector = cv2.ORB_create(nfeatures=count)
+    points, found = detector.detectAndCompute(grey, None)
+    rows = np.zeros((count, FEATURE_BYTES[kind]), np.uint8)
+    if found is not None:
+        # OpenCV keeps all that are as strong as the last one.
+        strongest = np.argsort([-point.response for point in points], kind="stable")[:count]
+        rows[: len(strongest), :-1] = found[strongest]
+        rows[: len(strongest), -1] = 1
+    return rows.reshape(count, -1, 3)

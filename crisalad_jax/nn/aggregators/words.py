@@ -1,0 +1,124 @@
+"""Visual words that nothing learns but k-means: VLAD, and bags of words.
+
+Patches of zeros are none: an image may have fewer features than there is room for.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import PositiveInt
+from crisalad_jax.nn import random_init
+from crisalad_jax.nn.aggregators.base import (
+    AGGREGATORS,
+    Aggregator,
+    Centroids,
+    FeatureRows,
+    TokenShape,
+)
+from crisalad_jax.nn.aggregators.vlad import VladConfig, nearest_words, residual_sums
+from crisalad_jax.nn.backbones.base import Backbone, Features, Grid, Patches
+from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise
+from crisalad_jax.nn.tokens import Tokens
+from crisalad_jax.utils.pytree import pytree_dataclass
+
+
+@pytree_dataclass
+class Vlad:
+    """The visual words."""
+
+    words: Centroids
+    """k-means centroids of unit features."""
+
+
+@AGGREGATORS.register("vlad", tiny={"clusters": 16})
+@dataclasses.dataclass(frozen=True)
+class HardVladConfig(VladConfig):
+    """VLAD (Jegou et al., CVPR 2010), intra-normalised (Arandjelovic and Zisserman, CVPR 2013)."""
+
+    trainable: ClassVar[bool] = False
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Vlad:
+        """Draw random unit vectors as words, until a vocabulary is built."""
+        return Vlad(l2_normalise(random_init.normal(key, (self.clusters, backbone.dim))))
+
+    def from_centroids(self, centroids: Centroids, features: FeatureRows) -> Vlad:
+        """Use the centroids as words."""
+        return Vlad(centroids)
+
+    def sums(self, params: Vlad, patches: Patches) -> Float[Array, "*batch cluster dim"]:
+        """Sum residuals from the nearest word, each cluster's at length 1.
+
+        An image without any has equal numbers.
+        """
+        shares = word_shares(params.words, patches)
+        sums = l2_normalise(residual_sums(shares, patches, params.words))
+        return _unless_empty(sums, axes=(-2, -1))
+
+
+@pytree_dataclass
+class Bow:
+    """The visual words, and what each counts."""
+
+    words: Centroids
+    """k-means centroids of unit features; of binary ones majorities of bits."""
+    weights: Float[Array, " cluster"]
+    """log(N / n) of a word that n of the N images of the vocabulary have."""
+
+
+@AGGREGATORS.register("bow", tiny={"clusters": 100})
+@dataclasses.dataclass(frozen=True)
+class BowConfig(Aggregator):
+    """Bags of visual words by tf-idf (Sivic and Zisserman, ICCV 2003)."""
+
+    trainable: ClassVar[bool] = False
+    clusters: PositiveInt = 1000
+    """Number of words of the vocabulary, which `crisalad vocabulary` builds."""
+
+    def token_shape(self, dim: int) -> TokenShape:
+        """Return the shape of a global token with a number for each word."""
+        return TokenShape(self.clusters, 0, self.clusters)
+
+    def count_centroids(self, dim: int) -> int:
+        """Return the number of words."""
+        return self.clusters
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Bow:
+        """Draw random unit vectors as words that count alike, until a vocabulary is built."""
+        words = l2_normalise(random_init.normal(key, (self.clusters, backbone.dim)))
+        return Bow(words, random_init.ones(self.clusters))
+
+    def from_centroids(self, centroids: Centroids, features: FeatureRows) -> Bow:
+        """Use the centroids as words; `with_frequencies` weighs them."""
+        return Bow(centroids, jnp.ones(len(centroids)))
+
+    def with_frequencies(self, params: Bow, images: Sequence[np.ndarray]) -> Bow:
+        """Return the words with the weights log(N / n) of these images' features."""
+        has = [word_shares(params.words, jnp.asarray(each)).any(axis=0) for each in images]
+        count = np.maximum(np.sum(has, axis=0), 1)
+        return Bow(params.words, jnp.log(jnp.asarray(len(images) / count, jnp.float32)))
+
+    def apply(self, params: Bow, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+        """Return the share of an image's patches that have each word, times the word's weight.
+
+        An image without any has equal numbers.
+        """
+        patches = l2_normalise(at_least_float32(features.patches))
+        counts = word_shares(params.words, patches).sum(axis=-2)
+        shares = counts / jnp.maximum(counts.sum(axis=-1, keepdims=True), 1)
+        return Tokens.of_global(_unless_empty(shares * params.weights, axes=(-1,)))
+
+
+def word_shares(words: Centroids, patches: Patches) -> Float[Array, "*batch patch cluster"]:
+    """Return 1 for each unit patch's nearest word; patches of zeros have none."""
+    nearest = jax.nn.one_hot(nearest_words(words, patches, "euclidean"), len(words))
+    return nearest * patches.any(axis=-1, keepdims=True)
+
+
+def _unless_empty(x: Float[Array, "*shape"], axes: tuple[int, ...]) -> Float[Array, "*shape"]:
+    return jnp.where(x.any(axis=axes, keepdims=True), x, 1)

@@ -1,0 +1,71 @@
+"""Small grey images, normalised patch by patch: what SeqSLAM compares (Milford and Wyeth 2012)."""
+
+import dataclasses
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
+
+from crisalad_jax.config.checks import require, require_range
+from crisalad_jax.nn.backbones.base import (
+    BACKBONES,
+    Backbone,
+    Features,
+    FeatureSpec,
+    Grid,
+    Pixels,
+    Valid,
+)
+
+_SIZE = 32, 64
+_PATCH = 8
+_DIM = _SIZE[0] * _SIZE[1]
+_GREY = (0.299, 0.587, 0.114)
+"""Shares of red, green and blue, of BT.601."""
+_LEAST = 0.5
+"""Least deviation, half a grey level: a uniform patch's rounding is not to be amplified."""
+
+
+@BACKBONES.register("thumbnail")
+@dataclasses.dataclass(frozen=True)
+class ThumbnailConfig(Backbone):
+    """SeqSLAM's images of 32 x 64 grey pixels (Milford and Wyeth, ICRA 2012).
+
+    Each patch of 8 x 8 is less its mean and divided by its deviation. A picture of uniform patches
+    gets equal values. There are no parameters: the class token is the descriptor. Images are bytes,
+    with a mean of 0 and a deviation of 1/255.
+    """
+
+    dim: int = _DIM
+    depth: int = 1
+    patch_size: ClassVar[int] = _PATCH
+
+    def __post_init__(self) -> None:
+        """Check that its sizes are the only ones."""
+        require_range(self, _DIM, _DIM, "dim")
+        require_range(self, 1, 1, "depth")
+
+    def grid(self, image_size: tuple[int, int]) -> Grid:
+        """Return 1 x 1: the whole image is one patch."""
+        height, width = image_size
+        require(
+            (height, width) == _SIZE,
+            f"image size: found {height} x {width}, expected 32 x 64 for backbone thumbnail",
+        )
+        return 1, 1
+
+    def init(self, key: PRNGKeyArray) -> None:
+        """Return no parameters."""
+
+    def apply(
+        self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
+    ) -> tuple[Features, None]:
+        """Return the descriptor as the class token, and as the only patch."""
+        grey = (images.astype(jnp.float32) * jnp.array(_GREY, jnp.float32)).sum(axis=-1)
+        patches = grey.reshape(-1, _SIZE[0] // _PATCH, _PATCH, _SIZE[1] // _PATCH, _PATCH)
+        centred = patches - patches.mean(axis=(2, 4), keepdims=True)
+        deviation = jnp.sqrt(jnp.square(centred).mean(axis=(2, 4), keepdims=True))
+        normalised = (centred / jnp.maximum(deviation, _LEAST)).reshape(-1, _DIM)
+        is_flat = ~(deviation > _LEAST).any(axis=(1, 2, 3, 4))[:, None]
+        descriptors = jnp.where(is_flat, 1, normalised)
+        return Features(descriptors, descriptors[:, None]), None
