@@ -113,9 +113,10 @@ class Compare(ComparisonFlags):
     weights: tuple[str, ...] = ()
     """NAME=FILE or the NAME of a published model (`crisalad models`). If NAME is a method's, the
     weights are that method's, which is not trained. Any other name is a line of its own, whatever
-    model the file holds."""
+    model the file holds; + and a second stage after it, as in fol-large+fol, ranks the first
+    retrievals again."""
     rerank: int = 20
-    """How many first retrievals Patch-NetVLAD and TransVPR rank again."""
+    """How many first retrievals a second stage ranks again."""
 
 
 def run(arguments: Compare) -> dict[str, Any]:

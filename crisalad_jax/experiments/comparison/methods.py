@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.flags import parse_changes
 from crisalad_jax.data.augmentations import Augmentation
+from crisalad_jax.retrieval.reranking import RERANKERS
 from crisalad_jax.training.config import OptimiserConfig, TrainConfig
 from crisalad_jax.training.optimisers import Optimiser
 from crisalad_jax.training.recipes import (
@@ -111,7 +112,19 @@ def is_method(name: str) -> bool:
     """
     named = name in METHODS or name in RECIPES
     own = mines_tuples(name) or mixes_sets(name)
-    return (named and not own) or "+" in name or ":" in name
+    spelt = ("+" in name and split_second_stage(name)[1] is None) or ":" in name
+    return (named and not own) or spelt
+
+
+def split_second_stage(name: str) -> tuple[str, str | None]:
+    """Split the name of a model and its second stage; after a recipe's name + stands for a part.
+
+    Example:
+        >>> split_second_stage("fol-large+fol"), split_second_stage("crisalad+transvpr")
+        (('fol-large', 'fol'), ('crisalad+transvpr', None))
+    """
+    model, _, method = name.rpartition("+")
+    return (model, method) if method in RERANKERS and model not in RECIPES else (name, None)
 
 
 def method_training(name: str, preset: str, *, from_nothing: bool) -> TrainConfig:

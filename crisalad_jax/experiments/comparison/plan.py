@@ -31,6 +31,7 @@ from crisalad_jax.experiments.comparison.methods import (
     method_of,
     method_training,
     parse_row,
+    split_second_stage,
 )
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.grouping import parse_groupings
@@ -70,7 +71,8 @@ class ComparisonConfig:
     """Training set, in any layout that `read_places` reads."""
     weights: tuple[str, ...] = ()
     """Weights of methods that are not trained here, as NAME=FILE, or the NAME of a published model.
-    A name that is not a method's is a line of its own, whatever model the file holds."""
+    A name that is not a method's is a line of its own, whatever model the file holds. Such a name
+    may end in + and a second stage, as in fol-large+fol."""
     backbone: str | None = None
     """Backbone that training starts from; None trains from nothing, by the recipe `scratch`."""
     preset: str = "b14"
@@ -272,7 +274,7 @@ def _weights(config: ComparisonConfig) -> dict[str, pathlib.Path]:
                 f"--weights: found {text!r}, expected NAME=FILE or the NAME of a published model, "
                 f"each once, of one of those compared, {', '.join(config.lines)}"
             )
-        files[name] = find_weights(file or name)
+        files[name] = find_weights(file or split_second_stage(name)[0])
     return files
 
 
@@ -302,7 +304,7 @@ def _draft(config: ComparisonConfig, name: str, files: Mapping[str, pathlib.Path
     rerank, title, changed, run = None, name, "", name
     is_any = name in models_of(config.weights)
     if is_any:
-        training = TrainConfig(trainable="head")
+        training, rerank = TrainConfig(trainable="head"), split_second_stage(name)[1]
     elif row is not None:
         changed, training = row.words, row.training(**size)
     elif name in ABLATIONS:

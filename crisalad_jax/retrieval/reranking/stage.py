@@ -89,6 +89,8 @@ _METHODS: Mapping[str, Method] = {
         _by_features(matching.count_inliers),
     ),
 }
+RERANKERS = tuple(_METHODS)
+"""Names of the second stages."""
 _AT_ONCE = 16
 """Largest number of candidates of a query that are scored together."""
 _NUMBERS = 2**25

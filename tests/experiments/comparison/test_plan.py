@@ -49,7 +49,7 @@ def test_a_recipe_from_a_backbone_warms_up_for_a_quarter_too(settings, shared, m
 
 
 REFUSED = [
-    (("--methods", "crisalad,vlad"), ("--methods: found 'vlad', expected one of", "cricavpr")),
+    (("--methods", "crisalad,vlads"), ("--methods: found 'vlads', expected one of", "cricavpr")),
     (("--methods", "salad,salad"), ("--methods: found salad, salad", "each once")),
     (("--seeds", 0), ("seeds: found 0, expected at least 1",)),
     (("--jobs", 0), ("--jobs: found 0, expected at least 1",)),
@@ -116,3 +116,18 @@ def test_a_page_without_a_place(flags, capfd, tmp_path):
     page.write_text("nothing\n")
     words = (page, "found no <!-- out --> ... <!-- end of out -->, expected both comments")
     fails(capfd, *flags, "--out", tmp_path / "out", "--page", page, words=words)
+
+
+def test_weights_with_a_second_stage(settings, shared):
+    """A line of its own: the first stage alone stands above it."""
+    file = shared / "weights.safetensors"
+    name = "town+sinkhorn-divergence"
+    given = {"names": ("town", name), "weights": (f"town={file}", f"{name}={file}"), "rerank": 5}
+    variants = prepare(ComparisonConfig(**settings | given)).variants
+    assert [each.rerank for each in variants] == [None, "sinkhorn-divergence:5"]
+    assert variants[0].weights == variants[1].weights == file
+    given = {"names": ("x+fol",), "weights": (f"x+fol={file}",)}
+    with pytest.raises(
+        InputError, match=r"a model with aggregator salad .* expected fol and"
+    ):
+        prepare(ComparisonConfig(**settings | given))
