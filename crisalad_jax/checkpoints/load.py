@@ -185,6 +185,9 @@ def open_model(
     config = changed(read_model(file))
     if config.compute_dtype == "float64":
         raise InputError(f"--runtime: found {engine} with a model of float64, expected jax")
+    if config.backbone.local_features is not None:
+        found = f"{engine} with backbone {config.backbone.part_name}"
+        raise InputError(f"--runtime: found {found}, whose features no engine finds, expected jax")
     attends = config.cross_image.attends
     model = open_runtime(
         file,

@@ -190,7 +190,7 @@ def _data(given: Sequence[str]) -> dict[str, pathlib.Path] | pathlib.Path:
     require(
         len(named) == len(given) > 0,
         f"--data: found {' '.join(given) or 'none'}, expected one set, or "
-        "NAME=DIR of each, each name once",
+        "NAME=DIR of each, each name once, of letters, digits and _",
     )
     return named
 

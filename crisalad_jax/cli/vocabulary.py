@@ -23,7 +23,7 @@ SEVERAL = "quote a pattern, or list the images in a .txt"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Vocabulary(ReadFlags, SizeFlags, JsonFlag):
-    """Build AnyLoc's vocabulary from a folder of images: a whole model; or NetVLAD's, to train."""
+    """Build AnyLoc's vocabulary from images, or words of SIFT or ORB: a model; or NetVLAD's."""
 
     images: pathlib.Path
     """Folder, searched with its subfolders; or a file, a pattern, a list, a table or a video
@@ -43,7 +43,7 @@ class Vocabulary(ReadFlags, SizeFlags, JsonFlag):
     random."""
     aggregator: str | None = None
     """With --preset: anyloc (the default), or another that starts from centroids, such as netvlad
-    or a part of yours."""
+    or a part of yours; or sift-vlad, sift-bow or orb-bow, which need no backbone."""
     clusters: int | None = None
     """Words, where the aggregator has such a setting; by default the preset's."""
     layer: int | None = None

@@ -144,6 +144,16 @@ def differences(found: Any, expected: Any, prefix: str = "") -> list[str]:
         ]
     if found == expected:
         return []
+    if isinstance(found, tuple) and isinstance(expected, tuple):
+        names, others = (
+            [getattr(each, NAME, None) for each in each_of] for each_of in (found, expected)
+        )
+        if names == others and all(names):
+            return [
+                line
+                for name, one, other in zip(names, found, expected, strict=True)
+                for line in differences(one, other, f"{prefix}.{name}")
+            ]
     return [f"{prefix.removeprefix('.')}: found {_word(found)}, expected {_word(expected)}"]
 
 

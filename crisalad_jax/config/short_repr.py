@@ -101,14 +101,18 @@ def in_one_line(value: Any) -> str:
 
 
 def _write(value: Any, width: float) -> str:
-    """Write a value in a line of this width, or else in one for each field."""
-    if type(value).__repr__ is not concise_repr:
+    """Write a value in a line of this width, or else in one for each field, or item of a tuple."""
+    name, parts = type(value).__qualname__, _fields
+    if isinstance(value, tuple) and type(value).__repr__ is tuple.__repr__:
+        name, parts = "", _items
+    elif type(value).__repr__ is not concise_repr:
         return repr(value)
-    name = type(value).__qualname__
-    line = f"{name}({', '.join(_fields(value, math.inf))})"
+    line = f"{name}({', '.join(parts(value, math.inf))})"
+    if not name and len(value) == 1:
+        line = f"{line[:-1]},)"
     if len(line) <= width:
         return line
-    lines = ",\n".join(_fields(value, width - 4))
+    lines = ",\n".join(parts(value, width - 4))
     return f"{name}(\n{textwrap.indent(lines, '    ')},\n)"
 
 
@@ -122,6 +126,11 @@ def _fields(value: Any, width: float) -> Iterator[str]:
             yield f"{name}={each.part_name!r}"
         else:
             yield f"{name}={_write(each, width - len(name) - 1)}"
+
+
+def _items(values: tuple[Any, ...], width: float) -> Iterator[str]:
+    """Write the items of a tuple."""
+    return (_write(each, width) for each in values)
 
 
 def _short(value: Any) -> str:

@@ -22,11 +22,8 @@ def encode_local_features(
         A row of `FEATURE_BYTES` for each feature, strongest first, in the shape of an RGB image.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    if kind == "sift":
-        detector: cv2.Feature2D = cv2.SIFT_create(nfeatures=count)
-    else:
-        detector = cv2.ORB_create(nfeatures=count)
-    points, found = detector.detectAndCompute(grey, None)
+    detector = (cv2.SIFT if kind == "sift" else cv2.ORB).create(nfeatures=count)
+    points, found = detector.detectAndCompute(grey, None)  # pyright: ignore
     rows = np.zeros((count, FEATURE_BYTES[kind]), np.uint8)
     if found is not None:
         # OpenCV keeps all that are as strong as the last one.

@@ -81,9 +81,12 @@ class ModelConfig:
         fits = self.preprocessing.size_rule == "fixed" or not self.aggregator.fixed_grid
         words = f"fixed: {aggregator} has parameters for every patch, of images of one size alone"
         require_field(self.preprocessing, "size_rule", fits, words)
-        kind, pixels = self.backbone.local_features, self.preprocessing.pixels
-        fits = kind is None or pixels == "bytes"
-        require_field(self.preprocessing, "pixels", fits, f"bytes, in which {kind} finds features")
+        how, as_bytes = self.preprocessing, ("bytes", (0.0,) * 3, (1 / 255,) * 3)
+        require(
+            backbone.local_features is None or (how.pixels, how.mean, how.deviation) == as_bytes,
+            f"preprocessing: found {how.pixels} of mean {how.mean} and deviation {how.deviation} "
+            f"for backbone {backbone.part_name}, expected bytes of mean 0 and deviation 1/255",
+        )
         self.check_image_size(self.input_size)
         encoder, (global_dim, tokens, dim) = self.cross_image, self.token_shape
         if not encoder.attends:

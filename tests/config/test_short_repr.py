@@ -25,6 +25,7 @@ NAMES = {
     kind.__name__: kind
     for kind in (
         *(cj.ModelConfig, cj.TrainConfig, cj.OptimiserConfig, cj.MiningConfig, cj.LossConfig),
+        cj.MixtureSet,
         *(cj.CrossImageConfig, cj.ProjectionConfig, cj.PreprocessingConfig),
         *(cj.SinkhornConfig, ClassesConfig),
         *(type(registry.make(name)) for registry in REGISTRIES.values() for name in registry),

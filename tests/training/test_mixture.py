@@ -16,7 +16,7 @@ import pytest
 
 from crisalad_jax.cli.train import parse
 from crisalad_jax.config.flags import refusals
-from crisalad_jax.config.io import from_plain, read_config, to_plain
+from crisalad_jax.config.io import differences, from_plain, read_config, to_plain
 from crisalad_jax.config.plugins import sources_of
 from crisalad_jax.config.registry import make_part
 from crisalad_jax.data.loader import training_batches
@@ -30,11 +30,13 @@ from crisalad_jax.training.config import MixtureSet, TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.losses import LossConfig, metric_loss
+from crisalad_jax.training.losses.base import LOSSES, Loss, LossValue
 from crisalad_jax.training.mixture import with_sets
 from crisalad_jax.training.recipes import from_scratch, recipe
 from crisalad_jax.training.step import init_train_state, loss_and_gradient, step_config
 from crisalad_jax.training.trainer import run_keys
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.pytree import named_leaves
 from tests.conftest import MODEL, RECIPE, random_params, write_picture
 from tests.training.test_loop import assert_same_params, interrupt, metrics_of
@@ -177,6 +179,25 @@ def test_a_step_adds_the_weighted_losses_of_sub_batches_by_themselves(start):
     np.testing.assert_allclose(batch.result.easy_anchor_fraction, easy, rtol=1e-6)
 
 
+@pytest.mark.usefixtures("own_parts")
+def test_a_loss_with_parameters_is_of_one_set_alone(start: Crisalad):
+    @LOSSES.register("scaled")
+    @dataclasses.dataclass(frozen=True)
+    class Scaled(Loss):
+        def init(self, key, classes, dim):
+            return jnp.ones(())
+
+        def apply(self, params, batch):
+            return LossValue(params * batch.similarities.mean())
+
+    config = with_sets(dataclasses.replace(RECIPE, model=SMALL), ["near", "far"])
+    config = config.with_each(loss=lambda loss: dataclasses.replace(loss, kind=Scaled()))
+    static = step_config(config, steps=1)
+    with pytest.raises(InputError, match=r"mixture\.near\.loss: found scaled, which has"):
+        init_train_state(start, "all", static, key=jax.random.key(0))
+
+
+@pytest.mark.slow  # the recipe of SAGE below does the same in a quick test, without weights
 def test_a_killed_run_of_a_mixture_resumes_to_the_same_bits(
     sets: dict[str, Places], start: Crisalad, tmp_path: pathlib.Path, monkeypatch
 ):
@@ -214,6 +235,8 @@ def test_flags_of_each_set_are_flags_of_the_command(tmp_path: pathlib.Path):
     assert [run.places_per_batch for run in found.alone] == [20, 40]
     assert from_plain(TrainConfig, to_plain(found), source="here") == found
     assert sources_of(found)["mixture.1.sampler"][0] == "cliques"
+    other = dataclasses.replace(found, mixture=(gsv, dataclasses.replace(msls, weight=0.5)))
+    assert differences(other, found) == ["mixture.msls.weight: found 0.5, expected 1.0"]
     # Of a recipe's mixture the sets that there are, in sub-batches of the same size.
     words = "--data megascenes=A gsv=B --out O --preset tiny --recipe megaloc"
     found = parse("crisalad train", words.split()).settings
@@ -325,6 +348,8 @@ def test_a_published_mixture_trains_and_resumes(
         assert any(leaf.startswith(part) for leaf in changed), part
     if name == "sage":  # whose backbone is frozen
         assert not any("backbone" in leaf and "adapter" not in leaf for leaf in changed)
+    about = read_json(tmp_path / "run" / "data.json", "what it was trained on")["training"]
+    assert (about["places"], about["images"]) == (6 * len(names), 48 * len(names))
     sets = {each: read_places(root, min_images=1) for each, root in data.items()}
     interrupt(monkeypatch, "train_step", 3, config, sets, tmp_path / "killed", quiet=True)
     resumed = fit(config, sets, tmp_path / "killed", quiet=True)

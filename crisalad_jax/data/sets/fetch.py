@@ -215,7 +215,8 @@ def _pairs(published: PublishedSet, files: pathlib.Path) -> Iterator[tuple[pathl
 def _frames(published: PublishedSet, files: pathlib.Path) -> Iterator[tuple[pathlib.Path, str]]:
     """Yield the listed frames of two rides, and their names: so many metres apart."""
     how = published.frames
-    names = read_text(files / how["names"], "a list of frames").split()
+    lines = read_text(files / how["names"], "a list of frames").split()
+    names = [line.rpartition("/")[2] for line in lines]
     for side in ("database", "queries"):
         images = {path.name: path for path in list_images(files / how[side])}
         missing = [name for name in names if name not in images]

@@ -114,7 +114,7 @@ def check_search(kind: str, store: str, dtype: str) -> None:
     """
     choose("search", kind, SEARCHES)
     if kind != "exact" and dtype == "bits":
-        raise InputError(f"search: found {kind} of bits, expected exact, which takes them alone")
+        raise InputError(f"search: found {kind} for a map of bits, expected exact")
     if kind != "exact" and store != "files":
         raise InputError(f"search: found {kind}, expected exact, as {store} is searched by Milvus")
 

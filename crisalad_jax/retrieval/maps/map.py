@@ -494,7 +494,8 @@ class Map:
             "axes": self.axes,
             **contents(self),
             "zone": self.zone and str(self.zone),
-            "descriptor": f"{metadata.length_words}, {metadata.dtype}",
+            "descriptor": metadata.length_words
+            + ("" if metadata.is_bits else f", {metadata.dtype}"),
             "image_size": list(self.config.image_size),
             "resize": self.config.images_in_words,
             "grouping": metadata.grouping,

@@ -28,10 +28,11 @@ def orb_bow(model: ModelConfig, preset: str) -> TrainConfig:
 
 def _words(backbone: str, aggregator: str, preset: str) -> TrainConfig:
     """Photographs keep their sizes up to a longer side of 640, whatever the preset's images."""
+    unit = 1 / 255
     model = ModelConfig(
         image_size=(480, 640),
         preprocessing=PreprocessingConfig(
-            size_rule="longer-side", mean=(0.0, 0.0, 0.0), deviation=(1 / 255,) * 3
+            size_rule="longer-side", mean=(0.0, 0.0, 0.0), deviation=(unit, unit, unit)
         ),
         backbone=BACKBONES.make(backbone, preset),
         aggregator=AGGREGATORS.make(aggregator, preset),

@@ -73,7 +73,8 @@ PAIRS |= {f"old/{n:04}.jpg": picture(n, ".jpg") for n in (0, 3, 12)}
 
 @pytest.fixture
 def pairs(server, monkeypatch) -> PublishedSet:
-    inner = zipped({f"Set-v1/{name}": data for name, data in PAIRS.items()})
+    others = {"A/deep/new/0099.png": b"", "A/deep/old/0099.jpg": b""}  # of the same names
+    inner = zipped({f"Set-v1/{name}": data for name, data in PAIRS.items()} | others)
     server.files["/versions/4"] = zipped({"Set-v1.0.zip": inner, "description.md": b""})
     file = SetFile(server.url("/versions/4"), "data.zip", inside="Set-v1.0.zip")
     parts = (SetPart("test", 3, 3),)

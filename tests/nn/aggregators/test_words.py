@@ -103,8 +103,10 @@ def test_pixels_are_refused_where_features_are_meant() -> None:
     words = f"^images: found 96 x 128 pixels, expected the {COUNT} features of backbone sift"
     with pytest.raises(InputError, match=words):
         cj.describe(params, picture(0)[None], config)
-    with pytest.raises(InputError, match="pixels: found 'floats', expected bytes, in which sift"):
+    with pytest.raises(InputError, match=r"preprocessing: found floats of .*, expected bytes of m"):
         config.resized(None, ["floats"])
+    with pytest.raises(InputError, match=r"found bytes of mean \(0.485, .* for backbone sift, exp"):
+        dataclasses.replace(config, preprocessing=cj.PreprocessingConfig())
 
 
 def features(rows: np.ndarray, empty: int = 3) -> Features:

@@ -48,7 +48,7 @@ def test_a_map_of_bits_answers_by_the_signs(town_bits, town_map, params, sides):
         database = np.concatenate(list(whole.descriptors))
         assert places.metadata.descriptor_length == MODEL.descriptor_dim
         assert f"{MODEL.descriptor_dim} bits" in repr(places)
-        assert places.summary(verify=True)["descriptor"] == f"{MODEL.descriptor_dim} bits, bits"
+        assert places.summary(verify=True)["descriptor"] == f"{MODEL.descriptor_dim} bits"
         files = sorted((town_bits / "segments").glob("*.npy"))
         assert [np.load(file).shape for file in files] == [
             (4, MODEL.descriptor_dim // 8),
@@ -112,7 +112,7 @@ def test_bits_and_numbers_in_one_map_are_refused(town_bits, town_map, params, si
         ):
             with pytest.raises(InputError, match=words):
                 places.search(queries, 1)
-        with pytest.raises(InputError, match="search: found hnsw of bits, expected exact"):
+        with pytest.raises(InputError, match="search: found hnsw for a map of bits, expected"):
             places.build_search("hnsw")
     with pytest.raises(InputError, match=r"dtype: found 'bits', expected float32 in milvus:x.db"):
         dataclasses.replace(BITS, store="milvus:x.db")
