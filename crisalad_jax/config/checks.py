@@ -110,7 +110,7 @@ def takes(**kinds: type | tuple[type, ...]) -> Callable[[_F], _F]:
                 if not isinstance(value, kind):
                     plain = value is None or isinstance(value, str | int | float)
                     found = repr(value) if plain else type(value).__name__
-                    is_path = isinstance(kind, tuple) and os.PathLike in kind
+                    is_path = isinstance(kind, tuple) and os.PathLike in kind and int not in kind
                     words = "a path" if is_path else kind_of(cast(Any, Union)[kind]).words
                     raise InputError(f"{name}: found {found}, expected {words}")
             return function(*args, **options)
