@@ -127,7 +127,5 @@ def test_weights_with_a_second_stage(settings, shared):
     assert [each.rerank for each in variants] == [None, "sinkhorn-divergence:5"]
     assert variants[0].weights == variants[1].weights == file
     given = {"names": ("x+fol",), "weights": (f"x+fol={file}",)}
-    with pytest.raises(
-        InputError, match=r"a model with aggregator salad .* expected fol and"
-    ):
+    with pytest.raises(InputError, match=r"a model with aggregator salad .* expected fol and"):
         prepare(ComparisonConfig(**settings | given))
