@@ -74,7 +74,7 @@ LAYOUTS = {
 
 ROUNDED = {"tetra_boq": 5e-3, "tetra_salad": 1e-2}
 """Bounds where activations are rounded to 8 bits: a change of 1e-6 of the pixels moves features by
-1.6e-2, and descriptors by 1.4e-3 and 3e-3, as far as the public code's are from ours."""
+1.6e-2, as far as the public code's are from ours; descriptors are 1.4e-3 and 3e-3 from theirs."""
 
 HASHES = "hash_descriptor"
 """The descriptor that a model of two gives, where it has a second one for the bits."""
