@@ -1,11 +1,12 @@
 """Tables of what is claimed and how it was measured, for `docs/claims.md` and the README.
 
-    python scripts/bench/study_claims.py [--page docs/claims.md] [claims] [leakage]
+    python scripts/bench/study_claims.py [--page docs/claims.md] [claims] [models] [leakage]
 
-claims: every row of `docs/claims/claims.toml`, with licence, length and parameters from the table
-of published models, and the speed that `bench_claims.py` measured. leakage: what images in a batch
-tell under the published evaluations of models whose images attend to each other, computed from
-their rules alone: which frames are right, in which order they come, how many are in a batch.
+claims: every row of `docs/claims/claims.toml`. models: licence, length and parameters of the same
+from the table of published models, and the speed that `bench_claims.py` measured. leakage: what
+images in a batch tell under the published evaluations of models whose images attend to each other,
+computed from their rules alone: which frames are right, in which order they come, how many are in a
+batch.
 """
 
 import json
@@ -66,30 +67,32 @@ def command(row: dict[str, Any]) -> str:
 
 
 def claims() -> Study:
+    """What is printed, and how it was measured."""
+    header = ("model", "measured", "printed in", *HEADERS)
+    found = [
+        (row["title"], row["how"], row["source"], *(recall(row, name) for name in SETS))
+        for row in rows()
+    ]
+    caption = (
+        "R@1 in percent, as printed. \\* VPR-Bench's lists of Nordland; † another split, see "
+        '"measured", which begins with the size of images.'
+    )
+    return Study(Table(header, found, caption, 3), found)
+
+
+def models() -> Study:
+    """What a model costs, and the command that repeats its row."""
     path = FOLDER / "speed.json"
     measured = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     speeds = measured.get("times_megaloc", {})
-    header = (
-        "model",
-        *HEADERS,
-        "measured",
-        "printed in",
-        "licence",
-        "numbers",
-        "million parameters",
-    )
-    found = []
-    for row in rows():
-        licence, *sizes, speed = facts(row, speeds)
-        cells = [row["title"], *(recall(row, name) for name in SETS), row["how"], row["source"]]
-        found.append((*cells, licence, *sizes, speed, command(row)))
+    header = ("model", "reproduces", "licence", "numbers", "million parameters", "speed")
+    found = [(row["title"], command(row), *facts(row, speeds)) for row in rows()]
     device = f" on one {measured['device']}" if measured else ""
     caption = (
-        "R@1 in percent, as printed. \\* VPR-Bench's lists of Nordland; † another split, see "
-        f'"measured". Speed: images described a second{device}, as a multiple of MegaLoc\'s, at '
-        "its own image size, in bfloat16. The last column follows `crisalad evaluate --data SET`."
+        f"Speed: images described a second{device}, as a multiple of MegaLoc's, at its own image "
+        "size, in bfloat16. The second column follows `crisalad evaluate --data SET`."
     )
-    return Study(Table((*header, "speed", "reproduces"), found, caption, 1), found)
+    return Study(Table(header, found, caption, 3), found)
 
 
 def best() -> str:
@@ -187,7 +190,7 @@ def leakage() -> Study:
     return Study(Table(header, found, caption, 4), values)
 
 
-STUDIES = {"claims": claims, "leakage": leakage}
+STUDIES = {"claims": claims, "models": models, "leakage": leakage}
 
 
 def main() -> None:
