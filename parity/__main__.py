@@ -18,6 +18,7 @@ from crisalad_jax.utils.progress import progress_bar
 from parity.cases import checks
 from parity.compare import PRECISIONS, Row
 from parity.full_size import full_size_checks
+from parity.published import published_checks
 from parity.report import terminal_table, verdict, write_report
 
 
@@ -28,7 +29,8 @@ class Parity:
     precision: str = ",".join(PRECISIONS)
     """Precisions, separated by commas."""
     full_size: bool = False
-    """Also ViT-B/14 with random weights, at 224 x 224, 322 x 322 and 224 x 308: up to 4 GB."""
+    """Also ViT-B/14 with random weights, at 224 x 224, 322 x 322 and 224 x 308; and in float32 each
+    published network against outputs of its authors' code: up to 6 GB."""
     only: str = ""
     """Only what has this in its name, in upper or lower case."""
     seed: int = 0
@@ -57,6 +59,7 @@ def _plan(arguments: Parity) -> Work:
         found = checks(precision, arguments.seed)
         if arguments.full_size:
             found |= full_size_checks(precision, arguments.seed)
+            found |= published_checks() if precision == "float32" else {}
         for name, check in found.items():
             if arguments.only.lower() in name.lower():
                 work[precision, name] = check

@@ -14,12 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import torch
 
 from crisalad_jax import describe, pack_bits
 from crisalad_jax.checkpoints.formats import infer, to_params, to_state
 from crisalad_jax.checkpoints.public import vocabulary_model
-from crisalad_jax.config.preprocessing import IMAGENET_DEVIATION, IMAGENET_MEAN
 from crisalad_jax.nn.aggregators.gem import gem, generalised_mean, log_floored
 from crisalad_jax.nn.aggregators.queries import decode
 from crisalad_jax.nn.aggregators.sage import pooled, weighted
@@ -34,8 +32,9 @@ from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.nn.projection import ProjectionConfig
 from crisalad_jax.retrieval.reranking import fol, matching, patch_netvlad
 from parity import zoo
+from parity.published import CLOSE, HASHES, ROUNDED, expected_of, images_of, tolerance_of
 
-BOUND = 2e-5
+BOUND = CLOSE.value
 LAYOUTS = {
     "apgem_resnet101": "ap-gem",
     "boq_dinov2_12288": "boq-dinov2",
@@ -72,12 +71,6 @@ LAYOUTS = {
     "vladbuff_192_wpca4096": "vlad-buff",
 }
 
-ROUNDED = {"tetra_boq": 5e-3, "tetra_salad": 1e-2}
-"""Bounds where activations are rounded to 8 bits: a change of 1e-6 of the pixels moves features by
-1.6e-2, as far as the public code's are from ours; descriptors are 1.4e-3 and 3e-3 from theirs."""
-
-HASHES = "hash_descriptor"
-"""The descriptor that a model of two gives, where it has a second one for the bits."""
 QUICK = ("cosplace_resnet18_512", "transvpr")
 """Enough for the test command: full-size models take ten seconds and more each."""
 
@@ -89,17 +82,6 @@ def test_every_golden_is_compared() -> None:
 def compare(found: jax.Array, expected: np.ndarray, bound: float = BOUND) -> None:
     assert found.shape == expected.shape
     assert np.linalg.norm(found - expected) < bound * np.linalg.norm(expected)
-
-
-def images_of(name: str) -> np.ndarray:
-    """The golden images; TeTRA's are normalised, and resized as tensors to its only size."""
-    images = zoo.golden(name)["images"]
-    if name not in ROUNDED:
-        return images
-    unit = (images / np.float32(255) - np.float32(IMAGENET_MEAN)) / np.float32(IMAGENET_DEVIATION)
-    tensor = torch.from_numpy(unit).permute(0, 3, 1, 2)
-    resized = torch.nn.functional.interpolate(tensor, (322, 322), mode="bilinear")
-    return resized.permute(0, 2, 3, 1).numpy()
 
 
 def sampled(
@@ -134,8 +116,8 @@ def test_descriptors_are_the_public_codes(name: str) -> None:
         patches = extract_features(params, golden["images"], config).patches
         compare(*sampled(patches, config.backbone.grid(golden["images"].shape[1:3]), golden))
     found = describe(params, images_of(name), config)
-    expected = golden[HASHES if HASHES in golden else "descriptor"]
-    compare(found, expected, ROUNDED.get(name, BOUND))
+    expected = expected_of(name)
+    compare(found, expected, tolerance_of(name).value)
     if "bits" in golden:
         # 4 to 7 differ, of numbers that are near 0; two images differ in a thousand and more.
         bits = np.unpackbits(np.packbits(found > 0, axis=1) ^ golden["bits"], axis=1)
