@@ -31,7 +31,7 @@ from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.locks import staged_folder
 
 COMMON = (
-    "data weights preset image-size resize grouping batch-size split images queries radius "
+    "data weights image-size resize grouping batch-size split images queries radius "
     "precision pca dtype rerank report out json on-bad-image seeds quiet"
 )
 EXAMPLE = "crisalad evaluate --data pitts30k_test.mat --weights salad --report pitts30k"

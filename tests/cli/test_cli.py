@@ -107,6 +107,9 @@ LONG = "/".join(["folder"] * 20)
 POSITIONAL = {
     ("completion", "shell"): "{bash,zsh,fish}",
     ("convert", "source"): "SRC",
+    ("data", "action"): "{list,fetch,check}",
+    ("data", "what"): "NAME|DIR",
+    ("publish", "run"): "RUN",
     ("convert", "target"): "DST",
     ("models", "name"): "NAME",
     ("query", "images"): "IMAGE",
