@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from crisalad_jax.checkpoints import starter
+from crisalad_jax.config.checks import check_types, choose
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import one_line
 
@@ -25,6 +26,10 @@ class Licence:
     """Whether it allows commercial use; None where nothing is said."""
     terms: str = ""
     """What else a user has to know of it, in words."""
+
+    def __post_init__(self) -> None:
+        """Check the types."""
+        check_types(self)
 
     @property
     def words(self) -> str:
@@ -63,6 +68,10 @@ class Published:
     is a whole model."""
     note: str = ""
     """What is not certain of these facts, or has to be done by hand."""
+
+    def __post_init__(self) -> None:
+        """Check the types."""
+        check_types(self)
 
     @property
     def notice(self) -> str:
@@ -146,13 +155,16 @@ def _read(facts: dict[str, Any], source: str) -> tuple[dict[str, Licence], list[
     """
     try:
         licences = {each["name"]: Licence(**each) for each in facts.pop("licence", [])}
+        if taken := licences.keys() & _LICENCES.keys():
+            raise InputError(f"found licence {min(taken)}, a name that is taken")
         models = [
             model
             for family in facts.pop("family", [])
             for model in _models(family, _LICENCES | licences)
         ]
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{source}: cannot be read: {one_line(error)}") from error
+    except (InputError, KeyError, TypeError) as error:
+        words = "" if isinstance(error, InputError) else "cannot be read: "
+        raise InputError(f"{source}: {words}{one_line(error)}") from error
     names = [*PUBLISHED, *starter.FILES, *(model.name for model in models)]
     if len(set(names)) < len(names):
         raise InputError(f"{source}: found {max(names, key=names.count)}, a name that is taken")
@@ -164,7 +176,7 @@ def _models(family: dict[str, Any], licences: dict[str, Licence]) -> Iterator[Pu
     for model in family.pop("models"):
         fields: dict[str, Any] = {**family, **model}
         fields["repository"] = GITHUB + fields["repository"]
-        fields["licence"] = licences[fields["licence"]]
+        fields["licence"] = choose("licence", fields["licence"], licences)
         fields.setdefault("url", before and before + fields["file"])
         yield Published(**fields)
 

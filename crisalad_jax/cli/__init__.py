@@ -41,7 +41,7 @@ _COMMANDS = {
     "calibrate": "Let a map say unknown: from which similarity on its answers are right.",
     "query": "Ask a map where images were taken.",
     "serve": "Answer over HTTP, and in a browser, where photographs were taken.",
-    "vocabulary": "Build the vocabulary of AnyLoc or NetVLAD from a folder of images.",
+    "vocabulary": "Build the vocabulary of AnyLoc, NetVLAD, SIFT or ORB from a folder of images.",
     "export": "Write a model as a program that needs nothing of this package.",
     "publish": "Write a run's model with a model card, to a folder or to Hugging Face's hub.",
     "pca": "Fit principal components to descriptors, for shorter ones.",

@@ -111,9 +111,11 @@ def evaluate(
         1.0
     """
     kinds = check_evaluation(groupings, seed=seed, seeds=seeds, precision=precision)
-    parsed = groupings_of(groupings, benchmark)
     describer = describer_of(model, kinds)
     config = describer.config
+    parsed = [Grouping("single", "single")]
+    if config.cross_image.attends:
+        parsed = groupings_of(groupings, benchmark)
     length, is_unit = shortened(pca, describer, "model")
     is_bits = dtype == "bits"
     if is_bits:
@@ -146,7 +148,7 @@ def evaluate(
             )
         k = min(max(*KS, rerank.top if rerank else 0), len(benchmark.database))
         results = []
-        for grouping in parsed if config.cross_image.attends else [Grouping("single", "single")]:
+        for grouping in parsed:
             is_random = "shuffled" in (grouping.queries, grouping.database)
             drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
             name = str(grouping) if config.cross_image.attends else ANY

@@ -121,14 +121,30 @@ models = [{ name = "NAME", descriptor = 1, parameters = 1, file = "town.pth" }]
         (FAMILY.replace("FORMAT", "cosplace").replace("NAME", "megaloc"), "found megaloc, a name"),
         (FAMILY.replace("FORMAT", "vlad"), "NAME: found format 'vlad', expected one of its own or"),
         (FAMILY.replace("paper", "papers"), "cannot be read: .*'papers'"),
-        (FAMILY.replace("MIT", "Town's"), 'cannot be read: "Town\'s"'),
+        (FAMILY.replace("MIT", "Town"), "licence: found 'Town', expected one of Apache-2.0, "),
+        (FAMILY.replace("descriptor = 1", "descriptor = 'x'"), "Published.descriptor: found 'x'"),
+        (
+            "[[licence]]\nname = 'MIT'\ncommercial = false" + FAMILY,
+            "found licence MIT, a name that is taken",
+        ),
         ("[formats.cosplace]", "found formats.cosplace, a name that is taken"),
         (
             "[layers.cosplace]",
             r"found \[layers\], expected chains, tables, backbones",
         ),
         ("[heads.town]\naggregator = 'towns'", "aggregator: found 'towns', exp"),
-        ("[formats.town]\nholds = 'x'\nbackbone = 'nets'\nhead = 'boq'", "cannot be read: 'nets'"),
+        (
+            "[formats.town]\nholds = 'x'\nbackbone = 'nets'\nhead = 'boq'",
+            "backbone: found 'nets', exp",
+        ),
+        (
+            "[heads.town]\naggregator = 'boq'\nrows = 'a b c'",
+            "rows, form: found 'c', expected one of absent-exponent, ",
+        ),
+        (
+            "[formats.town]\nholds = 'x'\nbackbone = 'vit'\nhead = 'boq'\nimages = 'pillow 96'",
+            "images: found 'pillow 96', expected CHAIN HEIGHT WIDTH",
+        ),
         (
             "[heads.town]\naggregator = 'boq'\nrows = 'a b'",
             "cannot be read: not enough values to unpack",
@@ -137,9 +153,13 @@ models = [{ name = "NAME", descriptor = 1, parameters = 1, file = "town.pth" }]
 )
 def test_what_is_wrong_registers_nothing(text, words):
     before = dict(FORMATS), dict(PUBLISHED)
+    licence = "[[licence]]\nname = 'Town licence'\n" if text != "town" else ""
     with pytest.raises(InputError, match=f"^register_published: {words}"):
-        cj.register_published(text)
+        cj.register_published(licence + text)
     assert before == (FORMATS, PUBLISHED)
+    # Nor is the licence, which was right.
+    with pytest.raises(InputError, match="licence: found 'Town licence'"):
+        cj.register_published(FAMILY.replace("MIT", "Town licence"))
 
 
 def test_the_command_line_lists_it(tmp_path, capsys):

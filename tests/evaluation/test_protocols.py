@@ -53,6 +53,7 @@ def test_what_is_not_published_is_named():
         check_groupings(["published:salad"])
     with pytest.raises(InputError, match=r"found published:sage of town, .* or a size, as in seq"):
         groupings_of(["published:sage"], of("town"))
-    mixed = dataclasses.replace(of("sped"), queries=(pathlib.Path("b"), pathlib.Path("a")))
-    with pytest.raises(InputError, match="images of sped in another order than that"):
-        groupings_of(["published:sage"], mixed)
+    for side in ("queries", "database"):
+        mixed = dataclasses.replace(of("sped"), **{side: (pathlib.Path("b"), pathlib.Path("a"))})
+        with pytest.raises(InputError, match="images of sped in another order than that"):
+            groupings_of(["published:sage"], mixed)

@@ -15,7 +15,7 @@ import numpy as np
 from crisalad_jax.checkpoints.formats.format import BackboneNames, Format, Head, parts_of
 from crisalad_jax.checkpoints.formats.rows import SAME, Extra, Row, Rows, read_table, read_tables
 from crisalad_jax.checkpoints.formats.sizes import Reader, State, square_side
-from crisalad_jax.config.checks import require
+from crisalad_jax.config.checks import choose, require
 from crisalad_jax.config.io import from_plain
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
@@ -168,7 +168,7 @@ def _add(facts: Mapping[str, Any], source: str) -> None:
 def _backbone(text: str) -> BackboneNames:
     """Return the names of one of some backbones, after a prefix."""
     names, _, prefix = text.partition(" ")
-    first, *others = (_BACKBONES[name] for name in names.split(","))
+    first, *others = (choose("backbone", name, _BACKBONES) for name in names.split(","))
     for other in others:
         kinds, rows = first.kinds + other.kinds, first.rows + other.rows
         first = BackboneNames(kinds, rows, first.marks + other.marks)
@@ -192,19 +192,21 @@ def _classifier(layers: Mapping[str, tuple[int, int]]) -> Rows:
 
 
 def _format(name: str, facts: dict[str, Any]) -> Format:
-    chain, *size = facts.pop("images", "pillow 224 224").split()
+    chain, *size = (images := facts.pop("images", "pillow 224 224")).split()
+    expected = f"images: found {images!r}, expected CHAIN HEIGHT WIDTH, as in pillow 224 224"
+    require(len(size) == 2 and "".join(size).isdecimal(), expected)
     head, _, prefix = facts.pop("head").partition(" ")
     projection = facts.pop("projection", None)
     if projection is not None:
         theirs, table = projection.split()
         facts["projection"] = Row(("projection",), (theirs,), TABLES[table])
-    names = HEADS[head]
+    names = choose("head", head, HEADS)
     return (_Reference if name == REFERENCE else Format)(
         name=name,
         backbone=_backbone(facts.pop("backbone")),
         head=names._replace(prefix=prefix or names.prefix),
         image_size=(int(size[0]), int(size[1])),
-        preprocessing=_CHAINS[chain],
+        preprocessing=choose("images", chain, _CHAINS),
         encoder_rows=TABLES["encoder"],
         extras=_classifier(facts.pop("extras", {})),
         adjust=_ADJUST.get(name, Format.adjust),

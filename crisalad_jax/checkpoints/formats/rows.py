@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from crisalad_jax.config.checks import choose
 from crisalad_jax.nn.aggregators.gem import START
 from crisalad_jax.nn.backbones.dinov3 import rotary_periods
 from crisalad_jax.nn.backbones.vgg import VggConfig
@@ -201,10 +202,16 @@ def read_table(text: str, tables: Mapping[str, Rows]) -> Rows:
             before = theirs.removesuffix("+")
             rows += [
                 row._replace(theirs=tuple(before + name for name in row.theirs))
-                for row in tables[form]
+                for row in choose("rows, table", form, tables)
             ]
         else:
-            rows.append(Row(tuple(ours.split(",")), tuple(theirs.split(",")), kinds[form]))
+            rows.append(
+                Row(
+                    tuple(ours.split(",")),
+                    tuple(theirs.split(",")),
+                    choose("rows, form", form, kinds),
+                )
+            )
     return tuple(rows)
 
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from crisalad_jax.config.checks import PATH, takes
+from crisalad_jax.config.checks import PATH, require, takes
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.benchmarks.benchmark import readable_images
 from crisalad_jax.data.benchmarks.msls import MSLS_CITIES, is_msls
@@ -87,6 +87,7 @@ def check_set(
         ('set (two folders, no ground truth): found 4 database images and 4 queries, expected ...',)
     """
     root = pathlib.Path(folder)
+    require(root.exists(), f"{root}: found no such folder, expected one with a data set")
     published = None if expected is None else find_set(expected)
     if (root / "Dataframes").is_dir():
         return CheckedFolder((_checked_places(root, published, read=read, quiet=quiet),))

@@ -55,6 +55,15 @@ def test_sets_are_named_by_their_published_counts(tmp_path, counts):
     assert known(write_sides(tmp_path / "any", frames, frames)) == ["nordland-selavpr, all"]
 
 
+def test_a_number_of_queries_alone_names_no_set(tmp_path, counts):
+    """Of a part whose database no source counts, any set has as many queries."""
+    counts("pitts250k", SetPart("test", None, 6))
+    names = [utm_name("0", str(1000 * i), str(i)) for i in range(6)]
+    folder = write_sides(tmp_path / "own" / "images" / "test", names[:4], names)
+    assert known(folder) == [None]
+    assert known(folder, "pitts250k") == ["pitts250k, test"]
+
+
 def test_each_nordland_is_told_from_the_others(tmp_path, counts):
     """By the ground truth or the spacing: two of them have the same counts."""
     counts("nordland-star", SetPart("all", 60, 6, r"Nordland\*"))
@@ -153,13 +162,16 @@ def test_training_places_are_those_of_all_cities_or_not(shared):
     assert (part.database, part.queries, part.known, part.problem) == (24, 8, None, None)
     (problem,) = check_set(places, "gsv-cities", quiet=True).problems
     assert "found 2 cities, expected Bangkok, Barcelona, " in problem
+    (problem,) = check_set(places, "sped", quiet=True).problems
+    assert "found training places, expected SPED" in problem
     with pytest.raises(InputError, match="found no Dataframes/, expected GSV-Cities"):
         check_set(places / "Images", "gsv-cities")
 
 
 def test_what_is_no_set_is_one_line(tmp_path):
-    for folder in (tmp_path, tmp_path / "none"):
-        with pytest.raises(InputError, match=r"expected images/"):
-            check_set(folder)
+    with pytest.raises(InputError, match=r"expected images/"):
+        check_set(tmp_path)
+    with pytest.raises(InputError, match=r"none: found no such folder"):
+        check_set(tmp_path / "none")
     with pytest.raises(InputError, match="nearest: pitts30k"):
         check_set(tmp_path, "pits30k")
