@@ -129,14 +129,12 @@ def nearest_bits(database: Iterable[Bits], queries: Bits, k: int) -> Neighbours:
         of signs.
     """
 
-    def blocks() -> Generator[Block, None, None]:
-        count = 0
-        for part in database:
-            for start in range(0, len(part), _ROWS):
-                yield Block(count + start, part[start : start + _ROWS])
-            count += len(part)
-
-    compared = _compared(joined(blocks(), _ROWS), _as_words(queries), 8 * queries.shape[1])
+    pieces = (
+        Block(0, part[start : start + _ROWS])  # `joined` counts
+        for part in database
+        for start in range(0, len(part), _ROWS)
+    )
+    compared = _compared(joined(pieces, _ROWS), _as_words(queries), 8 * queries.shape[1])
     return best_products(compared, len(queries), k)
 
 

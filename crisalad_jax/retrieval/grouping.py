@@ -67,6 +67,10 @@ class Grouping:
             )
         for kind in kinds:
             choose("grouping", kind, _WORDS)
+        if at and {*kinds} == {"single"}:
+            raise InputError(
+                f"grouping: found {text!r}, expected single without a number of images"
+            )
         return cls(kinds[0], kinds[-1], int(size) if at else None)
 
     def __str__(self) -> str:

@@ -94,6 +94,7 @@ def test_groupings_come_once_and_in_their_order():
             "single@",
             "^grouping: found 'single@', expected a number of images after @",
         ),
+        ("single@4", "^grouping: found 'single@4', expected single without a number"),
         ("single@0", "^grouping: found 'single@0', expected a number"),
         ("single@-3", "^grouping: found 'single@-3', expected a number"),
         ("single/window/single", "^grouping: found 'single/window/single', .* QUERIES/DATABASE"),
