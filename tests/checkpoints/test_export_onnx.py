@@ -164,6 +164,9 @@ FUNCTIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "logarithms": lambda x: jnp.log1p(x) + jnp.expm1(x) + jnp.exp2(x),
     "powers": lambda x: x**2 + x**3 + jax.lax.rsqrt(x + 1) + x**0.3,
     "logic": lambda x: ((x > 0.3) & ~(x > 0.6) | (x != 0.5)).astype(jnp.float32),
+    "halves": lambda x: (
+        jnp.round(jnp.floor(16 * x) / 2) + 9 * jax.lax.round(4 - jnp.floor(16 * x) / 2)
+    ),
     "finite": lambda x: jnp.isfinite(x / jnp.where(x > 0.5, 0, 1)).astype(jnp.float32),
     "sums": lambda x: x.sum(1) + x.max(1) + x.min(1) + x.prod(1),
     "any and all": lambda x: ((x > 0.5).any(1) | (x > 0.1).all(1)).astype(jnp.float32),

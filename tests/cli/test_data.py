@@ -89,7 +89,7 @@ def test_a_folder_that_does_not_match_is_code_2_and_its_json_is_written(capfd, t
         (("fetch", "spd", "--to", "x"), "spd: found no data set of this name"),
         (("list", "--to", "x"), "--to: found with data list, expected only one of the two"),
         (("fetch", "sped", "--set", "sped"), "--set: found with data fetch"),
-        (("check", "nowhere"), "nowhere: found no such folder; expected images/"),
+        (("check", "nowhere"), "nowhere: found no such folder, expected one with"),
         (("check", ".", "--set", "pits"), "nearest: pitts30k"),
         (("lst",), "found 'lst', expected one of list, fetch, check"),
     ],

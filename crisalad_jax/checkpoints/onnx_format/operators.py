@@ -66,6 +66,12 @@ _COMPOSED: Mapping[str, Callable[..., Value]] = {
     "is_finite": lambda add, params, x: add("Equal", add("Mul", x, 0), 0),
     "log1p": lambda add, params, x: add("Log", add("Add", x, 1)),
     "ne": lambda add, params, x, y: add("Not", add("Equal", x, y)),
+    # `Round` takes halves to the even number, as jnp.round does; lax.round goes away from 0.
+    "round": lambda add, params, x: (
+        add("Round", x)
+        if params["rounding_method"].name == "TO_NEAREST_EVEN"
+        else add("Mul", add("Sign", x), add("Floor", add("Add", add("Abs", x), 0.5)))
+    ),
     "rsqrt": lambda add, params, x: add("Div", 1, add("Sqrt", x)),
     "select_n": lambda add, params, which, no, yes: add("Where", which, yes, no),
     "square": lambda add, params, x: add("Mul", x, x),
