@@ -259,6 +259,7 @@ def _rank(
     kinds = grouping.database, grouping.queries
     descriptors: dict[int, Descriptors] = {}
     batches: dict[int, Batches] = {}
+    shares: dict[int, float | None] = {}
     leaks: dict[str, list[float | None]] = {}
     rankings = {}
     for seed in seeds:
@@ -266,11 +267,12 @@ def _rank(
             if kind == "shuffled" or seed == seeds[0]:
                 descriptors.pop(number, None)  # makes room
                 batches[number] = side.batches(kind, grouping.batch_size, seed)
+                shares[number] = same_place_share(batches[number], side.same)
                 described = side.describe(batches[number])
                 descriptors[number] = pack_bits(described) if bits else described
         found = {
-            "database_share": same_place_share(batches[0], sides[0].same),
-            "query_share": same_place_share(batches[1], sides[1].same),
+            "database_share": shares[0],
+            "query_share": shares[1],
             "mirrored_share": mirrored_share(batches[1], batches[0], positives),
         }
         for name, share in found.items():

@@ -145,6 +145,13 @@ def at_least_float32(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return x.astype(jnp.promote_types(x.dtype, jnp.float32))
 
 
+def residual_sum(
+    x: Float[Array, "*batch dim"], update: Float[Array, "*batch dim"]
+) -> Float[Array, "*batch dim"]:
+    """Add an update in float32 at least, and round once to the type of `x`."""
+    return (at_least_float32(x) + at_least_float32(update)).astype(x.dtype)
+
+
 def linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*batch d_out"]:
     """Map the last axis affinely, in the type of `x`, on a CPU rounded once at the end.
 

@@ -4,18 +4,10 @@ import dataclasses
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float
 
-from crisalad_jax.config.checks import require, require_range
-from crisalad_jax.nn.backbones.base import (
-    BACKBONES,
-    Backbone,
-    Features,
-    FeatureSpec,
-    Grid,
-    Pixels,
-    Valid,
-)
+from crisalad_jax.nn.backbones.base import BACKBONES, Pixels
+from crisalad_jax.nn.backbones.handmade import WholeImageBackbone
 
 _SIDE = 128
 _CELL = 8
@@ -28,7 +20,7 @@ _GREY = (9798, 19235, 3735)
 
 @BACKBONES.register("hog")
 @dataclasses.dataclass(frozen=True)
-class HogConfig(Backbone):
+class HogConfig(WholeImageBackbone):
     """Histograms of oriented gradients of 128 x 128 pixels (Dalal and Triggs, CVPR 2005).
 
     Pictures are grey, with Sobel gradients. Unsigned angles fall into 9 bins, linearly between the
@@ -38,30 +30,11 @@ class HogConfig(Backbone):
     """
 
     dim: int = _DIM
-    depth: int = 1
     patch_size: ClassVar[int] = _SIDE
+    size: ClassVar[tuple[int, int]] = _SIDE, _SIDE
 
-    def __post_init__(self) -> None:
-        """Check that its sizes are the only ones."""
-        require_range(self, _DIM, _DIM, "dim")
-        require_range(self, 1, 1, "depth")
-
-    def grid(self, image_size: tuple[int, int]) -> Grid:
-        """Return 1 x 1: the whole image is one patch."""
-        height, width = image_size
-        require(
-            (height, width) == (_SIDE, _SIDE),
-            f"image size: found {height} x {width}, expected {_SIDE} x {_SIDE} for backbone hog",
-        )
-        return 1, 1
-
-    def init(self, key: PRNGKeyArray) -> None:
-        """Return no parameters."""
-
-    def apply(
-        self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
-    ) -> tuple[Features, None]:
-        """Return the descriptor as the class token, and as the only patch."""
+    def descriptors(self, images: Pixels) -> Float[Array, "image dim"]:
+        """Return the descriptors of images of `size`."""
         pixels = jnp.round(images.astype(jnp.float32)).astype(jnp.int32)
         grey = (pixels * jnp.array(_GREY, jnp.int32)).sum(axis=-1) + (1 << 14) >> 15
         padded = jnp.pad(grey.astype(jnp.float32), ((0, 0), (1, 1), (1, 1)), mode="reflect")
@@ -82,5 +55,4 @@ class HogConfig(Backbone):
         blocks = jnp.where(norms > 0, blocks / jnp.where(norms > 0, norms, 1), 0)
         descriptors = blocks.reshape(-1, _DIM)
         is_flat = ~descriptors.any(axis=-1, keepdims=True)
-        descriptors = jnp.where(is_flat, 1, descriptors)
-        return Features(descriptors, descriptors[:, None]), None
+        return jnp.where(is_flat, 1, descriptors)

@@ -9,38 +9,24 @@ import dataclasses
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
-from crisalad_jax.config.checks import PositiveInt, require, require_range
+from crisalad_jax.config.checks import PositiveInt, require
 from crisalad_jax.config.preprocessing import FEATURE_BYTES, LocalFeatures
-from crisalad_jax.nn.backbones.base import (
-    BACKBONES,
-    Backbone,
-    Features,
-    FeatureSpec,
-    Grid,
-    Pixels,
-    Valid,
-)
+from crisalad_jax.nn.backbones.base import BACKBONES, Features, FeatureSpec, Grid, Pixels, Valid
+from crisalad_jax.nn.backbones.handmade import HandmadeBackbone
 
 
 @dataclasses.dataclass(frozen=True)
-class _LocalFeatureBackbone(Backbone):
+class _LocalFeatureBackbone(HandmadeBackbone):
     """Local features of OpenCV: no parameters, and no class token."""
 
     any_size: ClassVar[bool] = True
     class_token: ClassVar[bool] = False
     exposes_levels: ClassVar[bool] = False
     local_features: ClassVar[LocalFeatures]
-    depth: int = 1
     count: PositiveInt = 500
     """Number of features of an image, at most: the strongest."""
-
-    def __post_init__(self) -> None:
-        """Check that its sizes are the only ones."""
-        width = type(self).dim
-        require_range(self, width, width, "dim")
-        require_range(self, 1, 1, "depth")
 
     @property
     def encoded_size(self) -> tuple[int, int]:
@@ -50,9 +36,6 @@ class _LocalFeatureBackbone(Backbone):
     def grid(self, image_size: tuple[int, int]) -> Grid:
         """Return one row of features, whatever the size of a photograph."""
         return 1, self.count
-
-    def init(self, key: PRNGKeyArray) -> None:
-        """Return no parameters."""
 
     @abc.abstractmethod
     def vectors(

@@ -33,6 +33,7 @@ from crisalad_jax.nn.layers import (
     init_small_linear,
     layer_norm,
     linear,
+    residual_sum,
 )
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -175,14 +176,10 @@ def block(params: TetraBlock, x: TokenBatch, heads: int) -> TokenBatch:
     layer = linear if params.norm4 is None else ternary_linear
     qkv = split_heads(layer(params.attn.qkv, layer_norm(params.norm1, x)), 3 * heads)
     mixed = dot_product_attention(*jnp.split(qkv, 3, axis=-2)).reshape(x.shape)
-    x = _sum(x, layer(params.attn.proj, layer_norm(params.norm2, mixed)))
+    x = residual_sum(x, layer(params.attn.proj, layer_norm(params.norm2, mixed)))
     hidden = gelu(layer(params.fc1, layer_norm(params.norm3, x)))
     hidden = hidden if params.norm4 is None else layer_norm(params.norm4, hidden)
-    return _sum(x, layer(params.fc2, hidden))
-
-
-def _sum(x: TokenBatch, update: TokenBatch) -> TokenBatch:
-    return (at_least_float32(x) + at_least_float32(update)).astype(x.dtype)
+    return residual_sum(x, layer(params.fc2, hidden))
 
 
 def ternary_linear(params: Linear, x: Float[Array, "*batch d_in"]) -> Float[Array, "*batch d_out"]:

@@ -4,18 +4,10 @@ import dataclasses
 from typing import ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float
 
-from crisalad_jax.config.checks import require, require_range
-from crisalad_jax.nn.backbones.base import (
-    BACKBONES,
-    Backbone,
-    Features,
-    FeatureSpec,
-    Grid,
-    Pixels,
-    Valid,
-)
+from crisalad_jax.nn.backbones.base import BACKBONES, Pixels
+from crisalad_jax.nn.backbones.handmade import WholeImageBackbone
 
 _SIZE = 32, 64
 _PATCH = 8
@@ -28,7 +20,7 @@ _LEAST = 0.5
 
 @BACKBONES.register("thumbnail")
 @dataclasses.dataclass(frozen=True)
-class ThumbnailConfig(Backbone):
+class ThumbnailConfig(WholeImageBackbone):
     """SeqSLAM's images of 32 x 64 grey pixels (Milford and Wyeth, ICRA 2012).
 
     Each patch of 8 x 8 is less its mean and divided by its deviation. A picture of uniform patches
@@ -37,35 +29,15 @@ class ThumbnailConfig(Backbone):
     """
 
     dim: int = _DIM
-    depth: int = 1
     patch_size: ClassVar[int] = _PATCH
+    size: ClassVar[tuple[int, int]] = _SIZE
 
-    def __post_init__(self) -> None:
-        """Check that its sizes are the only ones."""
-        require_range(self, _DIM, _DIM, "dim")
-        require_range(self, 1, 1, "depth")
-
-    def grid(self, image_size: tuple[int, int]) -> Grid:
-        """Return 1 x 1: the whole image is one patch."""
-        height, width = image_size
-        require(
-            (height, width) == _SIZE,
-            f"image size: found {height} x {width}, expected 32 x 64 for backbone thumbnail",
-        )
-        return 1, 1
-
-    def init(self, key: PRNGKeyArray) -> None:
-        """Return no parameters."""
-
-    def apply(
-        self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
-    ) -> tuple[Features, None]:
-        """Return the descriptor as the class token, and as the only patch."""
+    def descriptors(self, images: Pixels) -> Float[Array, "image dim"]:
+        """Return the descriptors of images of `size`."""
         grey = (images.astype(jnp.float32) * jnp.array(_GREY, jnp.float32)).sum(axis=-1)
         patches = grey.reshape(-1, _SIZE[0] // _PATCH, _PATCH, _SIZE[1] // _PATCH, _PATCH)
         centred = patches - patches.mean(axis=(2, 4), keepdims=True)
         deviation = jnp.sqrt(jnp.square(centred).mean(axis=(2, 4), keepdims=True))
         normalised = (centred / jnp.maximum(deviation, _LEAST)).reshape(-1, _DIM)
         is_flat = ~(deviation > _LEAST).any(axis=(1, 2, 3, 4))[:, None]
-        descriptors = jnp.where(is_flat, 1, normalised)
-        return Features(descriptors, descriptors[:, None]), None
+        return jnp.where(is_flat, 1, normalised)

@@ -35,13 +35,13 @@ from crisalad_jax.nn.layers import (
     Conv,
     LayerNorm,
     Linear,
-    at_least_float32,
     conv,
     gelu,
     init_layer_norm,
     init_small_linear,
     layer_norm,
     linear,
+    residual_sum,
 )
 from crisalad_jax.utils.pytree import pytree_dataclass
 
@@ -184,5 +184,4 @@ def block(params: TransVprBlock, x: TokenBatch, heads: int) -> TokenBatch:
     normed = layer_norm(params.pre_norm, x)
     x = x + attention(params.self_attn, normed, heads)
     x = layer_norm(params.norm1, x)
-    update = linear(params.linear2, gelu(linear(params.linear1, x)))
-    return (at_least_float32(x) + at_least_float32(update)).astype(x.dtype)
+    return residual_sum(x, linear(params.linear2, gelu(linear(params.linear1, x))))

@@ -1,0 +1,54 @@
+"""Backbones that nothing trains: features that people defined, of one width."""
+
+import abc
+import dataclasses
+from typing import ClassVar
+
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from crisalad_jax.config.checks import require, require_range
+from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Pixels, Valid
+
+
+@dataclasses.dataclass(frozen=True)
+class HandmadeBackbone(Backbone):
+    """A backbone without parameters, whose width is its class's."""
+
+    depth: int = 1
+
+    def __post_init__(self) -> None:
+        """Check that its sizes are the only ones."""
+        width = type(self).dim
+        require_range(self, width, width, "dim")
+        require_range(self, 1, 1, "depth")
+
+    def init(self, key: PRNGKeyArray) -> None:
+        """Return no parameters."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WholeImageBackbone(HandmadeBackbone):
+    """A descriptor of a whole image of one size."""
+
+    size: ClassVar[tuple[int, int]]
+    """Height and width in pixels."""
+
+    def grid(self, image_size: tuple[int, int]) -> Grid:
+        """Return 1 x 1: the whole image is one patch."""
+        found, expected = (f"{height} x {width}" for height, width in (image_size, self.size))
+        require(
+            found == expected,
+            f"image size: found {found}, expected {expected} for backbone {self.part_name}",
+        )
+        return 1, 1
+
+    @abc.abstractmethod
+    def descriptors(self, images: Pixels) -> Float[Array, "image dim"]:
+        """Return the descriptors of images of `size`."""
+
+    def apply(
+        self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
+    ) -> tuple[Features, None]:
+        """Return the descriptor as the class token, and as the only patch."""
+        descriptors = self.descriptors(images)
+        return Features(descriptors, descriptors[:, None]), None
