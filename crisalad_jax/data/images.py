@@ -18,6 +18,7 @@ import numpy as np
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.preprocessing import BitDepth
 from crisalad_jax.data.prepare import as_rgb
+from crisalad_jax.data.remote import address_of, is_remote, read_remote
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.data.video import frame_time, is_video, read_frame
 from crisalad_jax.utils.errors import InputError
@@ -121,6 +122,8 @@ def read_pixels(
     """Read an image file as `read_image` does, in the file's own depth; see `decode_image`."""
     if frame_time(path) is not None:
         return read_frame(path)
+    if is_remote(path):
+        return decode_image(read_remote(path), address_of(path), enough=enough)
     return decode_image(read_bytes(path, "an image file"), path, enough=enough)
 
 

@@ -12,6 +12,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "openvino": ("openvino", "onnx", *_CLI),
     "serve": ("fastapi", "uvicorn", "python_multipart", *_CLI),
     "data": ("huggingface_hub", "kagglehub", *_CLI),
+    "robot": ("fsspec", *_CLI),
     "milvus": ("pymilvus", "milvus_lite"),
     "convert": ("torch", *_CLI),
 }

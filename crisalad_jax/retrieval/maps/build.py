@@ -5,18 +5,22 @@ import dataclasses
 import os
 import pathlib
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from crisalad_jax.checkpoints.runtime import Runtime
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.reading import Reading
+from crisalad_jax.data.remote import for_each, size_of, whole_name
 from crisalad_jax.data.sources import ImageSource, open_sources
+from crisalad_jax.data.tracks import Track
 from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import check_search
+from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.map import Map, MapImage, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import (
     SHARES,
@@ -28,11 +32,11 @@ from crisalad_jax.retrieval.maps.metadata import (
     read_components,
     read_metadata,
 )
+from crisalad_jax.retrieval.maps.novelty import Novelty
 from crisalad_jax.retrieval.maps.store import check_store, store_name
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.segments import SEGMENT, Share, Shares, digest_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import progress_bar
 
@@ -63,27 +67,37 @@ class Indexed(NamedTuple):
     """What the approximate search recalls, see `Map.build_search`; None where none was asked."""
     shares_left: int = 0
     """Number of shares that are not there yet; until then these are counts of one share."""
+    near: int = 0
+    """Number of images left out by `every_metres`."""
+    similar: int = 0
+    """Number of images left out by `novelty`."""
     joined_elsewhere: bool = False
     """Whether another process joins the shares, so that these are counts of one share."""
 
 
 def _new_images(
-    maps: Sequence[Map], source: ImageSource
+    maps: Sequence[Map], source: ImageSource, left_out: Mapping[str, int]
 ) -> tuple[list[str], list[int], list[pathlib.Path]]:
     """List names, sizes and paths of the images that no map has.
+
+    Args:
+        maps: the maps.
+        source: the images.
+        left_out: bytes of images that were left out of the maps before, by name.
 
     Raises:
         InputError: a name in a map is of another image here.
     """
     names, sizes, new = [], [], []
-    for name, path in zip(source.names, source.paths, strict=True):
-        file = file_of(path)
-        size = file.stat().st_size if file.is_file() else None  # missing: to be skipped
+    all_sizes = for_each(lambda path: size_of(file_of(path)), source.paths)
+    # A size of None is of a missing file, which is skipped.
+    for name, path, size in zip(source.names, source.paths, all_sizes, strict=True):
         known = next(filter(None, (each.image(name) for each in maps)), None)
         if known is None:
-            names.append(name)
-            sizes.append(size or 0)
-            new.append(path)
+            if size is None or left_out.get(name) != size:
+                names.append(name)
+                sizes.append(size or 0)
+                new.append(path)
         elif size not in (None, known.bytes):
             raise InputError(
                 f"{path}: found {size} bytes, but the map has {name!r} of {known.bytes} bytes from "
@@ -99,7 +113,9 @@ def index(
     *,
     weights: str | os.PathLike[str],
     fps: float | None = None,
-    positions: Positions | str | os.PathLike[str] | None = None,
+    positions: Positions | Track | str | os.PathLike[str] | None = None,
+    every_metres: float | None = None,
+    novelty: float | None = None,
     store: str | None = None,
     dtype: Literal["float32", "float16", "bits"] | None = None,
     pca: Pca | str | os.PathLike[str] | None = None,
@@ -120,9 +136,14 @@ def index(
         out: the map's folder.
         weights: the file that the parameters are from, which queries load by default.
         fps: frames a second taken of a video, which is then expected; None is one.
-        positions: where images were taken, or a table of it. None is what `images` says, if that
-            is a table; else what @UTM names say; else what the EXIF data of JPEGs says. Names of
-            several zones of UTM give degrees, or metres of the map's zone.
+        positions: where images were taken, or a table or track of it (`read_track`). None is what
+            `images` says, if that is a table; else what @UTM names say; else what the EXIF data of
+            JPEGs says. Names of several zones of UTM give degrees, or metres of the map's zone.
+        every_metres: least distance of an image from the last one of its folder or video that was
+            taken; nearer ones are left out, and those without a position taken. None takes all.
+        novelty: largest cosine similarity of an image to the last one of its folder or video that
+            was taken; more similar ones are left out, so that a robot that stands still does not
+            fill its map. None takes all.
         store: "files", or "milvus:URI". None is the map's, and of a new map "files".
         dtype: type of the stored descriptors; "bits" stores their signs (`pack_bits`), which are
             searched by the Hamming distance. None is the map's, and of a new map "float32".
@@ -139,8 +160,8 @@ def index(
 
     Raises:
         InputError: parameters of another configuration; no image, or none that can be read;
-            positions of none of them; a map of another model or of other
-            settings; what `Map.append`, `new_metadata` and `open_for_appending` raise.
+            positions of none of them; a distance or similarity out of range; a map of another model
+            or of other settings; what `Map.append`, `new_metadata` and `open_for_appending` raise.
 
     Example:
         >>> import jax
@@ -155,6 +176,11 @@ def index(
     """
     describer = describer_of(model)
     part = None if share is None else Share.parse(share)
+    if novelty is not None:
+        check_min_similarity(novelty, "novelty")
+        require(
+            part is None, f"--novelty: found with --share {share}, expected only one of the two"
+        )
     out = pathlib.Path(out)
     metadata = read_metadata(out)
     (source,) = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
@@ -164,7 +190,13 @@ def index(
         if known.axes == AXES[1] and metadata is None:
             warn(f"{images}: the names are of several zones of UTM: positions become lat, lon")
     else:
-        known = positions_of(table, source.names, images)
+        known = positions_of(table, source.names, source.paths, images)
+    listed = len(source.names)
+    if every_metres is not None:
+        spaced = source.spaced(known if known.of else source.located(), every_metres)
+        near = set(source.names) - set(spaced.names)
+        known = known._replace(of={name: at for name, at in known.of.items() if name not in near})
+        source = spaced
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca)
     if metadata is None:
         options: dict[str, Any] = {"store": store or "files", "dtype": dtype or "float32"}
@@ -178,7 +210,7 @@ def index(
     if table is None and not known.of:
         known = None
     fitted = reading.fitted(len(source.paths))
-    work = _Indexing(describer, source, known, metadata, components, search, fitted)
+    work = _Indexing(describer, source, known, novelty, metadata, components, search, fitted)
     if part is not None:
         result = work.share(out, part)
     else:
@@ -190,6 +222,7 @@ def index(
             "recalls that are published for batches are not the map's (`crisalad evaluate "
             "--grouping single` measures those of single images)"
         )
+    result = result._replace(near=listed - len(source.names))
     return result if table is not None else result._replace(stay=0)
 
 
@@ -201,6 +234,8 @@ class _Indexing:
     source: ImageSource
     positions: Positions | None
     """Where they were taken; None is what the images' EXIF data says."""
+    novelty: float | None
+    """Largest similarity to the last image that was taken; None is any."""
     metadata: MapMetadata
     components: Pca | None
     search: str | None
@@ -230,25 +265,32 @@ class _Indexing:
             InputError: an image cannot be read; a name in a map is of another image here; or what
                 `Map.append` raises.
         """
-        names, sizes, new = _new_images((target, whole), source)
+        root, total = whole_name(source.root), len(source.paths)
+        choice = None if self.novelty is None else Novelty(target, source, root, self.novelty)
+        left_out = {} if choice is None else choice.left_out
+        names, sizes, new = _new_images((target, whole), source, left_out)
         positions = self.positions
         if positions is None:
             positions = _by_exif(whole, zip(names, new, strict=True))
         target.fitted(names, positions)  # checks them before any work
         unreadable: list[str] = []
-        root, total, quiet = (
-            real_path(source.root).as_posix(),
-            len(source.paths),
-            self.reading.quiet,
-        )
         stream = described(self.describer, new, self.reading, components=target.components)
         done, quiet = total - len(new), self.reading.quiet
         stream = shown(stream, "images", total, quiet=quiet, done=done)
         for part in joined(stream, SEGMENT):
             unreadable.extend(names[i] for i in part.unreadable)
-            if len(part.indices):
-                some, bytes_ = ([column[i] for i in part.indices] for column in (names, sizes))
-                target.append(some, bytes_, part.descriptors, root=root, positions=positions)
+            if not len(part.indices):
+                continue
+            numbers, rows = part.indices, part.descriptors
+            alike = numbers[:0]
+            if choice is not None:
+                is_new = choice.choose([names[i] for i in numbers], rows)
+                numbers, alike, rows = numbers[is_new], numbers[~is_new], rows[is_new]
+            if len(numbers):
+                some, bytes_ = ([column[i] for i in numbers] for column in (names, sizes))
+                target.append(some, bytes_, rows, root=root, positions=positions)
+            if choice is not None and len(alike):
+                choice.leave_out([names[i] for i in alike], [sizes[i] for i in alike])
         return unreadable
 
     def _counts(
@@ -257,15 +299,18 @@ class _Indexing:
         """Count what became of the images, of a map that had some before."""
         known, listed = {image.name for image in there}, set(self.source.names)
         given = () if self.positions is None else self.positions.of.keys()
+        there_now = len(listed & known)
+        rest = len(listed) - there_now - len(added) - len(unreadable)
         return Indexed(
             added=len(added),
-            there=len(listed & known),
+            there=there_now,
             positions=sum(image.position is not None for image in added),
             stay=len(known.intersection(given)),
             unreadable=unreadable,
             unmatched=[name for name in given if name not in listed],
             images=len(there) + len(added),
             metadata=self.metadata,
+            similar=0 if self.novelty is None else rest,
         )
 
     def _finish(self, target: Map) -> float | None:
