@@ -210,7 +210,7 @@ def index(
     if table is None and not known.of:
         known = None
     fitted = reading.fitted(len(source.paths))
-    work = _Indexing(describer, source, known, novelty, metadata, components, search, fitted)
+    work = _Indexing(describer, source, known, metadata, components, search, fitted, novelty)
     if part is not None:
         result = work.share(out, part)
     else:
@@ -234,12 +234,12 @@ class _Indexing:
     source: ImageSource
     positions: Positions | None
     """Where they were taken; None is what the images' EXIF data says."""
-    novelty: float | None
-    """Largest similarity to the last image that was taken; None is any."""
     metadata: MapMetadata
     components: Pca | None
     search: str | None
     reading: Reading
+    novelty: float | None = None
+    """Largest similarity to the last image that was taken; None is any."""
 
     def into(self, target: Map) -> Indexed:
         """Append all images to a map that is open for appending.
