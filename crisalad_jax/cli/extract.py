@@ -4,8 +4,8 @@ import dataclasses
 import pathlib
 from typing import Annotated, Any
 
-from crisalad_jax.cli.common import echo, open_flagged, pick
-from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags, Target
+from crisalad_jax.cli.common import echo, given_positions, open_flagged, pick
+from crisalad_jax.cli.flags import JsonFlag, ModelFlags, PlaceFlags, ReadFlags, Target
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
 from crisalad_jax.utils.output import counted
@@ -20,7 +20,7 @@ SEVERAL = "quote a pattern, or list the images in a .txt"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Extract(ReadFlags, ModelFlags, JsonFlag):
+class Extract(ReadFlags, ModelFlags, PlaceFlags, JsonFlag):
     """Write a descriptor of every image in a folder, in sorted path order."""
 
     images: pathlib.Path
@@ -51,9 +51,10 @@ def run(arguments: Extract) -> dict[str, Any]:
     """Describe the images, and print what was written."""
     out, how = arguments.out, pick(arguments, "grouping", "seed", "pairs", "database", "k")
     check_extraction(out, **how)
+    positions = given_positions(arguments)
     model, _, file = open_flagged(arguments, groupings=[arguments.grouping])
-    more = pick(arguments, "fps", "root", "pca", "verify", "reading")
-    result = extract(model, arguments.images, out, weights=file, **how, **more)
+    more = pick(arguments, "fps", "every_metres", "root", "pca", "verify", "reading")
+    result = extract(model, arguments.images, out, weights=file, positions=positions, **how, **more)
     described = counted(len(result.names), "descriptor")
     pairs = None
     if result.pairs is not None:

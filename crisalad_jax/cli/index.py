@@ -4,8 +4,8 @@ import dataclasses
 import pathlib
 from typing import Annotated, Any, Literal
 
-from crisalad_jax.cli.common import echo, open_flagged, pick
-from crisalad_jax.cli.flags import FOLDER, JsonFlag, ModelFlags, ReadFlags
+from crisalad_jax.cli.common import echo, given_positions, open_flagged, pick
+from crisalad_jax.cli.flags import FOLDER, JsonFlag, ModelFlags, PlaceFlags, ReadFlags
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
 from crisalad_jax.retrieval.maps.build import Indexed, index
@@ -13,8 +13,8 @@ from crisalad_jax.retrieval.maps.metadata import model_config, read_metadata, we
 from crisalad_jax.utils.output import counted
 
 COMMON = (
-    "images out weights fps positions store dtype pca search image-size resize batch-size "
-    "runtime compute-dtype on-bad-image json plugin quiet"
+    "images out weights fps positions every-metres novelty store dtype pca search image-size "
+    "resize batch-size runtime on-bad-image json quiet"
 )
 EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
 SEVERAL = "quote a pattern; other folders are added by the same command again"
@@ -22,7 +22,7 @@ SEVERAL = "quote a pattern; other folders are added by the same command again"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Index(ReadFlags, ModelFlags, JsonFlag):
+class Index(ReadFlags, ModelFlags, PlaceFlags, JsonFlag):
     """Make a map of a folder of images, or append to it those that it lacks.
 
     An existing map takes images by the model that made it, at its image size.
@@ -35,9 +35,9 @@ class Index(ReadFlags, ModelFlags, JsonFlag):
     """The map's folder. After a kill the same command goes on."""
     fps: float | None = None
     """Frames a second taken of a video, by default 1."""
-    positions: pathlib.Path | None = None
-    """CSV of name,east,north (metres) or name,lat,lon or name,x,y, for images that are new; by
-    default what a table as --images says, or @UTM names, or EXIF data."""
+    novelty: float | None = None
+    """Take an image only if its similarity to the last one taken of its folder or video is not
+    above that, such as 0.9."""
     store: str | None = None
     """files, in the map's folder, or milvus:URI, a file name.db or http://host:port; by default the
     map's, and of a new map files."""
@@ -54,14 +54,16 @@ class Index(ReadFlags, ModelFlags, JsonFlag):
 def run(arguments: Index) -> dict[str, Any]:
     """Index the images, and print what became of them."""
     out, weights, like = arguments.out, None, None
+    positions = given_positions(arguments)
     metadata = read_metadata(out)
     if metadata is not None:
         like = model_config(metadata, out)
         weights = None if arguments.weights else weights_of(metadata, out)
     model, _, file = open_flagged(arguments, weights, like=like)
     config = model.config
-    more = pick(arguments, "fps", "positions", "store", "dtype", "pca", "search")
-    result = index(model, arguments.images, out, weights=file, reading=arguments.reading, **more)
+    more = pick(arguments, "fps", "every_metres", "novelty", "reading")
+    more |= pick(arguments, "store", "dtype", "pca", "search")
+    result = index(model, arguments.images, out, weights=file, positions=positions, **more)
     echo(f"{out}: {'; '.join(_words(result, config))}")
     counts = {name: value for name, value in result._asdict().items() if name != "metadata"}
     return {
@@ -81,6 +83,10 @@ def _words(result: Indexed, config: ModelConfig) -> list[str]:
         words.append(f"{result.there} were there already")
     if result.stay:
         words.append(f"{result.stay} positions given are of such, and stay as they are")
+    if result.near:
+        words.append(f"{result.near} nearer than --every-metres left out")
+    if result.similar:
+        words.append(f"{result.similar} more similar than --novelty left out")
     if unmatched:
         words.append(
             f"{len(unmatched)} positions given are of no image here, {unmatched[0]!r} the first"

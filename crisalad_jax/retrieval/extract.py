@@ -17,8 +17,11 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.frames import file_of
 from crisalad_jax.data.images import check_lines, read_pixels
+from crisalad_jax.data.positions import Positions
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.data.sources import open_sources
+from crisalad_jax.data.remote import for_each, state_of, whole_name
+from crisalad_jax.data.sources import ImageSource, open_sources
+from crisalad_jax.data.tracks import Track
 from crisalad_jax.retrieval.chunks import Descriptors, as_rows, check_all_rows, check_rows
 from crisalad_jax.retrieval.describe import (
     check_readable,
@@ -49,7 +52,6 @@ from crisalad_jax.utils.files import (
     check_format,
     check_no_links,
     check_target,
-    real_path,
     wrap_os_errors,
 )
 from crisalad_jax.utils.locks import lock
@@ -82,6 +84,8 @@ def extract(
     out: StrPath | None = None,
     *,
     fps: float | None = None,
+    positions: Positions | Track | StrPath | None = None,
+    every_metres: float | None = None,
     weights: StrPath | None = None,
     grouping: str = "single",
     seed: int = 0,
@@ -105,6 +109,9 @@ def extract(
         out: a file .npy, with the names in another, or .h5, as hloc reads it. How it was made is
             written next to it, as JSON. None writes nothing.
         fps: frames a second taken of a video, which is then expected; None is one.
+        positions: where images were taken, for `every_metres`, as `index` takes it.
+        every_metres: least distance of an image from the last one of its folder or video that was
+            taken, as of `index`. None takes all.
         weights: the file that the parameters are from, for that JSON and for messages.
         grouping: one of `GROUPINGS`: which images attend to each other.
         seed: draws the order of the grouping "shuffled".
@@ -139,7 +146,15 @@ def extract(
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca, verify=verify)
     made_by = "--pairs" if pairs is not None else "model" if weights is None else str(weights)
     length, is_unit = shortened(components, describer, made_by, unit=pairs is not None)
-    paths, names = _listed(images, root, fps, reading)
+    sources = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
+    if every_metres is not None:
+        require(len(sources) == 1, f"every_metres: found {len(sources)} files, expected one source")
+        sources = [each.spaced(each.located(positions), every_metres) for each in sources]
+    require(
+        positions is None or every_metres is not None,
+        "--positions: found without --every-metres, expected both",
+    )
+    paths, names = _listed(images, sources, root)
     made = {} if out is None and database is None else _made(describer, components)
     others = None if pairs is None else _others(pairs, names, database, length, made, verify=verify)
     reading = reading.fitted(len(paths))
@@ -151,6 +166,7 @@ def extract(
         "weights": None if weights is None else starter.named(weights),
         "images": source,
         "fps": fps,
+        "every_metres": every_metres,
         "grouping": grouping,
         "batch_size": reading.batch_size,
         "seed": seed,
@@ -307,11 +323,10 @@ class _Work:
 
     def _digest(self) -> str:
         """Compute a digest of the settings, and of the names, sizes and times of the files."""
-        files = []
-        for path, name in zip(self.paths, self.names, strict=True):
-            with contextlib.suppress(OSError):  # reported when it is read
-                there = file_of(path).stat()
-                files.append(f"{name} {path} {there.st_size} {there.st_mtime_ns}")
+        states = for_each(lambda path: state_of(file_of(path)), self.paths)
+        each = zip(self.names, self.paths, states, strict=True)
+        # A missing file is reported when it is read.
+        files = [f"{name} {path} {state}" for name, path, state in each if state is not None]
         return digest_of(files, self.settings())
 
     def _check(self, rows: np.ndarray, numbers: np.ndarray) -> None:
@@ -374,10 +389,9 @@ def _remove_work(folder: pathlib.Path) -> None:
 
 
 def _listed(
-    images: StrPath | Sequence[StrPath], root: StrPath | None, fps: float | None, reading: Reading
+    images: StrPath | Sequence[StrPath], sources: Sequence[ImageSource], root: StrPath | None
 ) -> tuple[list[pathlib.Path], list[str]]:
     """List the images, and their names relative to the root."""
-    sources = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
     paths = [path for source in sources for path in source.paths]
     if isinstance(images, str | os.PathLike):
         (source,) = sources
@@ -389,7 +403,7 @@ def _listed(
 
 
 def _inside(path: pathlib.Path, root: StrPath) -> pathlib.PurePath:
-    whole, holder = real_path(path), real_path(root)
+    whole, holder = (pathlib.Path(whole_name(pathlib.Path(each))) for each in (path, root))
     if not whole.is_relative_to(holder):
         raise InputError(f"--root: found {holder}, expected a folder that holds {whole}")
     return whole.relative_to(holder)

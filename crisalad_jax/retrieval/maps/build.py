@@ -3,18 +3,21 @@
 import dataclasses
 import os
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.frames import frame_time, stored_bytes
+from crisalad_jax.data.frames import frame_time
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.reading import Reading
+from crisalad_jax.data.remote import for_each, size_of, whole_name
 from crisalad_jax.data.sources import ImageSource, open_sources
+from crisalad_jax.data.tracks import Track
 from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import check_search
+from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.map import Map, MapImage, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import (
     MapMetadata,
@@ -24,11 +27,11 @@ from crisalad_jax.retrieval.maps.metadata import (
     read_components,
     read_metadata,
 )
+from crisalad_jax.retrieval.maps.novelty import Novelty
 from crisalad_jax.retrieval.maps.store import check_store, store_name
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.segments import SEGMENT
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.output import warn
 
 if TYPE_CHECKING:
@@ -56,24 +59,35 @@ class Indexed(NamedTuple):
     metadata: MapMetadata
     recall: float | None = None
     """What the approximate search recalls, see `Map.build_search`; None where none was asked."""
+    near: int = 0
+    """Number of images left out by `every_metres`."""
+    similar: int = 0
+    """Number of images left out by `novelty`."""
 
 
 def _new_images(
-    target: Map, source: ImageSource
+    target: Map, source: ImageSource, left_out: Mapping[str, int]
 ) -> tuple[list[str], list[int], list[pathlib.Path]]:
     """List names, sizes and paths of the images that the map lacks.
+
+    Args:
+        target: the map.
+        source: the images.
+        left_out: bytes of images that were left out before, by name.
 
     Raises:
         InputError: a name in the map is of another image here.
     """
     names, sizes, new = [], [], []
-    for name, path in zip(source.names, source.paths, strict=True):
-        size = stored_bytes(path)  # None is missing: to be skipped
+    all_sizes = for_each(size_of, source.paths)
+    # A size of None is of a missing file, which is skipped.
+    for name, path, size in zip(source.names, source.paths, all_sizes, strict=True):
         known = target.image(name)
         if known is None:
-            names.append(name)
-            sizes.append(size or 0)
-            new.append(path)
+            if size is None or left_out.get(name) != size:
+                names.append(name)
+                sizes.append(size or 0)
+                new.append(path)
         elif size not in (None, known.bytes):
             raise InputError(
                 f"{path}: found {size} bytes, but the map has {name!r} of {known.bytes} bytes from "
@@ -89,7 +103,9 @@ def index(
     *,
     weights: str | os.PathLike[str],
     fps: float | None = None,
-    positions: Positions | str | os.PathLike[str] | None = None,
+    positions: Positions | Track | str | os.PathLike[str] | None = None,
+    every_metres: float | None = None,
+    novelty: float | None = None,
     store: str | None = None,
     dtype: Literal["float32", "float16", "bits"] | None = None,
     pca: Pca | str | os.PathLike[str] | None = None,
@@ -109,9 +125,14 @@ def index(
         out: the map's folder.
         weights: the file that the parameters are from, which queries load by default.
         fps: frames a second taken of a video, which is then expected; None is one.
-        positions: where images were taken, or a table of it. None is what `images` says, if that
-            is a table; else what @UTM names say; else what the EXIF data of JPEGs says. Names of
-            several zones of UTM give degrees, or metres of the map's zone.
+        positions: where images were taken, or a table or track of it (`read_track`). None is what
+            `images` says, if that is a table; else what @UTM names say; else what the EXIF data of
+            JPEGs says. Names of several zones of UTM give degrees, or metres of the map's zone.
+        every_metres: least distance of an image from the last one of its folder or video that was
+            taken; nearer ones are left out, and those without a position taken. None takes all.
+        novelty: largest cosine similarity of an image to the last one of its folder or video that
+            was taken; more similar ones are left out, so that a robot that stands still does not
+            fill its map. None takes all.
         store: "files", or "milvus:URI". None is the map's, and of a new map "files".
         dtype: type of the stored descriptors; "bits" stores their signs (`pack_bits`), which are
             searched by the Hamming distance. None is the map's, and of a new map "float32".
@@ -126,8 +147,8 @@ def index(
 
     Raises:
         InputError: parameters of another configuration; no image, or none that can be read;
-            positions of none of them; a map of another model or of other
-            settings; what `Map.append`, `new_metadata` and `open_for_appending` raise.
+            positions of none of them; a distance or similarity out of range; a map of another model
+            or of other settings; what `Map.append`, `new_metadata` and `open_for_appending` raise.
 
     Example:
         >>> import jax
@@ -141,6 +162,8 @@ def index(
         4
     """
     describer = describer_of(model)
+    if novelty is not None:
+        check_min_similarity(novelty, "novelty")
     out = pathlib.Path(out)
     metadata = read_metadata(out)
     (source,) = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
@@ -150,7 +173,13 @@ def index(
         if known.axes == AXES[1] and metadata is None:
             warn(f"{images}: the names are of several zones of UTM: positions become lat, lon")
     else:
-        known = positions_of(table, source.names, images)
+        known = positions_of(table, source.names, source.paths, images)
+    listed = len(source.names)
+    if every_metres is not None:
+        spaced = source.spaced(known if known.of else source.located(), every_metres)
+        near = set(source.names) - set(spaced.names)
+        known = known._replace(of={name: at for name, at in known.of.items() if name not in near})
+        source = spaced
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca)
     if metadata is None:
         options: dict[str, Any] = {"store": store or "files", "dtype": dtype or "float32"}
@@ -164,7 +193,7 @@ def index(
     if table is None and not known.of:
         known = None
     fitted = reading.fitted(len(source.paths))
-    work = _Indexing(describer, source, known, metadata, components, search, fitted)
+    work = _Indexing(describer, source, known, metadata, components, search, fitted, novelty)
     with open_for_appending(out, metadata, components) as target:
         result = work.into(target)
     if result.added == result.images and describer.config.cross_image.attends:
@@ -173,6 +202,7 @@ def index(
             "recalls that are published for batches are not the map's (`crisalad evaluate "
             "--grouping single` measures those of single images)"
         )
+    result = result._replace(near=listed - len(source.names))
     return result if table is not None else result._replace(stay=0)
 
 
@@ -188,6 +218,8 @@ class _Indexing:
     components: Pca | None
     search: str | None
     reading: Reading
+    novelty: float | None = None
+    """Largest similarity to the last image that was taken; None is any."""
 
     def into(self, target: Map) -> Indexed:
         """Append all images to a map that is open for appending.
@@ -212,21 +244,32 @@ class _Indexing:
             InputError: an image cannot be read; a name in a map is of another image here; or what
                 `Map.append` raises.
         """
-        names, sizes, new = _new_images(target, self.source)
+        root, total = whole_name(self.source.root), len(self.source.paths)
+        choice = None if self.novelty is None else Novelty(target, self.source, root, self.novelty)
+        left_out = {} if choice is None else choice.left_out
+        names, sizes, new = _new_images(target, self.source, left_out)
         positions = self.positions
         if positions is None:
             positions = _by_exif(target, zip(names, new, strict=True))
         target.fitted(names, positions)  # checks them before any work
         unreadable: list[str] = []
-        root, total = real_path(self.source.root).as_posix(), len(self.source.paths)
         stream = described(self.describer, new, self.reading, components=target.components)
         done, quiet = total - len(new), self.reading.quiet
         stream = shown(stream, "images", total, quiet=quiet, done=done)
         for part in joined(stream, SEGMENT):
             unreadable.extend(names[i] for i in part.unreadable)
-            if len(part.indices):
-                some, bytes_ = ([column[i] for i in part.indices] for column in (names, sizes))
-                target.append(some, bytes_, part.descriptors, root=root, positions=positions)
+            if not len(part.indices):
+                continue
+            numbers, rows = part.indices, part.descriptors
+            alike = numbers[:0]
+            if choice is not None:
+                is_new = choice.choose([names[i] for i in numbers], rows)
+                numbers, alike, rows = numbers[is_new], numbers[~is_new], rows[is_new]
+            if len(numbers):
+                some, bytes_ = ([column[i] for i in numbers] for column in (names, sizes))
+                target.append(some, bytes_, rows, root=root, positions=positions)
+            if choice is not None and len(alike):
+                choice.leave_out([names[i] for i in alike], [sizes[i] for i in alike])
         return unreadable
 
     def _counts(
@@ -235,15 +278,18 @@ class _Indexing:
         """Count what became of the images, of a map that had some before."""
         known, listed = {image.name for image in there}, set(self.source.names)
         given = () if self.positions is None else self.positions.of.keys()
+        there_now = len(listed & known)
+        rest = len(listed) - there_now - len(added) - len(unreadable)
         return Indexed(
             added=len(added),
-            there=len(listed & known),
+            there=there_now,
             positions=sum(image.position is not None for image in added),
             stay=len(known.intersection(given)),
             unreadable=unreadable,
             unmatched=[name for name in given if name not in listed],
             images=len(there) + len(added),
             metadata=self.metadata,
+            similar=0 if self.novelty is None else rest,
         )
 
     def _finish(self, target: Map) -> float | None:
