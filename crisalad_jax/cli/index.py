@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 from typing import Annotated, Any, Literal
 
-from crisalad_jax.cli.common import echo, given_positions, open_flagged, pick, waiting_words
+from crisalad_jax.cli.common import echo, given_positions, open_flagged, pick
 from crisalad_jax.cli.flags import FOLDER, JsonFlag, ModelFlags, PlaceFlags, ReadFlags
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
@@ -13,8 +13,8 @@ from crisalad_jax.retrieval.maps.metadata import model_config, read_metadata, we
 from crisalad_jax.utils.output import counted
 
 COMMON = (
-    "images out weights fps positions every-metres novelty store dtype pca search share image-size "
-    "resize batch-size runtime on-bad-image json quiet"
+    "images out weights fps positions every-metres novelty store dtype pca search image-size "
+    "resize batch-size runtime compute-dtype on-bad-image json quiet"
 )
 EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
 SEVERAL = "quote a pattern; other folders are added by the same command again"
@@ -49,9 +49,6 @@ class Index(ReadFlags, ModelFlags, PlaceFlags, JsonFlag):
     use."""
     search: Literal["exact", "hnsw", "ivf-pq"] | None = None
     """Build an approximate search, and print what it recalls; exact removes it (docs/large.md)."""
-    share: str | None = None
-    """INDEX/COUNT: describe one share; other processes and hosts take the others, the last one
-    joins all."""
 
 
 def run(arguments: Index) -> dict[str, Any]:
@@ -65,13 +62,9 @@ def run(arguments: Index) -> dict[str, Any]:
     model, _, file = open_flagged(arguments, weights, like=like)
     config = model.config
     more = pick(arguments, "fps", "every_metres", "novelty", "reading")
-    more |= pick(arguments, "store", "dtype", "pca", "search", "share")
+    more |= pick(arguments, "store", "dtype", "pca", "search")
     result = index(model, arguments.images, out, weights=file, positions=positions, **more)
-    if waiting := waiting_words(result):
-        described = f"{counted(result.added, 'image')} described"
-        echo(f"{out}: share {arguments.share}: {described}; {waiting}")
-    else:
-        echo(f"{out}: {'; '.join(_words(result, config))}")
+    echo(f"{out}: {'; '.join(_words(result, config))}")
     counts = {name: value for name, value in result._asdict().items() if name != "metadata"}
     return {
         "out": str(out),

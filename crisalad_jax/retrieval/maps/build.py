@@ -1,15 +1,12 @@
 """Build maps from folders of images: each image is described independently, in bounded memory."""
 
-import contextlib
 import dataclasses
 import os
 import pathlib
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.checks import require
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.reading import Reading
@@ -23,10 +20,8 @@ from crisalad_jax.retrieval.maps.approximate import check_search
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.map import Map, MapImage, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import (
-    SHARES,
     MapMetadata,
     check_model,
-    has_images,
     model_config,
     new_metadata,
     read_components,
@@ -35,10 +30,9 @@ from crisalad_jax.retrieval.maps.metadata import (
 from crisalad_jax.retrieval.maps.novelty import Novelty
 from crisalad_jax.retrieval.maps.store import check_store, store_name
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
-from crisalad_jax.retrieval.segments import SEGMENT, Share, Shares, digest_of
+from crisalad_jax.retrieval.segments import SEGMENT
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
-from crisalad_jax.utils.progress import progress_bar
 
 if TYPE_CHECKING:
     from crisalad_jax.nn.config import ModelConfig
@@ -65,34 +59,30 @@ class Indexed(NamedTuple):
     metadata: MapMetadata
     recall: float | None = None
     """What the approximate search recalls, see `Map.build_search`; None where none was asked."""
-    shares_left: int = 0
-    """Number of shares that are not there yet; until then these are counts of one share."""
     near: int = 0
     """Number of images left out by `every_metres`."""
     similar: int = 0
     """Number of images left out by `novelty`."""
-    joined_elsewhere: bool = False
-    """Whether another process joins the shares, so that these are counts of one share."""
 
 
 def _new_images(
-    maps: Sequence[Map], source: ImageSource, left_out: Mapping[str, int]
+    target: Map, source: ImageSource, left_out: Mapping[str, int]
 ) -> tuple[list[str], list[int], list[pathlib.Path]]:
-    """List names, sizes and paths of the images that no map has.
+    """List names, sizes and paths of the images that the map lacks.
 
     Args:
-        maps: the maps.
+        target: the map.
         source: the images.
-        left_out: bytes of images that were left out of the maps before, by name.
+        left_out: bytes of images that were left out of the map before, by name.
 
     Raises:
-        InputError: a name in a map is of another image here.
+        InputError: a name in the map is of another image here.
     """
     names, sizes, new = [], [], []
     all_sizes = for_each(lambda path: size_of(file_of(path)), source.paths)
     # A size of None is of a missing file, which is skipped.
     for name, path, size in zip(source.names, source.paths, all_sizes, strict=True):
-        known = next(filter(None, (each.image(name) for each in maps)), None)
+        known = target.image(name)
         if known is None:
             if size is None or left_out.get(name) != size:
                 names.append(name)
@@ -120,7 +110,6 @@ def index(
     dtype: Literal["float32", "float16", "bits"] | None = None,
     pca: Pca | str | os.PathLike[str] | None = None,
     search: Literal["exact", "hnsw", "ivf-pq"] | None = None,
-    share: str | None = None,
     reading: Reading = Reading(),
 ) -> Indexed:
     """Make a map of a folder of images, or append to it those that it lacks.
@@ -151,8 +140,6 @@ def index(
             copy. None is the map's, and of a new map none.
         search: the approximate search that is built from the map's descriptors; "exact" removes
             one. None leaves what there is, which is of no use once the map has grown.
-        share: INDEX/COUNT, to describe one share of the images; processes on any hosts that see the
-            same folders take the others, and the last one to end joins all.
         reading: how images are read.
 
     Returns:
@@ -175,12 +162,8 @@ def index(
         4
     """
     describer = describer_of(model)
-    part = None if share is None else Share.parse(share)
     if novelty is not None:
         check_min_similarity(novelty, "novelty")
-        require(
-            part is None, f"--novelty: found with --share {share}, expected only one of the two"
-        )
     out = pathlib.Path(out)
     metadata = read_metadata(out)
     (source,) = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
@@ -211,11 +194,8 @@ def index(
         known = None
     fitted = reading.fitted(len(source.paths))
     work = _Indexing(describer, source, known, metadata, components, search, fitted, novelty)
-    if part is not None:
-        result = work.share(out, part)
-    else:
-        with open_for_appending(out, metadata, components) as target:
-            result = work.into(target)
+    with open_for_appending(out, metadata, components) as target:
+        result = work.into(target)
     if result.added == result.images and describer.config.cross_image.attends:
         warn(
             f"{out}: a map describes each image alone, and this model attends across images: "
@@ -248,15 +228,14 @@ class _Indexing:
             InputError: what `_append` and `_finish` raise.
         """
         known = len(target)
-        unreadable = self._append(target, self.source, target)
+        unreadable = self._append(target)
         result = self._counts(target.images[:known], target.images[known:], unreadable)
         return result._replace(recall=self._finish(target))
 
-    def _append(self, target: Map, source: ImageSource, whole: Map) -> list[str]:
-        """Describe images as the map's are, and append them to `target`, `SEGMENT` at a time.
+    def _append(self, target: Map) -> list[str]:
+        """Describe images as the map's are, and append them, `SEGMENT` at a time.
 
-        Images whose names `target` or the `whole` map has are left out, so that the same call
-        resumes after a kill.
+        Images whose names the map has are left out, so that the same call resumes after a kill.
 
         Returns:
             The names of the images that cannot be read.
@@ -265,13 +244,12 @@ class _Indexing:
             InputError: an image cannot be read; a name in a map is of another image here; or what
                 `Map.append` raises.
         """
-        root, total = whole_name(source.root), len(source.paths)
-        choice = None if self.novelty is None else Novelty(target, source, root, self.novelty)
-        left_out = {} if choice is None else choice.left_out
-        names, sizes, new = _new_images((target, whole), source, left_out)
+        root, total = whole_name(self.source.root), len(self.source.paths)
+        choice = None if self.novelty is None else Novelty(target, self.source, root, self.novelty)
+        names, sizes, new = _new_images(target, self.source, choice.left_out if choice else {})
         positions = self.positions
         if positions is None:
-            positions = _by_exif(whole, zip(names, new, strict=True))
+            positions = _by_exif(target, zip(names, new, strict=True))
         target.fitted(names, positions)  # checks them before any work
         unreadable: list[str] = []
         stream = described(self.describer, new, self.reading, components=target.components)
@@ -319,69 +297,6 @@ class _Indexing:
         if self.search is None:
             return None
         return target.build_search(self.search, quiet=self.reading.quiet)
-
-    def share(self, out: pathlib.Path, part: Share) -> Indexed:
-        """Index the images of one share in a map of its own; if it is the last one, join all.
-
-        Raises:
-            InputError: a share of other settings is there; what `_append` and `_finish` raise.
-        """
-        metadata, source = self.metadata, self.source
-        settings = {name: getattr(metadata, name) for name in ("dtype", "pca", "config")}
-        settings |= {"batch_size": self.reading.batch_size, "digest": self.describer.digest}
-        shares = Shares(out / SHARES, part, digest_of(source.names, settings))
-        mine = part.of(len(source.paths), self.reading.batch_size)
-        own = source._replace(names=source.names[mine], paths=source.paths[mine])
-        with contextlib.ExitStack() as stack:
-            whole, there = None, []
-            if has_images(out):
-                whole = stack.enter_context(Map.open(out, verify=False, calibrated=False))
-                whole.fitted(source.names, self.positions)
-                there = whole.images
-            result = self._counts(there, [], [])
-            if result.there == len(source.names) and not shares.folder.exists():
-                return result
-            if shares.result(part.index) is None:
-                own_metadata = dataclasses.replace(metadata, store="files")
-                with open_for_appending(shares.own, own_metadata, self.components) as target:
-                    unreadable = self._append(target, own, whole or target)
-                    result = self._counts(there, target.images, unreadable)
-                shares.finish({"unreadable": unreadable})
-        with shares.joining() as (results, waiting):
-            if results is None:
-                return result._replace(**waiting)
-            bar = progress_bar("joining", part.count, "shares", quiet=self.reading.quiet)
-            with open_for_appending(out, metadata, self.components) as target, bar as joining:
-                known = len(target)
-                for index in range(part.count):
-                    _append_share(target, shares.path(index))
-                    joining.advance(1)
-                recall = self._finish(target)
-        unreadable = [name for each in results for name in each["unreadable"]]
-        result = self._counts(target.images[:known], target.images[known:], unreadable)
-        return result._replace(recall=recall)
-
-
-def _append_share(target: Map, folder: pathlib.Path) -> None:
-    """Append the images of a share's map that the whole map lacks, and remove the share's."""
-    if not has_images(folder):
-        return  # it is joined, or had no new image
-    with Map.open(folder) as part:
-        start = 0
-        for rows in part.descriptors:
-            images = part.images[start : start + len(rows)]
-            start += len(rows)
-            new = [i for i, image in enumerate(images) if target.image(image.name) is None]
-            if new:
-                of = {image.name: image.position for image in images if image.position}
-                target.append(
-                    [images[i].name for i in new],
-                    [images[i].bytes for i in new],
-                    rows[new],
-                    root=images[0].root,
-                    positions=None if part.axes is None else Positions(part.axes, of, part.zone),
-                )
-    shutil.rmtree(folder)
 
 
 def _by_exif(target: Map, images: Iterable[tuple[str, pathlib.Path]]) -> Positions:
