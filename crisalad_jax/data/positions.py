@@ -253,7 +253,7 @@ def _along(
     if local:
         words.append(f"the times of {local} are taken as UTC (--time-offset)")
     warn(f"{track.source}: {'; '.join(words)}")
-    of = {names[i]: (float(points[i, 0]), float(points[i, 1])) for i in there}
+    of = {names[i]: (float(points[i, 0]), float(points[i, 1])) for i in there.tolist()}
     return Positions(track.axes, of)
 
 
