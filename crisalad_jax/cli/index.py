@@ -14,7 +14,7 @@ from crisalad_jax.utils.output import counted
 
 COMMON = (
     "images out weights fps positions every-metres novelty store dtype pca search image-size "
-    "resize batch-size runtime on-bad-image json quiet"
+    "resize batch-size runtime compute-dtype on-bad-image json quiet"
 )
 EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
 SEVERAL = "quote a pattern; other folders are added by the same command again"

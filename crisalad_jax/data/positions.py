@@ -240,7 +240,7 @@ def _along(
             f"{track.source}: found a track from {ends}, expected the times of the {len(timed)} "
             f"images of {images} that have one, {first} to {last} (--time-offset shifts them)"
         )
-    at = there[gaps[there].argmax()]
+    at = int(there[gaps[there].argmax()])
     words = [f"{len(there)} of {len(names)} images on the track, {ends}"]
     if len(timed) > len(there):
         words.append(f"{len(timed) - len(there)} were taken before or after it")

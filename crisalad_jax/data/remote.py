@@ -23,6 +23,7 @@ _T = TypeVar("_T")
 AT_ONCE = 16
 """Number of files at addresses that are read at a time: most of that is waiting."""
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.I | re.S)  # C:/ is a drive
+_SECRET = re.compile(r"([^:]+://)[^/]*@([^?]*)|(https?://)([^?]*)\?", re.I)
 _HEADER = 2**16
 """Bytes that are read at a time of a file's beginning, where EXIF data is."""
 
@@ -52,6 +53,20 @@ def whole_name(folder: pathlib.Path) -> str:
     return address_of(folder) if is_remote(folder) else real_path(folder).as_posix()
 
 
+def check_address(path: str | os.PathLike[str]) -> None:
+    """Check that an address has nothing secret, as names and messages repeat it.
+
+    Raises:
+        InputError: it has a user, or a query, which may be a signature.
+    """
+    found = _SECRET.match(address_of(path))
+    if found is not None:
+        raise InputError(
+            f"{''.join(part or '' for part in found.groups())}: found a user or a query in the "
+            "address, expected none: fsspec's configuration can have passwords"
+        )
+
+
 @functools.lru_cache
 def _file_system(root: str) -> Any:
     """Return what reads a host or bucket: one for all threads, so that it lists a folder once."""
@@ -65,19 +80,13 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[Any, str]]:
     """Yield the file system of an address and the path there; its errors become one line.
 
     Raises:
-        InputError: an address with a password or a query, which could be one; a package that is
-            missing; or whatever else the file system raises.
+        InputError: what `check_address` raises; a package that is missing; or whatever else the
+            file system raises.
     """
+    check_address(path)
     address = address_of(path)
     try:
         parts = urllib.parse.urlsplit(address)
-        if "@" in parts.netloc or (parts.query and parts.scheme.startswith("http")):
-            host = parts.netloc.rpartition("@")[2]
-            raise InputError(
-                f"{parts.scheme}://{host}{parts.path}: found an address with a user or a query, "
-                "expected one without, as names and messages repeat it; fsspec's configuration can "
-                "have passwords"
-            )
         files = _file_system(f"{parts.scheme}://{parts.netloc}")
         yield files, files._strip_protocol(address)
     except ModuleNotFoundError as error:
@@ -167,5 +176,6 @@ def list_remote(path: pathlib.Path, pattern: pathlib.Path | None = None) -> list
                 f"{address_of(path)}: found no folder there, expected one of images, an image, or "
                 "a pattern"
             )
-        found = files.find(there) if pattern is None else files.glob(there)
-        return [path / each[start:].lstrip("/") for each in found]
+        listing = files.find if pattern is None else files.glob
+        found = listing(there, detail=True).items()
+        return [path / each[start:].lstrip("/") for each, of in found if of["type"] == "file"]

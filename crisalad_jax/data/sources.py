@@ -33,7 +33,7 @@ from crisalad_jax.data.positions import (
     read_image_table,
     utm_positions,
 )
-from crisalad_jax.data.remote import address_of, is_remote, list_remote
+from crisalad_jax.data.remote import address_of, check_address, is_remote, list_remote
 from crisalad_jax.data.tables import Disk
 from crisalad_jax.data.tracks import Track
 from crisalad_jax.data.video import count_frames, list_frames, name_frame
@@ -181,6 +181,7 @@ def _remote(path: pathlib.Path) -> ImageSource:
     Raises:
         InputError: there are none.
     """
+    check_address(path)
     if is_image(path) and not _PATTERN.search(str(path)):
         return _source(path.parent, [path], path)
     root, pattern = (_before_pattern(path), path) if _PATTERN.search(str(path)) else (path, None)
@@ -393,6 +394,8 @@ def _addresses(
         InputError: some are not images at addresses, or not of one host or bucket.
     """
     paths = list(map(pathlib.Path, names))
+    for path in paths:
+        check_address(path)
     other = next((path for path in paths if not is_remote(path) or has_frames(path)), None)
     if other is not None:
         raise InputError(f"{source}: found {other} with addresses, expected images at addresses")

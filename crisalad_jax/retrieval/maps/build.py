@@ -73,7 +73,7 @@ def _new_images(
     Args:
         target: the map.
         source: the images.
-        left_out: bytes of images that were left out before, by name.
+        left_out: bytes of images that were left out of the map before, by name.
 
     Raises:
         InputError: a name in the map is of another image here.
@@ -246,8 +246,7 @@ class _Indexing:
         """
         root, total = whole_name(self.source.root), len(self.source.paths)
         choice = None if self.novelty is None else Novelty(target, self.source, root, self.novelty)
-        left_out = {} if choice is None else choice.left_out
-        names, sizes, new = _new_images(target, self.source, left_out)
+        names, sizes, new = _new_images(target, self.source, choice.left_out if choice else {})
         positions = self.positions
         if positions is None:
             positions = _by_exif(target, zip(names, new, strict=True))
