@@ -52,6 +52,8 @@ class Index(ReadFlags, ModelFlags, JsonFlag):
     share: str | None = None
     """INDEX/COUNT: describe one share; other processes and hosts take the others, the last one
     joins all."""
+    again: bool = False
+    """Add images that `crisalad map remove` removed, too."""
 
 
 def run(arguments: Index) -> dict[str, Any]:
@@ -63,7 +65,7 @@ def run(arguments: Index) -> dict[str, Any]:
         weights = None if arguments.weights else weights_of(metadata, out)
     model, _, file = open_flagged(arguments, weights, like=like)
     config = model.config
-    more = pick(arguments, "fps", "positions", "store", "dtype", "pca", "search", "share")
+    more = pick(arguments, "fps", "positions", "store", "dtype", "pca", "search", "share", "again")
     result = index(model, arguments.images, out, weights=file, reading=arguments.reading, **more)
     if waiting := waiting_words(result):
         described = f"{counted(result.added, 'image')} described"
@@ -86,6 +88,8 @@ def _words(result: Indexed, config: ModelConfig) -> list[str]:
     words = [f"{counted(result.added, 'image')} added, {result.positions} with positions"]
     if result.there:
         words.append(f"{result.there} were there already")
+    if result.removed:
+        words.append(f"{result.removed} were removed from the map and stay out (--again adds them)")
     if result.stay:
         words.append(f"{result.stay} positions given are of such, and stay as they are")
     if unmatched:

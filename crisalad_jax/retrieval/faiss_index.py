@@ -68,7 +68,7 @@ class Index(NamedTuple):
         k: int,
         effort: int | None = None,
         *,
-        without: Int[np.ndarray, " rows"] = np.empty(0, np.int64),
+        without: Int[np.ndarray, " rows"] | None = None,
     ) -> Neighbours:
         """Find the most similar descriptors of each query, approximately.
 
@@ -81,7 +81,7 @@ class Index(NamedTuple):
             effort: how much is looked at, for more to be found in more time: of HNSW, candidates
                 kept while searching (by default 128, or 2 k); of IVF-PQ, lists looked into (by
                 default a sixteenth of them).
-            without: indices that are not to be found.
+            without: indices that are not to be found; None is none.
 
         Raises:
             InputError: queries of another length, not finite or not of unit length; k or effort
@@ -96,7 +96,7 @@ class Index(NamedTuple):
         else:
             lists = self.faiss_index.nlist
             chosen = faiss.SearchParametersIVF(nprobe=min(effort or -(-lists // 16), lists))
-        if len(without):
+        if without is not None and len(without):
             left = np.ones(self.size, bool)
             left[without] = False
             packed = np.packbits(left, bitorder="little")  # must live as long as the search

@@ -48,9 +48,7 @@ class Approximate(NamedTuple):
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
 
-    def search(
-        self, queries: Queries, k: int, count: int, removed: Removed = NONE
-    ) -> Neighbours:
+    def search(self, queries: Queries, k: int, count: int, removed: Removed = NONE) -> Neighbours:
         """Find the k most similar of `count` descriptors: candidates, ranked exactly.
 
         Queries with fewer than k candidates are searched exactly. What was removed is no candidate,

@@ -65,12 +65,16 @@ class Indexed(NamedTuple):
     """Number of shares that are not there yet; until then these are counts of one share."""
     joined_elsewhere: bool = False
     """Whether another process joins the shares, so that these are counts of one share."""
+    removed: int = 0
+    """Number of images that were removed from the map, and stay out."""
 
 
 def _new_images(
-    maps: Sequence[Map], source: ImageSource
+    maps: Sequence[Map], source: ImageSource, again: bool
 ) -> tuple[list[str], list[int], list[pathlib.Path]]:
     """List names, sizes and paths of the images that no map has.
+
+    Those that were removed from one are left out, unless their bytes changed or they come `again`.
 
     Raises:
         InputError: a name in a map is of another image here.
@@ -81,6 +85,8 @@ def _new_images(
         size = file.stat().st_size if file.is_file() else None  # missing: to be skipped
         known = next(filter(None, (each.image(name) for each in maps)), None)
         if known is None:
+            if not again and any(each.was_removed(name, size) for each in maps):
+                continue
             names.append(name)
             sizes.append(size or 0)
             new.append(path)
@@ -105,6 +111,7 @@ def index(
     pca: Pca | str | os.PathLike[str] | None = None,
     search: Literal["exact", "hnsw", "ivf-pq"] | None = None,
     share: str | None = None,
+    again: bool = False,
     reading: Reading = Reading(),
 ) -> Indexed:
     """Make a map of a folder of images, or append to it those that it lacks.
@@ -132,6 +139,7 @@ def index(
             one. None leaves what there is, which is of no use once the map has grown.
         share: INDEX/COUNT, to describe one share of the images; processes on any hosts that see the
             same folders take the others, and the last one to end joins all.
+        again: whether to add images that were removed from the map, too (`remove_images`).
         reading: how images are read.
 
     Returns:
@@ -171,14 +179,14 @@ def index(
         metadata = new_metadata(describer, weights, out, pca=components, **options)
     else:
         check_model(metadata, out, describer.digest, weights)
-        _check_settings(metadata, out, describer.config, dtype, store, components)
+        check_settings(metadata, out, describer.config, dtype, store, components)
         components = read_components(out, metadata)
     if search is not None:
         check_search(search, metadata.store, metadata.dtype)
     if table is None and not known.of:
         known = None
     fitted = reading.fitted(len(source.paths))
-    work = _Indexing(describer, source, known, metadata, components, search, fitted)
+    work = _Indexing(describer, source, known, metadata, components, search, again, fitted)
     if part is not None:
         result = work.share(out, part)
     else:
@@ -204,6 +212,7 @@ class _Indexing:
     metadata: MapMetadata
     components: Pca | None
     search: str | None
+    again: bool
     reading: Reading
 
     def into(self, target: Map) -> Indexed:
@@ -215,7 +224,8 @@ class _Indexing:
         known = len(target)
         unreadable = self._append(target, self.source, target)
         result = self._counts(target.images[:known], target.images[known:], unreadable)
-        return result._replace(recall=self._finish(target))
+        removed = sum(map(target.was_removed, self.source.names))
+        return result._replace(recall=self._finish(target), removed=removed)
 
     def _append(self, target: Map, source: ImageSource, whole: Map) -> list[str]:
         """Describe images as the map's are, and append them to `target`, `SEGMENT` at a time.
@@ -230,7 +240,7 @@ class _Indexing:
             InputError: an image cannot be read; a name in a map is of another image here; or what
                 `Map.append` raises.
         """
-        names, sizes, new = _new_images((target, whole), source)
+        names, sizes, new = _new_images((target, whole), source, self.again)
         positions = self.positions
         if positions is None:
             positions = _by_exif(whole, zip(names, new, strict=True))
@@ -314,27 +324,20 @@ class _Indexing:
                 recall = self._finish(target)
         unreadable = [name for each in results for name in each["unreadable"]]
         result = self._counts(target.images[:known], target.images[known:], unreadable)
-        return result._replace(recall=recall)
+        removed = sum(map(target.was_removed, source.names))
+        return result._replace(recall=recall, removed=removed)
 
 
 def _append_share(target: Map, folder: pathlib.Path) -> None:
     """Append the images of a share's map that the whole map lacks, and remove the share's."""
     if not has_images(folder):
         return  # it is joined, or had no new image
-    with Map.open(folder) as part:
-        start = 0
-        for rows in part.descriptors:
-            images = part.images[start : start + len(rows)]
-            start += len(rows)
-            new = [i for i, image in enumerate(images) if target.image(image.name) is None]
-            if new:
-                of = {image.name: image.position for image in images if image.position}
+    with Map.open(folder) as share:
+        for part in share.parts():
+            new = part.only([target.image(name) is None for name in part.names])
+            if new.names:
                 target.append(
-                    [images[i].name for i in new],
-                    [images[i].bytes for i in new],
-                    rows[new],
-                    root=images[0].root,
-                    positions=None if part.axes is None else Positions(part.axes, of, part.zone),
+                    new.names, new.sizes, new.descriptors, root=new.root, positions=new.positions
                 )
     shutil.rmtree(folder)
 
@@ -351,13 +354,13 @@ def _by_exif(target: Map, images: Iterable[tuple[str, pathlib.Path]]) -> Positio
     return found
 
 
-def _check_settings(
+def check_settings(
     metadata: MapMetadata,
     folder: pathlib.Path,
     config: "ModelConfig",
-    dtype: str | None,
-    store: str | None,
-    pca: Pca | None,
+    dtype: str | None = None,
+    store: str | None = None,
+    pca: Pca | None = None,
 ) -> None:
     """Check that a model's configuration and the given settings agree with an existing map."""
     if store is not None:

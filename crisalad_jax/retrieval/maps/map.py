@@ -12,6 +12,7 @@ import contextlib
 import dataclasses
 import datetime
 import functools
+import itertools
 import operator
 import os
 import pathlib
@@ -48,6 +49,7 @@ from crisalad_jax.retrieval.maps.metadata import (
     SEGMENTS,
     MapMetadata,
     check_model,
+    existing_metadata,
     has_images,
     model_config,
     read_components,
@@ -93,6 +95,15 @@ class NewImages(NamedTuple):
     positions: Positions | None = None
     added: str | None = None
     """The time when they were described; None is now."""
+
+    def only(self, chosen: Sequence[bool]) -> "NewImages":
+        """Return those of the images that are chosen."""
+        names, sizes = (
+            list(itertools.compress(column, chosen)) for column in (self.names, self.sizes)
+        )
+        return self._replace(
+            names=names, sizes=sizes, descriptors=self.descriptors[np.array(chosen)]
+        )
 
 
 MOST_CHANGED = 10**6
@@ -177,7 +188,7 @@ class Map:
             for number, record in enumerate(segments.changes)
         ]
         columns = zip(segments.spans, segments.records, segments.paths, strict=True)
-        parts = [(span.first, self._read_record, *each) for span, *each in columns]
+        parts = [(span.first, self._read_record, record, path) for span, record, path in columns]
         # A change of n rows came before the images of row n.
         for _, read, record, path in sorted(changes + parts, key=operator.itemgetter(0)):
             read(record, path)
@@ -215,11 +226,7 @@ class Map:
             crisalad_jax.utils.errors.InputError: no-map: found no map, expected a folder that ...
         """
         folder = pathlib.Path(folder)
-        metadata = read_metadata(folder)
-        if metadata is None:
-            raise InputError(
-                f"{folder}: found no map, expected a folder that `crisalad index` put images into"
-            )
+        metadata = existing_metadata(folder)
         opened = cls._opened(folder, metadata)
         opened._calibrated = calibrated
         if calibrated:
@@ -309,18 +316,17 @@ class Map:
         """What was appended, in order: from which folder, on which day, and how many are left."""
         ends = np.array([*(first for *_, first in self._parts), len(self._stored)], np.int64)
         counts = np.diff(self.removed.numbers_of(ends)).tolist()
-        return additions_of([(*of, n) for (*of, _), n in zip(self._parts, counts, strict=True)])
+        pairs = zip(self._parts, counts, strict=True)
+        return additions_of([(time, root, images) for (time, root, _), images in pairs])
 
     def was_removed(self, name: str, size: int | None = None) -> bool:
         """Return whether an image of this name, and of this size if that is given, was removed."""
-        if name in self._numbers:
-            return False
-        sizes = self._removed_sizes.get(name, set())
-        return bool(sizes) if size is None else size in sizes
+        sizes = self.removed_names.get(name, ())
+        return name not in self._numbers and (bool(sizes) if size is None else size in sizes)
 
     @functools.cached_property
-    def _removed_sizes(self) -> dict[str, set[int]]:
-        """Sizes of the images that were removed, by name."""
+    def removed_names(self) -> dict[str, set[int]]:
+        """Names of the images that were removed or replaced, with the sizes of their files."""
         sizes = collections.defaultdict[str, set[int]](set)
         for row in self._gone:
             sizes[self._stored[row].name].add(self._stored[row].bytes)
@@ -387,7 +393,7 @@ class Map:
         if not first:  # new ones, as answers hold the old
             self.images, self._numbers = [], {}
             self.removed = Removed(np.array(sorted(self._gone), np.int64))
-            self.__dict__.pop("_removed_sizes", None)
+            self.__dict__.pop("removed_names", None)
         rows = (row for row in range(first, len(self._stored)) if row not in self._gone)
         images = [self._stored[row] for row in rows]
         self._numbers |= {image.name: i for i, image in enumerate(images, len(self))}
@@ -574,40 +580,33 @@ class Map:
     ) -> None:
         """Remove, move and append images: all of it counts once this returns, and none before.
 
-        The images that are left have other numbers then. Positions are in the map's axes and zone,
-        unless no other image has one.
+        The images that are left have other numbers then.
 
         Args:
-            verb: why.
+            verb: why. "replace" also removes the images that have the names of those that are
+                added.
             removed: numbers of images.
-            moved: new positions, by the names of images.
-            added: images, which may have the names of those that are removed.
+            moved: new positions, by the names of images; in other axes than the map's only where no
+                other image has one.
+            added: new images.
 
         Raises:
             InputError: no image would be left, more than `MOST_CHANGED` of them, or what `append`
                 raises.
         """
         self._check_there()
-        gone = frozenset(removed)
-        new = {} if moved is None else moved.of
-        if len(gone) + len(new) > MOST_CHANGED:
-            raise InputError(
-                f"{self.folder}: found a change of {len(gone) + len(new)} images, expected at most "
-                f"{MOST_CHANGED} at a time"
-            )
+        gone = set(removed)
         stay = [image for number, image in enumerate(self.images) if number not in gone]
-        fixed = any(image.position is not None for image in stay if image.name not in new)
-        axes, zone = (self.axes, self.zone) if fixed else (None, None)
+        axes, zone, new = self.axes, self.zone, {}
         if moved is not None:
-            moved = moved.fitted(self.folder, axes, zone)
-            axes, zone = moved.axes, moved.zone or zone
-        rows = [int(self.removed.rows_of(np.array(self._numbers[name]))) for name in new]
+            moved = self.fitted_anew(moved)
+            axes, zone, new = moved.axes, moved.zone, moved.of
         record = {
             "verb": verb,
             "changed": _now(),
-            "removed": self.removed.rows_of(np.array(sorted(gone), np.int64)).tolist(),
-            "moved": rows,
-            "positions": [] if moved is None else list(moved.of.values()),
+            "removed": [],
+            "moved": self._rows_of(self._numbers[name] for name in new),
+            "positions": list(new.values()),
             "axes": axes,
             "zone": zone,
         }
@@ -615,8 +614,11 @@ class Map:
         def parts() -> Iterator[tuple[Mapping[str, Any], Descriptors]]:
             taken = {image.name for image in stay}
             for part in added:
+                if verb == "replace":
+                    gone.update(self._numbers[name] for name in part.names)
+                    taken.difference_update(part.names)
                 if part.positions is not None:
-                    positions = part.positions.fitted(self.folder, record["axes"], record["zone"])
+                    positions = part.positions.fitted(part.root, record["axes"], record["zone"])
                     part = part._replace(positions=positions)
                     record["axes"] = positions.axes
                     record["zone"] = positions.zone or record["zone"]
@@ -627,6 +629,12 @@ class Map:
                     f"{self.folder}: found all its {len(self)} images to be removed, expected at "
                     "least one to stay: a map without images is none, so remove its folder instead"
                 )
+            if len(gone) + len(new) > MOST_CHANGED:
+                raise InputError(
+                    f"{self.folder}: found a change of {len(gone) + len(new)} images, expected at "
+                    f"most {MOST_CHANGED} at a time"
+                )
+            record["removed"] = self._rows_of(sorted(gone))
 
         known = len(self._segments.spans)
         self._segments.change(record, parts())
@@ -635,6 +643,41 @@ class Map:
         number = len(self._segments.changes) - 1
         self._read_change(self._segments.changes[number], self._segments.change_path(number))
         self._settle()
+
+    def fitted_anew(self, positions: Positions) -> Positions:
+        """Return new positions of images in the map's axes and zone; in their own if no other has.
+
+        Raises:
+            InputError: they have no place there, see `Positions.fitted`.
+        """
+        axes, zone = self.axes, self.zone
+        if positions.axes != axes and not any(
+            image.position is not None and image.name not in positions.of for image in self.images
+        ):
+            axes = zone = None
+        found = positions.fitted(self.folder, axes, zone)
+        return found._replace(zone=found.zone or zone)
+
+    def _rows_of(self, numbers: Iterable[int]) -> list[int]:
+        return self.removed.rows_of(np.fromiter(numbers, np.int64)).tolist()
+
+    def positions_of(self, names: Iterable[str]) -> Positions | None:
+        """Return the positions of some images; None where none of them has one."""
+        pairs = ((name, self.images[self._numbers[name]].position) for name in names)
+        of = {name: at for name, at in pairs if at is not None}
+        return Positions(self.axes, of, self.zone) if self.axes and of else None
+
+    def added(self, name: str) -> str | None:
+        """Return when the image of this name was described; None where its record does not say."""
+        (row,) = self._rows_of([self._numbers[name]])
+        after = bisect.bisect(self._parts, row, key=operator.itemgetter(2))
+        return self._parts[after - 1][0]
+
+    def descriptors_of(self, names: Iterable[str]) -> Queries:
+        """Read the descriptors of some images; of bits, unit vectors of the signs."""
+        rows = self._rows_of(self._numbers[name] for name in names)
+        found = self._segments[np.array(rows, np.int64)]
+        return sign_vectors(found) if self.metadata.is_bits else found.astype(np.float32)
 
     def _check_there(self) -> None:
         if not self.exists:
@@ -676,21 +719,12 @@ class Map:
         counts = self.removed.numbers_of(np.array([first for *_, first in self._parts], np.int64))
         starts = [*counts.tolist(), len(self)]
         blocks = self.descriptors
-        for (added, root, _), start, end in zip(
-            self._parts, starts[:-1], starts[1:], strict=True
-        ):
+        for (added, root, _), start, end in zip(self._parts, starts[:-1], starts[1:], strict=True):
             if start == end:
                 continue
-            images = self.images[start:end]
-            of = {image.name: image.position for image in images if image.position is not None}
-            yield NewImages(
-                [image.name for image in images],
-                [image.bytes for image in images],
-                next(blocks),
-                root,
-                Positions(self.axes, of, self.zone) if self.axes and of else None,
-                added,
-            )
+            names = [image.name for image in self.images[start:end]]
+            sizes = [image.bytes for image in self.images[start:end]]
+            yield NewImages(names, sizes, next(blocks), root, self.positions_of(names), added)
 
     def verify(self) -> None:
         """Read all descriptors, and compare them with the digests in the records.
@@ -855,7 +889,9 @@ def open_for_appending(
             if existing is not None:
                 remove_unrecorded(folder, len(opened._segments))
                 if waiting := opened._segments.remove_waiting():
-                    warn(f"{folder}: {counted(waiting, 'addition')} of an unfinished change removed")
+                    warn(
+                        f"{folder}: {counted(waiting, 'addition')} of an unfinished change removed"
+                    )
             yield opened
         except BaseException:
             if not has_images(folder):
