@@ -117,19 +117,9 @@ def _list(arguments: Map) -> dict[str, Any]:
         {"addition": index + 1, **each, "images": counts[index]}
         for index, each in enumerate(found["additions"])
     ]
-    folders = [
-        [Cell(each["folder"]), Cell(str(each["images"])), *_ends(each)] for each in found["folders"]
-    ]
-    additions = [
-        [
-            *(Cell(str(each[name] or "unknown")) for name in ("addition", "day", "root")),
-            _count(each),
-        ]
-        for each in found["additions"]
-    ]
     show_tables(
-        Table(["folder", "images", "first", "last"], folders),
-        Table(["addition", "day", "from", "images"], additions, labels=3),
+        _table(found["folders"], "folder", "images", "first", "last"),
+        _table(found["additions"], "addition", "images", "day", "root"),
     )
     if arguments.names:
         found["names"] = [image.name for image in chosen]
