@@ -164,13 +164,6 @@ def _given(flags: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def waiting_words(result: Any) -> str | None:
-    """Say what a described share of the images waits for; None where all are described."""
-    if result.shares_left:
-        return f"shares still to be done: {result.shares_left}; the last one joins all"
-    return "another process joins all" if result.joined_elsewhere else None
-
-
 def find_given(
     weights: pathlib.Path | None, *, runtime: RuntimeName = "jax", quiet: bool = False
 ) -> pathlib.Path | None:

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 from typing import Annotated, Any
 
-from crisalad_jax.cli.common import echo, open_flagged, pick, waiting_words
+from crisalad_jax.cli.common import echo, open_flagged, pick
 from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags, Target
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
@@ -45,22 +45,16 @@ class Extract(ReadFlags, ModelFlags, JsonFlag):
     """Pairs of each image; never with itself."""
     pca: pathlib.Path | None = None
     """Components that `crisalad pca` fitted, for shorter descriptors."""
-    share: str | None = None
-    """INDEX/COUNT: describe one share; other processes and hosts take the others, the last one
-    joins all. Of the grouping single."""
 
 
-def run(arguments: Extract) -> dict[str, Any] | None:
+def run(arguments: Extract) -> dict[str, Any]:
     """Describe the images, and print what was written."""
-    out, how = arguments.out, pick(arguments, "grouping", "seed", "pairs", "database", "k", "share")
+    out, how = arguments.out, pick(arguments, "grouping", "seed", "pairs", "database", "k")
     check_extraction(out, **how)
     model, _, file = open_flagged(arguments, groupings=[arguments.grouping])
     more = pick(arguments, "fps", "root", "pca", "verify", "reading")
     result = extract(model, arguments.images, out, weights=file, **how, **more)
     described = counted(len(result.names), "descriptor")
-    if waiting := waiting_words(result):
-        echo(f"{out}: share {arguments.share}: {described}; {waiting}")
-        return None
     pairs = None
     if result.pairs is not None:
         pairs = {"file": str(arguments.pairs), "count": len(result.pairs)}

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 from typing import Annotated, Any, Literal
 
-from crisalad_jax.cli.common import echo, open_flagged, pick, waiting_words
+from crisalad_jax.cli.common import echo, open_flagged, pick
 from crisalad_jax.cli.flags import FOLDER, JsonFlag, ModelFlags, ReadFlags
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
@@ -13,7 +13,7 @@ from crisalad_jax.retrieval.maps.metadata import model_config, read_metadata, we
 from crisalad_jax.utils.output import counted
 
 COMMON = (
-    "images out weights fps positions store dtype pca search share image-size resize batch-size "
+    "images out weights fps positions store dtype pca search image-size resize batch-size "
     "runtime compute-dtype on-bad-image json plugin quiet"
 )
 EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
@@ -49,9 +49,6 @@ class Index(ReadFlags, ModelFlags, JsonFlag):
     use."""
     search: Literal["exact", "hnsw", "ivf-pq"] | None = None
     """Build an approximate search, and print what it recalls; exact removes it (docs/large.md)."""
-    share: str | None = None
-    """INDEX/COUNT: describe one share; other processes and hosts take the others, the last one
-    joins all."""
     again: bool = False
     """Add images that `crisalad map remove` removed, too."""
 
@@ -65,13 +62,9 @@ def run(arguments: Index) -> dict[str, Any]:
         weights = None if arguments.weights else weights_of(metadata, out)
     model, _, file = open_flagged(arguments, weights, like=like)
     config = model.config
-    more = pick(arguments, "fps", "positions", "store", "dtype", "pca", "search", "share", "again")
+    more = pick(arguments, "fps", "positions", "store", "dtype", "pca", "search", "again")
     result = index(model, arguments.images, out, weights=file, reading=arguments.reading, **more)
-    if waiting := waiting_words(result):
-        described = f"{counted(result.added, 'image')} described"
-        echo(f"{out}: share {arguments.share}: {described}; {waiting}")
-    else:
-        echo(f"{out}: {'; '.join(_words(result, config))}")
+    echo(f"{out}: {'; '.join(_words(result, config))}")
     counts = {name: value for name, value in result._asdict().items() if name != "metadata"}
     return {
         "out": str(out),

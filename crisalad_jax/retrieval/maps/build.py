@@ -1,28 +1,24 @@
 """Build maps from folders of images: each image is described independently, in bounded memory."""
 
-import contextlib
 import dataclasses
 import os
 import pathlib
-import shutil
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import frame_time, stored_bytes
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import ImageSource, open_sources
-from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import check_search
 from crisalad_jax.retrieval.maps.map import Map, MapImage, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import (
-    SHARES,
     MapMetadata,
     check_model,
-    has_images,
     model_config,
     new_metadata,
     read_components,
@@ -30,11 +26,10 @@ from crisalad_jax.retrieval.maps.metadata import (
 )
 from crisalad_jax.retrieval.maps.store import check_store, store_name
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
-from crisalad_jax.retrieval.segments import SEGMENT, Share, Shares, digest_of
+from crisalad_jax.retrieval.segments import SEGMENT
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.output import warn
-from crisalad_jax.utils.progress import progress_bar
 
 if TYPE_CHECKING:
     from crisalad_jax.nn.config import ModelConfig
@@ -61,31 +56,26 @@ class Indexed(NamedTuple):
     metadata: MapMetadata
     recall: float | None = None
     """What the approximate search recalls, see `Map.build_search`; None where none was asked."""
-    shares_left: int = 0
-    """Number of shares that are not there yet; until then these are counts of one share."""
-    joined_elsewhere: bool = False
-    """Whether another process joins the shares, so that these are counts of one share."""
     removed: int = 0
     """Number of images that were removed from the map, and stay out."""
 
 
 def _new_images(
-    maps: Sequence[Map], source: ImageSource, again: bool
+    target: Map, source: ImageSource, again: bool
 ) -> tuple[list[str], list[int], list[pathlib.Path]]:
-    """List names, sizes and paths of the images that no map has.
+    """List names, sizes and paths of the images that the map lacks.
 
-    Those that were removed from one are left out, unless their bytes changed or they come `again`.
+    Those that were removed from it are left out, unless their bytes changed or they come `again`.
 
     Raises:
-        InputError: a name in a map is of another image here.
+        InputError: a name in the map is of another image here.
     """
     names, sizes, new = [], [], []
     for name, path in zip(source.names, source.paths, strict=True):
-        file = file_of(path)
-        size = file.stat().st_size if file.is_file() else None  # missing: to be skipped
-        known = next(filter(None, (each.image(name) for each in maps)), None)
+        size = stored_bytes(path)  # None is missing: to be skipped
+        known = target.image(name)
         if known is None:
-            if not again and any(each.was_removed(name, size) for each in maps):
+            if not again and target.was_removed(name, size):
                 continue
             names.append(name)
             sizes.append(size or 0)
@@ -110,7 +100,6 @@ def index(
     dtype: Literal["float32", "float16", "bits"] | None = None,
     pca: Pca | str | os.PathLike[str] | None = None,
     search: Literal["exact", "hnsw", "ivf-pq"] | None = None,
-    share: str | None = None,
     again: bool = False,
     reading: Reading = Reading(),
 ) -> Indexed:
@@ -137,8 +126,6 @@ def index(
             copy. None is the map's, and of a new map none.
         search: the approximate search that is built from the map's descriptors; "exact" removes
             one. None leaves what there is, which is of no use once the map has grown.
-        share: INDEX/COUNT, to describe one share of the images; processes on any hosts that see the
-            same folders take the others, and the last one to end joins all.
         again: whether to add images that were removed from the map, too (`remove_images`).
         reading: how images are read.
 
@@ -162,7 +149,6 @@ def index(
         4
     """
     describer = describer_of(model)
-    part = None if share is None else Share.parse(share)
     out = pathlib.Path(out)
     metadata = read_metadata(out)
     (source,) = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
@@ -187,11 +173,8 @@ def index(
         known = None
     fitted = reading.fitted(len(source.paths))
     work = _Indexing(describer, source, known, metadata, components, search, again, fitted)
-    if part is not None:
-        result = work.share(out, part)
-    else:
-        with open_for_appending(out, metadata, components) as target:
-            result = work.into(target)
+    with open_for_appending(out, metadata, components) as target:
+        result = work.into(target)
     if result.added == result.images and describer.config.cross_image.attends:
         warn(
             f"{out}: a map describes each image alone, and this model attends across images: "
@@ -222,16 +205,15 @@ class _Indexing:
             InputError: what `_append` and `_finish` raise.
         """
         known = len(target)
-        unreadable = self._append(target, self.source, target)
+        unreadable = self._append(target)
         result = self._counts(target.images[:known], target.images[known:], unreadable)
         removed = sum(map(target.was_removed, self.source.names))
         return result._replace(recall=self._finish(target), removed=removed)
 
-    def _append(self, target: Map, source: ImageSource, whole: Map) -> list[str]:
-        """Describe images as the map's are, and append them to `target`, `SEGMENT` at a time.
+    def _append(self, target: Map) -> list[str]:
+        """Describe images as the map's are, and append them, `SEGMENT` at a time.
 
-        Images whose names `target` or the `whole` map has are left out, so that the same call
-        resumes after a kill.
+        Images whose names the map has are left out, so that the same call resumes after a kill.
 
         Returns:
             The names of the images that cannot be read.
@@ -240,17 +222,13 @@ class _Indexing:
             InputError: an image cannot be read; a name in a map is of another image here; or what
                 `Map.append` raises.
         """
-        names, sizes, new = _new_images((target, whole), source, self.again)
+        names, sizes, new = _new_images(target, self.source, self.again)
         positions = self.positions
         if positions is None:
-            positions = _by_exif(whole, zip(names, new, strict=True))
+            positions = _by_exif(target, zip(names, new, strict=True))
         target.fitted(names, positions)  # checks them before any work
         unreadable: list[str] = []
-        root, total, quiet = (
-            real_path(source.root).as_posix(),
-            len(source.paths),
-            self.reading.quiet,
-        )
+        root, total = real_path(self.source.root).as_posix(), len(self.source.paths)
         stream = described(self.describer, new, self.reading, components=target.components)
         done, quiet = total - len(new), self.reading.quiet
         stream = shown(stream, "images", total, quiet=quiet, done=done)
@@ -284,62 +262,6 @@ class _Indexing:
         if self.search is None:
             return None
         return target.build_search(self.search, quiet=self.reading.quiet)
-
-    def share(self, out: pathlib.Path, part: Share) -> Indexed:
-        """Index the images of one share in a map of its own; if it is the last one, join all.
-
-        Raises:
-            InputError: a share of other settings is there; what `_append` and `_finish` raise.
-        """
-        metadata, source = self.metadata, self.source
-        settings = {name: getattr(metadata, name) for name in ("dtype", "pca", "config")}
-        settings |= {"batch_size": self.reading.batch_size, "digest": self.describer.digest}
-        shares = Shares(out / SHARES, part, digest_of(source.names, settings))
-        mine = part.of(len(source.paths), self.reading.batch_size)
-        own = source._replace(names=source.names[mine], paths=source.paths[mine])
-        with contextlib.ExitStack() as stack:
-            whole, there = None, []
-            if has_images(out):
-                whole = stack.enter_context(Map.open(out, verify=False, calibrated=False))
-                whole.fitted(source.names, self.positions)
-                there = whole.images
-            result = self._counts(there, [], [])
-            if result.there == len(source.names) and not shares.folder.exists():
-                return result
-            if shares.result(part.index) is None:
-                own_metadata = dataclasses.replace(metadata, store="files")
-                with open_for_appending(shares.own, own_metadata, self.components) as target:
-                    unreadable = self._append(target, own, whole or target)
-                    result = self._counts(there, target.images, unreadable)
-                shares.finish({"unreadable": unreadable})
-        with shares.joining() as (results, waiting):
-            if results is None:
-                return result._replace(**waiting)
-            bar = progress_bar("joining", part.count, "shares", quiet=self.reading.quiet)
-            with open_for_appending(out, metadata, self.components) as target, bar as joining:
-                known = len(target)
-                for index in range(part.count):
-                    _append_share(target, shares.path(index))
-                    joining.advance(1)
-                recall = self._finish(target)
-        unreadable = [name for each in results for name in each["unreadable"]]
-        result = self._counts(target.images[:known], target.images[known:], unreadable)
-        removed = sum(map(target.was_removed, source.names))
-        return result._replace(recall=recall, removed=removed)
-
-
-def _append_share(target: Map, folder: pathlib.Path) -> None:
-    """Append the images of a share's map that the whole map lacks, and remove the share's."""
-    if not has_images(folder):
-        return  # it is joined, or had no new image
-    with Map.open(folder) as share:
-        for part in share.parts():
-            new = part.only([target.image(name) is None for name in part.names])
-            if new.names:
-                target.append(
-                    new.names, new.sizes, new.descriptors, root=new.root, positions=new.positions
-                )
-    shutil.rmtree(folder)
 
 
 def _by_exif(target: Map, images: Iterable[tuple[str, pathlib.Path]]) -> Positions:

@@ -19,10 +19,10 @@ import numpy as np
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import file_of, stored_bytes
 from crisalad_jax.data.positions import Positions, positions_of
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import open_sources
-from crisalad_jax.data.video import file_of
 from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
 from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.maps.build import check_settings
@@ -232,7 +232,7 @@ def replace_images(
                 unreadable.extend(changed[i][0] for i in part.unreadable)
                 some = [changed[i] for i in part.indices]
                 if some:
-                    sizes = [file_of(path).stat().st_size for _, path in some]
+                    sizes = [stored_bytes(path) or 0 for _, path in some]
                     names = [name for name, _ in some]
                     positions = places.positions_of(names)
                     yield NewImages(names, sizes, part.descriptors, root, positions)
@@ -247,14 +247,12 @@ def replace_images(
 
 
 def _has_changed(places: Map, name: str, path: pathlib.Path) -> bool:
-    image, file = places.image(name), file_of(path)
+    image, added = places.image(name), places.added(name)
     assert image is not None
-    if not file.is_file():
-        return True  # to be skipped, or refused
-    there, added = file.stat(), places.added(name)
-    if added is None or there.st_size != image.bytes:
+    if added is None or stored_bytes(path) != image.bytes:  # a missing file is skipped, or refused
         return True
-    return int(there.st_mtime) > datetime.datetime.fromisoformat(added).timestamp()
+    written = int(file_of(path).stat().st_mtime)
+    return written > datetime.datetime.fromisoformat(added).timestamp()
 
 
 def move_images(
