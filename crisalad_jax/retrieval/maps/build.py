@@ -172,7 +172,7 @@ def index(
     if table is None and not known.of:
         known = None
     fitted = reading.fitted(len(source.paths))
-    work = _Indexing(describer, source, known, metadata, components, search, again, fitted)
+    work = _Indexing(describer, source, known, metadata, components, search, fitted, again)
     with open_for_appending(out, metadata, components) as target:
         result = work.into(target)
     if result.added == result.images and describer.config.cross_image.attends:
@@ -195,8 +195,8 @@ class _Indexing:
     metadata: MapMetadata
     components: Pca | None
     search: str | None
-    again: bool
     reading: Reading
+    again: bool = False
 
     def into(self, target: Map) -> Indexed:
         """Append all images to a map that is open for appending.

@@ -20,7 +20,7 @@ import crisalad_jax.retrieval.maps.map
 from crisalad_jax.data.positions import Positions, utm_positions
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.describer import describer_of
-from crisalad_jax.retrieval.maps.build import _append_share
+from crisalad_jax.retrieval.maps.corrections import merge_maps
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import check_model, new_metadata, read_metadata
 from crisalad_jax.retrieval.segments import write_record
@@ -435,9 +435,8 @@ def test_a_map_has_metres_of_one_zone(folder):
         first, second, third = (image.position for image in places.images[-3:])
         assert (places.axes, places.zone) == (("east", "north"), (32, False))
         assert places.summary()["zone"] == "32 north"
-    # As a process adds its share of the images.
-    with open_for_appending(folder.parent / "whole", metadata("files")) as whole:
-        _append_share(whole, folder)
+    merge_maps(folder.parent / "whole", folder)
+    with Map.open(folder.parent / "whole") as whole:
         assert (whole.axes, whole.zone) == (("east", "north"), (32, False))
         assert [image.position for image in whole.images[-3:]] == [first, second, third]
     assert first == (499000.0, 5411000.0)
