@@ -152,6 +152,20 @@ def test_a_map_killed_at_any_step_of_an_append_is_whole_and_goes_on(tmp_path):
     assert steps[1] >= 4 * 2
 
 
+def test_a_map_killed_at_any_step_of_a_change_is_as_before_or_after(tmp_path):
+    steps = list(map(int, killed("changes", tmp_path)))
+    assert len(steps) == 5
+    # Of remove, replace, move, merge, and a merge into a new map: to write, sync and rename one
+    # file, and a folder to sync, are four calls already.
+    assert min(steps) >= 4
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
+def test_a_map_killed_at_random_moments_of_a_change_is_as_before_or_after(tmp_path, kills):
+    found = killed("random changes", tmp_path, kills=kills, longest=0.05)
+    assert found == [str(kills)] * 5
+
+
 def test_a_full_disk_is_one_line_and_leaves_the_map_as_it_was(tmp_path):
     lines = killed("disk", tmp_path)
     expected = ("map.json", "0000000003.npy", "0000000003.npy")
