@@ -88,6 +88,11 @@ from .retrieval.describe import describe_images as describe_images
 from .retrieval.describe import prepare_image as prepare_image
 from .retrieval.extract import extract as extract
 from .retrieval.maps.build import index as index
+from .retrieval.maps.corrections import MapChange as MapChange
+from .retrieval.maps.corrections import merge_maps as merge_maps
+from .retrieval.maps.corrections import move_images as move_images
+from .retrieval.maps.corrections import remove_images as remove_images
+from .retrieval.maps.corrections import replace_images as replace_images
 from .retrieval.maps.live import query_live as query_live
 from .retrieval.maps.map import Map as Map
 from .retrieval.maps.map import MapImage as MapImage

@@ -38,6 +38,7 @@ _COMMANDS = {
     "ablate": "Train CriSALAD with one part changed at a time (Tables 2 and 3).",
     "extract": "Write the descriptors of a folder of images.",
     "index": "Make a map of a folder of images, or append to it those that it lacks.",
+    "map": "List what is in a map, remove, replace or move its images, or merge maps.",
     "calibrate": "Let a map say unknown: from which similarity on its answers are right.",
     "query": "Ask a map where images were taken.",
     "serve": "Answer over HTTP, and in a browser, where photographs were taken.",

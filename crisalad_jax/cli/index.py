@@ -57,6 +57,8 @@ class Index(ReadFlags, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     use."""
     search: Literal["exact", "hnsw", "ivf-pq"] | None = None
     """Build an approximate search, and print what it recalls; exact removes it (docs/large.md)."""
+    again: bool = False
+    """Add images that `crisalad map remove` removed, too."""
 
 
 def run(arguments: Index) -> dict[str, Any]:
@@ -70,7 +72,7 @@ def run(arguments: Index) -> dict[str, Any]:
     model, _, file = open_flagged(arguments, weights, like=like)
     config = model.config
     more = pick(arguments, "fps", "topic", "position_topic", "every_metres", "novelty", "reading")
-    more |= pick(arguments, "store", "dtype", "pca", "search")
+    more |= pick(arguments, "store", "dtype", "pca", "search", "again")
     result = index(model, arguments.images, out, weights=file, positions=positions, **more)
     echo(f"{out}: {'; '.join(_words(result, config))}")
     counts = {name: value for name, value in result._asdict().items() if name != "metadata"}
@@ -89,6 +91,8 @@ def _words(result: Indexed, config: ModelConfig) -> list[str]:
     words = [f"{counted(result.added, 'image')} added, {result.positions} with positions"]
     if result.there:
         words.append(f"{result.there} were there already")
+    if result.removed:
+        words.append(f"{result.removed} were removed from the map and stay out (--again adds them)")
     if result.stay:
         words.append(f"{result.stay} positions given are of such, and stay as they are")
     if result.near:

@@ -63,7 +63,12 @@ class Index(NamedTuple):
         return self.faiss_index.ntotal
 
     def search(
-        self, queries: Float[np.ndarray, "q d"], k: int, effort: int | None = None
+        self,
+        queries: Float[np.ndarray, "q d"],
+        k: int,
+        effort: int | None = None,
+        *,
+        without: Int[np.ndarray, " rows"] | None = None,
     ) -> Neighbours:
         """Find the most similar descriptors of each query, approximately.
 
@@ -76,6 +81,7 @@ class Index(NamedTuple):
             effort: how much is looked at, for more to be found in more time: of HNSW, candidates
                 kept while searching (by default 128, or 2 k); of IVF-PQ, lists looked into (by
                 default a sixteenth of them).
+            without: indices that are not to be found; None is none.
 
         Raises:
             InputError: queries of another length, not finite or not of unit length; k or effort
@@ -90,6 +96,11 @@ class Index(NamedTuple):
         else:
             lists = self.faiss_index.nlist
             chosen = faiss.SearchParametersIVF(nprobe=min(effort or -(-lists // 16), lists))
+        if without is not None and len(without):
+            left = np.ones(self.size, bool)
+            left[without] = False
+            packed = np.packbits(left, bitorder="little")  # must live as long as the search
+            chosen.sel = faiss.IDSelectorBitmap(len(packed), faiss.swig_ptr(packed))
         similarities, indices = self.faiss_index.search(queries, k, params=chosen)
         return Neighbours(indices, np.where(indices < 0, -np.inf, similarities).astype(np.float32))
 

@@ -3,12 +3,15 @@
 A segment's rows go to a store. Then its record, JSON with a checksum, appears under its name: that
 single rename commits the segment. Whoever is killed at any moment leaves the rows as they were
 before the segment or after it.
+
+A change commits any number of segments by one record of its own. The names of their records say
+which change they wait for.
 """
 
 import hashlib
 import json
 import pathlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,14 +59,31 @@ class Segments:
         self.spans: list[Segment] = []
         self.records: list[dict[str, Any]] = []
         """The records in order; each has the `names` of its rows."""
+        self.paths: list[pathlib.Path] = []
+        """The files of these records."""
+        self.changes: list[dict[str, Any]] = []
+        """The records of changes in order; each has the number of `rows` that are there after."""
         # A writer adds records in order, so those that are listed now have all before them. It may
-        # add more while they are read.
-        listed = set(folder.glob("[0-9]*.json"))
-        while (path := self.path(len(self))).exists():
+        # add more while they are read. Segments of a change are there before its record.
+        later = set(folder.glob("change-*.json"))
+        while (path := self.change_path(len(self.changes))).exists():
+            self.changes.append(read_json(path, "a record of a change"))
+            later.discard(path)
+        _check_all_read(later, path)
+        listed = {_first_of(each): each for each in folder.glob("[0-9]*.json")}
+        for path in self.waiting():
+            listed.pop(_first_of(path), None)
+        while (path := listed.pop(len(self), self.path(len(self)))).exists():
             self._take(read_json(path, "a record of images"), path)
-            listed.discard(path)
-        if listed:
-            raise InputError(f"{min(listed)}: expected {path.name} before it, found no such file")
+        if not self.change_path(len(self.changes)).exists():  # or it and others came meanwhile
+            _check_all_read(set(listed.values()), path)
+        for number, change in enumerate(self.changes):
+            rows = change.get("rows")
+            if not isinstance(rows, int) or not 0 <= rows <= len(self):
+                raise InputError(
+                    f"{self.change_path(number)}: found a change of {rows} rows, expected at most "
+                    f"{len(self)}, of which there are records"
+                )
         store.check([(span.first, span.count) for span in self.spans])
 
     def __len__(self) -> int:
@@ -74,12 +94,29 @@ class Segments:
         """Return the file of the record of the segment that begins with a row."""
         return self.folder / f"{first:010d}.json"
 
+    def change_path(self, number: int) -> pathlib.Path:
+        """Return the file of the record of a change, by its number from 0."""
+        return self.folder / f"change-{number:010d}.json"
+
+    def waiting(self) -> list[pathlib.Path]:
+        """List the records of segments whose change is not there, in order."""
+        numbered = ((path, path.stem.partition(".")[2]) for path in self.folder.glob("[0-9]*.json"))
+        count = len(self.changes)
+        return sorted(path for path, of in numbered if of.isdecimal() and int(of) >= count)
+
+    @property
+    def has_more(self) -> bool:
+        """Whether another process has added a segment or a change since these were read."""
+        paths = self.path(len(self)), self.change_path(len(self.changes))
+        return any(path.exists() for path in paths)
+
     def _take(self, record: dict[str, Any], path: pathlib.Path) -> None:
         names, digest = record.get("names"), record.get("sha256")
         if not isinstance(names, list) or not names or not isinstance(digest, str):
             raise InputError(f"{path}: not a whole record of images: no names, or no sha256")
         self.spans.append(Segment(len(self), len(names), digest))
         self.records.append(record)
+        self.paths.append(path)
 
     def append(self, record: Mapping[str, Any], rows: Descriptors) -> None:
         """Append a segment: it is there for good once this returns, and not at all before.
@@ -91,12 +128,55 @@ class Segments:
         Raises:
             InputError: the store or the folder cannot be written to.
         """
+        self._append(record, rows, self.path(len(self)))
+
+    def _append(self, record: Mapping[str, Any], rows: Descriptors, path: pathlib.Path) -> None:
         rows = np.ascontiguousarray(rows, self._dtype)
-        path = self.path(len(self))
         whole = {**record, "sha256": _sha256(rows, self._dtype)}
         self.store.add(len(self), rows)
         write_record(path, whole)
         self._take(whole, path)
+
+    def change(
+        self, record: Mapping[str, Any], parts: Iterable[tuple[Mapping[str, Any], Descriptors]] = ()
+    ) -> None:
+        """Append segments and record a change: all is there once this returns, and none before.
+
+        Args:
+            record: JSON values of the change, which the parts may complete.
+            parts: record and rows of each segment, as of `append`.
+
+        Raises:
+            InputError: the store or the folder cannot be written to.
+        """
+        first, number = len(self), len(self.changes)
+        path = self.change_path(number)
+        try:
+            for addition, rows in parts:
+                waiting = self.path(len(self)).with_suffix(f".{number:010d}.json")
+                self._append(addition, rows, waiting)
+            whole = {**record, "rows": len(self)}
+            write_record(path, whole)
+        except BaseException:
+            if not path.exists():
+                self._drop(first)
+            raise
+        self.changes.append(whole)
+
+    def remove_waiting(self) -> int:
+        """Remove the segments whose change is not there; return how many there were."""
+        waiting = self.waiting()
+        for record in reversed(waiting):  # so that a kill leaves the rows of one without a record
+            record.unlink()
+            self.store.drop(_first_of(record))
+        return len(waiting)
+
+    def _drop(self, first: int) -> None:
+        self.remove_waiting()
+        self.store.drop(first)
+        kept = sum(span.first < first for span in self.spans)
+        for each in (self.spans, self.records, self.paths):
+            del each[kept:]
 
     def blocks(self) -> Iterator[Descriptors]:
         """Yield the rows of each segment in order."""
@@ -105,7 +185,7 @@ class Segments:
 
     def __getitem__(self, numbers: Int64[np.ndarray, " n"]) -> Descriptors:
         """Read rows of files by number, in any order."""
-        return self.store.rows(numbers)  # pyright: ignore[reportAttributeAccessIssue]
+        return self.store.rows(numbers)
 
     def verify(self) -> None:
         """Read all rows, and compare them with the digests in the records.
@@ -119,6 +199,17 @@ class Segments:
                     f"{self.path(span.first).with_suffix('')}: descriptors {span.first} to "
                     f"{span.first + span.count - 1} have changed since they were written"
                 )
+
+
+def _first_of(path: pathlib.Path) -> int:
+    """Return the number of the first row of the segment whose record is at `path`; -1 of others."""
+    first = path.name.partition(".")[0]
+    return int(first) if first.isdecimal() else -1
+
+
+def _check_all_read(listed: set[pathlib.Path], missing: pathlib.Path) -> None:
+    if listed:
+        raise InputError(f"{min(listed)}: expected {missing.name} before it, found no such file")
 
 
 def _sha256(rows: np.ndarray, dtype: np.dtype) -> str:

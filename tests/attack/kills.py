@@ -508,6 +508,88 @@ def attack_maps(bench: Bench, scale: float) -> list[Row]:
     return [at_each, of_chains, *attack_readers(folder, go, rows, bench.say)]
 
 
+CHANGING = Marks(
+    {
+        "opening the map": "crisalad_jax.retrieval.maps.corrections:open_for_appending",
+        "changing": "crisalad_jax.retrieval.maps.map:Map.change",
+        "a descriptors' file": "crisalad_jax.retrieval.maps.file_store:FileStore.add",
+        "a record": "crisalad_jax.retrieval.segments:write_record",
+    }
+)
+
+
+def map_state(folder: pathlib.Path) -> list[tuple]:
+    """Return all that a map says of its images, and their descriptors."""
+    from crisalad_jax.retrieval.maps.map import Map
+
+    with Map.open(folder) as opened:
+        rows = np.concatenate(list(opened.descriptors))
+        return [(*image, row.tobytes()) for image, row in zip(opened.images, rows, strict=True)]
+
+
+def attack_changes(bench: Bench, scale: float) -> list[Row]:
+    """Kill `map remove`, `replace` and `merge`, each in a copy of one map, and do it again."""
+    import crisalad_jax.retrieval.maps.build
+    import crisalad_jax.retrieval.maps.corrections
+    from tests.conftest import write_picture
+
+    folder, build = bench.folder / "changes", crisalad_jax.retrieval.maps.build
+    corrections = crisalad_jax.retrieval.maps.corrections
+    weights = ["--weights", str(bench.world.path("weights.safetensors"))]
+    assert describes(bench, "index", "map", INDEXING, build)(folder / "base").code == 0
+    images = bench.folder / "images of map"
+    new, more = (shutil.copytree(images, bench.folder / name) for name in ("new", "more"))
+    (more / "sub").rename(more / "other")
+    for number in range(3, 9):
+        write_picture(new / "sub" / f"@{100 + number}@500@10@S@{number:03d}@.jpg", 50 + number)
+
+    def index_more(out: pathlib.Path) -> list[str]:
+        return ["index", *weights, "--quiet", "--images", str(more), "--out", str(out / "map")]
+
+    assert (
+        runs(bench, INDEXING, index_more, (build, "SEGMENT", TOGETHER))(folder / "more").code == 0
+    )
+    verbs = {
+        "remove": ["sub/*@00[2-7]@.jpg"],
+        "replace": ["--images", str(new), *weights, "--batch-size", str(TOGETHER)],
+        "merge": [str(folder / "more" / "map")],
+    }
+    rows = []
+    for verb, words in verbs.items():
+
+        def given(out: pathlib.Path, verb: str = verb, words: Sequence[str] = words) -> list[str]:
+            return ["map", verb, str(out / "map"), *words, "--quiet"]
+
+        go = runs(bench, CHANGING, given, (corrections, "SEGMENT", TOGETHER))
+        shutil.copytree(folder / "base", folder / verb)
+        done = go(folder / verb)
+        assert done.code == 0, done
+        either = [map_state(folder / name / "map") for name in ("base", verb)]
+        assert either[0] != either[1]
+        row = Row(f"kills of map: {verb}", "the map before or after; the same command finishes")
+        killed = 0
+        while killed < part_of(20, scale, least=3):
+            chain = folder / f"{verb}{row.tries}"
+            shutil.copytree(folder / "base", chain)
+            times = (1, 1, 1 if verb == "remove" else 3, 1 if verb == "remove" else 3)
+            spreads = (0.0005, 0.005, 0.05)
+            when = a_moment(bench, CHANGING, done.seconds, times, spreads)
+            code = go(chain, when).code
+            killed += code != 0
+            found, again = map_state(chain / "map"), go(chain)
+            wrong = [] if code in (0, -signal.SIGKILL) else [f"exit code {code}"]
+            wrong += [] if found in either else ["neither before nor after"]
+            ended = again.code == 0 and map_state(chain / "map") == either[1]
+            wrong += [] if ended else [f"it ended otherwise: {again.err[-300:]}"]
+            wrong += has_temporaries(chain)
+            row.note(not wrong, f"seed {bench.seed}, {chain.name}, {when}: {wrong}")
+            if not wrong:
+                shutil.rmtree(chain)
+        bench.say(f"{row.attack}: {killed} kills, {row.tries} tries")
+        rows.append(row)
+    return rows
+
+
 def attack_readers(
     folder: pathlib.Path, go: Go, rows: np.ndarray, say: Callable[[str], None]
 ) -> list[Row]:
@@ -660,6 +742,7 @@ def attack_compare(bench: Bench, scale: float) -> list[Row]:
 ATTACKS: Mapping[str, Attack] = {
     "training": attack_training,
     "maps": attack_maps,
+    "map changes": attack_changes,
     "extract .npy": functools.partial(attack_extract, ".npy"),
     "extract .h5": functools.partial(attack_extract, ".h5"),
     "compare": attack_compare,

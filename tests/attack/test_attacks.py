@@ -31,6 +31,7 @@ ALL = (
     ("interruptions", 1, "long", 24),
     ("kills", 1, "training", 240),
     ("kills", 1, "maps, extract .npy, extract .h5", 100),
+    ("kills", 1, "map changes", 60),
     ("kills", 1, "compare", 6),
     ("memory", 1, "", 7),
     ("service", 1, "", 2000),

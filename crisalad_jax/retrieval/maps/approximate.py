@@ -15,6 +15,7 @@ import numpy as np
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import Queries, sample
 from crisalad_jax.retrieval.maps.file_store import FileStore
+from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.neighbours import Neighbours, similarities_of
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
@@ -47,16 +48,18 @@ class Approximate(NamedTuple):
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
 
-    def search(self, queries: Queries, k: int, count: int) -> Neighbours:
+    def search(self, queries: Queries, k: int, count: int, removed: Removed = NONE) -> Neighbours:
         """Find the k most similar of `count` descriptors: candidates, ranked exactly.
 
-        Queries with fewer than k candidates are searched exactly.
+        Queries with fewer than k candidates are searched exactly. What was removed is no candidate,
+        and its room in the search goes to others.
 
         Raises:
             InputError: the store is damaged or gone.
         """
         each, least = _CANDIDATES[self.kind]
-        numbers = self.index.search(queries, min(count, max(least, each * k))).indices
+        candidates = min(count - len(removed.rows), max(least, each * k))
+        numbers = self.index.search(queries, candidates, without=removed.rows).indices
         query, found = np.nonzero(numbers >= 0)
         similarities = np.full(numbers.shape, -np.inf, np.float32)
         similarities[query, found] = similarities_of(
@@ -67,8 +70,9 @@ class Approximate(NamedTuple):
         )
         few = np.flatnonzero(numbers[:, -1] < 0)
         if few.size:
-            numbers[few], similarities[few] = self.store.search(queries[few], k, count)
-        return Neighbours(numbers, similarities)
+            exact = self.store.search(queries[few], k, count, removed)
+            numbers[few], similarities[few] = removed.rows_of(exact.indices), exact.similarities
+        return Neighbours(removed.numbers_of(numbers), similarities)
 
 
 def open_approximate(

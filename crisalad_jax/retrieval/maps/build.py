@@ -59,6 +59,8 @@ class Indexed(NamedTuple):
     metadata: MapMetadata
     recall: float | None = None
     """What the approximate search recalls, see `Map.build_search`; None where none was asked."""
+    removed: int = 0
+    """Number of images that were removed from the map, and stay out."""
     near: int = 0
     """Number of images left out by `every_metres`."""
     similar: int = 0
@@ -66,14 +68,17 @@ class Indexed(NamedTuple):
 
 
 def _new_images(
-    target: Map, source: ImageSource, left_out: Mapping[str, int]
+    target: Map, source: ImageSource, left_out: Mapping[str, int], *, again: bool
 ) -> tuple[list[str], list[int], list[pathlib.Path]]:
     """List names, sizes and paths of the images that the map lacks.
+
+    Those that were removed from it are left out, unless their bytes changed or they come `again`.
 
     Args:
         target: the map.
         source: the images.
         left_out: bytes of images that were left out of the map before, by name.
+        again: whether images that were removed are taken.
 
     Raises:
         InputError: a name in the map is of another image here.
@@ -84,10 +89,13 @@ def _new_images(
     for name, path, size in zip(source.names, source.paths, all_sizes, strict=True):
         known = target.image(name)
         if known is None:
-            if size is None or left_out.get(name) != size:
-                names.append(name)
-                sizes.append(size or 0)
-                new.append(path)
+            if size is not None and left_out.get(name) == size:
+                continue
+            if not again and target.was_removed(name, size):
+                continue
+            names.append(name)
+            sizes.append(size or 0)
+            new.append(path)
         elif size not in (None, known.bytes):
             raise InputError(
                 f"{path}: found {size} bytes, but the map has {name!r} of {known.bytes} bytes from "
@@ -112,6 +120,7 @@ def index(
     dtype: Literal["float32", "float16", "bits"] | None = None,
     pca: Pca | str | os.PathLike[str] | None = None,
     search: Literal["exact", "hnsw", "ivf-pq"] | None = None,
+    again: bool = False,
     reading: Reading = Reading(),
 ) -> Indexed:
     """Make a map of a folder of images, or append to it those that it lacks.
@@ -145,6 +154,7 @@ def index(
             copy. None is the map's, and of a new map none.
         search: the approximate search that is built from the map's descriptors; "exact" removes
             one. None leaves what there is, which is of no use once the map has grown.
+        again: whether to add images that were removed from the map, too (`remove_images`).
         reading: how images are read.
 
     Returns:
@@ -192,14 +202,14 @@ def index(
         metadata = new_metadata(describer, weights, out, pca=components, **options)
     else:
         check_model(metadata, out, describer.digest, weights)
-        _check_settings(metadata, out, describer.config, dtype, store, components)
+        check_settings(metadata, out, describer.config, dtype, store, components)
         components = read_components(out, metadata)
     if search is not None:
         check_search(search, metadata.store, metadata.dtype)
     if table is None and not known.of:
         known = None
     fitted = reading.fitted(len(source.paths))
-    work = _Indexing(describer, source, known, metadata, components, search, fitted, novelty)
+    work = _Indexing(describer, source, known, metadata, components, search, fitted, again, novelty)
     with open_for_appending(out, metadata, components) as target:
         result = work.into(target)
     if result.added == result.images and describer.config.cross_image.attends:
@@ -224,6 +234,7 @@ class _Indexing:
     components: Pca | None
     search: str | None
     reading: Reading
+    again: bool = False
     novelty: float | None = None
     """Largest similarity to the last image that was taken; None is any."""
 
@@ -236,7 +247,10 @@ class _Indexing:
         known = len(target)
         unreadable = self._append(target)
         result = self._counts(target.images[:known], target.images[known:], unreadable)
-        return result._replace(recall=self._finish(target))
+        removed = sum(map(target.was_removed, self.source.names))
+        if self.novelty is not None:
+            result = result._replace(similar=result.similar - removed)
+        return result._replace(recall=self._finish(target), removed=removed)
 
     def _append(self, target: Map) -> list[str]:
         """Describe images as the map's are, and append them, `SEGMENT` at a time.
@@ -252,7 +266,8 @@ class _Indexing:
         """
         root, total = whole_name(self.source.root), len(self.source.paths)
         choice = None if self.novelty is None else Novelty(target, self.source, root, self.novelty)
-        names, sizes, new = _new_images(target, self.source, choice.left_out if choice else {})
+        left_out = {} if choice is None else choice.left_out
+        names, sizes, new = _new_images(target, self.source, left_out, again=self.again)
         positions = self.positions
         if positions is None:
             positions = _by_exif(target, zip(names, new, strict=True))
@@ -317,13 +332,13 @@ def _by_exif(target: Map, images: Iterable[tuple[str, pathlib.Path]]) -> Positio
     return found
 
 
-def _check_settings(
+def check_settings(
     metadata: MapMetadata,
     folder: pathlib.Path,
     config: "ModelConfig",
-    dtype: str | None,
-    store: str | None,
-    pca: Pca | None,
+    dtype: str | None = None,
+    store: str | None = None,
+    pca: Pca | None = None,
 ) -> None:
     """Check that a model's configuration and the given settings agree with an existing map."""
     if store is not None:

@@ -2,6 +2,7 @@
 
 import collections
 import datetime
+import itertools
 import pathlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,21 +21,24 @@ class MapAddition(NamedTuple):
     root: str
     """The folder that their names are relative to."""
     images: int
+    """Number of its images that were not removed."""
 
 
-def with_addition(
-    additions: list[MapAddition], added: str | None, root: str, images: int
-) -> list[MapAddition]:
-    """Return additions with one more, which counts to the last if that is of its day and root."""
-    day = added and added[:10]
-    if additions and additions[-1][:2] == (day, root):
-        *additions, last = additions
-        images += last.images
-    return [*additions, MapAddition(day, root, images)]
+def additions_of(parts: Sequence[tuple[str | None, str, int]]) -> list[MapAddition]:
+    """Join parts of a map, by time, root and number of images, to additions of a day and root."""
+    days = ((time and time[:10], root, images) for time, root, images in parts)
+    return [
+        MapAddition(*key, sum(images for _, _, images in some))
+        for key, some in itertools.groupby(days, key=lambda part: part[:2])
+    ]
 
 
-def contents(places: "Map") -> dict[str, Any]:
+def contents(places: "Map", chosen: "Sequence[MapImage] | None" = None) -> dict[str, Any]:
     """List what is in a map as JSON values by name.
+
+    Args:
+        places: the map.
+        chosen: some of its images, of which the folders and the extent are then; None is all.
 
     Returns:
         `folders`: each folder below a root, or video, with its number of images and, where all of
@@ -42,7 +46,8 @@ def contents(places: "Map") -> dict[str, Any]:
         `additions`; `extent`: the smallest and the largest of each axis of the positions, or None.
     """
     folders: dict[str, list[Moment | None]] = collections.defaultdict(list)
-    for image in places.images:
+    images = places.images if chosen is None else chosen
+    for image in images:
         moment = moment_of(image.name)
         folders[sequence_of(pathlib.PurePosixPath(image.name))].append(moment)
     return {
@@ -51,7 +56,7 @@ def contents(places: "Map") -> dict[str, Any]:
             for name, moments in folders.items()
         ],
         "additions": [each._asdict() for each in places.additions],
-        "extent": _extent(places.images, places.axes),
+        "extent": _extent(images, places.axes),
     }
 
 

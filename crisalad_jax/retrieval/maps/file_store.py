@@ -17,6 +17,7 @@ from crisalad_jax.retrieval.chunks import (
     gathered,
     joined,
 )
+from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.neighbours import QUERY_CHUNK, Neighbours, nearest
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, check_source, npy_header, write_npy
@@ -80,10 +81,21 @@ class FileStore:
         # Without what a `memmap` does at each indexing.
         return np.memmap(path, self._dtype, "r", len(header), shape).view(np.ndarray)
 
-    def search(self, queries: Queries | Bits, k: int, count: int) -> Neighbours:
+    def drop(self, first: int) -> None:
+        """Remove files; see `Store.drop`."""
+        for path in self._folder.glob("[0-9]*.npy"):
+            if int(path.stem) >= first:
+                path.unlink()
+                self._counts.pop(int(path.stem), None)
+        self._mapped.cache_clear()
+
+    def search(
+        self, queries: Queries | Bits, k: int, count: int, removed: Removed = NONE
+    ) -> Neighbours:
         """Find the k most similar descriptors of each query; see `Store.search`."""
         if self._dtype == BITS:
-            parts = (self._open(first) for first in self._counts if first < count)
+            left = ((n, removed.left(n, rows)) for n, rows in self._counts.items() if n < count)
+            parts = (self._open(n) if some is None else self._open(n)[some] for n, some in left)
             return nearest_bits(parts, queries, k)
         size = max(1, _BLOCK // max(self._length, min(len(queries), QUERY_CHUNK)))
 
@@ -92,9 +104,12 @@ class FileStore:
                 rows = self._open(first)
                 # A block of small files would keep a descriptor open for each of its parts.
                 rows = np.array(rows) if len(rows) < size // 8 else rows
-                yield from blocks(rows, str(self._path(first)), size)
+                places = removed.left(first, len(rows))
+                yield from blocks(rows, str(self._path(first)), size, places=places)
 
-        read_rows = functools.partial(self.rows, release=True)
+        def read_rows(numbers: Int64[np.ndarray, " n"]) -> Descriptors:
+            return self.rows(removed.rows_of(numbers), release=True)
+
         return nearest(lambda: joined(files(), size), queries, k, read_rows, 2 * size)
 
     def rows(self, numbers: Int64[np.ndarray, " n"], *, release: bool = False) -> Descriptors:

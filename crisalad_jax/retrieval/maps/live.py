@@ -61,7 +61,9 @@ def query_live(
 ) -> Iterator[LiveAnswer]:
     """Answer images as they come: which of a map's are most similar.
 
-    The programs are compiled before the first frame is taken, for frames of the source's size.
+    The programs are compiled before the first frame is taken, for frames of the source's size. What
+    is added to the map or corrected meanwhile counts from the next frame on, unless `sequence` has
+    begun to follow the camera through the map as it was.
 
     Args:
         places: the map, open.
@@ -104,17 +106,19 @@ def query_live(
     least = asked_similarity(places, min_similarity)
     model_describer = places.describer(model, groupings=["single" if window == 1 else "window"])
     describer = FrameDescriber(model_describer, window)
-    ask = asking(places, k, sequence)
 
     def answers() -> Iterator[LiveAnswer]:
+        now, ask = places, asking(places, k, sequence)
         blank = np.zeros((*(source.size or places.config.image_size), 3), np.uint8)
         places.search(places.shorten(describer(blank)), k)
         describer.forget()
         ready()
         for frame in source.frames(check):
             asked = [pathlib.Path(frame.name)]
-            found = ask(places.shorten(describer(frame.image)), asked)
-            answer = answers_of(places, asked, [found], least)
+            if sequence is None and (then := now) is not (now := then.refreshed()):
+                ask = asking(now, k, None)
+            found = ask(now.shorten(describer(frame.image)), asked)
+            answer = answers_of(now, asked, [found], least)
             latency = time.perf_counter() - frame.taken
             yield LiveAnswer(answer, frame.time, 1000 * latency)
 

@@ -1,19 +1,23 @@
 """Maps: a folder of descriptors with a description of itself, which grows by appending.
 
 Each addition is a segment: its descriptors go to the store, then the record of its images appears
-under its name. That single rename commits the addition. A map whose writer is killed at any moment
-is as it was before the addition or after it. docs/maps.md has the format.
+under its name. That single rename commits the addition. A change, which removes, moves and adds
+images, is a record too. A map whose writer is killed at any moment is as it was before the addition
+or change, or after it. docs/maps.md has the format.
 """
 
 import bisect
+import collections
 import contextlib
 import dataclasses
 import datetime
 import functools
+import itertools
+import operator
 import os
 import pathlib
 import weakref
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, cast
 
 import numpy as np
@@ -38,13 +42,14 @@ from crisalad_jax.retrieval.maps.approximate import (
     stale_kind,
 )
 from crisalad_jax.retrieval.maps.calibration import Calibration, read_calibration
-from crisalad_jax.retrieval.maps.contents import MapAddition, contents, with_addition
+from crisalad_jax.retrieval.maps.contents import MapAddition, additions_of, contents
 from crisalad_jax.retrieval.maps.metadata import (
     COMPONENTS,
     METADATA,
     SEGMENTS,
     MapMetadata,
     check_model,
+    existing_metadata,
     has_images,
     model_config,
     read_components,
@@ -52,13 +57,14 @@ from crisalad_jax.retrieval.maps.metadata import (
     weights_of,
 )
 from crisalad_jax.retrieval.maps.recovery import remove_unrecorded
+from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.maps.store import open_store
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, save_pca
 from crisalad_jax.retrieval.segments import Segments, write_record
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import lock
-from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.output import counted, warn
 from crisalad_jax.utils.shapes import Float32, Int64
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
@@ -77,6 +83,31 @@ class MapImage(NamedTuple):
     """Size of the described file in bytes; a file of another size is another picture."""
     position: tuple[float, float] | None
     root: str
+
+
+class NewImages(NamedTuple):
+    """Images to be appended, all from one folder; see `Map.append`."""
+
+    names: Sequence[str]
+    sizes: Sequence[int]
+    descriptors: Descriptors
+    root: str
+    positions: Positions | None = None
+    added: str | None = None
+    """The time when they were described; None is now."""
+
+    def only(self, chosen: Sequence[bool]) -> "NewImages":
+        """Return those of the images that are chosen."""
+        names, sizes = (
+            list(itertools.compress(column, chosen)) for column in (self.names, self.sizes)
+        )
+        return self._replace(
+            names=names, sizes=sizes, descriptors=self.descriptors[np.array(chosen)]
+        )
+
+
+MOST_CHANGED = 10**6
+"""Number of images that one change removes or moves at most, whose record JSON has room for."""
 
 
 @brief
@@ -126,9 +157,11 @@ class Map:
         self.metadata = metadata
         """The contents of map.json."""
         self.images: list[MapImage] = []
-        """The images by number."""
-        self.additions: list[MapAddition] = []
-        """What was appended, in order: from which folder, on which day, and how many images."""
+        """The images by number; those that were removed have none."""
+        self.removed = NONE
+        """What was removed, by the row of each in the store, which no change alters."""
+        self.changed = ""
+        """When images were last removed, replaced or merged into it; empty for never."""
         self.axes: tuple[str, str] | None = None
         """Axes of the positions, see `positions.AXES`; None where no image has a position."""
         self.zone: Zone | None = None
@@ -138,13 +171,28 @@ class Map:
         self.components = read_components(folder, metadata)
         """The components that shorten descriptors, and those of queries; None is none."""
         self._segments, self._numbers = segments, dict[str, int]()
+        self._stored: list[MapImage] = []
+        """The images by row, those that were removed included."""
+        self._gone = set[int]()
+        """Rows that were removed."""
+        self._parts: list[tuple[str | None, str, int]] = []
+        """Of each record of images the time, the root and the first row."""
+        self._calibrated = False
         self._opened_at = os.stat(segments.folder)
         self._close = weakref.finalize(self, segments.store.close)
         self._approximate: Approximate | None = None
         self._describer: tuple[object, Describer] | None = None
         """A model that is known to be the one that made the map, and what describes with it."""
-        for span, record in zip(segments.spans, segments.records, strict=True):
-            self._read_record(record, segments.path(span.first))
+        changes = [
+            (record["rows"], self._read_change, record, segments.change_path(number))
+            for number, record in enumerate(segments.changes)
+        ]
+        columns = zip(segments.spans, segments.records, segments.paths, strict=True)
+        parts = [(span.first, self._read_record, record, path) for span, record, path in columns]
+        # A change of n rows came before the images of row n.
+        for _, read, record, path in sorted(changes + parts, key=operator.itemgetter(0)):
+            read(record, path)
+        self._settle()
 
     @classmethod
     @takes(folder=PATH)
@@ -178,14 +226,17 @@ class Map:
             crisalad_jax.utils.errors.InputError: no-map: found no map, expected a folder that ...
         """
         folder = pathlib.Path(folder)
-        metadata = read_metadata(folder)
-        if metadata is None:
-            raise InputError(
-                f"{folder}: found no map, expected a folder that `crisalad index` put images into"
-            )
+        metadata = existing_metadata(folder)
         opened = cls._opened(folder, metadata)
+        opened._calibrated = calibrated
         if calibrated:
             opened.calibration = read_calibration(folder, metadata.model)
+            if opened.calibration is not None and opened.changed > opened.calibration.created:
+                warn(
+                    f"{folder}: its images were changed ({opened.changed[:10]}) since its least "
+                    f"similarity was measured ({opened.calibration.created[:10] or 'unknown'}); "
+                    "`crisalad calibrate` measures it again"
+                )
         if verify and metadata.store == "files":
             opened.verify()
         opened._approximate = open_approximate(folder, opened._segments, verify=verify)
@@ -247,6 +298,40 @@ class Map:
             return os.path.samestat(there, self._opened_at) and (self.folder / METADATA).is_file()
         return False
 
+    def refreshed(self) -> Self:
+        """Return the map as it is now: this one or, where it was changed, a new one for its place.
+
+        Raises:
+            InputError: as `open`.
+        """
+        if not self._segments.has_more or not self.exists:
+            return self
+        self.close()
+        again = type(self).open(self.folder, verify=False, calibrated=self._calibrated)
+        again._describer = self._describer
+        return again
+
+    @property
+    def additions(self) -> list[MapAddition]:
+        """What was appended, in order: from which folder, on which day, and how many are left."""
+        ends = np.array([*(first for *_, first in self._parts), len(self._stored)], np.int64)
+        counts = np.diff(self.removed.numbers_of(ends)).tolist()
+        pairs = zip(self._parts, counts, strict=True)
+        return additions_of([(time, root, images) for (time, root, _), images in pairs])
+
+    def was_removed(self, name: str, size: int | None = None) -> bool:
+        """Return whether an image of this name, and of this size if that is given, was removed."""
+        sizes = self.removed_names.get(name, ())
+        return name not in self._numbers and (bool(sizes) if size is None else size in sizes)
+
+    @functools.cached_property
+    def removed_names(self) -> dict[str, set[int]]:
+        """Names of the images that were removed or replaced, with the sizes of their files."""
+        sizes = collections.defaultdict[str, set[int]](set)
+        for row in self._gone:
+            sizes[self._stored[row].name].add(self._stored[row].bytes)
+        return sizes
+
     def image(self, name: str) -> MapImage | None:
         """Return what the map knows of the image of this name; None if it has none."""
         number = self._numbers.get(name)
@@ -265,19 +350,61 @@ class Map:
                 MapImage(_inside(name), int(size), at and (float(at[0]), float(at[1])), root)
                 for name, size, at in zip(*columns, strict=True)
             ]
-            axes = record["axes"] and (record["axes"][0], record["axes"][1])
-            zone = record["zone"] and Zone(int(record["zone"][0]), bool(record["zone"][1]))
+            axes, zone = _axes_in(record)
             Positions(axes or AXES[2], {i.name: i.position for i in images if i.position}).check()
             if not isinstance(root, str) or not isinstance(added, str | None):
                 raise TypeError(f"found root {root!r}, expected text, and added {added!r}, a time")
         except (ValueError, LookupError, TypeError, OverflowError) as error:
             raise InputError(f"{path}: not a whole record of images: {error!r}") from error
+        self._parts.append((added, root, len(self._stored)))
+        self._stored += images
+        self.axes, self.zone = self.axes or axes, self.zone or zone
+
+    def _read_change(self, record: Mapping[str, Any], path: pathlib.Path) -> None:
+        """Take what a record of a change says.
+
+        Raises:
+            InputError: a value is missing or of another type.
+        """
+        try:
+            rows = [*record["removed"], *record["moved"]]
+            if not all(isinstance(row, int) and 0 <= row < len(self._stored) for row in rows):
+                raise ValueError(f"found rows beyond {len(self._stored)} or no numbers")
+            pairs = zip(record["moved"], record["positions"], strict=True)
+            moved = {row: (float(at[0]), float(at[1])) for row, at in pairs}
+            self.axes, self.zone = _axes_in(record)
+            Positions(self.axes or AXES[2], {str(row): at for row, at in moved.items()}).check()
+            if not isinstance(record["changed"], str):
+                raise TypeError("found no time")
+        except (ValueError, LookupError, TypeError, OverflowError) as error:
+            raise InputError(f"{path}: not a whole record of a change: {error!r}") from error
+        for row, at in moved.items():
+            self._stored[row] = self._stored[row]._replace(position=at)
+        self._gone.update(record["removed"])
+        if record["verb"] != "move":
+            self.changed = record["changed"]
+
+    def _settle(self, first: int = 0) -> None:
+        """Number the images from a row on, of which those before it have their numbers.
+
+        Raises:
+            InputError: a name stands twice.
+        """
+        if not first:  # new ones, as answers hold the old
+            self.images, self._numbers = [], {}
+            self.removed = Removed(np.array(sorted(self._gone), np.int64))
+            self.__dict__.pop("removed_names", None)
+        rows = (row for row in range(first, len(self._stored)) if row not in self._gone)
+        images = [self._stored[row] for row in rows]
         self._numbers |= {image.name: i for i, image in enumerate(images, len(self))}
         self.images += images
         if len(self._numbers) < len(self.images):
+            pairs = enumerate(self.images)
+            twice = next(image.name for i, image in pairs if self._numbers[image.name] != i)
+            row = self.removed.rows_of(np.array(self._numbers[twice]))
+            firsts = [span.first for span in self._segments.spans]
+            path = self._segments.paths[bisect.bisect(firsts, row) - 1]
             raise InputError(f"{path}: not a whole record of images: a name stands twice")
-        self.axes, self.zone = self.axes or axes, self.zone or zone
-        self.additions = with_addition(self.additions, added, root, len(images))
 
     def search(self, queries: Queries, k: int, *, exact: bool = False) -> Neighbours:
         """Find the k most similar images of each query, best first; all where there are fewer.
@@ -300,8 +427,8 @@ class Map:
         queries = self._rows("queries", queries)
         k = min(k, len(self))
         if self._approximate is not None and not exact:
-            return self._approximate.search(queries, k, len(self))
-        return self._segments.store.search(queries, k, len(self))
+            return self._approximate.search(queries, k, len(self._segments), self.removed)
+        return self._segments.store.search(queries, k, len(self._segments), self.removed)
 
     @property
     def search_kind(self) -> str:
@@ -436,34 +563,168 @@ class Map:
                 positions that have no place among the map's, a store that cannot be written to, or
                 a map that is no longer where it was opened.
         """
-        if not self.exists:
-            raise InputError(f"{self.folder}: found the opened map gone, expected it in this place")
-        descriptors = self._rows("descriptors", descriptors)
-        if twice := len(names) - len(set(names) - self._numbers.keys()):
-            raise InputError(
-                f"{self.folder}: found {twice} of {len(names)} names twice, or in the map already, "
-                "expected new ones"
-            )
-        positions = self.fitted(names, positions)
-        axes, known, zone = positions or (None, {}, None)
+        self._check_there()
+        first = len(self._segments)
+        part = NewImages(names, sizes, descriptors, root, self.fitted(names, positions))
+        self._segments.append(*self._addition(part, self._numbers.keys()))
+        self._read_record(self._segments.records[-1], self._segments.paths[-1])
+        self._settle(first)
+
+    def change(
+        self,
+        verb: Literal["remove", "replace", "move", "merge"],
+        *,
+        removed: Iterable[int] = (),
+        moved: Positions | None = None,
+        added: Iterable["NewImages"] = (),
+    ) -> None:
+        """Remove, move and append images: all of it counts once this returns, and none before.
+
+        The images that are left have other numbers then.
+
+        Args:
+            verb: why. "replace" also removes the images that have the names of those that are
+                added.
+            removed: numbers of images.
+            moved: new positions, by the names of images; in other axes than the map's only where no
+                other image has one.
+            added: new images.
+
+        Raises:
+            InputError: no image would be left, more than `MOST_CHANGED` of them, or what `append`
+                raises.
+        """
+        self._check_there()
+        gone = set(removed)
+        stay = [image for number, image in enumerate(self.images) if number not in gone]
+        axes, zone, new = self.axes, self.zone, {}
+        if moved is not None:
+            moved = self.fitted_anew(moved)
+            axes, zone, new = moved.axes, moved.zone, moved.of
         record = {
-            "root": root,
-            "added": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            "verb": verb,
+            "changed": _now(),
+            "removed": [],
+            "moved": self._rows_of(self._numbers[name] for name in new),
+            "positions": list(new.values()),
             "axes": axes,
             "zone": zone,
-            "names": list(names),
-            "bytes": list(sizes),
-            "positions": [known.get(name) for name in names],
         }
-        path = self._segments.path(len(self))
-        self._segments.append(record, descriptors)
-        self._read_record(record, path)
+
+        def parts() -> Iterator[tuple[Mapping[str, Any], Descriptors]]:
+            taken = {image.name for image in stay}
+            for part in added:
+                if verb == "replace":
+                    gone.update(self._numbers[name] for name in part.names)
+                    taken.difference_update(part.names)
+                if part.positions is not None:
+                    positions = part.positions.fitted(part.root, record["axes"], record["zone"])
+                    part = part._replace(positions=positions)
+                    record["axes"] = positions.axes
+                    record["zone"] = positions.zone or record["zone"]
+                yield self._addition(part, taken)
+                taken.update(part.names)
+            if not taken:
+                raise InputError(
+                    f"{self.folder}: found all its {len(self)} images to be removed, expected at "
+                    "least one to stay: a map without images is none, so remove its folder instead"
+                )
+            if len(gone) + len(new) > MOST_CHANGED:
+                raise InputError(
+                    f"{self.folder}: found a change of {len(gone) + len(new)} images, expected at "
+                    f"most {MOST_CHANGED} at a time"
+                )
+            record["removed"] = self._rows_of(sorted(gone))
+
+        known = len(self._segments.spans)
+        self._segments.change(record, parts())
+        for each in range(known, len(self._segments.spans)):
+            self._read_record(self._segments.records[each], self._segments.paths[each])
+        number = len(self._segments.changes) - 1
+        self._read_change(self._segments.changes[number], self._segments.change_path(number))
+        self._settle()
+
+    def fitted_anew(self, positions: Positions) -> Positions:
+        """Return new positions of images in the map's axes and zone; in their own if no other has.
+
+        Raises:
+            InputError: they have no place there, see `Positions.fitted`.
+        """
+        axes, zone = self.axes, self.zone
+        if positions.axes != axes and not any(
+            image.position is not None and image.name not in positions.of for image in self.images
+        ):
+            axes = zone = None
+        found = positions.fitted(self.folder, axes, zone)
+        return found._replace(zone=found.zone or zone)
+
+    def _rows_of(self, numbers: Iterable[int]) -> list[int]:
+        return self.removed.rows_of(np.fromiter(numbers, np.int64)).tolist()
+
+    def positions_of(self, names: Iterable[str]) -> Positions | None:
+        """Return the positions of some images; None where none of them has one."""
+        pairs = ((name, self.images[self._numbers[name]].position) for name in names)
+        of = {name: at for name, at in pairs if at is not None}
+        return Positions(self.axes, of, self.zone) if self.axes and of else None
+
+    def added(self, name: str) -> str | None:
+        """Return when the image of this name was described; None where its record does not say."""
+        (row,) = self._rows_of([self._numbers[name]])
+        after = bisect.bisect(self._parts, row, key=operator.itemgetter(2))
+        return self._parts[after - 1][0]
+
+    def descriptors_of(self, names: Iterable[str]) -> Queries:
+        """Read the descriptors of some images; of bits, unit vectors of the signs."""
+        rows = self._rows_of(self._numbers[name] for name in names)
+        found = self._segments[np.array(rows, np.int64)]
+        return sign_vectors(found) if self.metadata.is_bits else found.astype(np.float32)
+
+    def _check_there(self) -> None:
+        if not self.exists:
+            raise InputError(f"{self.folder}: found the opened map gone, expected it in this place")
+
+    def _addition(
+        self, part: "NewImages", taken: Collection[str]
+    ) -> tuple[dict[str, Any], Descriptors]:
+        """Return the record of new images, whose names are not `taken`, and their descriptors."""
+        descriptors = self._rows("descriptors", part.descriptors)
+        if twice := len(part.names) - len(set(part.names).difference(taken)):
+            raise InputError(
+                f"{self.folder}: found {twice} of {len(part.names)} names twice, or in the map "
+                "already, expected new ones"
+            )
+        axes, known, zone = part.positions or (None, {}, None)
+        record = {
+            "root": part.root,
+            "added": part.added or _now(),
+            "axes": axes,
+            "zone": zone,
+            "names": list(part.names),
+            "bytes": list(part.sizes),
+            "positions": [known.get(name) for name in part.names],
+        }
+        return record, descriptors
 
     @property
     def descriptors(self) -> Iterator[Descriptors]:
         """Descriptors in order, one array for each addition; of bits, unit vectors of the signs."""
-        blocks = self._segments.blocks()
-        return map(sign_vectors, blocks) if self.metadata.is_bits else blocks
+        for span, block in zip(self._segments.spans, self._segments.blocks(), strict=True):
+            left = self.removed.left(span.first, span.count)
+            rows = block if left is None else block[left]
+            if len(rows):
+                yield sign_vectors(rows) if self.metadata.is_bits else rows
+
+    def parts(self) -> Iterator["NewImages"]:
+        """Yield the images that are left of each addition, to append them to another map."""
+        counts = self.removed.numbers_of(np.array([first for *_, first in self._parts], np.int64))
+        starts = [*counts.tolist(), len(self)]
+        blocks = self.descriptors
+        for (added, root, _), start, end in zip(self._parts, starts[:-1], starts[1:], strict=True):
+            if start == end:
+                continue
+            names = [image.name for image in self.images[start:end]]
+            sizes = [image.bytes for image in self.images[start:end]]
+            yield NewImages(names, sizes, next(blocks), root, self.positions_of(names), added)
 
     def as_stored(self, descriptors: Descriptors) -> Float32[np.ndarray, "n d"]:
         """Round descriptors as the map stores them; of bits, unit vectors of the signs."""
@@ -472,10 +733,10 @@ class Map:
 
     def descriptor(self, name: str) -> Float32[np.ndarray, " d"]:
         """Read the stored descriptor of the image of this name."""
-        number, spans = self._numbers[name], self._segments.spans
-        span = spans[bisect.bisect_right(spans, number, key=lambda span: span.first) - 1]
-        row = number - span.first
-        rows = self._segments.store.read(span.first, span.count)[row : row + 1]
+        row = int(self.removed.rows_of(np.array([self._numbers[name]]))[0])
+        spans = self._segments.spans
+        span = spans[bisect.bisect_right(spans, row, key=lambda span: span.first) - 1]
+        rows = self._segments.store.read(span.first, span.count)[[row - span.first]]
         return self.as_stored(rows)[0]
 
     def verify(self) -> None:
@@ -504,6 +765,7 @@ class Map:
         metadata = self.metadata
         return {
             "images": len(self),
+            "removed": len(self._gone),
             "positions": sum(image.position is not None for image in self.images),
             "axes": self.axes,
             **contents(self),
@@ -638,7 +900,11 @@ def open_for_appending(
                 write_record(folder / METADATA, dataclasses.asdict(metadata), indent=2)
             opened = stack.enter_context(Map._opened(folder, existing or metadata))
             if existing is not None:
-                remove_unrecorded(folder, len(opened))
+                remove_unrecorded(folder, len(opened._segments))
+                if waiting := opened._segments.remove_waiting():
+                    warn(
+                        f"{folder}: {counted(waiting, 'addition')} of an unfinished change removed"
+                    )
             yield opened
         except BaseException:
             if not has_images(folder):
@@ -647,6 +913,16 @@ def open_for_appending(
                 for path in (folder / SEGMENTS).glob("[0-9]*.npy"):
                     path.unlink()
             raise
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+def _axes_in(record: Mapping[str, Any]) -> tuple[tuple[str, str] | None, Zone | None]:
+    """Return the axes and the zone that a record states."""
+    axes = record["axes"] and (record["axes"][0], record["axes"][1])
+    return axes, record["zone"] and Zone(int(record["zone"][0]), bool(record["zone"][1]))
 
 
 def _inside(name: object) -> str:

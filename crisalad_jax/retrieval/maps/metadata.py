@@ -157,6 +157,20 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
     return metadata if has_images(folder) else None
 
 
+def existing_metadata(folder: str | os.PathLike[str]) -> MapMetadata:
+    """Read the metadata of the map in `folder`.
+
+    Raises:
+        InputError: there is none, or what `read_metadata` raises.
+    """
+    metadata = read_metadata(folder)
+    if metadata is None:
+        raise InputError(
+            f"{folder}: found no map, expected a folder that `crisalad index` put images into"
+        )
+    return metadata
+
+
 def read_components(folder: pathlib.Path, metadata: MapMetadata) -> Pca | None:
     """Read the components of a map; None where it has none.
 

@@ -12,10 +12,11 @@ import numpy as np
 
 from crisalad_jax.retrieval.bits import Bits
 from crisalad_jax.retrieval.chunks import Descriptors, Queries
+from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
-from crisalad_jax.utils.shapes import Float
+from crisalad_jax.utils.shapes import Float, Int64
 
 TOKEN = "CRISALAD_MILVUS_TOKEN"
 """The environment variable that holds a server's token, or its user:password."""
@@ -156,15 +157,27 @@ class MilvusStore:
 
     def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
         """Fetch the descriptors of one addition; see `Store.read`."""
-        found: dict[int, Any] = {}
-        for start in range(first, first + count, self._rows):
-            stop = min(start + self._rows, first + count)
-            part = self._fetch(f"{start} <= id and id < {stop}", "id", "descriptor")
-            found |= {row["id"]: row["descriptor"] for row in part}
-        return np.array([found[number] for number in range(first, first + count)], np.float32)
+        return self.rows(np.arange(first, first + count))
 
-    def search(self, queries: Queries | Bits, k: int, count: int) -> Neighbours:
+    def rows(self, numbers: Int64[np.ndarray, " n"]) -> Descriptors:
+        """Fetch the descriptors of these numbers; see `Store.rows`."""
+        found: dict[int, Any] = {}
+        for start in range(0, len(numbers), self._rows):
+            some = numbers[start : start + self._rows].tolist()
+            part = self._fetch(f"id in {some}", "id", "descriptor")
+            found |= {row["id"]: row["descriptor"] for row in part}
+        return np.array([found[number] for number in numbers.tolist()], np.float32)
+
+    def drop(self, first: int) -> None:
+        """Do nothing, as the next addition overwrites them; see `Store.drop`."""
+
+    def search(
+        self, queries: Queries | Bits, k: int, count: int, removed: Removed = NONE
+    ) -> Neighbours:
         """Find the k most similar descriptors of each query; see `Store.search`."""
+        condition, left = f"id < {count}", count - len(removed.rows)
+        if left < count:
+            condition += f" and id not in {removed.rows.tolist()}"
         if k > _MOST:
             raise InputError(f"k: found {k}, expected at most {_MOST}, of which Milvus gives")
 
@@ -178,7 +191,7 @@ class MilvusStore:
                         self._collection,
                         data=list(queries[start : start + size]),
                         limit=k,
-                        filter=f"id < {count}",
+                        filter=condition,
                         # milvus-lite reads an empty list as all fields, descriptors included.
                         output_fields=["id"],
                         search_params={"metric_type": "IP"},
@@ -188,7 +201,8 @@ class MilvusStore:
                 np.array([[hit["distance"] for hit in hits] for hits in found], np.float32),
             )
 
-        return break_ties(ask, queries, k, min(count, _MOST))
+        found = break_ties(ask, queries, k, min(left, _MOST))
+        return found._replace(indices=removed.numbers_of(found.indices))
 
     def close(self) -> None:
         """Disconnect; other processes may then open the file."""

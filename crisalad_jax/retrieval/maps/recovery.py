@@ -17,13 +17,14 @@ def remove_unrecorded(folder: pathlib.Path, images: int) -> None:
 
     Args:
         folder: the map's, whose lock is held.
-        images: number of images that its records count.
+        images: number of images that its records count, those that were removed included.
 
     Raises:
         InputError: more is left than a kill leaves, so that a record was lost.
     """
     files = sorted((folder / SEGMENTS).glob("[0-9]*.npy"))
-    unrecorded = [path for path in files if not path.with_suffix(".json").exists()]
+    recorded = {path.name.partition(".")[0] for path in (folder / SEGMENTS).glob("[0-9]*.json")}
+    unrecorded = [path for path in files if path.stem not in recorded]
     lost = [path for path, count in indexed_images(folder) if count > images]
     if not images and (folder / CALIBRATION).exists():
         lost.append(folder / CALIBRATION)

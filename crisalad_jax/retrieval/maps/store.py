@@ -15,10 +15,11 @@ from crisalad_jax.retrieval.bits import Bits
 from crisalad_jax.retrieval.chunks import Descriptors, Queries
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.milvus_store import MilvusStore, check_address
+from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
-from crisalad_jax.utils.shapes import Float
+from crisalad_jax.utils.shapes import Float, Int64
 
 DTYPES = ("float32", "float16", "bits")
 """Types that descriptors may be stored as; bits are their signs (`retrieval.bits`)."""
@@ -38,12 +39,27 @@ class Store(Protocol):
         """Read the descriptors that were added together as numbers `first` and on."""
         ...
 
-    def search(self, queries: Queries | Bits, k: int, count: int) -> Neighbours:
-        """Find the k nearest of numbers below `count`, exactly; 1 <= k <= count.
+    def rows(self, numbers: Int64[np.ndarray, " n"]) -> Descriptors:
+        """Read the descriptors of these numbers, in any order."""
+        ...
+
+    def drop(self, first: int) -> None:
+        """Forget what was added from number `first` on, which did not count."""
+
+    def search(
+        self, queries: Queries | Bits, k: int, count: int, removed: Removed = NONE
+    ) -> Neighbours:
+        """Find the k nearest of numbers below `count`, exactly.
 
         They are compared by inner product, packed bits by those that are equal.
 
         Of equal similarities the lower number stands first, also at the k-th place.
+
+        Args:
+            queries: as they are compared.
+            k: neighbours of each, from 1 to as many as are left.
+            count: number of descriptors, those that were removed included.
+            removed: which are left out. The others are numbered in its way in the result.
         """
         ...
 

@@ -15,11 +15,12 @@ import re
 import secrets
 import sys
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any
 
 import fastapi
+import numpy as np
 import pydantic
 from fastapi import Query
 from fastapi.exceptions import RequestValidationError
@@ -36,11 +37,12 @@ from crisalad_jax.data.positions import AXES, MOST_METRES, Positions, exif_posit
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.data.tables import number_of
 from crisalad_jax.retrieval.describe import prepare_image
-from crisalad_jax.retrieval.maps.map import Answer
+from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage
 from crisalad_jax.retrieval.maps.query import answer_fields, position_fields
 from crisalad_jax.retrieval.serve.pictures import (
     check_new_name,
     check_picture,
+    image_in,
     read_thumbnail,
     receive_picture,
 )
@@ -109,7 +111,7 @@ class Neighbour:
     position: dict[str, float] | None
     """east and north, or x and y, in metres, or lat and lon in degrees."""
     number: int
-    """Its picture is at /images/{number}."""
+    """Its picture is at /images/{number}, also after others were removed from the map."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -264,7 +266,7 @@ def make_app(
     Returns:
         An ASGI application.
     """
-    places, since = worker.places, time.monotonic()
+    since = time.monotonic()
     cores = usable_cores()
     lanes = [(most, ThreadPoolExecutor(min(cores, count), "decode")) for most, count in _LANES]
     shown = ThreadPoolExecutor(min(cores, 2), "thumbnails")
@@ -285,7 +287,7 @@ def make_app(
 
     async def prepare(data: bytes, name: str) -> Pixels:
         def decode() -> Pixels:
-            return prepare_image(decode_image(data, name), places.config, name)
+            return prepare_image(decode_image(data, name), worker.places.config, name)
 
         pixels = await asyncio.to_thread(check_picture, data, name, max_pixels)
         lane = next(lane for most, lane in lanes if pixels <= most)
@@ -313,6 +315,7 @@ def make_app(
     @app.get("/health")
     async def health(_: _Nothing) -> Health:
         """Tell that the service runs, of which model, how it searches, and since when."""
+        places = worker.places
         if not places.exists:
             raise HTTPException(503, FAILED)
         return Health(
@@ -327,9 +330,10 @@ def make_app(
     @guarded.get("/map")
     def describe_map(_: _Nothing) -> Places:
         """Tell how large the map is, and where its images were taken."""
+        places = worker.places
         known = [
-            (number, *image.position)
-            for number, image in enumerate(places.images[:])
+            (int(row), *image.position)
+            for row, image in zip(*_by_row(places), strict=True)
             if image.position is not None
         ]
         return Places(
@@ -353,7 +357,9 @@ def make_app(
         """Show an image of the map."""
         try:
             loop = asyncio.get_running_loop()
-            data = await loop.run_in_executor(shown, thumbnail, places, map_images, number)
+            places = worker.places
+            image = image_in(places, number), places.folder, map_images
+            data = await loop.run_in_executor(shown, thumbnail, *image)
         except InputError as error:
             raise HTTPException(404, str(error)) from error
         return Response(data, media_type="image/jpeg")
@@ -365,11 +371,11 @@ def make_app(
         async with _room(waiting):
             start = time.perf_counter()
             question = Question(await prepare(data, name), asked.k or k)
-            found = await asyncio.wrap_future(worker.submit(question))
+            places, found = await asyncio.wrap_future(worker.submit(question))
         neighbours = [
             Neighbour(
                 **answer_fields(Answer(rank, similarity, places.images[number]), places.axes),
-                number=number,
+                number=_row(places, number),
             )
             for rank, (number, similarity) in enumerate(found, 1)
         ]
@@ -387,7 +393,7 @@ def make_app(
         data, _ = await receive_picture(request, max_bytes)
         async with _room(waiting):
             start = time.perf_counter()
-            pixels = await prepare(data, asked.name)
+            pixels, places = await prepare(data, asked.name), worker.places
             # A map in other axes leaves out what EXIF data says, as `crisalad index` does.
             if position is None and places.axes in (None, AXES[1]):
                 said = await asyncio.to_thread(exif_position, io.BytesIO(data))
@@ -395,7 +401,8 @@ def make_app(
             addition = Addition(pixels, data, asked.name, position)
             number = await asyncio.wrap_future(worker.submit(addition))
         there = position_fields(places.images[number], places.axes)
-        return Appended(number, asked.name, there, len(places), _milliseconds(start))
+        row = _row(places, number)
+        return Appended(row, asked.name, there, len(places), _milliseconds(start))
 
     async def answer(scope: Scope, receive: Receive, send: Send) -> None:
         """Answer who names this service's host, and HEAD as GET: the server leaves out the body."""
@@ -409,6 +416,16 @@ def make_app(
 
     app.include_router(guarded)
     return answer
+
+
+def _row(places: Map, number: int) -> int:
+    return int(places.removed.rows_of(np.array(number)))
+
+
+def _by_row(places: Map) -> tuple[Sequence[int], list[MapImage]]:
+    """List images, of which others may be appended meanwhile, and their rows."""
+    images = places.images[:]
+    return places.removed.rows_of(np.arange(len(images))).tolist(), images
 
 
 def _check_parameters(request: Request) -> None:

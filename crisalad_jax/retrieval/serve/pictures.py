@@ -17,7 +17,7 @@ from crisalad_jax.data.frames import frame_time
 from crisalad_jax.data.images import IMAGE_SUFFIXES, jpeg_scans, read_image
 from crisalad_jax.data.remote import size_of
 from crisalad_jax.data.resize import resize_image
-from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.map import Map, MapImage
 from crisalad_jax.retrieval.serve.worker import ADDED
 from crisalad_jax.utils.errors import InputError
 
@@ -123,22 +123,36 @@ def check_new_name(name: str) -> None:
         )
 
 
-def read_thumbnail(places: Map, images: str | os.PathLike[str] | None, number: int) -> bytes:
+def image_in(places: Map, row: int) -> MapImage:
+    """Return the image of a map in a row of its store, which no change gives to another image.
+
+    Raises:
+        InputError: the map has no such image, or no more.
+    """
+    number = int(places.removed.numbers_of(np.array(row)))
+    if not 0 <= number < len(places):
+        last = places.removed.rows_of(np.array(len(places) - 1))
+        raise InputError(f"number: found {row}, expected 0 to {last}")
+    if row in places.removed.rows:
+        raise InputError(f"number: found {row}, which was removed from the map")
+    return places.images[number]
+
+
+def read_thumbnail(
+    image: MapImage, folder: pathlib.Path, images: str | os.PathLike[str] | None
+) -> bytes:
     """Return a small JPEG of an image of a map.
 
     Args:
-        places: the map.
+        image: the image.
+        folder: the map's.
         images: folder of the map's images; None is where they were.
-        number: the image's.
 
     Raises:
-        InputError: the map has no such image, or its file is gone, changed or unreadable.
+        InputError: its file is gone, changed or unreadable.
     """
-    if not 0 <= number < len(places):
-        raise InputError(f"number: found {number}, expected 0 to {len(places) - 1}")
-    image = places.images[number]
     # The record of a map keeps its names below a folder.
-    folders = [*([] if images is None else [images]), image.root, places.folder / ADDED]
+    folders = [*([] if images is None else [images]), image.root, folder / ADDED]
     paths = (pathlib.Path(folder, image.name) for folder in folders)
     path = next((path for path in paths if size_of(path) == image.bytes), None)
     if path is None:

@@ -1,6 +1,7 @@
 """The one thread that owns an open map and its model: it describes, appends and searches.
 
-Nothing else searches or appends, so that every search sees a whole map.
+Nothing else searches or appends, so that every search sees a whole map. What other processes change
+is seen from the next batch on.
 """
 
 import collections
@@ -95,9 +96,9 @@ class MapWorker:
         """Queue work.
 
         Returns:
-            Of a question, (number, similarity) of its k most similar images; of an addition, its
-            number. It raises `InputError` for an addition that the map does not take,
-            `NameTakenError` among them, and `MapFailedError` for all else.
+            Of a question, the map that was searched, and (number, similarity) of its k most similar
+            images; of an addition, its number. It raises `InputError` for an addition that the map
+            does not take, `NameTakenError` among them, and `MapFailedError` for all else.
         """
         result: Future[Any] = Future()
         self._waiting.append((work, result))
@@ -112,6 +113,7 @@ class MapWorker:
         if not batch:
             return
         try:
+            self.places = self.places.refreshed()
             descriptors = self._describe([work.pixels for work, _ in batch])
             jobs = [_Job(*each, row) for each, row in zip(batch, descriptors, strict=True)]
             # Additions first: an answer sees what came in with its question.
@@ -197,7 +199,7 @@ class MapWorker:
         for job, numbers, similarities in zip(jobs, *found, strict=True):
             k = job.work.k
             best = zip(numbers[:k].tolist(), similarities[:k].tolist(), strict=True)
-            job.result.set_result(list(best))
+            job.result.set_result((self.places, list(best)))
 
 
 class _Job(NamedTuple):

@@ -113,7 +113,7 @@ def test_candidates_come_from_the_index(grown, monkeypatch):
         assert approximate is not None
 
         class Poor:
-            def search(self, queries, k):
+            def search(self, queries, k, without):
                 numbers = np.full((len(queries), k), -1)
                 numbers[:, :2] = 7, 3
                 return type("Found", (), {"indices": numbers})

@@ -11,6 +11,7 @@ from crisalad_jax.data.live import Camera, FolderWatch, Frame
 from crisalad_jax.data.video import list_frames
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import index
+from crisalad_jax.retrieval.maps.corrections import remove_images
 from crisalad_jax.retrieval.maps.live import latency_words, query_live
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import json_lines
@@ -81,6 +82,21 @@ def test_a_watched_folder_and_a_camera(town_map, shared, params, tmp_path):
         with Camera(video) as camera:
             last = list(live(places, camera, params, k=1))[-1]
     assert (last.time, json.loads(last.json_line())["query"]) == (0.3, "walk.avi#t=0.300")
+
+
+@pytest.mark.parametrize("sequence", [None, BayesFilter()])
+def test_a_correction_counts_from_the_next_frame_on(town_map, sides, params, tmp_path, sequence):
+    """A filter follows the camera through the map as it was."""
+    folder = shutil.copytree(town_map, tmp_path / "map")
+    image = list_images(sides[0])[2]
+    with Map.open(folder) as places:
+        stream = live(places, Given([image, image]), params, k=9, sequence=sequence)
+        first = [one.image.name for _, found in next(stream).answers.rows() for one in found]
+        remove_images(folder, [image.name])
+        second = [one.image.name for _, found in next(stream).answers.rows() for one in found]
+    assert len(first) == 7
+    left = [name for name in first if name != image.name]
+    assert second == left if sequence is None else sorted(second) == sorted(first)
 
 
 def test_a_map_of_a_video_tells_times(shared, params, tmp_path):

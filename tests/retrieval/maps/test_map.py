@@ -20,7 +20,7 @@ import crisalad_jax.retrieval.maps.map
 from crisalad_jax.data.positions import Positions, utm_positions
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.describer import describer_of
-from crisalad_jax.retrieval.maps.build import _append_share
+from crisalad_jax.retrieval.maps.corrections import merge_maps
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import check_model, new_metadata, read_metadata
 from crisalad_jax.retrieval.segments import write_record
@@ -150,6 +150,20 @@ def test_a_map_killed_at_any_step_of_an_append_is_whole_and_goes_on(tmp_path):
     # A file: a write, two fsyncs and a rename; of the new map three appends of two files each.
     assert steps[0] >= 4 * (1 + 3 * 2)
     assert steps[1] >= 4 * 2
+
+
+def test_a_map_killed_at_any_step_of_a_change_is_as_before_or_after(tmp_path):
+    steps = list(map(int, killed("changes", tmp_path)))
+    assert len(steps) == 5
+    # Of remove, replace, move, merge, and a merge into a new map: to write, sync and rename one
+    # file, and a folder to sync, are four calls already.
+    assert min(steps) >= 4
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
+def test_a_map_killed_at_random_moments_of_a_change_is_as_before_or_after(tmp_path, kills):
+    found = killed("random changes", tmp_path, kills=kills, longest=0.05)
+    assert found == [str(kills)] * 5
 
 
 def test_a_full_disk_is_one_line_and_leaves_the_map_as_it_was(tmp_path):
@@ -435,9 +449,8 @@ def test_a_map_has_metres_of_one_zone(folder):
         first, second, third = (image.position for image in places.images[-3:])
         assert (places.axes, places.zone) == (("east", "north"), (32, False))
         assert places.summary()["zone"] == "32 north"
-    # As a process adds its share of the images.
-    with open_for_appending(folder.parent / "whole", metadata("files")) as whole:
-        _append_share(whole, folder)
+    merge_maps(folder.parent / "whole", folder)
+    with Map.open(folder.parent / "whole") as whole:
         assert (whole.axes, whole.zone) == (("east", "north"), (32, False))
         assert [image.position for image in whole.images[-3:]] == [first, second, third]
     assert first == (499000.0, 5411000.0)

@@ -21,12 +21,13 @@ import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.load import load
-from crisalad_jax.data.images import IMAGE_SUFFIXES, read_image
+from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, read_image
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.calibration import Calibration, write_calibration
+from crisalad_jax.retrieval.maps.corrections import remove_images
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import SEGMENTS
 from crisalad_jax.retrieval.maps.query import answer_fields, query
@@ -394,6 +395,35 @@ def test_pictures_of_the_map(service, sides, own_map, params):
         ]
         assert own.ask("GET", "/images/3").status == 404
         assert own.ask("GET", "/images/4").status == 200
+
+
+def test_a_correction_is_seen_and_other_numbers_stay(own_map, params, sides):
+    first, _, last, *_ = list_images(sides[0])
+    with serving(own_map, params) as own:
+
+        def best(path):
+            return own.ask("POST", "/locate?k=1", path.read_bytes()).json["neighbours"][0]
+
+        before = best(first), best(last)
+        assert [each["name"] for each in before] == [first.name, last.name]
+        picture = own.ask("GET", f"/images/{before[1]['number']}")
+        remove_images(own_map, [first.name])
+        assert best(first)["name"] != first.name
+        assert best(last)["number"] == before[1]["number"]
+        assert own.ask("GET", f"/images/{before[1]['number']}").data == picture.data
+        gone = own.ask("GET", f"/images/{before[0]['number']}")
+        assert (gone.status, "was removed from the map" in gone.json["error"]) == (404, True)
+        assert own.ask("GET", "/health").json["images"] == 6
+        numbers = [number for number, *_ in own.ask("GET", "/map").json["positions"]]
+        assert numbers == [n for n in range(7) if n != before[0]["number"]]
+        for bad in (-1, 7):
+            assert own.ask("GET", f"/images/{bad}").status == 404
+        # What fails is told, and tried again.
+        change = own_map / "segments" / "change-0000000001.json"
+        change.write_text("{}")
+        assert own.ask("POST", "/locate", last.read_bytes()).status == 500
+        change.unlink()
+        assert best(last)["name"] == last.name
 
 
 def test_a_frame_of_a_video_is_shown_under_its_name(shared, params, tmp_path):

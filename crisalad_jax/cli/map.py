@@ -1,0 +1,193 @@
+"""`crisalad map`."""
+
+import bisect
+import collections
+import dataclasses
+import itertools
+import pathlib
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from crisalad_jax.cli.common import echo, open_flagged, pick, refuse_with, show_tables
+from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags
+from crisalad_jax.config.checks import require
+from crisalad_jax.experiments.tables import Cell, Table
+from crisalad_jax.retrieval.maps.contents import contents
+from crisalad_jax.retrieval.maps.corrections import (
+    MapChange,
+    find_images,
+    merge_maps,
+    move_images,
+    remove_images,
+    replace_images,
+)
+from crisalad_jax.retrieval.maps.map import Map as OpenMap
+from crisalad_jax.retrieval.maps.metadata import existing_metadata, model_config, weights_of
+from crisalad_jax.utils.output import counted
+
+COMMON = (
+    "action map what names addition day images fps positions weights batch-size runtime "
+    "on-bad-image json quiet"
+)
+EXAMPLE = "crisalad map remove corridor.map 'monday/*'"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Map(ReadFlags, ModelFlags, JsonFlag):
+    """List what is in a map, remove, replace or move some of its images, or merge maps.
+
+    Each change is there as a whole or not at all, also after a kill (docs/how-to/correct-a-map.md).
+    """
+
+    action: Annotated[
+        tyro.conf.Positional[Literal["list", "remove", "replace", "move", "merge"]],
+        tyro.conf.arg(metavar="{list,remove,replace,move,merge}"),
+    ]
+    """List folders, days and additions; remove images; replace those whose files in --images have
+    changed; move images to --positions; or merge other maps into it, or into a new one."""
+    map: Annotated[tyro.conf.Positional[pathlib.Path], tyro.conf.arg(metavar="MAP")]
+    """The map's folder."""
+    what: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="NAME|PATTERN|MAP...")
+    ] = ()
+    """Names of images or patterns such as 'monday/*', for list and remove; other maps, for
+    merge."""
+    names: bool = False
+    """With list: the names of the images, too."""
+    addition: int | None = None
+    """With list and remove: only images of this addition, numbered as `list` does."""
+    day: str | None = None
+    """With list and remove: only images that were added on this day, as YYYY-MM-DD (UTC)."""
+    images: pathlib.Path | None = None
+    """With replace: where the changed images are, by the same names, as `crisalad index` takes
+    it."""
+    fps: float | None = None
+    """With replace: frames a second taken of a video, by default 1."""
+    positions: pathlib.Path | None = None
+    """With move: CSV of name,east,north (metres) or name,lat,lon or name,x,y."""
+
+
+_OF = {
+    "names": ("list",),
+    "addition": ("list", "remove"),
+    "day": ("list", "remove"),
+    "images": ("replace",),
+    "fps": ("replace",),
+    "weights": ("replace",),
+    "positions": ("move",),
+}
+"""Which actions a flag is for."""
+
+
+def needs_jax(arguments: Map) -> bool:
+    """Return whether JAX describes images."""
+    return arguments.action == "replace" and arguments.runtime == "jax"
+
+
+def run(arguments: Map) -> dict[str, Any]:
+    """List or change the map."""
+    action = f"map {arguments.action}"
+    others = [name for name, actions in _OF.items() if arguments.action not in actions]
+    refuse_with(action, **pick(arguments, *others))
+    if arguments.action in ("replace", "move"):
+        require(not arguments.what, f"{action}: found {arguments.what[:1]}, expected no names")
+    if arguments.action == "list":
+        return _list(arguments)
+    change = _CHANGES[arguments.action](arguments)
+    echo(f"{arguments.map}: {'; '.join(_words(change, arguments.action))}")
+    return {"map": str(arguments.map), "action": arguments.action, **change._asdict()}
+
+
+def _list(arguments: Map) -> dict[str, Any]:
+    with OpenMap.open(arguments.map, verify=False, calibrated=False) as places:
+        numbers, _ = find_images(places, arguments.what, arguments.addition, arguments.day)
+        chosen = [places.images[number] for number in numbers]
+        found = {
+            "map": str(arguments.map),
+            "images": len(chosen),
+            "removed": len(places.removed.rows),
+            "axes": places.axes,
+            **contents(places, chosen),
+        }
+        ends = list(itertools.accumulate(each.images for each in places.additions))
+    counts = collections.Counter(bisect.bisect(ends, number) for number in numbers)
+    found["additions"] = [
+        {"addition": index + 1, **each, "images": counts[index]}
+        for index, each in enumerate(found["additions"])
+    ]
+    show_tables(
+        _table(found["folders"], "folder", "images", "first", "last"),
+        _table(found["additions"], "addition", "images", "day", "root"),
+    )
+    if arguments.names:
+        found["names"] = [image.name for image in chosen]
+        echo("\n".join(found["names"]))
+    echo(f"{arguments.map}: {counted(len(chosen), 'image')}; {found['removed']} removed before")
+    return found
+
+
+def _table(rows: Sequence[dict[str, Any]], *columns: str) -> Table:
+    cells = [[Cell(str(each.get(name) or "-")) for name in columns] for each in rows]
+    return Table(columns, cells)
+
+
+def _replace(arguments: Map) -> MapChange:
+    out, images = arguments.map, arguments.images
+    require(images is not None, "--images: found none, expected the folder of changed images")
+    metadata = existing_metadata(out)
+    weights = None if arguments.weights else weights_of(metadata, out)
+    model, _, file = open_flagged(arguments, weights, like=model_config(metadata, out))
+    assert images is not None
+    more = pick(arguments, "fps", "reading")
+    return replace_images(model, images, out, weights=file, **more)
+
+
+def _move(arguments: Map) -> MapChange:
+    positions = arguments.positions
+    require(positions is not None, "--positions: found none, expected a table of new positions")
+    assert positions is not None
+    return move_images(arguments.map, positions)
+
+
+_CHANGES = {
+    "remove": lambda given: remove_images(
+        given.map, given.what, addition=given.addition, day=given.day
+    ),
+    "replace": _replace,
+    "move": _move,
+    "merge": lambda given: merge_maps(given.map, *given.what, quiet=given.quiet),
+}
+_DONE = {"remove": "removed", "replace": "replaced", "move": "moved", "merge": "added"}
+_THERE = {
+    "remove": "were removed before",
+    "replace": "have not changed",
+    "move": "have these positions already",
+    "merge": "were there already",
+}
+
+
+def _words(change: MapChange, action: str) -> list[str]:
+    """Describe what became of the images in clauses; empty groups are left out."""
+    words = [f"{counted(len(change.names), 'image')} {_DONE[action]}"]
+    if not change.names:
+        words = ["nothing to do"]
+    if change.there:
+        words.append(f"{change.there} {_THERE[action]}")
+    if change.stay_out:
+        words.append(f"{change.stay_out} were removed from this map and stay out")
+    if change.unmatched:
+        words.append(
+            f"{len(change.unmatched)} are not in the map, {change.unmatched[0]!r} the first"
+        )
+    if change.unreadable:
+        words.append(
+            f"{len(change.unreadable)} unreadable stay as they were, {change.unreadable[0]!r} the "
+            "first"
+        )
+    words.append(f"{counted(change.images, 'image')} now")
+    if change.stale_search is not None:
+        kind = change.stale_search
+        words.append(f"searched exactly until `crisalad index --search {kind}` builds it again")
+    return words

@@ -1,0 +1,423 @@
+"""Correct maps: remove, replace and move images, and merge maps, each by one change."""
+
+import collections
+import contextlib
+import dataclasses
+import datetime
+import difflib
+import fnmatch
+import itertools
+import os
+import pathlib
+import re
+import uuid
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from crisalad_jax.checkpoints.runtime import Runtime
+from crisalad_jax.config.checks import require
+from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import file_of, stored_bytes
+from crisalad_jax.data.positions import Positions, positions_of
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.data.sources import open_sources
+from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
+from crisalad_jax.retrieval.describer import describer_of
+from crisalad_jax.retrieval.maps.build import check_settings
+from crisalad_jax.retrieval.maps.map import Map, NewImages, open_for_appending
+from crisalad_jax.retrieval.maps.metadata import (
+    MapMetadata,
+    check_model,
+    existing_metadata,
+    read_metadata,
+)
+from crisalad_jax.retrieval.segments import SEGMENT
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import atomic_folder, real_path
+from crisalad_jax.utils.progress import progress_bar
+
+if TYPE_CHECKING:
+    from crisalad_jax.nn.model import Model
+
+_SAME = 0.99
+"""Least similarity of two descriptors of one picture: batches, float16 and bits round them."""
+_NEAR = 10_000
+"""Number of names that are searched for one like a name that is not there."""
+
+
+@brief
+class MapChange(NamedTuple):
+    """What became of a map's images."""
+
+    names: list[str]
+    """Names of the images that were removed, replaced, moved or merged into the map."""
+    there: int
+    """Number of images that needed nothing: removed before, unchanged, or in the map already."""
+    images: int
+    """Number of images that the map has now."""
+    unmatched: Sequence[str] = ()
+    """Given names that no image of the map has."""
+    unreadable: Sequence[str] = ()
+    """Names of images that could not be read, and stay as they were."""
+    stay_out: int = 0
+    """Number of images that were removed from the map before, and are not merged into it."""
+    stale_search: str | None = None
+    """Kind of an approximate search that lacks images now, and is not used."""
+
+
+@contextlib.contextmanager
+def _open_existing(folder: str | os.PathLike[str]) -> Iterator[Map]:
+    with open_for_appending(folder, existing_metadata(folder)) as places:
+        yield places
+
+
+def find_images(
+    places: Map, patterns: Sequence[str], addition: int | None = None, day: str | None = None
+) -> tuple[list[int], int]:
+    """Find images by name, or pattern, among those of an addition or a day.
+
+    Returns:
+        Their numbers in order, and how many images that were removed before were meant.
+
+    Raises:
+        InputError: no such addition or day, or a name or pattern of no image.
+    """
+    additions = places.additions
+    ends = [0, *itertools.accumulate(each.images for each in additions)]
+    if addition is not None and not 1 <= addition <= len(additions):
+        raise InputError(f"addition: found {addition}, expected 1 to {len(additions)}")
+    days = list(dict.fromkeys(each.day for each in additions))
+    if day is not None and day not in days:
+        known = ", ".join(each or "unknown" for each in days[-8:])
+        raise InputError(f"day: found {day}, expected one of {known}")
+    among = [
+        number
+        for index, each in enumerate(additions)
+        if addition in (None, index + 1) and day in (None, each.day)
+        for number in range(ends[index], ends[index + 1])
+    ]
+    if not patterns:
+        return among, 0
+    numbers = {places.images[number].name: number for number in among}
+    found, before = set[int](), set[str]()
+    for pattern in patterns:
+        if pattern in numbers:
+            found.add(numbers[pattern])
+            continue
+        matches = re.compile(fnmatch.translate(pattern)).match
+        some = {number for name, number in numbers.items() if matches(name)}
+        gone = {name for name in places.removed_names if matches(name) or name == pattern}
+        if not some and not gone:
+            near = difflib.get_close_matches(pattern, list(numbers)[:_NEAR])
+            words = f"did you mean {' or '.join(near)}?" if near else "see `crisalad map list`"
+            raise InputError(f"{places.folder}: found no image {pattern!r}; {words}")
+        found |= some
+        before |= set() if some else gone
+    return sorted(found), len(before)
+
+
+def remove_images(
+    folder: str | os.PathLike[str],
+    names: Sequence[str] = (),
+    *,
+    addition: int | None = None,
+    day: str | None = None,
+) -> MapChange:
+    """Remove images from a map; their descriptors stay in its files, and are no longer found.
+
+    `index` does not bring them back, unless their files get other bytes or it is asked to.
+
+    Args:
+        folder: the map's.
+        names: of images, or patterns such as "monday/*", where * is any letters, ? is one, and
+            [ab] is a or b.
+        addition: only images of this addition, counted from 1 in `Map.additions`.
+        day: only images that were added on this day, as YYYY-MM-DD.
+
+    Returns:
+        What was removed.
+
+    Raises:
+        InputError: nothing is named; a name, pattern, addition or day of no image; all images; or
+            what `open_for_appending` raises.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, Model, Reading, index, init_crisalad, save_weights
+        >>> model = Model(init_crisalad(jax.random.key(0), PRESETS["tiny"]), PRESETS["tiny"])
+        >>> weights = folder / "weights.safetensors"
+        >>> save_weights(weights, model)
+        >>> _ = index(model, pictures, folder / "map", weights=weights, reading=Reading(quiet=True))
+        >>> remove_images(folder / "map", ["[12].png"]).names
+        ['1.png', '2.png']
+    """
+    names = [names] if isinstance(names, str) else list(names)
+    if not names and addition is None and day is None:
+        raise InputError("names: found none, expected names or patterns, an addition or a day")
+    with _open_existing(folder) as places:
+        numbers, there = find_images(places, names, addition, day)
+        found = [places.images[number].name for number in numbers]
+        if numbers:
+            places.change("remove", removed=numbers)
+        return MapChange(found, there, len(places), stale_search=places.stale_search)
+
+
+def replace_images(
+    model: "Model | Runtime",
+    images: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    *,
+    weights: str | os.PathLike[str],
+    fps: float | None = None,
+    reading: Reading = Reading(),
+) -> MapChange:
+    """Describe again the images of a map whose files have changed, all by one change.
+
+    A file has changed that has another size, or was written since the image was described. The
+    images keep their positions, and become the last ones of the map.
+
+    Args:
+        model: the model that made the map.
+        images: where the files are, as `index` takes it.
+        folder: the map's.
+        weights: the file that the parameters are from, for messages.
+        fps: frames a second taken of videos.
+        reading: how images are read.
+
+    Returns:
+        What was replaced; `unmatched` are images that the map does not have.
+
+    Raises:
+        InputError: another model; no image of the map's names; an image that cannot be read, or
+            none that can; or what `open_for_appending` raises.
+
+    Example:
+        >>> import jax, shutil
+        >>> from crisalad_jax import PRESETS, Model, Reading, index, init_crisalad, save_weights
+        >>> model = Model(init_crisalad(jax.random.key(0), PRESETS["tiny"]), PRESETS["tiny"])
+        >>> weights, quiet = folder / "weights.safetensors", Reading(quiet=True)
+        >>> save_weights(weights, model)
+        >>> _ = index(model, pictures, folder / "map", weights=weights, reading=quiet)
+        >>> (folder / "new").mkdir()
+        >>> _ = shutil.copy(pictures / "1.png", folder / "new" / "3.png")
+        >>> new = folder / "new"
+        >>> replace_images(model, new, folder / "map", weights=weights, reading=quiet).names
+        ['3.png']
+    """
+    describer = describer_of(model)
+    metadata = existing_metadata(folder)
+    check_model(metadata, folder, describer.digest, weights)
+    check_settings(metadata, pathlib.Path(folder), describer.config)
+    (source,) = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
+    with open_for_appending(folder, metadata) as places:
+        pairs = list(zip(source.names, source.paths, strict=True))
+        known = [(name, path) for name, path in pairs if places.image(name) is not None]
+        if not known:
+            raise InputError(
+                f"{images}: found none of the {len(places)} images of {folder}, expected names "
+                f"such as {places.images[0].name!r}"
+            )
+        changed = [(name, path) for name, path in known if _has_changed(places, name, path)]
+        replaced, unreadable = list[str](), list[str]()
+        root, paths = real_path(source.root).as_posix(), [path for _, path in changed]
+        stream = described(
+            describer, paths, reading.fitted(len(paths)), components=places.components
+        )
+        stream = shown(stream, "images", len(paths), quiet=reading.quiet)
+
+        def parts() -> Iterator[NewImages]:
+            for part in joined(stream, SEGMENT):
+                unreadable.extend(changed[i][0] for i in part.unreadable)
+                some = [changed[i] for i in part.indices]
+                if some:
+                    sizes = [stored_bytes(path) or 0 for _, path in some]
+                    names = [name for name, _ in some]
+                    positions = places.positions_of(names)
+                    yield NewImages(names, sizes, part.descriptors, root, positions)
+                    replaced.extend(names)
+            check_readable(images, len(paths), len(replaced))
+
+        if changed:
+            places.change("replace", added=parts())
+        unmatched = [name for name in source.names if places.image(name) is None]
+        counts = len(known) - len(changed), len(places)
+        return MapChange(replaced, *counts, unmatched, unreadable, 0, places.stale_search)
+
+
+def _has_changed(places: Map, name: str, path: pathlib.Path) -> bool:
+    image, added = places.image(name), places.added(name)
+    assert image is not None
+    if added is None or stored_bytes(path) != image.bytes:  # a missing file is skipped, or refused
+        return True
+    written = int(file_of(path).stat().st_mtime)
+    return written > datetime.datetime.fromisoformat(added).timestamp()
+
+
+def move_images(
+    folder: str | os.PathLike[str], positions: Positions | str | os.PathLike[str]
+) -> MapChange:
+    """Give images of a map new positions, such as poses after SLAM.
+
+    Positions come into the map's axes and zone. They may have others where no other image of the
+    map has a position.
+
+    Args:
+        folder: the map's.
+        positions: by name, or a table of it, as `index` takes them.
+
+    Returns:
+        What was moved.
+
+    Raises:
+        InputError: positions of none of the images, or that have no place in the map; or what
+            `open_for_appending` raises.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import (
+        ...     PRESETS, Model, Positions, Reading, index, init_crisalad, save_weights
+        ... )
+        >>> model = Model(init_crisalad(jax.random.key(0), PRESETS["tiny"]), PRESETS["tiny"])
+        >>> weights = folder / "weights.safetensors"
+        >>> save_weights(weights, model)
+        >>> _ = index(model, pictures, folder / "map", weights=weights, reading=Reading(quiet=True))
+        >>> move_images(folder / "map", Positions(("x", "y"), {"1.png": (2.0, 3.5)})).names
+        ['1.png']
+    """
+    with _open_existing(folder) as places:
+        names = [image.name for image in places.images]
+        paths = [pathlib.Path(image.root, image.name) for image in places.images]
+        given = positions_of(positions, names, paths, folder)
+        of = {name: at for name, at in given.of.items() if places.image(name) is not None}
+        unmatched = [name for name in given.of if name not in of]
+        moved = places.fitted_anew(given._replace(of=of))
+        if (moved.axes, moved.zone) == (places.axes, places.zone):
+            now = places.positions_of(of)
+            there = {} if now is None else now.of
+            of = {name: at for name, at in moved.of.items() if at != there.get(name)}
+            moved = moved._replace(of=of)
+        same = len(given.of) - len(unmatched) - len(moved.of)
+        if moved.of:
+            places.change("move", moved=moved)
+        return MapChange(list(moved.of), same, len(places), unmatched)
+
+
+def merge_maps(
+    folder: str | os.PathLike[str], *others: str | os.PathLike[str], quiet: bool = True
+) -> MapChange:
+    """Append the images of other maps, of the same model and settings, to a map, or make it.
+
+    A new map has what is left of the others' images, and none of what was removed; its descriptors
+    are in files. Images keep their folders and days.
+
+    Args:
+        folder: the map's.
+        *others: the others'.
+        quiet: no progress bar.
+
+    Returns:
+        What was appended.
+
+    Raises:
+        InputError: maps of several models or settings; a name of two images; positions that have no
+            place in the map; or what `Map.open` and `open_for_appending` raise.
+
+    Example:
+        >>> import jax
+        >>> from crisalad_jax import PRESETS, Model, Reading, index, init_crisalad, save_weights
+        >>> model = Model(init_crisalad(jax.random.key(0), PRESETS["tiny"]), PRESETS["tiny"])
+        >>> weights, quiet = folder / "weights.safetensors", Reading(quiet=True)
+        >>> save_weights(weights, model)
+        >>> for number in (1, 2):
+        ...     image = pictures / f"{number}.png"
+        ...     _ = index(model, image, folder / f"map{number}", weights=weights, reading=quiet)
+        >>> merge_maps(folder / "both", folder / "map1", folder / "map2").images
+        2
+    """
+    require(bool(others), "others: found none, expected at least one map")
+    folder = pathlib.Path(folder)
+    with contextlib.ExitStack() as stack:
+        for other in others:
+            if real_path(other) == real_path(folder):
+                raise InputError(f"{other}: found the map itself, expected others")
+        opened = [stack.enter_context(Map.open(each, calibrated=False)) for each in others]
+        metadata = read_metadata(folder)
+        if metadata is not None:
+            target = stack.enter_context(open_for_appending(folder, metadata))
+        else:
+            metadata = dataclasses.replace(
+                opened[0].metadata,
+                store="files",
+                collection=f"crisalad_{uuid.uuid4().hex}",
+                created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            )
+            temporary = stack.enter_context(atomic_folder(folder))
+            components = opened[0].components
+            target = stack.enter_context(open_for_appending(temporary, metadata, components))
+        for other in opened:
+            _check_alike(other, metadata, folder)
+        return _merge(target, opened, quiet=quiet)
+
+
+def _check_alike(other: Map, metadata: MapMetadata, folder: pathlib.Path) -> None:
+    for name in ("model", "config", "dtype", "pca"):
+        found, expected = (getattr(each, name) for each in (other.metadata, metadata))
+        if found != expected:
+            words = name
+            if name == "config":
+                words = next(key for key in expected if found.get(key) != expected[key])
+                found, expected = found.get(words), expected[words]
+            found, expected = (str(each)[:60] or "none" for each in (found, expected))
+            raise InputError(
+                f"{other.folder}: found a map of {words} {found}, expected {expected} as in "
+                f"{folder}"
+            )
+
+
+def _merge(target: Map, others: Sequence[Map], *, quiet: bool) -> MapChange:
+    sources = {image.name: target for image in target.images}
+    merged, there, stay_out = list[str](), 0, 0
+    total = sum(map(len, others))
+    with progress_bar("merging", total, "images", quiet=quiet) as bar:
+
+        def parts() -> Iterator[NewImages]:
+            nonlocal there, stay_out
+            for other in others:
+                for part in other.parts():
+                    known = [name in sources for name in part.names]
+                    gone = list(map(target.was_removed, part.names, part.sizes))
+                    _check_same(part.only(known), other, sources)
+                    new = part.only([not any(pair) for pair in zip(known, gone, strict=True)])
+                    there += sum(known)
+                    stay_out += sum(gone)
+                    if new.names:
+                        yield new
+                    merged.extend(new.names)
+                    sources.update(dict.fromkeys(new.names, other))
+                    bar.advance(len(part.names))
+
+        found = parts()
+        first = next(found, None)
+        if first is not None:
+            target.change("merge", added=itertools.chain([first], found))
+    return MapChange(merged, there, len(target), (), (), stay_out, target.stale_search)
+
+
+def _check_same(part: NewImages, other: Map, sources: dict[str, Map]) -> None:
+    """Check that names that another map has too are of the same image: its size and descriptor."""
+    by_source = collections.defaultdict[Map, list[int]](list)
+    for number, name in enumerate(part.names):
+        by_source[sources[name]].append(number)
+    for source, numbers in by_source.items():
+        names = [part.names[number] for number in numbers]
+        theirs = source.descriptors_of(names)
+        similar = np.einsum("nd,nd->n", theirs, other.descriptors_of(names))
+        for number, name, similarity in zip(numbers, names, similar, strict=True):
+            image = source.image(name)
+            if image is None or image.bytes != part.sizes[number] or similarity < _SAME:
+                raise InputError(
+                    f"{other.folder}: found {name!r}, which is another image in {source.folder}, "
+                    "expected other names: remove it from one of the two maps first"
+                )

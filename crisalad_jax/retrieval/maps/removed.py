@@ -1,0 +1,32 @@
+"""Rows of a store that were removed from its map, and the numbers of those that are left."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from crisalad_jax.utils.shapes import Int64
+
+
+class Removed(NamedTuple):
+    """Rows that do not count; the others are numbered from 0 in order."""
+
+    rows: Int64[np.ndarray, " removed"] = np.empty(0, np.int64)
+    """In ascending order."""
+
+    def numbers_of(self, rows: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+        """Return the number of each row that is left."""
+        return rows - np.searchsorted(self.rows, rows)
+
+    def rows_of(self, numbers: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+        """Return the row of each number."""
+        left_before = self.rows - np.arange(len(self.rows))
+        return numbers + np.searchsorted(left_before, numbers, side="right")
+
+    def left(self, first: int, count: int) -> Int64[np.ndarray, " left"] | None:
+        """Return the places that are left of `count` rows from `first` on; None where all are."""
+        start, end = np.searchsorted(self.rows, [first, first + count])
+        gone = self.rows[start:end] - first
+        return np.delete(np.arange(count), gone) if gone.size else None
+
+
+NONE = Removed()
