@@ -14,7 +14,7 @@ from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval import extract as extract_module
 from crisalad_jax.retrieval.descriptor_files import read_descriptors
 from crisalad_jax.retrieval.extract import check_extraction, extract
-from crisalad_jax.retrieval.pca import PcaConfig, fit_pca
+from crisalad_jax.retrieval.pca import fit_pca
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import BusyFolderError
@@ -45,7 +45,7 @@ def test_into_memory(params, town, expected, tmp_path, monkeypatch):
     found = run(params, town)
     assert found.names == [path.relative_to(town).as_posix() for path in paths]
     np.testing.assert_array_equal(found.descriptors, expected)
-    assert (found.skipped, found.pairs) == ([], None)
+    assert found.skipped == []
     listed = run(params, [str(path) for path in reversed(paths)])
     assert listed.names == [path.as_posix() for path in reversed(paths)]
     np.testing.assert_allclose(listed.descriptors, expected[::-1], atol=2e-6)
@@ -70,27 +70,16 @@ def test_components_in_memory(params, town, expected, tmp_path):
     found = run(params, town, tmp_path / "d.npy", pca=fitted)
     np.testing.assert_array_equal(found.descriptors, fitted.apply(expected))
     assert json.loads((tmp_path / "d.npy.json").read_text())["pca"] == "3 components"
-    loose = fit_pca(expected, 3, PcaConfig(renormalise=False))
-    with pytest.raises(InputError, match="--pairs: found descriptors whose lengths are left"):
-        run(params, town, pca=loose, pairs=tmp_path / "pairs.txt")
 
 
-def test_only_descriptors_of_the_same_model_are_paired_or_shortened(params, town, tmp_path):
-    """Others of the same length would give pairs and components that mean nothing."""
+def test_only_descriptors_of_the_same_model_are_shortened(params, town, tmp_path):
+    """Others of the same length would give components that mean nothing."""
     other = jax.tree.map(lambda leaf: leaf * 1.01, params)
-    out, pairs = tmp_path / "d.npy", tmp_path / "pairs.txt"
+    out = tmp_path / "d.npy"
     found = run(params, town, out)
     digest = model_hash(params, MODEL)
     assert json.loads((tmp_path / "d.npy.json").read_text())["model_sha256"] == digest
-    assert run(params, town, pairs=pairs, database=out, k=1).pairs
-    words = "d.npy: found descriptors of another model, or shortened in another way"
-    with pytest.raises(InputError, match=words):
-        run(other, town, tmp_path / "e.npy", pairs=pairs, database=out)
-    for place, turned in (("a", 1), ("b", -1)):  # other components of the same length
-        fitted = fit_pca(turned * found.descriptors[: 4 + turned], 2, model=digest)
-        run(params, town, tmp_path / f"{place}.npy", pca=fitted)
-    with pytest.raises(InputError, match=r"a\.npy: found descriptors of another model"):
-        run(params, town, pca=fitted, pairs=pairs, database=tmp_path / "a.npy")
+    fitted = fit_pca(found.descriptors, 2, model=digest)
     with pytest.raises(InputError, match=f"fitted to descriptors of model {digest[:12]}"):
         run(other, town, tmp_path / "e.npy", pca=fitted)
     assert not list(tmp_path.glob("e.*"))
@@ -129,9 +118,6 @@ def test_what_is_refused(params, images, options, words, tmp_path, monkeypatch):
     ("options", "words"),
     [
         ({"out": "d.txt"}, "d.txt: suffix of the descriptors' file"),
-        ({"database": "d.h5"}, "--database: found without --pairs"),
-        ({"pairs": "d.names.txt"}, "--pairs: found d.names.txt, which --out writes"),
-        ({"pairs": "p.txt", "k": 0}, "k: found 0, expected at least 1"),
         ({"share": "3/3"}, "share: found '3/3', expected INDEX/COUNT"),
         ({"share": "0/3", "grouping": "window"}, "share: found grouping window, expected images"),
         ({"share": "0/3", "out": None}, "share: found no file to write, expected images"),
@@ -154,15 +140,15 @@ def test_a_descriptor_that_is_not_finite_is_not_written(params, town, tmp_path):
 
 @pytest.mark.parametrize("suffix", [".npy", ".h5"])
 def test_shares_make_the_set_of_one_process(params, town, expected, tmp_path, suffix):
-    out, pairs = tmp_path / f"d{suffix}", tmp_path / "pairs.txt"
-    whole = run(params, town, pairs=tmp_path / "whole.txt", k=2)
+    out = tmp_path / f"d{suffix}"
+    whole = run(params, town)
     for share in ("2/3", "0/3"):
-        part = run(params, town, out, share=share, pairs=pairs, k=2)
+        part = run(params, town, out, share=share)
         assert part.shares_left > 0
         assert not out.exists()
     assert part.names == whole.names[: len(part.names)]
-    found = run(params, town, out, share="1/3", pairs=pairs, k=2)
-    assert (found.shares_left, found.pairs) == (0, whole.pairs)
+    found = run(params, town, out, share="1/3")
+    assert (found.shares_left, found.names) == (0, whole.names)
     names, descriptors = read_descriptors(out)
     by_name = dict(zip(names, descriptors, strict=True))
     assert by_name.keys() == set(whole.names)
@@ -171,7 +157,7 @@ def test_shares_make_the_set_of_one_process(params, town, expected, tmp_path, su
         assert names == whole.names
     names = {"d.names.txt"} if suffix == ".npy" else set()
     left = {path.name for path in tmp_path.iterdir()}
-    assert left == {out.name, f"{out.name}.json", "pairs.txt", "whole.txt", *names}
+    assert left == {out.name, f"{out.name}.json", *names}
     again = run(params, town, out, share="1/3")
     assert (again.shares_left, set(again.names)) == (0, set(whole.names))
 
