@@ -122,8 +122,7 @@ def _table(answers: Answers) -> tuple[str, int]:
     for place in _places(answers, degrees=False):
         if place.position is not None:
             at = dict(zip(answers.axes or (), place.position, strict=True))
-            answer = {"answer" if key == "name" else key: place.answer[key] for key in place.answer}
-            rows.append({"name": place.query, **at, **answer, "time": place.time})
+            rows.append({"name": place.query, **at, **place.answer, "time": place.time})
     text = io.StringIO()
     writer = csv.DictWriter(text, rows[0] if rows else ("name", *(answers.axes or ())))
     writer.writeheader()
@@ -206,7 +205,7 @@ def _places(answers: Answers, *, degrees: bool = True) -> list[_Place]:
 
 
 def _answer_fields(answer: Answer) -> dict[str, Any]:
-    fields = {"name": printable(answer.image.name), "similarity": round(answer.similarity, 6)}
+    fields = {"answer": printable(answer.image.name), "similarity": round(answer.similarity, 6)}
     if answer.probability is not None:
         fields["probability"] = round(answer.probability, 6)
     return fields

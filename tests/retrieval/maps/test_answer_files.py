@@ -60,7 +60,7 @@ def test_geojson(tmp_path):
     # RFC 7946: longitude comes first.
     assert first["geometry"]["coordinates"] == pytest.approx([longitude, latitude], abs=DEGREES)
     assert first["properties"] == {
-        **{"query": NAMES[0], "name": "map & <0>.jpg", "similarity": 0.9, "known": True},
+        **{"query": NAMES[0], "answer": "map & <0>.jpg", "similarity": 0.9, "known": True},
     }
     # Not similar enough; and without a position.
     assert (second["geometry"], second["properties"]["known"]) == (None, False)
@@ -82,7 +82,7 @@ def test_gpx_without_times_is_points(tmp_path):
     found = gpxpy.parse(text, version="1.1")
     assert found.version == "1.1"
     assert [point.name for point in found.waypoints] == NAMES[:2]
-    assert found.waypoints[0].description == "name map & <0>.jpg; similarity 0.9"
+    assert found.waypoints[0].description == "answer map & <0>.jpg; similarity 0.9"
     for number, point in enumerate(found.waypoints):
         at = (point.latitude, point.longitude)
         assert at == pytest.approx(expected_degrees(number), abs=DEGREES)
@@ -123,7 +123,7 @@ def test_kml(tmp_path):
         return [each.firstChild.data for each in document.getElementsByTagName(tag)]
 
     assert texts("name") == STAMPS[:2]
-    assert texts("description")[0] == "name map & <0>.jpg; similarity 0.9"
+    assert texts("description")[0] == "answer map & <0>.jpg; similarity 0.9"
     assert texts("when") == ["2023-11-14T22:13:20.250Z", "2023-11-14T22:13:21.500Z"]
     longitude, latitude = map(float, texts("coordinates")[0].split(","))
     assert (latitude, longitude) == pytest.approx(expected_degrees(0), abs=DEGREES)
