@@ -96,6 +96,7 @@ from .retrieval.maps.corrections import replace_images as replace_images
 from .retrieval.maps.live import query_live as query_live
 from .retrieval.maps.map import Map as Map
 from .retrieval.maps.map import MapImage as MapImage
+from .retrieval.maps.pairs import image_pairs as image_pairs
 from .retrieval.maps.query import query as query
 from .retrieval.neighbours import Neighbours as Neighbours
 from .retrieval.pca import fit_pca as fit_pca

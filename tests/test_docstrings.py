@@ -30,7 +30,15 @@ DOCUMENTED = {
 FUNCTIONS = {name: value for name, value in DOCUMENTED.items() if not inspect.isclass(value)}
 SLOW = {
     *("Map", "attend_across_images", "build_vocabulary", "convert", "evaluate", "extract"),
-    *("evaluation_record", "extract_features", "extract_tokens", "fit", "gradient_norms", "index"),
+    *(
+        "evaluation_record",
+        "extract_features",
+        "extract_tokens",
+        "fit",
+        "gradient_norms",
+        "image_pairs",
+    ),
+    *("index",),
     *("init_train_state", "transport_masses", "write_report"),
     *("merge_params", "publish", "query", "query_live", "read_backbone", "show_attention"),
     *("show_image_attention", "show_transport", "split_params", "train", "write_export"),

@@ -41,6 +41,7 @@ _COMMANDS = {
     "map": "List what is in a map, remove, replace or move its images, or merge maps.",
     "calibrate": "Let a map say unknown: from which similarity on its answers are right.",
     "query": "Ask a map where images were taken.",
+    "pairs": "Choose pairs of images to match, for COLMAP and hloc.",
     "serve": "Answer over HTTP, and in a browser, where photographs were taken.",
     "vocabulary": "Build the vocabulary of AnyLoc, NetVLAD, SIFT or ORB from a folder of images.",
     "export": "Write a model as a program that needs nothing of this package.",

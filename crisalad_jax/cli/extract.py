@@ -18,8 +18,8 @@ from crisalad_jax.retrieval.grouping import GROUPINGS
 from crisalad_jax.utils.output import counted
 
 COMMON = (
-    "weights images out image-size resize grouping batch-size runtime compute-dtype root pairs "
-    "database k pca on-bad-image json quiet"
+    "weights images out image-size resize grouping batch-size runtime compute-dtype root pca "
+    "on-bad-image json quiet"
 )
 EXAMPLE = "crisalad extract --weights salad --images photos --out photos.npy"
 SEVERAL = "quote a pattern, or list the images in a .txt"
@@ -42,29 +42,19 @@ class Extract(ReadFlags, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     """Draws the shuffled order."""
     root: pathlib.Path | None = None
     """Folder that names are relative to, by default --images: hloc's folder of all images."""
-    pairs: Annotated[pathlib.Path | None, Target((".txt",))] = None
-    """File for hloc's pairs: each image with those most similar to it, a pair a line."""
-    database: pathlib.Path | None = None
-    """Descriptors, .h5 or .npy, of the images that are paired with these; by default these."""
-    k: int = 20
-    """Pairs of each image; never with itself."""
     pca: pathlib.Path | None = None
     """Components that `crisalad pca` fitted, for shorter descriptors."""
 
 
 def run(arguments: Extract) -> dict[str, Any]:
     """Describe the images, and print what was written."""
-    out, how = arguments.out, pick(arguments, "grouping", "seed", "pairs", "database", "k")
+    out, how = arguments.out, pick(arguments, "grouping", "seed")
     check_extraction(out, **how)
     positions = given_positions(arguments)
     model, _, file = open_flagged(arguments, groupings=[arguments.grouping])
     more = pick(arguments, "fps", "topic", "every_metres", "root", "pca", "verify", "reading")
     result = extract(model, arguments.images, out, weights=file, positions=positions, **how, **more)
     described = counted(len(result.names), "descriptor")
-    pairs = None
-    if result.pairs is not None:
-        pairs = {"file": str(arguments.pairs), "count": len(result.pairs)}
-        echo(f"{arguments.pairs}: {len(result.pairs)} pairs")
     skipped = f"; {len(result.skipped)} unreadable images left out" if result.skipped else ""
     length, images = result.descriptors.shape[1], model.config.images_in_words
     echo(
@@ -78,5 +68,4 @@ def run(arguments: Extract) -> dict[str, Any]:
         "grouping": arguments.grouping,
         "images": images,
         "skipped": result.skipped,
-        "pairs": pairs,
     }

@@ -14,9 +14,14 @@ from crisalad_jax.cli.common import STDOUT, echo, find_given, pick, refuse_with,
 from crisalad_jax.cli.flags import FrameFlags, JsonFlag, ReadFlags, RuntimeName, Target
 from crisalad_jax.config.checks import require
 from crisalad_jax.data.live import Camera, FolderWatch
+from crisalad_jax.retrieval.maps.answer_files import (
+    POSITION_SUFFIXES,
+    check_positions,
+    format_answers,
+)
 from crisalad_jax.retrieval.maps.live import latency_words, query_live
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.retrieval.maps.query import Answers, json_lines, json_rows, query, write_answers
+from crisalad_jax.retrieval.maps.query import Answers, json_lines, json_rows, query
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch
 from crisalad_jax.retrieval.seqslam import SeqSlam
 from crisalad_jax.retrieval.sequence import BayesFilter
@@ -31,8 +36,8 @@ _COLUMNS = 8
 
 
 COMMON = (
-    "images map watch camera fps window weights k min-similarity sequence json gallery map-images "
-    "batch-size on-bad-image quiet"
+    "images map watch camera fps window weights k min-similarity sequence json out gallery "
+    "map-images batch-size on-bad-image quiet"
 )
 EXAMPLE = "crisalad query new.jpg --map map --json -"
 
@@ -80,6 +85,9 @@ class Query(ReadFlags, FrameFlags, JsonFlag):
     json: Annotated[pathlib.Path | None, Target((".json", ".jsonl"))] = None
     """File for the answers: .jsonl, a line of JSON for each query, or .json, a list; - prints
     lines."""
+    out: Annotated[pathlib.Path | None, Target(POSITION_SUFFIXES)] = None
+    """File for where the queries were taken, by its suffix: .csv, which --positions takes, or
+    .geojson, .gpx or .kml, in degrees."""
     gallery: Annotated[pathlib.Path | None, Target((".png", ".svg", ".pdf"))] = None
     """PNG, SVG or PDF of up to 24 queries beside up to 8 answers each."""
     map_images: pathlib.Path | None = None
@@ -102,6 +110,8 @@ def run(arguments: Query) -> None:
     _check_files(arguments)
     sequence = _sequence_of(arguments)
     with _opened(arguments) as places:
+        if arguments.out is not None:
+            check_positions(arguments.out, places.axes, places.zone)
         answers = query(
             places,
             arguments.images,
@@ -134,16 +144,22 @@ def run(arguments: Query) -> None:
             )
             save(figure, staged.enter_context(atomic_path(gallery)))
             written[gallery] = f"{_ROWS} of {asked}" if len(answers.queries) > _ROWS else asked
-        if file not in (None, STDOUT):
-            write_answers(file, answers)
-            written[file] = asked
+        for path in (file, arguments.out):
+            if path not in (None, STDOUT):
+                text, count = format_answers(path, answers)
+                staged.enter_context(atomic_path(path)).write_text(text, "utf-8", newline="")
+                written[path] = asked if count == len(answers.queries) else f"{count} of {asked}"
     for path, words in written.items():
         echo(f"{path}: {words} in a map of {images}{unknown}")
 
 
 def _check_files(arguments: Query) -> None:
     """Check that the gallery has what it needs, and a file of its own."""
-    gallery, file = arguments.gallery, arguments.json
+    gallery, file, out = arguments.gallery, arguments.json, arguments.out
+    require(
+        out is None or out.suffix != "",
+        f"--out: found {out}, expected a name that ends in {' or '.join(POSITION_SUFFIXES)}",
+    )
     refuse_without("--gallery", gallery, map_images=arguments.map_images)
     if gallery is None:
         return
@@ -233,7 +249,7 @@ def _run_live(arguments: Query) -> None:
     """Print an answer for each image that comes, until a signal or the end of a video."""
     name = "--camera" if arguments.watch is None else "--watch"
     require(not arguments.images, f"IMAGE: found with {name}, expected only one of the two")
-    refuse_with(name, **pick(arguments, "gallery", "map_images", "topic"))
+    refuse_with(name, **pick(arguments, "gallery", "map_images", "out", "topic"))
     if name == "--watch":
         refuse_with(name, **pick(arguments, "camera", "fps"))
     require(

@@ -4,7 +4,7 @@ import dataclasses
 import os
 import pathlib
 
-from crisalad_jax.cli.common import echo, find_given
+from crisalad_jax.cli.common import echo, find_given, refuse_without
 from crisalad_jax.cli.flags import DecodeFlags
 from crisalad_jax.retrieval.serve import serve_map
 from crisalad_jax.utils.files import read_text
@@ -32,6 +32,11 @@ class Serve(DecodeFlags):
     """Folder of the map's pictures, if they are not where they were."""
     k: int = 5
     """Answers to a picture, where the request names no number."""
+    tiles: str | None = None
+    """Address of a street map behind the page's map, which browsers then ask for the tiles:
+    https://tile.openstreetmap.org/{z}/{x}/{y}.png."""
+    tiles_attribution: str | None = None
+    """Words to show with the tiles; by default what OpenStreetMap asks for, of its own."""
     max_bytes: int = 20 * 2**20
     """Bytes that a request may have."""
     max_pixels: int = 2**26
@@ -43,6 +48,7 @@ class Serve(DecodeFlags):
 
 def run(arguments: Serve) -> None:
     """Serve the map until a signal ends it."""
+    refuse_without("--tiles", arguments.tiles, tiles_attribution=arguments.tiles_attribution)
     if arguments.token_file is None:
         token = os.environ.get("CRISALAD_TOKEN")
     else:

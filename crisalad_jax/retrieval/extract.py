@@ -5,14 +5,14 @@ import dataclasses
 import os
 import pathlib
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.checks import check_count, check_seed, choose, require
+from crisalad_jax.config.checks import check_seed, choose, require
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.frames import file_of
@@ -22,7 +22,7 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.remote import for_each, state_of, whole_name
 from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.data.tracks import Track
-from crisalad_jax.retrieval.chunks import Descriptors, as_rows, check_all_rows, check_rows
+from crisalad_jax.retrieval.chunks import Descriptors, check_rows
 from crisalad_jax.retrieval.describe import (
     check_readable,
     described,
@@ -35,21 +35,16 @@ from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.descriptor_files import (
     MADE_BY,
     open_npy,
-    read_descriptors,
-    read_record,
     targets,
     write_descriptors,
     write_rows,
 )
 from crisalad_jax.retrieval.grouping import GROUPINGS, batches_of
-from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_pairs
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened
 from crisalad_jax.retrieval.segments import SEGMENT, Segments, digest_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import (
-    atomic_path,
-    check_format,
     check_no_links,
     check_target,
     wrap_os_errors,
@@ -74,8 +69,6 @@ class Extracted(NamedTuple):
     """Their descriptors, float32; a memory map where they are in a file."""
     skipped: list[str]
     """Names of the images that could not be read."""
-    pairs: list[tuple[str, str]] | None = None
-    """Each image with those most similar to it, best first; None where no pairs were asked for."""
 
 
 def extract(
@@ -91,9 +84,6 @@ def extract(
     grouping: str = "single",
     seed: int = 0,
     root: StrPath | None = None,
-    pairs: StrPath | None = None,
-    database: StrPath | None = None,
-    k: int = 20,
     pca: StrPath | Pca | None = None,
     verify: bool = True,
     reading: Reading = Reading(),
@@ -119,19 +109,16 @@ def extract(
         seed: draws the order of the grouping "shuffled".
         root: folder that names are relative to. By default it is the folder `images`, or that of
             another source; files of a list keep their names.
-        pairs: a file for hloc's pairs: each image with those most similar to it, never itself.
-        database: descriptors, .h5 or .npy, of the images to pair these with; None is these.
-        k: number of pairs of each image.
         pca: components that shorten the descriptors, or a file of them.
-        verify: whether to check the bytes of `database` and `pca` against their checksums.
+        verify: whether to check the bytes of `pca` against their checksum.
         reading: how images are read.
 
     Returns:
         Names and descriptors of the images that could be read.
 
     Raises:
-        InputError: what `describer_of` and `check_extraction` raise; components or a database of
-            another length; no image, an image that cannot be read, or none that can; a name that is
+        InputError: what `describer_of` and `check_extraction` raise; components of another
+            length; no image, an image that cannot be read, or none that can; a name that is
             not a line of text or does not lie under `root`; or a file that cannot be read or
             written.
 
@@ -144,10 +131,10 @@ def extract(
         (4, 576)
     """
     describer = describer_of(model, [grouping])
-    check_extraction(out, grouping=grouping, seed=seed, pairs=pairs, database=database, k=k)
+    check_extraction(out, grouping=grouping, seed=seed)
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca, verify=verify)
-    made_by = "--pairs" if pairs is not None else "model" if weights is None else str(weights)
-    length, is_unit = shortened(components, describer, made_by, unit=pairs is not None)
+    made_by = "model" if weights is None else str(weights)
+    length, is_unit = shortened(components, describer, made_by)
     sources = open_sources(images, fps=fps, topic=topic, on_bad_image=reading.on_bad_image)
     if every_metres is not None:
         require(len(sources) == 1, f"every_metres: found {len(sources)} files, expected one source")
@@ -157,8 +144,7 @@ def extract(
         "--positions: found without --every-metres, expected both",
     )
     paths, names = _listed(images, sources, root)
-    made = {} if out is None and database is None else _made(describer, components)
-    others = None if pairs is None else _others(pairs, names, database, length, made, verify=verify)
+    made = {} if out is None else _made(describer, components)
     reading = reading.fitted(len(paths))
     source = str(images) if isinstance(images, str | os.PathLike) else "images"
     work = _Work(
@@ -183,15 +169,10 @@ def extract(
         listed = [name for stored in rows.records for name in stored["names"]]
         check_readable(source, len(paths), len(listed))
         file = temporary_beside(folder / "rows.npy")
-        with in_use(file), contextlib.ExitStack() as staged:
+        with in_use(file):
             with wrap_os_errors(folder):
                 write_rows(file, (len(listed), length), work.descriptors(rows))
             found = Extracted(listed, open_npy(file, verify=False), skipped)
-            if pairs is not None:  # staged, so that pairs and descriptors appear, or none
-                between = others or (listed, found.descriptors)
-                nearest = nearest_pairs(listed, found.descriptors, *between, k=k)
-                write_pairs(staged.enter_context(atomic_path(pairs)), nearest)
-                found = found._replace(pairs=nearest)
             if out is None:
                 return found._replace(descriptors=np.array(found.descriptors))
             whole = record | {"skipped": skipped}
@@ -204,9 +185,6 @@ def check_extraction(
     *,
     grouping: str = "single",
     seed: int = 0,
-    pairs: StrPath | None = None,
-    database: StrPath | None = None,
-    k: int = 20,
 ) -> None:
     """Check what can be checked of an extraction before a model is loaded.
 
@@ -214,29 +192,18 @@ def check_extraction(
         out: as `extract` takes it, and so are the others.
         grouping: which images attend to each other.
         seed: draws the order of the grouping "shuffled".
-        pairs: a file for hloc's pairs.
-        database: descriptors of the images to pair these with.
-        k: number of pairs of each image.
 
     Raises:
-        InputError: an unknown suffix or grouping; a file that cannot be made, or that would
-            take the place of another; a number out of range; or a database without pairs.
+        InputError: an unknown suffix or grouping; a file that cannot be made; or a number out of
+            range.
 
     Example:
         >>> check_extraction("descriptors.npy", grouping="single")
     """
-    files = [] if out is None else targets(pathlib.Path(out))
-    for target in (*files, *([] if pairs is None else [pairs])):
+    for target in [] if out is None else targets(pathlib.Path(out)):
         check_target(target)
     choose("grouping", grouping, GROUPINGS)
     check_seed("seed", seed)
-    if pairs is not None:
-        if pathlib.Path(pairs) in files:
-            raise InputError(f"--pairs: found {pairs}, which --out writes, expected another")
-        check_format("--pairs", pairs, ".txt")
-        check_count("k", k)
-    elif database is not None:
-        raise InputError("--database: found without --pairs, expected both")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -418,29 +385,3 @@ def _made(describer: Describer, components: Pca | None) -> dict[str, str | None]
         MADE_BY: describer.digest,
         "pca_sha256": None if components is None else pca_hash(components),
     }
-
-
-def _others(
-    pairs: StrPath,
-    names: list[str],
-    database: StrPath | None,
-    length: int,
-    made: Mapping[str, str | None],
-    *,
-    verify: bool,
-) -> tuple[list[str], Descriptors] | None:
-    """Read the descriptors to pair the images with; None pairs them with themselves."""
-    check_names(pairs, names)
-    if database is None:
-        return None
-    known = read_record(pathlib.Path(database))
-    require(
-        MADE_BY not in known or all(known.get(key) == value for key, value in made.items()),
-        f"{database}: found descriptors of another model, or shortened in another way, by their "
-        "record; expected them as those that are paired with them",
-    )
-    listed, descriptors = read_descriptors(database, verify=verify)
-    check_names(pairs, listed)
-    as_rows(descriptors, str(database), length)
-    check_all_rows(descriptors, str(database), unit=True)
-    return listed, descriptors

@@ -67,8 +67,9 @@ _TIMED = re.compile(
 )
 TARGETS: Mapping[str, tuple[str, ...]] = {
     "evaluate": ("table.json", "pictures/config.json", "report/index.html"),
-    "extract .npy": ("d.npy", "d.names.txt", "d.npy.json", "pairs.txt"),
-    "extract .h5": ("d.h5", "d.h5.json", "pairs.txt"),
+    "extract .npy": ("d.npy", "d.names.txt", "d.npy.json"),
+    "extract .h5": ("d.h5", "d.h5.json"),
+    "pairs": ("pairs.txt",),
     "query": ("answers.json", "gallery.png"),
     "pca": ("pca.safetensors",),
     "convert": ("public.pth",),

@@ -79,7 +79,8 @@ WRITERS: Mapping[str, tuple[str, str]] = {
 }  # fmt: skip
 """Where the lock of a new folder is; of `query`, which writes none, in the map that it reads."""
 TARGETS = {
-    "extract": ("--out d.npy", "--out d.h5", "--pairs pairs.txt"),
+    "extract": ("--out d.npy", "--out d.h5"),
+    "pairs": ("--out pairs.txt",),
     "query": ("--json answers.json", "--gallery gallery.png"),
     "pca": ("--out pca.safetensors",),
     "info": ("--json info.json",),

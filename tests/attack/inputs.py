@@ -278,13 +278,15 @@ def wrong_files() -> Iterator[Case]:
 # ---- Targets ----
 
 TARGETS = {
-    **{"evaluate": "--json --out --report", "extract": "--out --pairs", "convert": "DST"},
-    **{"query": "--json --gallery", "info": "--json"},
-    **dict.fromkeys(("train", "index", "pca", "export", "vocabulary"), "--out"),
+    **{"evaluate": "--json --out --report", "extract": "--out", "convert": "DST"},
+    **{"query": "--json --out --gallery", "info": "--json"},
+    **dict.fromkeys(("train", "index", "pairs", "pca", "export", "vocabulary"), "--out"),
     **dict.fromkeys(("compare", "demo", "render"), "--out"),
 }
 SUFFIX = {
     ("extract", "--out"): ".npy",
+    ("pairs", "--out"): ".txt",
+    ("query", "--out"): ".csv",
     ("pca", "--out"): ".safetensors",
     ("convert", "DST"): ".pth",
     ("vocabulary", "--out"): ".safetensors",

@@ -38,9 +38,10 @@ COMMANDS: Mapping[str, str] = {
     "evaluate": "evaluate --data @town --weights @weights.safetensors --quiet --batch-size 4 "
     "--seeds 1 --json OUT/table.json --out OUT/pictures --report OUT/report",
     "extract .npy": "extract --weights @weights.safetensors --images @images --quiet "
-    "--batch-size 4 --out OUT/d.npy --pairs OUT/pairs.txt",
+    "--batch-size 4 --out OUT/d.npy",
     "extract .h5": "extract --weights @weights.safetensors --images @images --quiet "
-    "--batch-size 4 --out OUT/d.h5 --pairs OUT/pairs.txt",
+    "--batch-size 4 --out OUT/d.h5",
+    "pairs": "pairs --map @map --out OUT/pairs.txt --overlap 2 --quiet",
     "index": "index --weights @weights.safetensors --images @images --quiet --out OUT/map "
     "--batch-size 4",
     "query": "query @images --map @map --quiet --json OUT/answers.json --gallery OUT/gallery.png",

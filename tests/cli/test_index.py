@@ -5,19 +5,18 @@ import pathlib
 import shutil
 
 import cv2
-import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli.tables import fact_lines
 from crisalad_jax.data.images import list_images
-from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
+from crisalad_jax.retrieval.descriptor_files import read_descriptors
 from crisalad_jax.retrieval.maps.map import Map
 from tests.cli.test_cli import fails, files_in, runs, succeeds
 from tests.conftest import BATCH, describe_single
+from tests.retrieval.maps.test_pairs import brute_force as nearest
+from tests.retrieval.maps.test_pairs import by_name
 from tests.retrieval.maps.test_stores import brute_force
-from tests.retrieval.test_hloc_pairs import brute_force as nearest
-from tests.retrieval.test_hloc_pairs import by_name, pairs_as_hloc_reads_them
 
 MILVUS = "milvus:{map}/rows.db"
 
@@ -91,6 +90,25 @@ def test_answers_are_a_table_json_or_a_gallery(folder, queries, tmp_path, capfd)
     assert said.count("@@@database") == 5 * 5  # the table, too
     # A query and five answers, each 204 pixels wide.
     assert cv2.imread(str(picture)).shape[1] > 6 * 204
+
+
+def test_answers_are_positions_of_a_new_map(shared, folder, queries, tmp_path, capfd):
+    """What `query --out` writes, `index --positions` reads; GeoJSON has the same in degrees."""
+    table, layer = tmp_path / "a.csv", tmp_path / "a.geojson"
+    said = succeeds(capfd, *query(folder, queries, "--k", 1, "--out", table))
+    assert said.endswith(f"{table}: 5 queries in a map of 7 images")
+    succeeds(capfd, *index(shared, queries, tmp_path / "new", "--positions", table))
+    lines, _ = runs(capfd, *query(folder, queries, "--json", "-", "--out", layer))
+    best = {row["query"]: row["neighbours"][0] for row in map(json.loads, lines.splitlines())}
+    with Map.open(tmp_path / "new") as found:
+        for image in found.images:
+            assert image.position == tuple(best[image.name]["position"].values())
+    features = json.loads(layer.read_text())["features"]
+    assert [each["properties"]["query"] for each in features] == list(best)
+    assert all(len(each["geometry"]["coordinates"]) == 2 for each in features)
+    said = succeeds(capfd, *query(folder, queries, "--out", table, "--min-similarity", 1))
+    # One of the queries is an image of the map.
+    assert f"{table}: 1 of 5 queries in a map of 7 images; 4 of 5 unknown" in said
 
 
 def test_a_gallery_shows_so_much_and_says_of_how_much(
@@ -207,6 +225,8 @@ def test_a_map_keeps_its_settings(shared, folder, database, capfd, flags, words)
             ("{images}", "--json", "{map}/x", "--gallery", "{map}/../map/x"),
             "x, as --json, expected two files",
         ),
+        (("{images}", "--out", "{map}/x"), "x, expected a name that ends in .csv or .geojson"),
+        (("{images}", "--out", "{map}/x.json"), "x.json, expected a name that ends in .csv or"),
         (("{images}", "--map", "{images}"), "and no map.json, expected a map"),
         (("{images}", "--map", "{map}/none"), "none: found no map, expected a folder that"),
     ],
@@ -238,39 +258,51 @@ def test_positions_of_images_that_are_there_are_said_to_stay(
 # Pairs
 
 
-def test_extract_writes_pairs_that_hloc_reads(shared, database, queries, tmp_path, capfd, weights):
-    """Names relative to the folder of all images, as hloc has them; against brute force."""
+def test_pairs_that_hloc_reads(shared, database, queries, tmp_path, capfd, weights):
+    """Of images, of a map, and of other images with it: the same names as in hloc's features."""
     root = shared / "town" / "images" / "test"
+    usual = ("--root", root, "--batch-size", BATCH, "--quiet")
+    sides = []
+    for images in (database, queries):
+        out = tmp_path / f"{images.name}.h5"
+        given = ("extract", "--weights", weights, "--images", images, "--out", out, *usual)
+        succeeds(capfd, *given)
+        sides.append(by_name(*read_descriptors(out)))
+    succeeds(capfd, *index(shared, database, tmp_path / "map"))
+    among, again, between = (tmp_path / f"{name}.txt" for name in ("among", "again", "between"))
+    given = ("pairs", *usual, "--images", database, "--weights", weights, "--k", 2)
+    said = succeeds(capfd, *given, "--out", among)
+    given = ("pairs", *usual, "--map", tmp_path / "map", "--k", 2, "--out", again)
+    succeeds(capfd, *given, "--json", tmp_path / "pairs.json")
+    assert again.read_text() == among.read_text()
+    pairs = read_pairs(among)
+    assert said.endswith(f"{among}: {len(pairs)} pairs of 7 images, named relative to {root}")
+    assert set(map(frozenset, pairs)) == set(map(frozenset, nearest(sides[0], sides[0], 2)))
+    result = json.loads((tmp_path / "pairs.json").read_text())
+    assert (result["pairs"], result["root"], result["unreadable"]) == (len(pairs), str(root), [])
+    given = ("pairs", "--map", tmp_path / "map", "--images", queries, "--k", 3, *usual)
+    succeeds(capfd, *given, "--out", between)
+    assert read_pairs(between) == nearest(sides[1], sides[0], 3)
 
-    def extract(images: pathlib.Path, out: str, *more: object) -> tuple:
-        return (
-            *("extract", "--weights", weights, "--images", images),
-            *("--root", root, "--out", tmp_path / out, "--batch-size", BATCH, "--quiet", *more),
-        )
 
-    one, two = tmp_path / "among.txt", tmp_path / "pairs.txt"
-    said = succeeds(capfd, *extract(database, "db.h5", "--pairs", one, "--k", 2))
-    assert f"{one}: 14 pairs" in said
-    flags = ("--pairs", two, "--k", 3, "--database", tmp_path / "db.h5")
-    assert f"{two}: 15 pairs" in succeeds(capfd, *extract(queries, "q.h5", *flags))
+def read_pairs(file: pathlib.Path) -> list[tuple[str, str]]:
+    """A pair a line, as hloc reads them: more or fewer than two names is an error."""
+    lines = [line.split(" ") for line in file.read_text(encoding="utf-8").splitlines()]
+    return [(query, image) for query, image in lines]
 
-    sides = [by_name(*read_descriptors(tmp_path / name)) for name in ("db.h5", "q.h5")]
-    assert set(sides[1]) == {f"queries/{path.name}" for path in list_images(queries)}
-    among = pairs_as_hloc_reads_them(one, tmp_path / "db.h5")
-    assert among == nearest(sides[0], sides[0], 2)
-    between = pairs_as_hloc_reads_them(two, tmp_path / "q.h5", tmp_path / "db.h5")
-    assert between == nearest(sides[1], sides[0], 3)
 
-    words = (f"--root: found {queries}, expected a folder that holds {database}",)
-    fails(capfd, *extract(database, "x.h5", "--root", queries), words=words)
-    short = tmp_path / "short.h5"
-    write_descriptors(short, np.eye(3, dtype=np.float32), ["a", "b", "c"])
-    wrong = extract(database, "x.h5", "--pairs", two, "--database", short)
-    fails(capfd, *wrong, words=("short.h5: found shape", "expected (images, 48)"))
-    spaced = tmp_path / "images"
-    spaced.mkdir()
-    (spaced / "a b.jpg").write_bytes(list_images(database)[0].read_bytes())
-    wrong = extract(spaced, "x.h5", "--root", spaced, "--pairs", tmp_path / "none.txt")
-    fails(capfd, *wrong, words=("none.txt: found the image name 'a b.jpg'", "without spaces"))
-    assert not list(tmp_path.glob("x.*"))
-    assert not (tmp_path / "none.txt").exists()
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        ((), "--map: found none, and no --images"),
+        (("--images", "{images}", "--k", 0), "k: found 0, expected some rule"),
+        (("--map", "{map}", "--images", "{images}", "--overlap", 2), "overlap and within: found"),
+        (("--map", "{map}", "--fps", 2), "--fps: found without --images"),
+        (("--map", "{map}", "--weights", "salad"), "--weights: found without --images"),
+        (("--images", "{images}/none", "--weights", "hog"), "none: found no such file"),
+    ],
+)
+def test_pairs_that_are_refused(folder, queries, tmp_path, capfd, flags, words):
+    filled = [str(part).format(map=folder, images=queries) for part in flags]
+    fails(capfd, "pairs", *filled, "--out", tmp_path / "pairs.txt", words=(words,))
+    assert not (tmp_path / "pairs.txt").exists()

@@ -235,8 +235,8 @@ def test_json_is_never_written_under_the_name_of_another_format(capfd, tmp_path,
     fails(capfd, "models", "--latex", name, words=words)
     words = ("--latex: found - with --json -, expected only one of the two",)
     fails(capfd, "models", "--latex", "-", "--json", "-", words=words)
-    extract = ("extract", "--images", "a", "--out", "d.npy", "--pairs", name)
-    fails(capfd, *extract, words=(f"--pairs: found {name}, expected a name that ends in .txt",))
+    pairs = ("pairs", "--images", "a", "--out", name)
+    fails(capfd, *pairs, words=(f"--out: found {name}, expected a name that ends in .txt",))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -38,13 +38,14 @@ OUTPUTS = (
     *(f"{verb} --out" for verb in ("vocabulary", "compare", "ablate", "demo", "render")),
     *(f"{verb} --json" for verb in ("evaluate", "query", "info", "models", "calibrate")),
     *(f"{verb} --latex" for verb in ("evaluate", "ablate", "info", "models", "calibrate")),
-    *("evaluate --report", "extract --pairs", "query --gallery", "convert DST"),
+    *("evaluate --report", "pairs --out", "query --out", "query --gallery", "convert DST"),
 )
 SUFFIXES = {
     "--json": ".json",
     "--latex": ".tex",
     "--gallery": ".png",
-    "--pairs": ".txt",
+    "pairs --out": ".txt",
+    "query --out": ".csv",
     "extract --out": ".npy",
 }
 

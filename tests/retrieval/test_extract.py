@@ -14,7 +14,7 @@ from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval import extract as extract_module
 from crisalad_jax.retrieval.descriptor_files import read_descriptors
 from crisalad_jax.retrieval.extract import check_extraction, extract
-from crisalad_jax.retrieval.pca import PcaConfig, fit_pca
+from crisalad_jax.retrieval.pca import fit_pca
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL, describe_single, read_options
@@ -43,7 +43,7 @@ def test_into_memory(params, town, expected, tmp_path, monkeypatch):
     found = run(params, town)
     assert found.names == [path.relative_to(town).as_posix() for path in paths]
     np.testing.assert_array_equal(found.descriptors, expected)
-    assert (found.skipped, found.pairs) == ([], None)
+    assert found.skipped == []
     listed = run(params, [str(path) for path in reversed(paths)])
     assert listed.names == [path.as_posix() for path in reversed(paths)]
     np.testing.assert_allclose(listed.descriptors, expected[::-1], atol=2e-6)
@@ -68,27 +68,16 @@ def test_components_in_memory(params, town, expected, tmp_path):
     found = run(params, town, tmp_path / "d.npy", pca=fitted)
     np.testing.assert_array_equal(found.descriptors, fitted.apply(expected))
     assert json.loads((tmp_path / "d.npy.json").read_text())["pca"] == "3 components"
-    loose = fit_pca(expected, 3, PcaConfig(renormalise=False))
-    with pytest.raises(InputError, match="--pairs: found descriptors whose lengths are left"):
-        run(params, town, pca=loose, pairs=tmp_path / "pairs.txt")
 
 
-def test_only_descriptors_of_the_same_model_are_paired_or_shortened(params, town, tmp_path):
-    """Others of the same length would give pairs and components that mean nothing."""
+def test_only_descriptors_of_the_same_model_are_shortened(params, town, tmp_path):
+    """Others of the same length would give components that mean nothing."""
     other = jax.tree.map(lambda leaf: leaf * 1.01, params)
-    out, pairs = tmp_path / "d.npy", tmp_path / "pairs.txt"
+    out = tmp_path / "d.npy"
     found = run(params, town, out)
     digest = model_hash(params, MODEL)
     assert json.loads((tmp_path / "d.npy.json").read_text())["model_sha256"] == digest
-    assert run(params, town, pairs=pairs, database=out, k=1).pairs
-    words = "d.npy: found descriptors of another model, or shortened in another way"
-    with pytest.raises(InputError, match=words):
-        run(other, town, tmp_path / "e.npy", pairs=pairs, database=out)
-    for place, turned in (("a", 1), ("b", -1)):  # other components of the same length
-        fitted = fit_pca(turned * found.descriptors[: 4 + turned], 2, model=digest)
-        run(params, town, tmp_path / f"{place}.npy", pca=fitted)
-    with pytest.raises(InputError, match=r"a\.npy: found descriptors of another model"):
-        run(params, town, pca=fitted, pairs=pairs, database=tmp_path / "a.npy")
+    fitted = fit_pca(found.descriptors, 2, model=digest)
     with pytest.raises(InputError, match=f"fitted to descriptors of model {digest[:12]}"):
         run(other, town, tmp_path / "e.npy", pca=fitted)
     assert not list(tmp_path.glob("e.*"))
@@ -127,9 +116,6 @@ def test_what_is_refused(params, images, options, words, tmp_path, monkeypatch):
     ("options", "words"),
     [
         ({"out": "d.txt"}, "d.txt: suffix of the descriptors' file"),
-        ({"database": "d.h5"}, "--database: found without --pairs"),
-        ({"pairs": "d.names.txt"}, "--pairs: found d.names.txt, which --out writes"),
-        ({"pairs": "p.txt", "k": 0}, "k: found 0, expected at least 1"),
     ],
 )
 def test_what_is_known_before_there_is_a_model(options, words, tmp_path, monkeypatch):

@@ -28,7 +28,6 @@ from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage, ranked
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch, SequenceTracker, TrackResult
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.shapes import Bool, Float32, Float64
 
 if TYPE_CHECKING:  # answers are searched without JAX
@@ -293,20 +292,3 @@ def json_text(row: dict[str, Any]) -> str:
     """Return a row as one line of JSON."""
     text = json.dumps(row, ensure_ascii=False)
     return text if text.isprintable() else json.dumps(row)
-
-
-def write_answers(path: str | os.PathLike[str], answers: Answers) -> None:
-    """Write answers as JSON: a line for each query or, in a file .json, a list of them.
-
-    Args:
-        path: the file.
-        answers: what `query` found.
-
-    Raises:
-        InputError: the file cannot be made.
-    """
-    lines = list(json_lines(answers))
-    if pathlib.Path(path).suffix.lower() == ".json":
-        lines = ["[", *(f"{line}," for line in lines[:-1]), lines[-1], "]"]
-    with atomic_path(path) as temporary:
-        temporary.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")

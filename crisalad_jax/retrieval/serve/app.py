@@ -46,6 +46,7 @@ from crisalad_jax.retrieval.serve.pictures import (
     read_thumbnail,
     receive_picture,
 )
+from crisalad_jax.retrieval.serve.tiles import Tiles
 from crisalad_jax.retrieval.serve.worker import (
     Addition,
     MapFailedError,
@@ -82,21 +83,23 @@ def _hash(tag: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-HEADERS = {
-    # The page holds its style and its script; nothing else runs in it.
-    "Content-Security-Policy": (
-        f"default-src 'none'; script-src {_hash('script')}; style-src {_hash('style')}; "
-        "img-src 'self' blob: data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
-        "frame-ancestors 'none'"
-    ),
-    "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
-    "Referrer-Policy": "no-referrer",
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Cache-Control": "no-store",
-}
-"""Headers of every answer."""
+def headers(tiles: Tiles | None = None) -> dict[str, str]:
+    """Return the headers of every answer."""
+    return {
+        # The page holds its style and its script; nothing else runs in it.
+        "Content-Security-Policy": (
+            f"default-src 'none'; script-src {_hash('script')}; style-src {_hash('style')}; "
+            f"img-src 'self' blob: data:{f' {tiles.origin}' if tiles else ''}; "
+            "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        ),
+        "X-Content-Type-Options": "nosniff",
+        "X-Frame-Options": "DENY",
+        # OpenStreetMap's servers refuse browsers that do not say whose page wants tiles.
+        "Referrer-Policy": "strict-origin" if tiles else "no-referrer",
+        "Cross-Origin-Opener-Policy": "same-origin",
+        "Cross-Origin-Resource-Policy": "same-origin",
+        "Cache-Control": "no-store",
+    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,6 +169,8 @@ class Places:
     appends: bool
     k: int
     max_bytes: int
+    tiles: Tiles | None
+    """What the page draws behind them; null where nothing."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -249,6 +254,7 @@ def make_app(
     max_bytes: int = 20 * 2**20,
     max_pixels: int = MOST_PIXELS,
     most_waiting: int = 128,
+    tiles: Tiles | None = None,
 ) -> ASGIApp:
     """Make the application that answers for a map.
 
@@ -262,6 +268,7 @@ def make_app(
         max_bytes: largest body of a request.
         max_pixels: most pixels of a picture that a request brings.
         most_waiting: number of requests with a picture at once; more are told to come again.
+        tiles: what the page draws behind the map's places.
 
     Returns:
         An ASGI application.
@@ -346,6 +353,8 @@ def make_app(
             appends=appends,
             k=k,
             max_bytes=max_bytes,
+            # A map without positions may have got some that no tile has.
+            tiles=tiles if places.axes == AXES[1] or places.zone else None,
         )
 
     @guarded.get(

@@ -20,12 +20,13 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from crisalad_jax.config.checks import check_count, require
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.serve.app import (
-    HEADERS,
     MOST_ANSWERS,
     MOST_PIXELS,
     bracketed,
+    headers,
     make_app,
 )
+from crisalad_jax.retrieval.serve.tiles import Tiles, open_tiles
 from crisalad_jax.retrieval.serve.worker import MapWorker
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import most_files
@@ -56,6 +57,8 @@ def serve_map(
     max_bytes: int = 20 * 2**20,
     max_pixels: int = MOST_PIXELS,
     batch_size: int = 16,
+    tiles: str | None = None,
+    tiles_attribution: str | None = None,
     verify: bool = True,
     quiet: bool = False,
     ready: Callable[[str], object] = lambda _: None,
@@ -76,14 +79,18 @@ def serve_map(
         max_bytes: largest body of a request.
         max_pixels: most pixels of a picture that a request brings.
         batch_size: largest number of pictures described together, each as if it were alone.
+        tiles: address of a street map's tiles, which browsers draw behind the map's places:
+            https://tile.openstreetmap.org/{z}/{x}/{y}.png. None draws none.
+        tiles_attribution: words to show with them; None is what OpenStreetMap asks for, of its own.
         verify: whether to compare the map's descriptors with their checksums.
         quiet: whether to show no progress bar.
         ready: called with the service's address once it answers.
 
     Raises:
         InputError: a number out of range; an address that is not this machine's or in use; one that
-            others can reach without a token; no such folder; or what `Map.open`,
-            `Map.load_model` and `open_for_appending` raise.
+            others can reach without a token; no such folder; tiles for a map in neither degrees nor
+            a known zone of UTM; or what `Map.open`, `Map.load_model` and `open_for_appending`
+            raise.
 
     Example:
         >>> serve_map("city.map", host="0.0.0.0")
@@ -103,6 +110,7 @@ def serve_map(
         stop = stack.enter_context(defer_signals())
         listener = stack.enter_context(contextlib.closing(_bound(host, port)))
         places = stack.enter_context(_opened(folder, append=append, verify=verify))
+        behind = None if tiles is None else open_tiles(tiles, tiles_attribution, places)
         places.load_model(weights)
         worker = MapWorker(places, places.describer(), batch_size=batch_size)
         stack.enter_context(contextlib.closing(worker))
@@ -118,9 +126,10 @@ def serve_map(
             k=k,
             max_bytes=max_bytes,
             max_pixels=max_pixels,
+            tiles=behind,
         )
         address = f"http://{bracketed(host)}:{listener.getsockname()[1]}"
-        Server(app, stop, lambda: ready(address)).run([listener])
+        Server(app, stop, lambda: ready(address), behind).run([listener])
 
 
 class _Connection(H11Protocol):
@@ -176,8 +185,14 @@ class _Connection(H11Protocol):
 class Server(uvicorn.Server):
     """A server of HTTP that ends at a deferred signal."""
 
-    def __init__(self, app: ASGIApp, stop: SignalState, ready: Callable[[], object]) -> None:
-        """Take the application, the signals, and what to call once it answers."""
+    def __init__(
+        self,
+        app: ASGIApp,
+        stop: SignalState,
+        ready: Callable[[], object],
+        tiles: Tiles | None = None,
+    ) -> None:
+        """Take the application, the signals, what to call once it answers, and the page's tiles."""
         config = uvicorn.Config(
             app,
             loop="asyncio",  # uvloop would take the signals that `defer_signals` handles
@@ -190,7 +205,7 @@ class Server(uvicorn.Server):
             server_header=False,
             proxy_headers=False,
             timeout_graceful_shutdown=_GRACE,
-            headers=list(HEADERS.items()),
+            headers=list(headers(tiles).items()),
         )
         super().__init__(config)
         self._stop, self._ready = stop, ready

@@ -17,10 +17,11 @@ from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.live import FolderWatch, Frame
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.maps.answer_files import write_answers
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.live import query_live
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.retrieval.maps.query import Answers, json_lines, query, write_answers
+from crisalad_jax.retrieval.maps.query import Answers, json_lines, query
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL, random_params, read_options
 from tests.retrieval.maps.conftest import ask

@@ -71,7 +71,7 @@ def serving(
         stack.enter_context(contextlib.closing(worker))
         app = make_app(worker, appends=appends, max_bytes=LIMIT, **options)
         stop, up = SignalState(), threading.Event()
-        server = Server(app, stop, up.set)
+        server = Server(app, stop, up.set, options.get("tiles"))
         listener = stack.enter_context(contextlib.closing(_bound("127.0.0.1", 0)))
         thread = threading.Thread(target=server.run, args=([listener],), daemon=True)
         thread.start()

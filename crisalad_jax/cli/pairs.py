@@ -1,0 +1,115 @@
+"""`crisalad pairs`."""
+
+import contextlib
+import dataclasses
+import pathlib
+import tempfile
+from typing import Annotated, Any
+
+from crisalad_jax.cli.common import echo, find_given, pick, refuse_without
+from crisalad_jax.cli.flags import JsonFlag, ReadFlags, RuntimeName, Target
+from crisalad_jax.config.checks import require
+from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.pairs import check_rules, image_pairs
+from crisalad_jax.utils.output import counted
+
+COMMON = (
+    "map images out root k min-similarity min-gap overlap within weights fps runtime batch-size "
+    "on-bad-image json quiet"
+)
+EXAMPLE = "crisalad pairs --images photos --out pairs.txt --k 10"
+SEVERAL = "quote a pattern, or make a map of all (`crisalad index`)"
+"""What to do in place of several values of --images."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Pairs(ReadFlags, JsonFlag):
+    """Choose pairs of images to match, for COLMAP and hloc.
+
+    Among the images of --map or of --images, for a reconstruction; or, with both, of --images with
+    those of the map, to localise them.
+    """
+
+    map: pathlib.Path | None = None
+    """Folder that `crisalad index` wrote."""
+    images: pathlib.Path | None = None
+    """Folder, file, pattern, list, table or video (docs/how-to/image-sources.md)."""
+    out: Annotated[pathlib.Path, Target((".txt",))]
+    """File for a pair a line: two names with a space between them."""
+    root: pathlib.Path | None = None
+    """Folder that names are relative to, COLMAP's image_path; by default that of the images."""
+    k: int = 20
+    """Each image with its k most similar ones; 0 for none of these."""
+    min_similarity: float = -1.0
+    """Least similarity of these."""
+    min_gap: float | None = None
+    """Seconds that these are apart, at least, by the times in their names: loops."""
+    overlap: int = 0
+    """Each image with so many next ones of its folder or video, too."""
+    within: float | None = None
+    """Images at most so many metres apart, too, where positions are known."""
+    weights: pathlib.Path | None = None
+    """Describes --images; by default the model that made the map, or starter. A file or a published
+    name."""
+    fps: float | None = None
+    """Frames a second taken of a video, by default 1."""
+    runtime: RuntimeName = "jax"
+    """What computes the model: jax, onnxruntime or openvino (docs/export.md)."""
+    verify: bool = True
+    """Check files against their checksums; --no-verify skips that, where they are huge."""
+
+
+def needs_jax(arguments: Pairs) -> bool:
+    """Return whether JAX describes images: those of a map have descriptors."""
+    return arguments.images is not None and arguments.runtime == "jax"
+
+
+def run(arguments: Pairs) -> dict[str, Any]:
+    """Choose the pairs, and write them."""
+    folder, images, reading = arguments.map, arguments.images, arguments.reading
+    rules = pick(arguments, "k", "overlap", "within", "min_gap")
+    check_rules(among=folder is None or images is None, **rules)
+    refuse_without("--images", images, **pick(arguments, "weights", "fps"))
+    rules |= pick(arguments, "root", "min_similarity")
+    unreadable: list[str] = []
+    with contextlib.ExitStack() as stack:
+        if folder is None:
+            require(images is not None, "--map: found none, and no --images, expected one or both")
+            scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="crisalad-"))
+            folder = pathlib.Path(scratch, "map")
+            unreadable = _index(arguments, folder)
+            images = None
+        verify = arguments.verify
+        places = stack.enter_context(Map.open(folder, verify=verify, calibrated=False))
+        if images is not None:
+            runtime = arguments.runtime
+            weights = find_given(arguments.weights, runtime=runtime, quiet=arguments.quiet)
+            places.load_model(weights, engine=runtime, verify=verify)
+            rules |= pick(arguments, "fps")
+        found = image_pairs(places, images, reading=reading, **rules)
+        of = counted(len(places), "image")
+    found.write(arguments.out)
+    unreadable += found.unreadable
+    skipped = f"; {len(unreadable)} unreadable images left out" if unreadable else ""
+    echo(
+        f"{arguments.out}: {counted(len(found.pairs), 'pair')} {'of' if images is None else 'with'}"
+        f" {of}, named relative to {found.root}{skipped}"
+    )
+    return {
+        "out": str(arguments.out),
+        "pairs": len(found.pairs),
+        "root": str(found.root),
+        "unreadable": unreadable,
+    }
+
+
+def _index(arguments: Pairs, folder: pathlib.Path) -> list[str]:
+    """Describe --images into a map, and return the names of those that cannot be read."""
+    from crisalad_jax.checkpoints.load import open_model
+    from crisalad_jax.retrieval.maps.build import index
+
+    options = pick(arguments, "verify", "quiet")
+    model, _, file = open_model(arguments.weights, arguments.runtime, lambda same: same, **options)
+    options = pick(arguments, "fps", "reading")
+    assert arguments.images is not None
+    return index(model, arguments.images, folder, weights=file, **options).unreadable

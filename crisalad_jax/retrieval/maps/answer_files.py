@@ -1,0 +1,245 @@
+"""Files of a map's answers: JSON, and the tables and layers that maps of other programs read.
+
+GeoJSON is RFC 7946, GPX version 1.1 of Topografix's schema, KML version 2.2 of OGC 07-147r2.
+"""
+
+import csv
+import datetime
+import io
+import os
+import pathlib
+import xml.etree.ElementTree as xml
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from crisalad_jax.data.metres import Zone
+from crisalad_jax.data.positions import AXES, utm_degrees
+from crisalad_jax.data.video import moment_of
+from crisalad_jax.retrieval.maps.map import Answer
+from crisalad_jax.retrieval.maps.query import Answers, json_lines, json_text
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import atomic_path
+from crisalad_jax.utils.output import printable
+
+POSITION_SUFFIXES = (".csv", ".geojson", ".gpx", ".kml")
+"""Suffixes of files that have positions."""
+_DECIMALS = 9
+"""Of degrees: a tenth of a millimetre."""
+
+
+class _Place(NamedTuple):
+    """A query, and what its best answer says of it."""
+
+    query: str
+    position: tuple[float, float] | None
+    """Of the best answer; None where that has none, or is not similar enough."""
+    time: str | float | None
+    """UTC, as ISO 8601; or seconds into a video; None where the name says none."""
+    known: bool
+    answer: dict[str, Any]
+    """The best answer's name, its similarity, and what else is known of it."""
+
+
+def write_answers(path: str | os.PathLike[str], answers: Answers) -> int:
+    """Write answers in the format that the file's name says.
+
+    JSON has all answers: a line for each query (.jsonl, or any other suffix) or a list of them
+    (.json). The others have the best answer's position: .csv in the map's axes, for `--positions`;
+    .geojson, .gpx and .kml in degrees. GPX is a track where all names say seconds since 1970. A
+    query of an unknown place, or whose answer has no position, is without geometry in GeoJSON, and
+    left out of CSV, GPX and KML.
+
+    Args:
+        path: the file.
+        answers: what `query` found.
+
+    Returns:
+        The number of queries in the file.
+
+    Raises:
+        InputError: the map has no positions or, for degrees, metres without a known zone of UTM; or
+            the file cannot be made.
+    """
+    text, count = format_answers(path, answers)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="")
+    return count
+
+
+def format_answers(path: str | os.PathLike[str], answers: Answers) -> tuple[str, int]:
+    """Return what `write_answers` writes, and the number of queries in it.
+
+    Raises:
+        InputError: as `check_positions`.
+    """
+    check_positions(path, answers.axes, answers.zone)
+    return _WRITERS.get(_suffix(path), _json_lines)(answers)
+
+
+def check_positions(
+    path: str | os.PathLike[str], axes: tuple[str, str] | None, zone: Zone | None
+) -> None:
+    """Check that a map has positions that a file of its answers can hold.
+
+    Args:
+        path: the file.
+        axes: the map's.
+        zone: the map's.
+
+    Raises:
+        InputError: it has none or, for degrees, metres without a known zone of UTM.
+    """
+    suffix = _suffix(path)
+    if suffix not in POSITION_SUFFIXES:
+        return
+    if axes is None:
+        raise InputError(f"{path}: found no positions in the map, expected some")
+    if suffix != ".csv" and axes != AXES[1] and zone is None:
+        raise InputError(
+            f"{path}: found positions in {', '.join(axes)} without a zone of UTM, expected "
+            "degrees, or metres of a known zone; a file .csv has them as they are"
+        )
+
+
+def _suffix(path: str | os.PathLike[str]) -> str:
+    return pathlib.Path(path).suffix.lower()
+
+
+def _json_lines(answers: Answers) -> tuple[str, int]:
+    return "".join(f"{line}\n" for line in json_lines(answers)), len(answers.queries)
+
+
+def _json_list(answers: Answers) -> tuple[str, int]:
+    lines = ",\n".join(json_lines(answers))
+    return f"[\n{lines}\n]\n", len(answers.queries)
+
+
+def _table(answers: Answers) -> tuple[str, int]:
+    """Write a table that `read_image_table` reads: the query's name, and where it was taken."""
+    rows = []
+    for place in _places(answers, degrees=False):
+        if place.position is not None:
+            at = dict(zip(answers.axes or (), place.position, strict=True))
+            rows.append({"name": place.query, **at, **place.answer, "time": place.time})
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0] if rows else ("name", *(answers.axes or ())))
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue(), len(rows)
+
+
+def _geojson(answers: Answers) -> tuple[str, int]:
+    features = []
+    for place in _places(answers):
+        geometry = None
+        if place.position is not None:
+            latitude, longitude = place.position
+            geometry = {"type": "Point", "coordinates": [longitude, latitude]}
+        more = {} if answers.min_similarity is None else {"known": place.known}
+        more |= {} if place.time is None else {"time": place.time}
+        properties = {"query": place.query, **place.answer, **more}
+        features.append({"type": "Feature", "geometry": geometry, "properties": properties})
+    lines = ",\n".join(map(json_text, features))
+    return f'{{"type": "FeatureCollection", "features": [\n{lines}\n]}}\n', len(features)
+
+
+def _gpx(answers: Answers) -> tuple[str, int]:
+    places = [place for place in _places(answers) if place.position]
+    root = xml.Element("gpx", version="1.1", creator="crisalad-jax")
+    root.set("xmlns", "http://www.topografix.com/GPX/1/1")
+    is_track = bool(places) and all(isinstance(place.time, str) for place in places)
+    parent = xml.SubElement(xml.SubElement(root, "trk"), "trkseg") if is_track else root
+    for place in places:
+        assert place.position is not None
+        latitude, longitude = map(_degrees, place.position)
+        tag = "trkpt" if is_track else "wpt"
+        point = xml.SubElement(parent, tag, lat=latitude, lon=longitude)
+        if isinstance(place.time, str):
+            xml.SubElement(point, "time").text = place.time
+        xml.SubElement(point, "name").text = place.query
+        xml.SubElement(point, "desc").text = _words(place.answer)
+    return _xml(root), len(places)
+
+
+def _kml(answers: Answers) -> tuple[str, int]:
+    places = [place for place in _places(answers) if place.position]
+    root = xml.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
+    document = xml.SubElement(root, "Document")
+    for place in places:
+        assert place.position is not None
+        latitude, longitude = map(_degrees, place.position)
+        mark = xml.SubElement(document, "Placemark")
+        xml.SubElement(mark, "name").text = place.query
+        xml.SubElement(mark, "description").text = _words(place.answer)
+        if isinstance(place.time, str):
+            xml.SubElement(xml.SubElement(mark, "TimeStamp"), "when").text = place.time
+        point = xml.SubElement(mark, "Point")
+        xml.SubElement(point, "coordinates").text = f"{longitude},{latitude}"
+    return _xml(root), len(places)
+
+
+_WRITERS: Mapping[str, Callable[[Answers], tuple[str, int]]] = {
+    ".json": _json_list,
+    ".csv": _table,
+    ".geojson": _geojson,
+    ".gpx": _gpx,
+    ".kml": _kml,
+}
+"""What writes a format, by the suffix of its files: the text, and the number of queries in it."""
+
+
+def _places(answers: Answers, *, degrees: bool = True) -> list[_Place]:
+    """Return what is known of each query, in order, with latitude and longitude or map axes."""
+    best = [found[0] for _, found in answers.rows()]
+    positions = [answer.image.position for answer in best]
+    if degrees and answers.axes != AXES[1]:
+        positions = _to_degrees(answers, positions)
+    names, known = map(printable, answers.names), answers.known.tolist()
+    columns = zip(names, answers.queries, positions, known, best, strict=True)
+    return [
+        _Place(name, at if is_known else None, _time(path), is_known, _answer_fields(answer))
+        for name, path, at, is_known, answer in columns
+    ]
+
+
+def _answer_fields(answer: Answer) -> dict[str, Any]:
+    fields = {"answer": printable(answer.image.name), "similarity": round(answer.similarity, 6)}
+    if answer.probability is not None:
+        fields["probability"] = round(answer.probability, 6)
+    return fields
+
+
+def _to_degrees(
+    answers: Answers, positions: list[tuple[float, float] | None]
+) -> list[tuple[float, float] | None]:
+    """Convert metres of a known zone of UTM to latitude and longitude."""
+    there = [number for number, at in enumerate(positions) if at is not None]
+    names = [answers.names[number] for number in there]
+    metres = np.array([positions[number] for number in there], np.float64).reshape(-1, 2)
+    found = np.round(utm_degrees(names, [answers.zone] * len(there), metres), _DECIMALS)
+    converted = dict(zip(there, map(tuple, found.tolist()), strict=True))
+    return [converted.get(number) for number in range(len(positions))]
+
+
+def _time(query: pathlib.Path) -> str | float | None:
+    moment = moment_of(query)
+    if moment is None or moment.clock:
+        return None if moment is None else moment.seconds
+    time = datetime.datetime.fromtimestamp(moment.seconds, datetime.UTC)
+    return time.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _degrees(value: float) -> str:
+    """Write degrees without an exponent, which GPX's numbers cannot have."""
+    return f"{value:.{_DECIMALS}f}".rstrip("0").rstrip(".")
+
+
+def _words(fields: Mapping[str, Any]) -> str:
+    return "; ".join(f"{name} {value}" for name, value in fields.items())
+
+
+def _xml(root: xml.Element) -> str:
+    xml.indent(root)
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{xml.tostring(root, encoding="unicode")}\n'

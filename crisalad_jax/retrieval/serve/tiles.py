@@ -1,0 +1,56 @@
+"""Tiles of a street map behind the page's map of places, from a server that the user names."""
+
+import dataclasses
+import re
+
+from crisalad_jax.data.positions import AXES
+from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.utils.errors import InputError
+
+_ADDRESS = re.compile(r"(https?://[\w.-]+(?::\d+)?)/[^\s{}]*(?:\{[xyz]\}[^\s{}]*){3}", re.ASCII)
+_OPENSTREETMAP = "© OpenStreetMap contributors"
+
+
+@dataclasses.dataclass(frozen=True)
+class Tiles:
+    """Where a browser gets tiles from: squares of 256 pixels in Web Mercator."""
+
+    url: str
+    """Address with {z}, {x} and {y} in the place of a tile's zoom, column and row."""
+    attribution: str
+    """Words that the page shows with them."""
+
+    @property
+    def origin(self) -> str:
+        """Scheme, host and port, which the page's policy allows."""
+        return self.url[: self.url.index("/", len("https://"))]
+
+
+def open_tiles(url: str, attribution: str | None, places: Map) -> Tiles:
+    """Check the address of tiles, and that a map has positions that are drawn on them.
+
+    Args:
+        url: the address.
+        attribution: words to show with them; None is what OpenStreetMap asks for, and nothing where
+            the tiles are of others.
+        places: the map.
+
+    Raises:
+        InputError: no such address; or positions that are neither degrees nor metres of a known
+            zone of UTM.
+    """
+    if not _ADDRESS.fullmatch(url) or any(url.count(f"{{{axis}}}") != 1 for axis in "xyz"):
+        raise InputError(
+            f"tiles: found {url!r}, expected an address with {{z}}, {{x}} and {{y}}, such as "
+            "https://tile.openstreetmap.org/{z}/{x}/{y}.png"
+        )
+    if places.axes not in (None, AXES[1]) and places.zone is None:
+        raise InputError(
+            f"tiles: found positions in {', '.join(places.axes or ())} without a zone of UTM in "
+            f"{places.folder}, expected degrees, or metres of a known zone"
+        )
+    if attribution is None:
+        host = url.split("/")[2].partition(":")[0]
+        is_open = host == "openstreetmap.org" or host.endswith(".openstreetmap.org")
+        attribution = _OPENSTREETMAP if is_open else ""
+    return Tiles(url, attribution)
