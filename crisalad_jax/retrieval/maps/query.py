@@ -26,6 +26,7 @@ from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage, ranked
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch, SequenceTracker, TrackResult
 from crisalad_jax.retrieval.neighbours import Neighbours
+from crisalad_jax.retrieval.verification.results import MapPose, Verification
 from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.shapes import Bool, Float32, Float64
 
@@ -62,6 +63,11 @@ class Answers(NamedTuple):
     root: pathlib.Path | None = None
     """Folder that names of queries are relative to: of their source or, of several, the one that
     holds all; None where names are whole paths."""
+    checks: Sequence[Sequence[Verification]] | None = None
+    """Verifications of the first answers to each query, in the order of `neighbours`; None where
+    answers were not verified."""
+    poses: Sequence[MapPose | None] | None = None
+    """Where the camera of each query was, where verified answers say so; None as `checks`."""
 
     @property
     def names(self) -> list[str]:
