@@ -1,7 +1,8 @@
 """What verification finds: the inliers of a query and an answer, and where the camera was."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from crisalad_jax.config.short_repr import brief
@@ -34,6 +35,25 @@ class Verification(NamedTuple):
     translation: Float64[np.ndarray, " 3"] | None = None
     """Metres from the answer's camera to the query's, in the answer camera's axes; None without
     depth, or without a second answer whose distance is known."""
+
+    def fields(self) -> dict[str, Any]:
+        """Return what JSON has of it: not the points, and a quaternion (x, y, z, w)."""
+        fields: dict[str, Any] = {
+            "inliers": self.inliers,
+            "matches": self.matches,
+            "confidence": round(self.confidence, 4),
+        }
+        if self.rotation is not None:
+            vector = cv2.Rodrigues(self.rotation)[0][:, 0]
+            angle = float(np.linalg.norm(vector))
+            # sin(angle / 2) / angle, which has a limit at 0.
+            axis = np.sinc(angle / (2 * np.pi)) / 2 * vector
+            fields["rotation_degrees"] = round(float(np.rad2deg(angle)), 2)
+            fields["quaternion"] = np.round([*axis, np.cos(angle / 2)], 6).tolist()
+        for name, value in (("direction", self.direction), ("translation", self.translation)):
+            if value is not None:
+                fields[name] = np.round(value, 4).tolist()
+        return fields
 
 
 @brief
