@@ -263,7 +263,9 @@ def verified(answers: Answers, verifier: Verifier, images: Iterable[np.ndarray],
     checks, poses = [], []
     for number, image in enumerate(images):
         found = [answers.images[i] for i in indices[number]]
-        order, checked, pose = verify_answers(verifier, image, found, answers.axes)
+        order, checked, pose = verify_answers(
+            verifier, image, found, similarities[number], answers.axes
+        )
         rows[number, : len(order)] = order
         checks.append(checked[:k])
         poses.append(pose)

@@ -12,14 +12,14 @@ from crisalad_jax.retrieval.maps.map import Map, MapImage
 from crisalad_jax.retrieval.verification.results import MapPose, Verification
 from crisalad_jax.retrieval.verification.verify import Verifier, order_by_inliers
 from crisalad_jax.utils.output import warn
-from crisalad_jax.utils.shapes import Float64, Int64
+from crisalad_jax.utils.shapes import Float32, Float64, Int64
 
 
 class VerifiedAnswers(NamedTuple):
     """The verified answers to one query."""
 
     order: Int64[np.ndarray, " n"]
-    """Their numbers, those with most inliers first."""
+    """Their numbers, as `order_by_inliers` has them."""
     checks: list[Verification]
     """In that order."""
     pose: MapPose | None
@@ -27,7 +27,11 @@ class VerifiedAnswers(NamedTuple):
 
 
 def verify_answers(
-    verifier: Verifier, image: np.ndarray, found: Sequence[MapImage], axes: tuple[str, str] | None
+    verifier: Verifier,
+    image: np.ndarray,
+    found: Sequence[MapImage],
+    similarities: Float32[np.ndarray, " n"],
+    axes: tuple[str, str] | None,
 ) -> VerifiedAnswers:
     """Verify the first answers to a query, and compute where its camera was.
 
@@ -35,6 +39,7 @@ def verify_answers(
         verifier: what verifies, and how many.
         image: the query.
         found: the answers, best first.
+        similarities: theirs.
         axes: of their positions; None where there are none.
 
     Raises:
@@ -43,7 +48,8 @@ def verify_answers(
     found = found[: verifier.verify.answers]
     names = [(each.root, each.name) for each in found]
     checks = verifier.check(image, names)
-    order = order_by_inliers(checks)
+    inliers = [check.inliers for check in checks]
+    order = order_by_inliers(similarities[: len(checks)], inliers)
     checks, names, found = ([each[i] for i in order] for each in (checks, names, found))
     known = [each.position for each in found if each.position is not None]
     zone = None

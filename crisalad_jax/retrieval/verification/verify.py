@@ -27,7 +27,7 @@ from crisalad_jax.retrieval.verification.geometry import (
 from crisalad_jax.retrieval.verification.matchers import SIDE, open_matcher
 from crisalad_jax.retrieval.verification.results import MapPose, Verification
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.shapes import Float64, Int64
+from crisalad_jax.utils.shapes import Float, Float64, Int, Int64
 
 _Points = Float64[np.ndarray, "n 2"]
 _DISTANCE = 3.0
@@ -35,6 +35,8 @@ _DISTANCE = 3.0
 those of the reduced image."""
 _POSE_DISTANCE = 1.5
 """The same for poses, which need more precise points."""
+_MOST_INLIERS = 70
+"""Inliers that change the order of answers no more."""
 _CACHED = 256
 """Number of the map's images whose features stay in memory, some 0.5 MB each."""
 _BASELINE = 0.3
@@ -52,7 +54,8 @@ class Verify:
     """
 
     answers: int = 10
-    """Number of each query's best answers that are verified, and put in order by their inliers."""
+    """Number of each query's best answers that are verified and put in order again, see
+    `order_by_inliers`."""
     matcher: str | os.PathLike[str] | None = None
     """ONNX file of a matcher, see `OnnxMatcher`; None is SIFT."""
     intrinsics: Intrinsics | None = None
@@ -302,6 +305,13 @@ def _by_depth(first: Verification, second: Verification) -> tuple[Pose, np.ndarr
     return pose, pose.rotation @ other.inverse.translation + pose.translation
 
 
-def order_by_inliers(checks: Sequence[Verification]) -> Int64[np.ndarray, " n"]:
-    """Return the order of verified answers: by inliers, and by similarity where these are equal."""
-    return np.argsort([-check.inliers for check in checks], kind="stable")
+def order_by_inliers(
+    similarities: Float[np.ndarray, " n"], inliers: Int[np.ndarray, " n"] | Sequence[int]
+) -> Int64[np.ndarray, " n"]:
+    """Return the order of verified answers: by similarity + min(inliers, 70) / 70, best first.
+
+    This is how Google's landmark recognition joins both (DELG, Cao et al., ECCV 2020). Inliers
+    alone rank worse than similarity where local features find few, as at night.
+    """
+    scores = similarities + np.minimum(inliers, _MOST_INLIERS) / _MOST_INLIERS
+    return np.argsort(-scores, kind="stable")
