@@ -91,7 +91,7 @@ def run(arguments: Evaluate) -> None:
     else:
         model, name, file = open_flagged(arguments, groupings=kinds)
     config = model.config
-    pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
+    pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.checksums)
     echo(name)
     echo(f"images at {config.images_in_words}")
     similarities = FirstSimilarities()
@@ -175,5 +175,5 @@ def _reranking(arguments: Evaluate) -> Reranking | None:
         rerank = dataclasses.replace(rerank, matcher=arguments.rerank_weights)
     elif arguments.rerank_weights is not None:
         file = find_weights(arguments.rerank_weights, quiet=arguments.quiet)
-        rerank = dataclasses.replace(rerank, model=load_weights(file, verify=arguments.verify))
+        rerank = dataclasses.replace(rerank, model=load_weights(file, verify=arguments.checksums))
     return rerank

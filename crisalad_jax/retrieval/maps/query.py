@@ -260,11 +260,11 @@ def verified(answers: Answers, verifier: Verifier, images: Iterable[np.ndarray],
     """
     indices, similarities = answers.neighbours
     rows = np.tile(np.arange(indices.shape[1]), (len(indices), 1))
-    checks, poses = [], []
+    first, checks, poses = verifier.verify.answers, [], []
     for number, image in enumerate(images):
-        found = [answers.images[i] for i in indices[number]]
+        found = [answers.images[i] for i in indices[number, :first]]
         order, checked, pose = verify_answers(
-            verifier, image, found, similarities[number], answers.axes
+            verifier, image, found, similarities[number, :first], answers.axes
         )
         rows[number, : len(order)] = order
         checks.append(checked[:k])

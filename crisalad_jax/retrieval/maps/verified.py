@@ -33,10 +33,10 @@ def verify_answers(
     similarities: Float32[np.ndarray, " n"],
     axes: tuple[str, str] | None,
 ) -> VerifiedAnswers:
-    """Verify the first answers to a query, and compute where its camera was.
+    """Verify answers to a query, put them in order, and compute where its camera was.
 
     Args:
-        verifier: what verifies, and how many.
+        verifier: what verifies.
         image: the query.
         found: the answers, best first.
         similarities: theirs.
@@ -45,11 +45,10 @@ def verify_answers(
     Raises:
         InputError: what `Verifier.check` raises.
     """
-    found = found[: verifier.verify.answers]
     names = [(each.root, each.name) for each in found]
     checks = verifier.check(image, names)
     inliers = [check.inliers for check in checks]
-    order = order_by_inliers(similarities[: len(checks)], inliers)
+    order = order_by_inliers(similarities, inliers)
     checks, names, found = ([each[i] for i in order] for each in (checks, names, found))
     known = [each.position for each in found if each.position is not None]
     zone = None

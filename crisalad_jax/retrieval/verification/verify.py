@@ -14,6 +14,7 @@ from crisalad_jax.config.checks import check_count, require
 from crisalad_jax.config.short_repr import with_field_docs
 from crisalad_jax.data.images import read_image, read_pixels
 from crisalad_jax.data.prepare import as_rgb
+from crisalad_jax.data.video import file_of
 from crisalad_jax.retrieval.verification.camera import Intrinsics
 from crisalad_jax.retrieval.verification.geometry import (
     Pose,
@@ -236,7 +237,11 @@ class Verifier:
         return None if found is None else (found.inverse, pose.translation)
 
     def _file(self, root: str, name: str) -> pathlib.Path:
-        return pathlib.Path(self.verify.map_images or root) / name
+        if self.verify.map_images is not None:
+            given = pathlib.Path(self.verify.map_images) / name
+            if file_of(given).is_file():
+                return given
+        return pathlib.Path(root) / name
 
     def _view(self, image: np.ndarray, name: str) -> _View:
         return _View(self._matcher.prepare(image), image.shape[:2], name)
