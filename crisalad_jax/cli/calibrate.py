@@ -39,8 +39,8 @@ class Calibrate(ReadFlags, SetFlags, TableFlags):
     matcher: pathlib.Path | None = None
     """ONNX file of the matcher that verifies; by default SIFT."""
     checksums: bool = True
-    """Check the map's descriptors against their checksums; --no-checksums skips that, where files are
-    huge."""
+    """Check the map's descriptors against their checksums; --no-checksums skips that, where files
+    are huge."""
 
 
 def run(arguments: Calibrate) -> dict[str, Any]:

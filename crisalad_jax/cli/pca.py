@@ -38,7 +38,8 @@ class Pca(JsonFlag, QuietFlag):
     seed: int = 0
     """Draws them."""
     checksums: bool = True
-    """Check descriptors against their checksums; --no-checksums skips that, where files are huge."""
+    """Check descriptors against their checksums; --no-checksums skips that, where files are
+    huge."""
 
 
 def run(arguments: Pca) -> dict[str, Any]:

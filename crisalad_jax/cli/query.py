@@ -5,8 +5,8 @@ import dataclasses
 import importlib
 import pathlib
 import sys
-from collections.abc import Iterator
-from typing import Annotated, Literal
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -252,10 +252,7 @@ def answer_lines(answers: Answers) -> Iterator[str]:
                 [
                     str(answer["rank"]) if known else "-",
                     *(f"{answer[name]:.3f}" for name in numbers),
-                    *(
-                        f"{answer['verified'][name]:.3g}" if "verified" in answer else "-"
-                        for name in checked
-                    ),
+                    *_verified_cells(answer, checked),
                     "-" if at is None else ", ".join(f"{value:.9g}" for value in at.values()),
                     answer["name"] if known else "unknown",
                 ]
@@ -266,6 +263,11 @@ def answer_lines(answers: Answers) -> Iterator[str]:
             yield name
         padded = (cell.rjust(width) for cell, width in zip(cells, widths, strict=False))
         yield "  ".join((*padded, cells[-1]))
+
+
+def _verified_cells(answer: dict[str, Any], columns: Sequence[str]) -> list[str]:
+    verified = answer.get("verified")
+    return [f"{verified[name]:.4g}" if verified else "-" for name in columns]
 
 
 def _run_live(arguments: Query) -> None:

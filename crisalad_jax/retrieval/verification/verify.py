@@ -36,8 +36,8 @@ _DISTANCE = 3.0
 those of the reduced image."""
 _POSE_DISTANCE = 1.5
 """The same for poses, which need more precise points."""
-_MOST_INLIERS = 70
-"""Inliers that change the order of answers no more."""
+_INLIER, _MOST_INLIERS = 0.002, 50
+"""Similarity that an inlier counts as, and how many of them count."""
 _CACHED = 256
 """Number of the map's images whose features stay in memory, some 0.5 MB each."""
 _BASELINE = 0.3
@@ -313,10 +313,11 @@ def _by_depth(first: Verification, second: Verification) -> tuple[Pose, np.ndarr
 def order_by_inliers(
     similarities: Float[np.ndarray, " n"], inliers: Int[np.ndarray, " n"] | Sequence[int]
 ) -> Int64[np.ndarray, " n"]:
-    """Return the order of verified answers: by similarity + min(inliers, 70) / 70, best first.
+    """Return the order of verified answers, best first.
 
-    This is how Google's landmark recognition joins both (DELG, Cao et al., ECCV 2020). Inliers
-    alone rank worse than similarity where local features find few, as at night.
+    An inlier counts as 0.002 of similarity, and the first 50 count: 0.1 at most. Inliers without
+    similarity rank worse than similarity without inliers where local features find few, as between
+    seasons (docs/verification.md has the numbers).
     """
-    scores = similarities + np.minimum(inliers, _MOST_INLIERS) / _MOST_INLIERS
+    scores = similarities + _INLIER * np.minimum(inliers, _MOST_INLIERS)
     return np.argsort(-scores, kind="stable")
