@@ -92,7 +92,7 @@ def pose_from_points(
         )
         if not found or inliers is None or len(inliers) < LEAST:
             return None
-        chosen = inliers[:, 0]
+        chosen = np.asarray(inliers[:, 0], int)
         turn, shift = cv2.solvePnPRefineLM(
             points[chosen], directions[chosen], np.eye(3), None, turn, shift
         )

@@ -1,6 +1,7 @@
 """Matchers: points of one image and the points of another that look the same."""
 
 import functools
+import os
 import pathlib
 from typing import Any, NamedTuple, Protocol
 
@@ -47,13 +48,13 @@ class Matcher(Protocol):
         ...
 
 
-def open_matcher(file: pathlib.Path | None) -> Matcher:
+def open_matcher(file: str | os.PathLike[str] | None) -> Matcher:
     """Open the matcher of a file ONNX, by default SIFT.
 
     Raises:
         InputError: there is no such file, or it is a program of another kind.
     """
-    return SiftMatcher() if file is None else OnnxMatcher(file)
+    return SiftMatcher() if file is None else OnnxMatcher(pathlib.Path(file))
 
 
 class SiftFeatures(NamedTuple):
@@ -144,7 +145,7 @@ class OnnxMatcher:
         sizes = zip(shape[2:], _FREE_SIDES, strict=True)
         self._sides = [side if isinstance(side, int) else free for side, free in sizes]
         self._channels, self._type = shape[1], types[inputs[0].type]
-        self._run = functools.partial(session.run, ["keypoints", "matches"])
+        self._run: Any = functools.partial(session.run, ["keypoints", "matches"])
         self._input, self._file = inputs[0].name, file
         self.name = f"onnx {sha256_of(file)}"
 

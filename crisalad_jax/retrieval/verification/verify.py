@@ -8,11 +8,12 @@ import pathlib
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from crisalad_jax.config.checks import check_count, require
 from crisalad_jax.config.short_repr import with_field_docs
-from crisalad_jax.data.images import read_image, read_pixels
+from crisalad_jax.data.images import read_image
 from crisalad_jax.data.prepare import as_rgb
 from crisalad_jax.data.video import file_of
 from crisalad_jax.retrieval.verification.camera import Intrinsics
@@ -28,6 +29,7 @@ from crisalad_jax.retrieval.verification.geometry import (
 from crisalad_jax.retrieval.verification.matchers import SIDE, open_matcher
 from crisalad_jax.retrieval.verification.results import MapPose, Verification
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import read_bytes
 from crisalad_jax.utils.shapes import Float, Float64, Int, Int64
 
 _Points = Float64[np.ndarray, "n 2"]
@@ -124,7 +126,7 @@ class Verifier:
             InputError: what `open_matcher` raises.
         """
         self.verify = verify
-        self._matcher = open_matcher(verify.matcher and pathlib.Path(verify.matcher))
+        self._matcher = open_matcher(verify.matcher)
         self._camera = verify.intrinsics
         self._map_camera = verify.map_intrinsics or verify.intrinsics
         self._read = functools.lru_cache(_CACHED)(
@@ -282,20 +284,21 @@ class Verifier:
 
     def _depths(self, view: _View, name: str, points: _Points) -> Float64[np.ndarray, " n"]:
         """Return the depth in metres at some pixels of an answer, 0 where it is unknown."""
-        folder = self.verify.map_depth
-        file = folder and pathlib.Path(folder, name).with_suffix(".png")
-        if not file or not file.is_file():
+        if self.verify.map_depth is None:
             return np.zeros(len(points))
-        depth = read_pixels(file)
+        file = pathlib.Path(self.verify.map_depth, name).with_suffix(".png")
+        if not file.is_file():
+            return np.zeros(len(points))
+        data = np.frombuffer(read_bytes(file, "depth"), np.uint8)
+        depth = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
         height, width = view.size
-        factor = depth.shape[1] / width
-        require(
-            depth.dtype == np.uint16
-            and depth.ndim == 2
-            and abs(depth.shape[0] - factor * height) < 1,
-            f"{file}: found {depth.dtype} of shape {depth.shape}, expected millimetres in 16 bits, "
-            f"grey, of the aspect of {view.name}, {width} x {height}",
-        )
+        shape, dtype = ((), None) if depth is None else (depth.shape, depth.dtype)
+        factor = shape[1] / width if len(shape) == 2 else 0.0
+        if depth is None or dtype != np.uint16 or abs(len(depth) - factor * height) >= 1:
+            raise InputError(
+                f"{file}: found {dtype} of shape {shape}, expected millimetres in 16 bits, grey, "
+                f"of the aspect of {view.name}, {width} x {height}"
+            )
         columns, rows = np.rint((points + 0.5) * factor - 0.5).astype(int).T
         return depth[rows.clip(0, len(depth) - 1), columns.clip(0, depth.shape[1] - 1)] / 1000
 
