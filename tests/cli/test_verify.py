@@ -7,7 +7,6 @@ import cv2
 from crisalad_jax.data.images import list_images
 from tests.cli.test_calibrate import calibrate
 from tests.cli.test_cli import fails, files_in, runs, succeeds
-from tests.cli.test_evaluate_rerank import weights  # noqa: F401
 from tests.cli.test_index import query
 from tests.conftest import BATCH
 from tests.retrieval.verification.test_matchers import write_matcher

@@ -24,6 +24,7 @@ from crisalad_jax.retrieval.verification.geometry import (
     pose_from_points,
     pose_on_map,
     relative_pose,
+    rotation_only,
     triangulated,
 )
 from crisalad_jax.retrieval.verification.matchers import SIDE, open_matcher
@@ -255,8 +256,11 @@ class Verifier:
         map_rays = self._rays(self._map_camera, database, checked.database_points)
         if checked.confidence < 1:
             return checked
+        turned = rotation_only(rays, map_rays, self._distance(database))
         pose = relative_pose(rays, map_rays, self._distance(database))
-        if pose is not None:
+        if turned is not None:
+            checked = checked._replace(rotation=turned)
+        elif pose is not None:
             checked = checked._replace(rotation=pose.rotation, direction=pose.translation)
         depths = self._depths(database, name, checked.database_points)
         known = depths > 0
