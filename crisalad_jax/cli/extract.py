@@ -52,8 +52,9 @@ def run(arguments: Extract) -> dict[str, Any]:
     check_extraction(out, **how)
     positions = given_positions(arguments)
     model, _, file = open_flagged(arguments, groupings=[arguments.grouping])
-    more = pick(arguments, "fps", "topic", "every_metres", "root", "pca", "verify", "reading")
-    result = extract(model, arguments.images, out, weights=file, positions=positions, **how, **more)
+    more = pick(arguments, "fps", "topic", "every_metres", "root", "pca", "reading")
+    more |= {"weights": file, "positions": positions, "verify": arguments.checksums}
+    result = extract(model, arguments.images, out, **how, **more)
     described = counted(len(result.names), "descriptor")
     skipped = f"; {len(result.skipped)} unreadable images left out" if result.skipped else ""
     length, images = result.descriptors.shape[1], model.config.images_in_words

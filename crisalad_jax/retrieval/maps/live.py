@@ -16,12 +16,15 @@ from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import (
     Answers,
     answers_of,
-    asked_similarity,
+    asked_thresholds,
     asking,
+    found_at_least,
     json_rows,
     json_text,
+    verified,
 )
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch
+from crisalad_jax.retrieval.verification.verify import Verifier, Verify
 from crisalad_jax.utils.output import counted
 
 if TYPE_CHECKING:  # answers are searched without JAX
@@ -56,6 +59,7 @@ def query_live(
     window: int = 1,
     min_similarity: float | None = None,
     sequence: SequenceSearch | None = None,
+    verify: Verify | None = None,
     ready: Callable[[], None] = lambda: None,
     check: Callable[[], None] = lambda: None,
 ) -> Iterator[LiveAnswer]:
@@ -74,6 +78,7 @@ def query_live(
             describes each alone, as a map's images are.
         min_similarity: see `query`.
         sequence: see `query`; frames that were passed over count for nothing.
+        verify: see `query`.
         ready: called when the first frame can be answered.
         check: called several times a second; it may raise, to end this.
 
@@ -103,12 +108,13 @@ def query_live(
         ['2.png']
     """
     check_count("k", k)
-    least = asked_similarity(places, min_similarity)
+    verifier = None if verify is None else Verifier(verify)
+    thresholds = asked_thresholds(places, min_similarity, verifier)
     model_describer = places.describer(model, groupings=["single" if window == 1 else "window"])
     describer = FrameDescriber(model_describer, window)
 
     def answers() -> Iterator[LiveAnswer]:
-        now, ask = places, asking(places, k, sequence)
+        now, ask = places, asking(places, found_at_least(k, verifier), sequence)
         blank = np.zeros((*(source.size or places.config.image_size), 3), np.uint8)
         places.search(places.shorten(describer(blank)), k)
         describer.forget()
@@ -116,9 +122,11 @@ def query_live(
         for frame in source.frames(check):
             asked = [pathlib.Path(frame.name)]
             if sequence is None and (then := now) is not (now := then.refreshed()):
-                ask = asking(now, k, None)
+                ask = asking(now, found_at_least(k, verifier), None)
             found = ask(now.shorten(describer(frame.image)), asked)
-            answer = answers_of(now, asked, [found], least)
+            answer = answers_of(now, asked, [found], thresholds)
+            if verifier is not None:
+                answer = verified(answer, verifier, [frame.image], k)
             latency = time.perf_counter() - frame.taken
             yield LiveAnswer(answer, frame.time, 1000 * latency)
 

@@ -28,6 +28,7 @@ from crisalad_jax.retrieval.serve.app import (
 )
 from crisalad_jax.retrieval.serve.tiles import Tiles, open_tiles
 from crisalad_jax.retrieval.serve.worker import MapWorker
+from crisalad_jax.retrieval.verification.verify import Verify
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import most_files
 from crisalad_jax.utils.output import warn
@@ -59,6 +60,7 @@ def serve_map(
     batch_size: int = 16,
     tiles: str | None = None,
     tiles_attribution: str | None = None,
+    rerank: Verify | None = None,
     verify: bool = True,
     quiet: bool = False,
     ready: Callable[[str], object] = lambda _: None,
@@ -82,6 +84,7 @@ def serve_map(
         tiles: address of a street map's tiles, which browsers draw behind the map's places:
             https://tile.openstreetmap.org/{z}/{x}/{y}.png. None draws none.
         tiles_attribution: words to show with them; None is what OpenStreetMap asks for, of its own.
+        rerank: how the best answers are verified by local features; None does not.
         verify: whether to compare the map's descriptors with their checksums.
         quiet: whether to show no progress bar.
         ready: called with the service's address once it answers.
@@ -127,6 +130,7 @@ def serve_map(
             max_bytes=max_bytes,
             max_pixels=max_pixels,
             tiles=behind,
+            rerank=rerank,
         )
         address = f"http://{bracketed(host)}:{listener.getsockname()[1]}"
         Server(app, stop, lambda: ready(address), behind).run([listener])
