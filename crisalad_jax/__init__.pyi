@@ -21,6 +21,7 @@ from .data.benchmarks import open_benchmark as open_benchmark
 from .data.images import read_image as read_image
 from .data.live import Camera as Camera
 from .data.live import FolderWatch as FolderWatch
+from .data.live import LatestFrame as LatestFrame
 from .data.loader import training_batches as training_batches
 from .data.places import Places as Places
 from .data.places import read_places as read_places
@@ -88,6 +89,7 @@ from .retrieval.describe import describe_images as describe_images
 from .retrieval.describe import prepare_image as prepare_image
 from .retrieval.extract import extract as extract
 from .retrieval.maps.build import index as index
+from .retrieval.maps.live import latency_words as latency_words
 from .retrieval.maps.live import query_live as query_live
 from .retrieval.maps.map import Map as Map
 from .retrieval.maps.map import MapImage as MapImage

@@ -273,8 +273,7 @@ def _run_live(arguments: Query) -> None:
                 print(answer.json_line(), flush=True)
                 latencies.append(answer.latency_ms)
         finally:
-            dropped = f"; {source.dropped} frames passed over" if source.dropped else ""
-            _log(f"{latency_words(latencies)}{dropped}")
+            _log(latency_words(latencies, source.dropped))
 
 
 def _log(line: str) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 import crisalad_jax.data.live
 from crisalad_jax.data.images import read_image
-from crisalad_jax.data.live import Camera, FolderWatch
+from crisalad_jax.data.live import Camera, FolderWatch, LatestFrame
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.conftest import write_picture, write_video
@@ -119,7 +119,7 @@ def test_a_video_plays_as_a_camera(tmp_path):
         assert camera.size == (48, 64)
         found = list(camera.frames())
     assert found[-1].time == 0.7
-    assert len(found) + camera.dropped == 8
+    assert len(found) + camera.dropped == len(found) + sum(frame.dropped for frame in found) == 8
     for frame in found:
         assert frame.name == f"{video.name}#t={frame.time:.3f}"
         assert frame.image.mean() == pytest.approx(100 * frame.time, abs=LEVELS)
@@ -150,6 +150,44 @@ def test_a_camera_at_a_rate(tmp_path):
     assert np.diff(given).min() > 0.25 - 0.01
     assert len(given) + camera.dropped == 7
     assert camera.dropped >= 1
+
+
+def test_a_file_plays_at_a_rate(tmp_path):
+    """Ten frames a second at half the rate are five: never before their time."""
+    begun = time.perf_counter()
+    with Camera(write_video(tmp_path / "a.avi", 5), rate=0.5) as camera:
+        slow = [(frame.time, frame.taken - begun) for frame in camera.frames()]
+    assert all(taken > 2 * at - 0.01 for at, taken in slow)
+    assert slow[-1][0] == 0.4
+
+
+def test_frames_of_several_threads_are_given_or_counted():
+    """Four writers and a slow reader: whatever the order, none is lost."""
+    latest = LatestFrame()
+    image = np.zeros((2, 2, 3), np.uint8)
+
+    def write(writer: int) -> None:
+        for number in range(50):
+            latest.put(image, number, f"{writer}-{number}")
+            time.sleep(0.0005)
+
+    writers = [threading.Thread(target=write, args=(writer,)) for writer in range(4)]
+    for writer in writers:
+        writer.start()
+    threading.Thread(target=lambda: [*(each.join() for each in writers), latest.close()]).start()
+    names, passed = [], 0
+    for frame in latest.frames():
+        names.append(frame.name)
+        passed += frame.dropped
+        time.sleep(0.002)
+    assert len(names) + passed == len(names) + latest.dropped == 200
+    assert len(set(names)) == len(names) > 1
+
+
+@pytest.mark.parametrize("rate", [0, -1, float("inf"), float("nan")])
+def test_a_rate_that_nothing_plays_at(tmp_path, rate):
+    with refused(f"rate: found {rate:g}, expected more than 0"):
+        Camera(write_video(tmp_path / "a.avi", 2), rate=rate)
 
 
 def test_a_camera_ends_when_it_is_told_to(tmp_path):
