@@ -6,7 +6,7 @@ import importlib
 import pathlib
 import sys
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -24,6 +24,10 @@ from crisalad_jax.utils.files import atomic_path, real_path
 from crisalad_jax.utils.output import counted, printable
 from crisalad_jax.utils.signals import defer_signals
 
+if TYPE_CHECKING:  # of an extra
+    from crisalad_jax.experiments.rerun_log import Recording
+
+_RECORDS = "crisalad_jax.experiments.rerun_log"
 _ROWS = 24
 """Largest number of queries in a gallery."""
 _COLUMNS = 8
@@ -31,8 +35,8 @@ _COLUMNS = 8
 
 
 COMMON = (
-    "images map watch camera fps window weights k min-similarity sequence json gallery map-images "
-    "batch-size on-bad-image quiet"
+    "images map watch camera fps window weights k min-similarity sequence json gallery rerun "
+    "map-images batch-size on-bad-image quiet"
 )
 EXAMPLE = "crisalad query new.jpg --map map --json -"
 
@@ -52,6 +56,8 @@ class Query(ReadFlags, JsonFlag):
     """Folder: answer the images that appear in it as they appear, a line of JSON each."""
     camera: str | None = None
     """Number from 0, URL or video file: answer its newest frame, time and again."""
+    rate: float | None = None
+    """How many times as fast as its own pace a file as --camera plays; by default 1."""
     fps: float | None = None
     """Frames a second taken of a video, by default 1; the most that --camera answers."""
     window: int = 1
@@ -81,8 +87,11 @@ class Query(ReadFlags, JsonFlag):
     lines."""
     gallery: Annotated[pathlib.Path | None, Target((".png", ".svg", ".pdf"))] = None
     """PNG, SVG or PDF of up to 24 queries beside up to 8 answers each."""
+    rerun: Annotated[pathlib.Path | None, Target((".rrd",))] = None
+    """Recording for the viewer Rerun: queries, answers, similarities and the way on the map, along
+    time (docs/how-to/from-a-bag-to-a-relocalising-robot.md)."""
     map_images: pathlib.Path | None = None
-    """Folder of the map's images, for the gallery, if they are not where they were."""
+    """Folder of the map's images, for --gallery and --rerun, if they are not where they were."""
     verify: bool = True
     """Check the map's descriptors, and an exported model, against their checksums; --no-verify
     skips that, where files are huge."""
@@ -98,6 +107,7 @@ def run(arguments: Query) -> None:
     if arguments.watch is not None or arguments.camera is not None:
         _run_live(arguments)
         return
+    refuse_without("--camera", None, rate=arguments.rate)
     _check_files(arguments)
     sequence = _sequence_of(arguments)
     with _opened(arguments) as places:
@@ -133,6 +143,9 @@ def run(arguments: Query) -> None:
             )
             save(figure, staged.enter_context(atomic_path(gallery)))
             written[gallery] = f"{_ROWS} of {asked}" if len(answers.queries) > _ROWS else asked
+        if arguments.rerun is not None:
+            staged.enter_context(_recording(arguments)).add(answers)
+            written[arguments.rerun] = asked
         if file not in (None, STDOUT):
             write_answers(file, answers)
             written[file] = asked
@@ -141,12 +154,14 @@ def run(arguments: Query) -> None:
 
 
 def _check_files(arguments: Query) -> None:
-    """Check that the gallery has what it needs, and a file of its own."""
-    gallery, file = arguments.gallery, arguments.json
-    refuse_without("--gallery", gallery, map_images=arguments.map_images)
+    """Check that pictures have what they need, and a file of their own."""
+    gallery, file, rerun = arguments.gallery, arguments.json, arguments.rerun
+    refuse_without("--gallery or --rerun", gallery or rerun, map_images=arguments.map_images)
+    if rerun is not None:
+        importlib.import_module(_RECORDS)  # or its extra is missing
     if gallery is None:
         return
-    importlib.import_module("crisalad_jax.experiments.report")  # or its extra is missing
+    importlib.import_module("crisalad_jax.experiments.report")
     require(
         file in (None, STDOUT) or real_path(file) != real_path(gallery),
         f"--gallery: found {gallery}, as --json, expected two files",
@@ -232,14 +247,15 @@ def _run_live(arguments: Query) -> None:
     """Print an answer for each image that comes, until a signal or the end of a video."""
     name = "--camera" if arguments.watch is None else "--watch"
     require(not arguments.images, f"IMAGE: found with {name}, expected only one of the two")
-    refuse_with(name, **pick(arguments, "gallery", "map_images"))
+    refuse_with(name, gallery=arguments.gallery)
     if name == "--watch":
-        refuse_with(name, **pick(arguments, "camera", "fps"))
+        refuse_with(name, **pick(arguments, "camera", "fps", "rate"))
     require(
         arguments.json in (None, STDOUT),
         f"--json: found {arguments.json} with {name}, expected -: answers go to the standard "
         "output as they come",
     )
+    _check_files(arguments)
     sequence = _sequence_of(arguments)
     with contextlib.ExitStack() as stack:
         # First, for its errors: loading a model takes seconds.
@@ -250,11 +266,15 @@ def _run_live(arguments: Query) -> None:
             words = f"watching {arguments.watch} ({there}, and left out)"
         else:
             assert arguments.camera is not None
-            source = stack.enter_context(Camera(arguments.camera, fps=arguments.fps))
+            rate = 1.0 if arguments.rate is None else arguments.rate
+            source = stack.enter_context(Camera(arguments.camera, fps=arguments.fps, rate=rate))
             words = f"taking frames from {source.name}"
         places = stack.enter_context(_opened(arguments))
         latencies: list[float] = []
         state = stack.enter_context(defer_signals())
+        recording = None
+        if arguments.rerun is not None:
+            recording = stack.enter_context(_recording(arguments))
 
         def ready() -> None:
             state.has_work = True  # the summary
@@ -272,8 +292,17 @@ def _run_live(arguments: Query) -> None:
             for answer in answers:
                 print(answer.json_line(), flush=True)
                 latencies.append(answer.latency_ms)
+                if recording is not None:
+                    recording.add(answer.answers, [answer.frame.image])
         finally:
             _log(latency_words(latencies, source.dropped))
+
+
+def _recording(arguments: Query) -> "contextlib.AbstractContextManager[Recording]":
+    from crisalad_jax.experiments.rerun_log import record
+
+    assert arguments.rerun is not None
+    return record(arguments.rerun, root=arguments.map_images)
 
 
 def _log(line: str) -> None:

@@ -13,6 +13,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "serve": ("fastapi", "uvicorn", "python_multipart", *_CLI),
     "data": ("huggingface_hub", "kagglehub", *_CLI),
     "milvus": ("pymilvus", "milvus_lite"),
+    "robot": ("rosbags", "rerun", *_CLI),
     "convert": ("torch", *_CLI),
 }
 """Modules of each extra, by its name; of two with a module the smaller is first."""

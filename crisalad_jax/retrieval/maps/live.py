@@ -10,7 +10,7 @@ import numpy as np
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count, takes
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.live import FolderWatch, LatestFrame
+from crisalad_jax.data.live import FolderWatch, Frame, LatestFrame
 from crisalad_jax.retrieval.describe import FrameDescriber
 from crisalad_jax.retrieval.maps.map import Answer, Map
 from crisalad_jax.retrieval.maps.query import (
@@ -34,12 +34,10 @@ class LiveAnswer(NamedTuple):
 
     answers: Answers
     """Of this one query."""
-    time: float
-    """The frame's; see `Frame`."""
+    frame: Frame
+    """Its image, its time, and how many frames were passed over since the answer before."""
     latency_ms: float
     """Milliseconds from the frame in hand to the answer."""
-    dropped: int = 0
-    """Number of frames that were passed over since the answer before."""
 
     @property
     def known(self) -> bool:
@@ -56,9 +54,9 @@ class LiveAnswer(NamedTuple):
         """Return the answer as one line of JSON."""
         (row,) = json_rows(self.answers)
         more = {
-            "time": round(self.time, 3),
+            "time": round(self.frame.time, 3),
             "latency_ms": round(self.latency_ms, 1),
-            "dropped": self.dropped,
+            "dropped": self.frame.dropped,
         }
         return json_text({"query": row.pop("query")} | more | row)
 
@@ -133,7 +131,7 @@ def query_live(
             found = ask(places.shorten(describer(frame.image)), asked)
             answer = answers_of(places, asked, [found], least)
             latency = time.perf_counter() - frame.taken
-            yield LiveAnswer(answer, frame.time, 1000 * latency, frame.dropped)
+            yield LiveAnswer(answer, frame, 1000 * latency)
 
     return answers()
 

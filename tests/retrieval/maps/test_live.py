@@ -80,9 +80,9 @@ def test_a_watched_folder_and_a_camera(town_map, shared, params, tmp_path):
         assert 0 < line["latency_ms"] < 60_000
         with Camera(video) as camera:
             *before, last = live(places, camera, params, k=1)
-    assert sum(1 + each.dropped for each in (*before, last)) == 4
-    assert json.loads(last.json_line())["dropped"] == last.dropped
-    assert (last.time, json.loads(last.json_line())["query"]) == (0.3, "walk.avi#t=0.300")
+    assert sum(1 + each.frame.dropped for each in (*before, last)) == 4
+    assert json.loads(last.json_line())["dropped"] == last.frame.dropped
+    assert (last.frame.time, json.loads(last.json_line())["query"]) == (0.3, "walk.avi#t=0.300")
 
 
 def test_frames_from_another_thread(town_map, shared, params):
@@ -101,9 +101,9 @@ def test_frames_from_another_thread(town_map, shared, params):
         assert list(stream) == []
     # The map's own images: the last one, and the third.
     assert (first.ranked[0].image.name, first.known) == (paths[-1].name, True)
-    assert (first.answers.names, first.time, first.dropped) == (["4"], 1767225604.0, 4)
+    assert (first.answers.names, first.frame.time, first.frame.dropped) == (["4"], 1767225604.0, 4)
     assert second.ranked[0].image.name == paths[2].name
-    assert (second.answers.names, second.dropped) == (["camera#t=1767225610.500"], 0)
+    assert (second.answers.names, second.frame.dropped) == (["camera#t=1767225610.500"], 0)
     assert latest.dropped == 4
 
 
