@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import frame_time, stored_bytes
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import ImageSource, open_sources
-from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import check_search
@@ -77,8 +77,7 @@ def _new_images(
     """
     names, sizes, new = [], [], []
     for name, path in zip(source.names, source.paths, strict=True):
-        file = file_of(path)
-        size = file.stat().st_size if file.is_file() else None  # missing: to be skipped
+        size = stored_bytes(path)  # None is missing: to be skipped
         known = next(filter(None, (each.image(name) for each in maps)), None)
         if known is None:
             names.append(name)

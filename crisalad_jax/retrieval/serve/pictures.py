@@ -13,9 +13,9 @@ from PIL import Image
 from starlette.datastructures import UploadFile
 from starlette.types import Message
 
+from crisalad_jax.data.frames import frame_time, stored_bytes
 from crisalad_jax.data.images import IMAGE_SUFFIXES, jpeg_scans, read_image
 from crisalad_jax.data.resize import resize_image
-from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.serve.worker import ADDED
 from crisalad_jax.utils.errors import InputError
@@ -104,7 +104,7 @@ def check_new_name(name: str) -> None:
 
     Raises:
         InputError: a part is empty, hidden or too long, there are too many, the name has control
-            characters or was not UTF-8, or it is a frame's of a video.
+            characters or was not UTF-8, or it is a frame's of a video or log.
 
     Example:
         >>> check_new_name("tuesday/0001.jpg")
@@ -139,7 +139,7 @@ def read_thumbnail(places: Map, images: str | os.PathLike[str] | None, number: i
     # The record of a map keeps its names below a folder.
     folders = [*([] if images is None else [images]), image.root, places.folder / ADDED]
     paths = (pathlib.Path(folder, image.name) for folder in folders)
-    path = next((path for path in paths if _size(path) == image.bytes), None)
+    path = next((path for path in paths if stored_bytes(path) == image.bytes), None)
     if path is None:
         raise InputError(f"{image.name}: found no such picture any more, see --map-images")
     try:
@@ -151,9 +151,3 @@ def read_thumbnail(places: Map, images: str | os.PathLike[str] | None, number: i
         height, width = (max(1, round(factor * side)) for side in pixels.shape[:2])
         pixels = resize_image(pixels, (height, width))
     return cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes()
-
-
-def _size(path: pathlib.Path) -> int | None:
-    """Return the bytes of an image's file, of a frame its video's; None where there is none."""
-    file = file_of(path)
-    return file.stat().st_size if file.is_file() else None
