@@ -16,8 +16,9 @@ import numpy as np
 from crisalad_jax.config.checks import PATH, require, takes
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.frames import check_rate, frame_name
+from crisalad_jax.data.frames import FrameName, check_rate, frame_name, is_log
 from crisalad_jax.data.images import SELF_CHECKED, check_folder, is_image, read_pixels
+from crisalad_jax.data.logs import Log, open_log
 from crisalad_jax.data.video import milliseconds_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
@@ -137,6 +138,10 @@ class FolderWatch:
         """Do nothing: no file is open."""
 
 
+_Played = Generator[tuple[float, tuple[np.ndarray, float, str]]]
+"""Seconds from the beginning when a frame is due; its image, time and name."""
+
+
 class LatestFrame:
     """A queue of one frame: a source that is given frames from outside, such as by a ROS callback.
 
@@ -234,7 +239,7 @@ class Camera(LatestFrame):
     """The newest frame of a camera, whenever one is asked for; older ones are passed over.
 
     A thread takes all frames from the camera, so that none waits in the camera's own queue. A
-    video file plays at its own pace, as if it were a camera.
+    video file or a robot log plays at its own pace, as if it were a camera.
 
     Example:
         >>> import cv2, numpy as np
@@ -255,42 +260,62 @@ class Camera(LatestFrame):
         *,
         fps: float | None = None,
         rate: float = 1.0,
+        topic: str | None = None,
     ) -> None:
         """Open the camera.
 
         Args:
-            camera: its number, from 0, or a URL, or a video file.
+            camera: its number, from 0, or a URL, or a video file, or a robot log (a ROS bag).
             fps: most frames a second that `frames` yields; None is as many as are asked for.
             rate: how many times as fast as its own pace a file plays.
+            topic: of a robot log, the topic of the images; None is the only one that has any.
 
         Raises:
-            InputError: it cannot be opened, or gives no frame; or a rate out of range.
+            InputError: it cannot be opened, or gives no frame; a rate out of range; or a topic that
+                the log does not have.
         """
         super().__init__(fps=fps)
         require(0 < rate < math.inf, f"rate: found {rate:g}, expected more than 0")
         given = os.fspath(camera) if isinstance(camera, os.PathLike) else str(camera)
-        self._is_file = pathlib.Path(given).is_file()
+        from_log = is_log(given)
+        require(
+            from_log or topic is None,
+            f"topic: found {topic} with {_name(given)}, expected a robot log",
+        )
+        self._is_file = from_log or pathlib.Path(given).is_file()
         self._rate = rate
         self.name = _name(given)
         """What messages call it: no user or password of a URL."""
         self._begins = pathlib.Path(given).name if self._is_file else self.name
+        self.size: Size | None
+        """Height and width of the frames; None where the camera does not tell."""
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._failure: Exception | None = None
+        self._capture: cv2.VideoCapture | None = None
+        if from_log:
+            log = open_log(given)
+            topic = log.image_topic(topic)
+            first = next(log.images(topic), None)
+            if first is None:
+                raise InputError(f"{given}: found no image in {topic}, expected at least one")
+            self.size = first[1].shape[:2]
+            self._played = self._logged(log, topic)
+            return
         is_number = given.isdecimal() and len(given) < 10 and not self._is_file  # 32 bits
         known = self._is_file or is_number or "://" in given
-        self._capture = cv2.VideoCapture(int(given) if is_number else given)
-        whole = known and self._capture.isOpened() and self._capture.grab()
+        self._capture = capture = cv2.VideoCapture(int(given) if is_number else given)
+        whole = known and capture.isOpened() and capture.grab()
         if not whole:
-            self._capture.release()
+            capture.release()
             raise InputError(
                 f"camera: found no frame from {self.name}, expected a number from 0, a URL or a "
                 "video file"
             )
         sides = (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH)
-        height, width = (int(self._capture.get(side)) for side in sides)
-        self.size: Size | None = (height, width) if height > 0 and width > 0 else None
-        """Height and width of the frames; None where the camera does not tell."""
-        self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
-        self._failure: Exception | None = None
+        height, width = (int(capture.get(side)) for side in sides)
+        self.size = (height, width) if height > 0 and width > 0 else None
+        self._played = self._captured(capture)
 
     def frames(self, check: Callable[[], None] = lambda: None) -> Iterator[Frame]:
         """Yield the newest frame, time and again, until the camera or the video ends.
@@ -313,7 +338,7 @@ class Camera(LatestFrame):
         """Put frames until there are no more; a file's at their times."""
         begun = time.monotonic()
         try:
-            with contextlib.closing(self._captured()) as frames:
+            with contextlib.closing(self._played) as frames:
                 for due, frame in frames:
                     self._closing.wait(max(0.0, begun + due / self._rate - time.monotonic()))
                     if self._closing.is_set():
@@ -324,27 +349,39 @@ class Camera(LatestFrame):
         finally:
             super().close()
 
-    def _captured(self) -> Generator[tuple[float, tuple[np.ndarray, float, str]]]:
-        """Yield when frames are due, and what `put` takes; the first is grabbed already."""
+    def _captured(self, capture: cv2.VideoCapture) -> _Played:
+        """Yield when a camera's or a video's frames are due, and what `put` takes.
+
+        The first is grabbed already.
+        """
         try:
             grabbed = True
             while grabbed:
-                at = milliseconds_of(self._capture)
-                found, image = self._capture.retrieve()
+                at = milliseconds_of(capture)
+                found, image = capture.retrieve()
                 when = at if self._is_file else round(1000 * time.time())
                 if found:
                     image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
                     due = at / 1000 if self._is_file else 0.0
                     yield due, (image, when / 1000, frame_name(self._begins, when))
-                grabbed = self._capture.grab() and not self._closing.is_set()
+                grabbed = capture.grab() and not self._closing.is_set()
         finally:
-            self._capture.release()
+            capture.release()
+
+    def _logged(self, log: Log, topic: str) -> _Played:
+        """Yield when a log's frames are due, and what `put` takes."""
+        begun = None
+        for stamp, image in log.images(topic):
+            begun = stamp if begun is None else begun
+            name = str(FrameName(self._begins, topic, stamp))
+            yield (stamp - begun) / 1e9, (image, stamp / 1e9, name)
 
     def close(self) -> None:
         """Let go of the camera."""
         self._closing.set()
         if self._thread is None:
-            self._capture.release()
+            if self._capture is not None:
+                self._capture.release()
         else:
             self._thread.join(timeout=1)  # a camera that hangs is left to the end of the process
 

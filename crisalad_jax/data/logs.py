@@ -223,7 +223,7 @@ class Log:
         name = self.image_topic(topic)
         for _, logged, message in self._messages([name]):
             stamp = _stamp(message, logged)
-            yield stamp, _decoded(message, str(FrameName(str(self.path), name, stamp)))
+            yield stamp, decode_ros_image(message, str(FrameName(str(self.path), name, stamp)))
 
     def stamps(self, topic: str) -> Int64[np.ndarray, " n"]:
         """Return the stamps of a topic's images, in order, each once; notes say what was not so.
@@ -247,7 +247,7 @@ class Log:
             if at == len(frames.stamps):
                 raise InputError(f"{name}: found no image there, expected a stamp in the log")
             message = self._message(topic, int(frames.numbers[at]), frames.logged)
-        return _decoded(message, name, enough)
+        return decode_ros_image(message, name, enough=enough)
 
     def positions(self, topic: str | None = None) -> Track | None:
         """Read positions along time; None where the log has none.
@@ -416,10 +416,32 @@ def _position(message: Any) -> tuple[float, float] | None:
     return at if np.isfinite(at).all() else None
 
 
-def _decoded(message: Any, name: str, enough: tuple[int, int] | None = None) -> np.ndarray:
-    """Decode an image message as `read_pixels` decodes a file."""
-    if message.__msgtype__ == _IMAGES[1]:
-        return decode_image(message.data.tobytes(), f"{name} ({message.format!r})", enough=enough)
+def decode_ros_image(
+    message: Any, name: str = "image", *, enough: tuple[int, int] | None = None
+) -> np.ndarray:
+    """Decode an image message of ROS, such as a node's callback gets.
+
+    Args:
+        message: an Image or a CompressedImage of sensor_msgs, of rclpy, rospy or rosbags.
+        name: name of the image, for messages.
+        enough: see `read_image`.
+
+    Returns:
+        RGB or grey, in the depth of the message.
+
+    Raises:
+        InputError: an encoding or a format that is not known, or bytes that are not such an image.
+
+    Example:
+        >>> import types
+        >>> from crisalad_jax import decode_ros_image
+        >>> grey = {"encoding": "mono8", "height": 2, "width": 3, "step": 4, "is_bigendian": 0}
+        >>> decode_ros_image(types.SimpleNamespace(**grey, data=bytes(range(8)))).tolist()
+        [[0, 1, 2], [4, 5, 6]]
+    """
+    data = np.frombuffer(message.data, np.uint8)
+    if hasattr(message, "format"):
+        return decode_image(data.tobytes(), f"{name} ({message.format!r})", enough=enough)
     if message.encoding not in _ENCODINGS:
         raise InputError(
             f"{name}: found an image of encoding {message.encoding!r}, expected one of "
@@ -429,12 +451,12 @@ def _decoded(message: Any, name: str, enough: tuple[int, int] | None = None) -> 
     dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     height, width, step = message.height, message.width, message.step
     row = width * channels * dtype.itemsize
-    if not (height and 0 < row <= step and height * step <= message.data.size):
+    if not (height and 0 < row <= step and height * step <= data.size):
         raise InputError(
-            f"{name}: found {message.data.size} bytes of {height} rows of {step}, expected rows of "
+            f"{name}: found {data.size} bytes of {height} rows of {step}, expected rows of "
             f"at least {row}, for {width} pixels of {message.encoding}"
         )
-    rows = np.array(message.data[: height * step].reshape(height, step)[:, :row])
+    rows = np.array(data[: height * step].reshape(height, step)[:, :row])
     pixels = rows.view(dtype).astype(dtype.newbyteorder("="), copy=False)
     image = pixels if channels == 1 else pixels.reshape(height, width, channels)
     try:

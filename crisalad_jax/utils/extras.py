@@ -7,14 +7,13 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "report": ("jinja2", "matplotlib", *_CLI),
     "train": ("optax", "orbax", "numba", "tensorboardX", "matplotlib", *_CLI),
     "maps": ("faiss", "h5py", "PIL", *_CLI),
-    "robot": ("rosbags", *_CLI),
+    "robot": ("rosbags", "rerun", *_CLI),
     "export": ("flatbuffers", *_CLI),
     "onnx": ("onnx", "onnxruntime", *_CLI),
     "openvino": ("openvino", "onnx", *_CLI),
     "serve": ("fastapi", "uvicorn", "python_multipart", *_CLI),
     "data": ("huggingface_hub", "kagglehub", *_CLI),
     "milvus": ("pymilvus", "milvus_lite"),
-    "robot": ("rosbags", "rerun", *_CLI),
     "convert": ("torch", *_CLI),
 }
 """Modules of each extra, by its name; of two with a module the smaller is first."""

@@ -27,7 +27,9 @@ ARGUMENTS = {
 
 def generate_launch_description() -> LaunchDescription:
     """Return the arguments and the process."""
-    declared = [DeclareLaunchArgument(name, default_value=value) for name, value in ARGUMENTS.items()]
+    declared = [
+        DeclareLaunchArgument(name, default_value=value) for name, value in ARGUMENTS.items()
+    ]
     command = [LaunchConfiguration("python"), str(NODE), "--ros-args"]
     for name in ARGUMENTS:
         if name != "python":

@@ -17,9 +17,7 @@ import math
 import sys
 import threading
 
-import crisalad_jax as cj
 import rclpy
-from crisalad_jax.data.logs import decode_message
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.executors import ExternalShutdownException
@@ -27,6 +25,8 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.task import Future
 from sensor_msgs.msg import CompressedImage, Image, NavSatFix
+
+import crisalad_jax as cj
 
 PARAMETERS = {
     "map": "",  # folder that `crisalad index` wrote
@@ -57,7 +57,6 @@ class PlaceRecognition(Node):
         self._places = cj.Map.open(self._value("map"))
         self._latest = cj.LatestFrame(fps=self._value("fps") or None)
         self._latencies: list[float] = []
-        self._frame_ids: dict[str, str] = {}
         self._place = self.create_publisher(DiagnosticArray, "~/place", 1)
         self._position = None
         if self._places.axes == ("lat", "lon"):
@@ -81,7 +80,7 @@ class PlaceRecognition(Node):
         """Put an image into the queue, under its stamp in nanoseconds."""
         stamp = message.header.stamp
         nanoseconds = 10**9 * stamp.sec + stamp.nanosec
-        self._latest.put(decode_message(message), nanoseconds / 1e9, str(nanoseconds))
+        self._latest.put(cj.decode_ros_image(message), nanoseconds / 1e9, str(nanoseconds))
 
     def _answer(self) -> None:
         """Answer images until the queue is closed."""
