@@ -125,10 +125,24 @@ class Future:
 
 
 class Ros:
-    """All that a node did, and what it is to be given."""
+    """All that a node did, and what it is to be given.
 
-    def __init__(self, parameters: dict[str, Any], messages: Sequence[tuple[float, Any]]) -> None:
-        self.parameters, self.messages = parameters, messages
+    Args:
+        parameters: as of the command line.
+        messages: what is published to the node's only subscription.
+        wait: seconds between two messages; None waits until each was handled.
+        handled: how many messages the node was through with.
+    """
+
+    def __init__(
+        self,
+        parameters: dict[str, Any],
+        messages: Sequence[Any],
+        wait: float | None,
+        handled: Callable[["Ros"], int],
+    ) -> None:
+        self.parameters, self.messages, self.wait = parameters, messages, wait
+        self.handled = handled
         self.node: Any = None
         self.published: dict[str, list[Any]] = {}
         self.subscribed: list[tuple[type, str, Callable, Any]] = []
@@ -142,14 +156,19 @@ class Ros:
         self.is_up = False
 
     def spin_until_future_complete(self, node: Any, future: Future) -> None:
-        """Call the subscription with each message, so many seconds after the one before."""
+        """Call the subscription with each message, and at the end press Ctrl-C."""
         ((_, _, callback, _),) = self.subscribed
-        for wait, message in self.messages:
-            time.sleep(wait)
-            if future.done():
-                return
+        for sent, message in enumerate(self.messages, 1):
             callback(message)
-        raise KeyboardInterrupt
+            is_last = sent == len(self.messages)
+            if self.wait is not None:
+                time.sleep(self.wait)
+            while (self.wait is None or is_last) and self.handled(self) < sent:
+                if future.done():
+                    return
+                time.sleep(0.001)
+        if not future.done():
+            raise KeyboardInterrupt
 
 
 def install(monkeypatch: pytest.MonkeyPatch, ros: Ros) -> None:

@@ -64,7 +64,8 @@ class PlaceRecognition(Node):
         elif self._places.axes is not None:
             self._position = self.create_publisher(PoseWithCovarianceStamped, "~/pose", 1)
         self._ready = threading.Event()
-        threading.Thread(target=self._answer, daemon=True).start()
+        self._thread = threading.Thread(target=self._answer, daemon=True)
+        self._thread.start()
         self._ready.wait()  # a model compiles in seconds
         topic = self._value("image_topic")
         kind = CompressedImage if topic.endswith("/compressed") else Image
@@ -85,15 +86,15 @@ class PlaceRecognition(Node):
     def _answer(self) -> None:
         """Answer images until the queue is closed."""
         least = self._value("min_similarity")
-        answers = cj.query_live(
-            self._places,
-            self._latest,
-            k=self._value("k"),
-            min_similarity=None if math.isnan(least) else least,
-            sequence=cj.BayesFilter() if self._value("sequence") == "bayes" else None,
-            ready=self._ready.set,
-        )
         try:
+            answers = cj.query_live(
+                self._places,
+                self._latest,
+                k=self._value("k"),
+                min_similarity=None if math.isnan(least) else least,
+                sequence=cj.BayesFilter() if self._value("sequence") == "bayes" else None,
+                ready=self._ready.set,
+            )
             for answer in answers:
                 self._latencies.append(answer.latency_ms)
                 self._publish(answer)
@@ -102,7 +103,7 @@ class PlaceRecognition(Node):
             self.ended.set_exception(error)
         self._ready.set()
 
-    def _publish(self, answer: cj.LiveAnswer) -> None:
+    def _publish(self, answer) -> None:
         best, known = answer.ranked[0], answer.known
         seconds, nanoseconds = divmod(int(answer.answers.names[0]), 10**9)
         position = answer.answers.position(best.image)
@@ -127,9 +128,9 @@ class PlaceRecognition(Node):
             values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
         )
         message.status = [status]
-        self._place.publish(message)
         if known and position is not None:
             self._publish_position(message.header, *position.values())
+        self._place.publish(message)
 
     def _publish_position(self, header, first: float, second: float) -> None:
         variance = self._value("position_stddev") ** 2
@@ -152,8 +153,10 @@ class PlaceRecognition(Node):
         self.get_logger().info(cj.latency_words(self._latencies, self._latest.dropped))
 
     def destroy_node(self) -> None:
-        """Close the queue and the map."""
+        """End the thread, and close the map."""
         self._latest.close()
+        self._thread.join()
+        self._places.close()
         super().destroy_node()
 
 
