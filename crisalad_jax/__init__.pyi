@@ -23,7 +23,7 @@ from .data.live import Camera as Camera
 from .data.live import FolderWatch as FolderWatch
 from .data.live import LatestFrame as LatestFrame
 from .data.loader import training_batches as training_batches
-from .data.logs import decode_ros_image as decode_ros_image
+from .data.logs import decode_message as decode_message
 from .data.places import Places as Places
 from .data.places import read_places as read_places
 from .data.query_set import QuerySet as QuerySet
