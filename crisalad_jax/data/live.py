@@ -374,7 +374,7 @@ class Camera(LatestFrame):
         for stamp, image in log.images(topic):
             begun = stamp if begun is None else begun
             name = str(FrameName(self._begins, topic, stamp))
-            yield (stamp - begun) / 1e9, (image, stamp / 1e9, name)
+            yield (stamp - begun) / 10**9, (image, stamp / 10**9, name)
 
     def close(self) -> None:
         """Let go of the camera."""

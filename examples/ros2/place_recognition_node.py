@@ -81,7 +81,7 @@ class PlaceRecognition(Node):
         """Put an image into the queue, under its stamp in nanoseconds."""
         stamp = message.header.stamp
         nanoseconds = 10**9 * stamp.sec + stamp.nanosec
-        self._latest.put(cj.decode_message(message), nanoseconds / 1e9, str(nanoseconds))
+        self._latest.put(cj.decode_message(message), nanoseconds / 10**9, str(nanoseconds))
 
     def _answer(self) -> None:
         """Answer images until the queue is closed."""
