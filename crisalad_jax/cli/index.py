@@ -5,7 +5,7 @@ import pathlib
 from typing import Annotated, Any, Literal
 
 from crisalad_jax.cli.common import echo, open_flagged, pick, waiting_words
-from crisalad_jax.cli.flags import FOLDER, JsonFlag, ModelFlags, ReadFlags
+from crisalad_jax.cli.flags import FOLDER, FrameFlags, JsonFlag, ModelFlags, ReadFlags
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
 from crisalad_jax.retrieval.maps.build import Indexed, index
@@ -22,22 +22,23 @@ SEVERAL = "quote a pattern; other folders are added by the same command again"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Index(ReadFlags, ModelFlags, JsonFlag):
+class Index(ReadFlags, FrameFlags, ModelFlags, JsonFlag):
     """Make a map of a folder of images, or append to it those that it lacks.
 
     An existing map takes images by the model that made it, at its image size.
     """
 
     images: pathlib.Path
-    """Folder, file, pattern, list, table or video (docs/how-to/image-sources.md); the map names
-    images by their paths in the folder, subfolders included."""
+    """Folder, file, pattern, list, table, video or robot log (docs/how-to/image-sources.md);
+    the map names images by their paths in the folder, subfolders included."""
     out: Annotated[pathlib.Path, FOLDER]
     """The map's folder. After a kill the same command goes on."""
-    fps: float | None = None
-    """Frames a second taken of a video, by default 1."""
     positions: pathlib.Path | None = None
     """CSV of name,east,north (metres) or name,lat,lon or name,x,y, for images that are new; by
-    default what a table as --images says, or @UTM names, or EXIF data."""
+    default what a table or robot log as --images says, or @UTM names, or EXIF data."""
+    position_topic: str | None = None
+    """Topic of positions in a robot log, by default the only NavSatFix, else the only odometry or
+    pose; "" takes none."""
     store: str | None = None
     """files, in the map's folder, or milvus:URI, a file name.db or http://host:port; by default the
     map's, and of a new map files."""
@@ -63,7 +64,8 @@ def run(arguments: Index) -> dict[str, Any]:
         weights = None if arguments.weights else weights_of(metadata, out)
     model, _, file = open_flagged(arguments, weights, like=like)
     config = model.config
-    more = pick(arguments, "fps", "positions", "store", "dtype", "pca", "search", "share")
+    more = pick(arguments, "fps", "topic", "position_topic", "positions", "store", "dtype", "pca")
+    more |= pick(arguments, "search", "share")
     result = index(model, arguments.images, out, weights=file, reading=arguments.reading, **more)
     if waiting := waiting_words(result):
         described = f"{counted(result.added, 'image')} described"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from crisalad_jax.cli.common import STDOUT, echo, find_given, pick, refuse_with, refuse_without
-from crisalad_jax.cli.flags import JsonFlag, ReadFlags, RuntimeName, Target
+from crisalad_jax.cli.flags import FrameFlags, JsonFlag, ReadFlags, RuntimeName, Target
 from crisalad_jax.config.checks import require
 from crisalad_jax.data.live import Camera, FolderWatch
 from crisalad_jax.retrieval.maps.live import latency_words, query_live
@@ -42,24 +42,25 @@ EXAMPLE = "crisalad query new.jpg --map map --json -"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Query(ReadFlags, JsonFlag):
+class Query(ReadFlags, FrameFlags, JsonFlag):
     """Find the images of a map that are most similar to others, and say where they were taken."""
 
     images: Annotated[
         tuple[pathlib.Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE...")
     ]
-    """Images, or folders of them, patterns, lists, tables or videos (docs/how-to/image-sources.md).
+    """Images, or folders of them, patterns, lists, tables, videos or robot logs
+    (docs/how-to/image-sources.md).
     None with --watch and --camera."""
     map: pathlib.Path
     """Folder that `crisalad index` wrote."""
     watch: pathlib.Path | None = None
     """Folder: answer the images that appear in it as they appear, a line of JSON each."""
     camera: str | None = None
-    """Number from 0, URL or video file: answer its newest frame, time and again."""
+    """Number from 0, URL, video or robot log: answer its newest frame, time and again."""
     rate: float | None = None
     """How many times as fast as its own pace a file as --camera plays; by default 1."""
     fps: float | None = None
-    """Frames a second taken of a video, by default 1; the most that --camera answers."""
+    """Frames a second taken of a video or log, by default 1; the most that --camera answers."""
     window: int = 1
     """Frames described together, each with those just before it: a moving camera's."""
     weights: pathlib.Path | None = None
@@ -115,7 +116,7 @@ def run(arguments: Query) -> None:
             places,
             arguments.images,
             sequence=sequence,
-            **pick(arguments, "k", "fps", "window", "exact", "min_similarity", "reading"),
+            **pick(arguments, "k", "fps", "topic", "window", "exact", "min_similarity", "reading"),
         )
     if answers.unreadable:
         echo(f"{len(answers.unreadable)} unreadable left out, {answers.unreadable[0]} the first")
@@ -249,7 +250,7 @@ def _run_live(arguments: Query) -> None:
     require(not arguments.images, f"IMAGE: found with {name}, expected only one of the two")
     refuse_with(name, gallery=arguments.gallery)
     if name == "--watch":
-        refuse_with(name, **pick(arguments, "camera", "fps", "rate"))
+        refuse_with(name, **pick(arguments, "camera", "fps", "rate", "topic"))
     require(
         arguments.json in (None, STDOUT),
         f"--json: found {arguments.json} with {name}, expected -: answers go to the standard "
@@ -266,8 +267,9 @@ def _run_live(arguments: Query) -> None:
             words = f"watching {arguments.watch} ({there}, and left out)"
         else:
             assert arguments.camera is not None
+            more = pick(arguments, "fps", "topic")
             rate = 1.0 if arguments.rate is None else arguments.rate
-            source = stack.enter_context(Camera(arguments.camera, fps=arguments.fps, rate=rate))
+            source = stack.enter_context(Camera(arguments.camera, rate=rate, **more))
             words = f"taking frames from {source.name}"
         places = stack.enter_context(_opened(arguments))
         latencies: list[float] = []

@@ -109,7 +109,8 @@ class Track(NamedTuple):
 
         Example:
             >>> import numpy as np
-            >>> track = Track("a", ("lat", "lon"), np.array([0.0, 4]), np.array([[0, 179], [8, -177]]))
+            >>> points = np.array([[0.0, 179.0], [8.0, -177.0]])
+            >>> track = Track("a", ("lat", "lon"), np.array([0.0, 4.0]), points)
             >>> [each.tolist() for each in track.interpolate(np.array([1.0, 3.0]))]
             [[[2.0, 180.0], [6.0, -178.0]], [4.0, 4.0]]
         """
@@ -185,13 +186,15 @@ class Log:
         """Return the name of the topic that positions are taken from; None where there is none.
 
         Args:
-            name: the topic's; None is the only one of NavSatFix or, without any of that type, the
-                only one of odometry or poses. Where there are several a note lists them.
+            name: the topic's; "" takes none. None is the only one of NavSatFix or, without any of
+                that type, the only one of odometry or poses; of several a note lists them.
 
         Raises:
             InputError: the log has no such topic, or it is not of positions.
         """
         fixes, poses = self._topics(_FIXES), self._topics(_POSES)
+        if name == "":
+            return None
         if name is None:
             found = fixes or poses
             if len(found) > 1:

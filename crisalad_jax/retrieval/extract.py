@@ -89,6 +89,7 @@ def extract(
     out: StrPath | None = None,
     *,
     fps: float | None = None,
+    topic: str | None = None,
     weights: StrPath | None = None,
     grouping: str = "single",
     seed: int = 0,
@@ -112,7 +113,8 @@ def extract(
             (docs/how-to/image-sources.md), or a list of files.
         out: a file .npy, with the names in another, or .h5, as hloc reads it. How it was made is
             written next to it, as JSON. None writes nothing.
-        fps: frames a second taken of a video, which is then expected; None is one.
+        fps: frames a second taken of a video or log, which is then expected; None is one.
+        topic: the topic of images in a robot log; None is the only one.
         weights: the file that the parameters are from, for that JSON and for messages.
         grouping: one of `GROUPINGS`: which images attend to each other.
         seed: draws the order of the grouping "shuffled".
@@ -151,7 +153,7 @@ def extract(
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca, verify=verify)
     made_by = "--pairs" if pairs is not None else "model" if weights is None else str(weights)
     length, is_unit = shortened(components, describer, made_by, unit=pairs is not None)
-    paths, names = _listed(images, root, fps, reading)
+    paths, names = _listed(images, root, fps, topic, reading)
     made = {} if out is None and database is None else _made(describer, components)
     others = None if pairs is None else _others(pairs, names, database, length, made, verify=verify)
     reading = reading.fitted(len(paths))
@@ -163,6 +165,7 @@ def extract(
         "weights": None if weights is None else starter.named(weights),
         "images": source,
         "fps": fps,
+        "topic": topic,
         "grouping": grouping,
         "batch_size": reading.batch_size,
         "seed": seed,
@@ -434,10 +437,14 @@ def _remove_work(folder: pathlib.Path) -> None:
 
 
 def _listed(
-    images: StrPath | Sequence[StrPath], root: StrPath | None, fps: float | None, reading: Reading
+    images: StrPath | Sequence[StrPath],
+    root: StrPath | None,
+    fps: float | None,
+    topic: str | None,
+    reading: Reading,
 ) -> tuple[list[pathlib.Path], list[str]]:
     """List the images, and their names relative to the root."""
-    sources = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
+    sources = open_sources(images, fps=fps, topic=topic, on_bad_image=reading.on_bad_image)
     paths = [path for source in sources for path in source.paths]
     if isinstance(images, str | os.PathLike):
         (source,) = sources

@@ -98,6 +98,8 @@ def index(
     *,
     weights: str | os.PathLike[str],
     fps: float | None = None,
+    topic: str | None = None,
+    position_topic: str | None = None,
     positions: Positions | str | os.PathLike[str] | None = None,
     store: str | None = None,
     dtype: Literal["float32", "float16", "bits"] | None = None,
@@ -118,10 +120,12 @@ def index(
             Or another source of images (docs/how-to/image-sources.md).
         out: the map's folder.
         weights: the file that the parameters are from, which queries load by default.
-        fps: frames a second taken of a video, which is then expected; None is one.
+        fps: frames a second taken of a video or log, which is then expected; None is one.
+        topic: the topic of images in a robot log; None is the only one.
+        position_topic: the topic of positions in a log; see `open_source`.
         positions: where images were taken, or a table of it. None is what `images` says, if that
-            is a table; else what @UTM names say; else what the EXIF data of JPEGs says. Names of
-            several zones of UTM give degrees, or metres of the map's zone.
+            is a table or a robot log; else what @UTM names say; else what the EXIF data of JPEGs
+            says. Names of several zones of UTM give degrees, or metres of the map's zone.
         store: "files", or "milvus:URI". None is the map's, and of a new map "files".
         dtype: type of the stored descriptors; "bits" stores their signs (`pack_bits`), which are
             searched by the Hamming distance. None is the map's, and of a new map "float32".
@@ -156,7 +160,8 @@ def index(
     part = None if share is None else Share.parse(share)
     out = pathlib.Path(out)
     metadata = read_metadata(out)
-    (source,) = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
+    how = {"fps": fps, "topic": topic, "position_topic": position_topic}
+    (source,) = open_sources(images, **how, on_bad_image=reading.on_bad_image)
     table = source.positions if positions is None else positions
     if table is None:
         known = utm_positions(source.names)
