@@ -196,6 +196,33 @@ def test_a_camera_of_a_video(town_map, tmp_path, capfd):
     assert summary.startswith(f"crisalad: {len(lines)} answers, latency median ")
 
 
+def test_a_bag_is_replayed_and_no_frame_is_lost(town_map, tmp_path, capfd):
+    """Forty frames, a hundred a second at twice the bag's rate: each is answered or counted."""
+    flat = [np.full((48, 64, 3), 6 * number, np.uint8) for number in range(40)]
+    step = SECOND // 50
+    bag = write_bag(
+        tmp_path / "walk.mcap",
+        [image(BEGIN + step * number, each) for number, each in enumerate(flat)],
+    )
+    out, error = runs(capfd, *query(town_map, "--camera", bag, "--rate", 2, "--k", 1))
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert len(lines) + sum(line["dropped"] for line in lines) == 40
+    for line in lines:
+        seconds = line["query"].removeprefix("walk.mcap#/camera/image_raw#t=")
+        assert float(seconds) == line["time"]
+        assert line["latency_ms"] > 0
+    assert lines[-1]["time"] == (BEGIN + 39 * step) / SECOND
+    ready, summary = error.splitlines()
+    assert ready == f"crisalad: ready, taking frames from {bag}"
+    assert summary.startswith(f"crisalad: {len(lines)} answer")
+    passed = 40 - len(lines)
+    words = {0: " ms", 1: "; 1 frame passed over"}
+    assert summary.endswith(words.get(passed, f"; {passed} frames passed over"))
+    given = query(town_map, "--camera", bag, "--topic", "/front")
+    fails(capfd, *given, words=("found --topic /front, expected", "/camera/image_raw (Image, 40)"))
+    fails(capfd, *query(town_map, "--camera", bag, "--rate", 0), words=("rate: found 0, expected",))
+
+
 @pytest.mark.parametrize(
     ("number", "code", "words"),
     [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "ended by SIGTERM")],
