@@ -4,14 +4,15 @@ import dataclasses
 import pathlib
 from typing import Any
 
-from crisalad_jax.cli.common import echo, find_given, open_set, show_tables
+from crisalad_jax.cli.common import echo, find_given, open_set, refuse_without, show_tables
 from crisalad_jax.cli.flags import ReadFlags, SetFlags, TableFlags
 from crisalad_jax.cli.tables import points_table
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.evaluation.calibrate import calibrate, operating_point_of
 from crisalad_jax.evaluation.operating_point import caveats
-from crisalad_jax.retrieval.maps.calibration import CALIBRATION
+from crisalad_jax.retrieval.maps.calibration import CALIBRATION, VERIFIED
 from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.verification.verify import Verify
 
 EXAMPLE = "crisalad calibrate --map corridor.map --data corridor-set --precision 0.99"
 
@@ -32,23 +33,39 @@ class Calibrate(ReadFlags, SetFlags, TableFlags):
     """Share of the answers that must be right."""
     weights: pathlib.Path | None = None
     """The model that made the map, as a file or a published name; by default where it was then."""
-    verify: bool = True
-    """Check the map's descriptors against their checksums; --no-verify skips that, where files are
-    huge."""
+    verify: int | None = None
+    """Measure how many inliers the best of so many verified answers must have, in place of a
+    similarity (docs/verification.md); remembered apart, for `crisalad query --verify`."""
+    matcher: pathlib.Path | None = None
+    """ONNX file of the matcher that verifies; by default SIFT."""
+    checksums: bool = True
+    """Check the map's descriptors against their checksums; --no-checksums skips that, where files
+    are huge."""
 
 
 def run(arguments: Calibrate) -> dict[str, Any]:
     """Calibrate the map, and print what it remembers."""
-    with Map.open(arguments.map, verify=arguments.verify, calibrated=False) as places:
+    refuse_without("--verify", arguments.verify, matcher=arguments.matcher)
+    verify = None
+    if arguments.verify is not None:
+        verify = Verify(answers=arguments.verify, matcher=arguments.matcher)
+    with Map.open(arguments.map, verify=arguments.checksums, calibrated=False) as places:
         places.load_model(find_given(arguments.weights, quiet=arguments.quiet))
         benchmark = open_set(arguments)
-        calibration = calibrate(places, benchmark, arguments.precision, reading=arguments.reading)
+        calibration = calibrate(
+            places, benchmark, arguments.precision, verify=verify, reading=arguments.reading
+        )
     point = operating_point_of(calibration)
-    show_tables(points_table({"single": point}), latex=arguments.latex)
+    name = "single" if verify is None else f"single + local:{verify.answers}"
+    show_tables(points_table({name: point}), latex=arguments.latex)
     for words in caveats(point):
         echo(words)
-    echo(
-        f"{arguments.map / CALIBRATION}: answers below similarity {point.min_similarity:.9g} are "
-        "unknown from now on"
-    )
+    if verify is None:
+        least = (
+            f"{arguments.map / CALIBRATION}: answers below similarity {point.min_similarity:.9g}"
+        )
+    else:
+        file = arguments.map / VERIFIED
+        least = f"{file}: verified answers with fewer than {calibration.min_inliers} inliers"
+    echo(f"{least} are unknown from now on")
     return to_plain(calibration)

@@ -235,5 +235,6 @@ def open_flagged(
             config if like is None else with_non_semantic_fields_of(like, config)
         ),
         groupings=groupings,
-        **pick(flags, "verify", "quiet"),
+        verify=flags.checksums,
+        quiet=flags.quiet,
     )

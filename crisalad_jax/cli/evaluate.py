@@ -59,9 +59,11 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     """NAME:TOPK puts the first TOPK retrievals in a new order by local features: patch-netvlad,
     patch-netvlad-ransac or patch-netvlad-sum, of a model with NetVLAD; fol, pair-vpr, selavpr,
     selavprpp or transvpr, of one of that method; sinkhorn-divergence, of any local tokens
-    (docs/methods.md). Adds a row to each of the table."""
+    (docs/methods.md); local, by SIFT features (docs/verification.md). Adds a row to each of the
+    table."""
     rerank_weights: pathlib.Path | None = None
-    """Model that makes these features, as --weights; by default the first stage's."""
+    """Model that makes these features, as --weights; by default the first stage's. For local, a
+    matcher as an ONNX file."""
     precision: float | None = None
     """Also print the similarity to ask for so that this share of the accepted first retrievals is
     right, such as 0.99, and the recall that is left."""
@@ -92,7 +94,7 @@ def run(arguments: Evaluate) -> None:
     else:
         model, name, file = open_flagged(arguments, groupings=kinds)
     config = model.config
-    pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.verify)
+    pca = None if arguments.pca is None else load_pca(arguments.pca, verify=arguments.checksums)
     echo(name)
     echo(f"images at {config.images_in_words}")
     similarities = FirstSimilarities()
@@ -178,7 +180,9 @@ def _reranking(arguments: Evaluate) -> Reranking | None:
     if arguments.rerank is None:
         return None
     rerank = parse_reranking(arguments.rerank)
-    if arguments.rerank_weights is not None:
+    if arguments.rerank_weights is not None and not rerank.needs_model:
+        rerank = dataclasses.replace(rerank, matcher=arguments.rerank_weights)
+    elif arguments.rerank_weights is not None:
         file = find_weights(arguments.rerank_weights, quiet=arguments.quiet)
-        rerank = dataclasses.replace(rerank, model=load_weights(file, verify=arguments.verify))
+        rerank = dataclasses.replace(rerank, model=load_weights(file, verify=arguments.checksums))
     return rerank

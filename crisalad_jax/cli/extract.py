@@ -53,8 +53,9 @@ def run(arguments: Extract) -> dict[str, Any] | None:
     out, how = arguments.out, pick(arguments, "grouping", "seed", "pairs", "database", "k", "share")
     check_extraction(out, **how)
     model, _, file = open_flagged(arguments, groupings=[arguments.grouping])
-    more = pick(arguments, "fps", "topic", "root", "pca", "verify", "reading")
-    result = extract(model, arguments.images, out, weights=file, **how, **more)
+    more = pick(arguments, "fps", "topic", "root", "pca", "reading")
+    more |= {"weights": file, "verify": arguments.checksums}
+    result = extract(model, arguments.images, out, **how, **more)
     described = counted(len(result.names), "descriptor")
     if waiting := waiting_words(result):
         echo(f"{out}: share {arguments.share}: {described}; {waiting}")

@@ -138,8 +138,8 @@ class ModelFlags(ComputeFlags, QuietFlag):
     runtime: RuntimeName = "jax"
     """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
     for it once; --weights may be an exported folder."""
-    verify: bool = True
-    """Check all files against their checksums; --no-verify skips that, where they are huge."""
+    checksums: bool = True
+    """Check all files against their checksums; --no-checksums skips that, where they are huge."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,7 @@ class Info(SizeFlags, PluginFlag, TableFlags):
     """Describe the model in this file of this package instead, or a published one, by its name."""
     map: pathlib.Path | None = None
     """Describe the map in this folder instead."""
-    verify: bool = False
+    checksums: bool = False
     """Read all of the map's descriptors, and compare them with their digests."""
     trainable: str | None = None
     """What trains, as `train` takes it: words such as all or adapters,head, or patterns of names;
@@ -35,7 +35,7 @@ class Info(SizeFlags, PluginFlag, TableFlags):
 
 def run(arguments: Info) -> dict[str, Any]:
     """Print the table of a model or a map."""
-    refuse_without("--map", arguments.map, verify=arguments.verify)
+    refuse_without("--map", arguments.map, checksums=arguments.checksums)
     return _model(arguments) if arguments.map is None else _map(arguments.map, arguments)
 
 
@@ -59,11 +59,11 @@ def _map(folder: pathlib.Path, arguments: Info) -> dict[str, Any]:
     of_models = {
         field.name: getattr(arguments, field.name) != field.default
         for field in dataclasses.fields(Info)
-        if field.name not in ("map", "verify", "json", "plugin")
+        if field.name not in ("map", "checksums", "json", "plugin")
     }
     refuse_with("--map", **of_models)
     with Map.open(folder, verify=False) as places:
-        summary = places.summary(verify=arguments.verify)
+        summary = places.summary(verify=arguments.checksums)
     extent = summary["extent"] or {}
     ends = {axis: f"{low:.9g} to {high:.9g}" for axis, (low, high) in extent.items()}
     known = {name: value for name, value in summary.items() if value not in (None, "none")}

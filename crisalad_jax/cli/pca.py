@@ -37,17 +37,19 @@ class Pca(JsonFlag, QuietFlag):
     """Fit at most so many descriptors, drawn at random."""
     seed: int = 0
     """Draws them."""
-    verify: bool = True
-    """Check descriptors against their checksums; --no-verify skips that, where files are huge."""
+    checksums: bool = True
+    """Check descriptors against their checksums; --no-checksums skips that, where files are
+    huge."""
 
 
 def run(arguments: Pca) -> dict[str, Any]:
     """Fit components, write them, and print their share of the variance."""
     weights = arguments.weights
-    model = None if weights is None else load(weights, **pick(arguments, "verify", "quiet"))
+    checked = {"verify": arguments.checksums}
+    model = None if weights is None else load(weights, quiet=arguments.quiet, **checked)
     dim = model.config.projection.dim if model else 0
     require(not dim, f"{weights}: found a model with a projection to {dim} numbers already")
-    descriptors = open_npy(arguments.descriptors, verify=arguments.verify)
+    descriptors = open_npy(arguments.descriptors, **checked)
     made = read_record(arguments.descriptors)
     pca = fit_pca(
         descriptors,

@@ -5,8 +5,8 @@ import dataclasses
 import importlib
 import pathlib
 import sys
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Literal
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -20,6 +20,8 @@ from crisalad_jax.retrieval.maps.query import Answers, json_lines, json_rows, qu
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch
 from crisalad_jax.retrieval.seqslam import SeqSlam
 from crisalad_jax.retrieval.sequence import BayesFilter
+from crisalad_jax.retrieval.verification.camera import Intrinsics
+from crisalad_jax.retrieval.verification.verify import Verify
 from crisalad_jax.utils.files import atomic_path, real_path
 from crisalad_jax.utils.output import counted, printable
 from crisalad_jax.utils.signals import defer_signals
@@ -36,7 +38,7 @@ _COLUMNS = 8
 
 COMMON = (
     "images map watch camera fps window weights k min-similarity sequence json gallery rerun "
-    "map-images batch-size on-bad-image quiet"
+    "map-images verify batch-size on-bad-image quiet"
 )
 EXAMPLE = "crisalad query new.jpg --map map --json -"
 
@@ -92,9 +94,24 @@ class Query(ReadFlags, FrameFlags, JsonFlag):
     """Recording for the viewer Rerun: queries, answers, similarities and the way on the map, along
     time (docs/how-to/from-a-bag-to-a-relocalising-robot.md)."""
     map_images: pathlib.Path | None = None
-    """Folder of the map's images, for --gallery and --rerun, if they are not where they were."""
-    verify: bool = True
-    """Check the map's descriptors, and an exported model, against their checksums; --no-verify
+    """Folder of the map's images, for --gallery, --rerun and --verify, if they are not where they were."""
+    verify: int | None = None
+    """Number of best answers that are verified by local features: matches, inliers and, with
+    --intrinsics, poses (docs/verification.md)."""
+    min_inliers: int | None = None
+    """A query whose best answer has fewer is of an unknown place; by default what `crisalad
+    calibrate --verify` measured for this map."""
+    matcher: pathlib.Path | None = None
+    """ONNX file of features and their matcher, such as ALIKED + LightGlue; by default SIFT."""
+    intrinsics: str | None = None
+    """Of the camera: fx,fy,cx,cy, or with ,width,height, or a file: YAML or JSON of ROS's
+    camera_info."""
+    map_intrinsics: str | None = None
+    """Of the camera that took the map's images, if that was another one."""
+    map_depth: pathlib.Path | None = None
+    """Folder of PNGs of 16 bits: depth of the map's images in millimetres, under their names."""
+    checksums: bool = True
+    """Check the map's descriptors, and an exported model, against their checksums; --no-checksums
     skips that, where files are huge."""
 
 
@@ -116,6 +133,7 @@ def run(arguments: Query) -> None:
             places,
             arguments.images,
             sequence=sequence,
+            verify=_verify_of(arguments),
             **pick(arguments, "k", "fps", "topic", "window", "exact", "min_similarity", "reading"),
         )
     if answers.unreadable:
@@ -157,7 +175,9 @@ def run(arguments: Query) -> None:
 def _check_files(arguments: Query) -> None:
     """Check that pictures have what they need, and a file of their own."""
     gallery, file, rerun = arguments.gallery, arguments.json, arguments.rerun
-    refuse_without("--gallery or --rerun", gallery or rerun, map_images=arguments.map_images)
+    if arguments.verify is None:
+        needs = "--gallery, --rerun or --verify"
+        refuse_without(needs, gallery or rerun, map_images=arguments.map_images)
     if rerun is not None:
         importlib.import_module(_RECORDS)  # or its extra is missing
     if gallery is None:
@@ -182,10 +202,22 @@ def _sequence_of(arguments: Query) -> SequenceSearch | None:
     return BayesFilter() if reach is None else BayesFilter(reach=reach)
 
 
+def _verify_of(arguments: Query) -> Verify | None:
+    """Make what the flags say of verification."""
+    flags = ("matcher", "intrinsics", "map_intrinsics", "map_depth", "min_inliers")
+    given = pick(arguments, *flags)
+    if arguments.verify is None:
+        refuse_without("--verify", None, **given)
+        return None
+    for name in ("intrinsics", "map_intrinsics"):
+        given[name] = given[name] and Intrinsics.parse(given[name])
+    return Verify(answers=arguments.verify, map_images=arguments.map_images, **given)
+
+
 @contextlib.contextmanager
 def _opened(arguments: Query) -> Iterator[Map]:
     """Open the map, and its model in the engine that the flags ask for."""
-    verify, runtime = arguments.verify, arguments.runtime
+    verify, runtime = arguments.checksums, arguments.runtime
     calibrated = arguments.min_similarity is None
     with Map.open(arguments.map, verify=verify, calibrated=calibrated) as places:
         places.load_model(
@@ -202,12 +234,16 @@ def _unknown_words(answers: Answers, places: Map) -> str:
 
     Nothing where any similarity counts.
     """
-    if answers.min_similarity is None:
-        return ""
-    count, least = int((~answers.known).sum()), f"{answers.min_similarity:.9g}"
-    measured = places.calibration
-    rests = "" if measured is None else f" (rests on {counted(measured.answered, 'answer')})"
-    return f"; {count} of {len(answers.queries)} unknown, below similarity {least}{rests}"
+    below = []
+    if answers.min_similarity is not None:
+        measured = places.calibration
+        rests = "" if measured is None else f" (rests on {counted(measured.answered, 'answer')})"
+        below.append(f"below similarity {answers.min_similarity:.9g}{rests}")
+    if answers.min_inliers is not None:
+        below.append(f"with fewer than {counted(answers.min_inliers, 'inlier')}")
+    count = int((~answers.known).sum())
+    unknown = f"; {count} of {len(answers.queries)} unknown, {' or '.join(below)}"
+    return unknown if below else ""
 
 
 def answer_lines(answers: Answers) -> Iterator[str]:
@@ -222,7 +258,8 @@ def answer_lines(answers: Answers) -> Iterator[str]:
         position += f" (zone {found[0]['zone']})"
     numbers = ["similarity"] if answers.probabilities is None else ["similarity", "probability"]
     queries: list[str | None] = [None]
-    rows = [["rank", *numbers, position, "name"]]
+    checked = [] if answers.checks is None else ["inliers", "confidence"]
+    rows = [["rank", *numbers, *checked, position, "name"]]
     for row in found:
         known = row.get("known", True)
         for answer in row["neighbours"] if known else row["neighbours"][:1]:
@@ -232,6 +269,7 @@ def answer_lines(answers: Answers) -> Iterator[str]:
                 [
                     str(answer["rank"]) if known else "-",
                     *(f"{answer[name]:.3f}" for name in numbers),
+                    *_verified_cells(answer, checked),
                     "-" if at is None else ", ".join(f"{value:.9g}" for value in at.values()),
                     answer["name"] if known else "unknown",
                 ]
@@ -242,6 +280,11 @@ def answer_lines(answers: Answers) -> Iterator[str]:
             yield name
         padded = (cell.rjust(width) for cell, width in zip(cells, widths, strict=False))
         yield "  ".join((*padded, cells[-1]))
+
+
+def _verified_cells(answer: dict[str, Any], columns: Sequence[str]) -> list[str]:
+    verified = answer.get("verified")
+    return [f"{verified[name]:.4g}" if verified else "-" for name in columns]
 
 
 def _run_live(arguments: Query) -> None:
@@ -286,6 +329,7 @@ def _run_live(arguments: Query) -> None:
             places,
             source,
             sequence=sequence,
+            verify=_verify_of(arguments),
             ready=ready,
             check=state.check,
             **pick(arguments, "k", "window", "min_similarity"),

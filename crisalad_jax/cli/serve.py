@@ -3,12 +3,16 @@
 import dataclasses
 import os
 import pathlib
+import re
 
 from crisalad_jax.cli.common import echo, find_given
 from crisalad_jax.cli.flags import DecodeFlags
 from crisalad_jax.retrieval.serve import serve_map
+from crisalad_jax.retrieval.verification.verify import Verify
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_text
 
+_LOCAL = re.compile(r"local(?::([1-9][0-9]{0,2}))?")
 EXAMPLE = "crisalad serve --map corridor.map --port 8000"
 
 
@@ -32,13 +36,16 @@ class Serve(DecodeFlags):
     """Folder of the map's pictures, if they are not where they were."""
     k: int = 5
     """Answers to a picture, where the request names no number."""
+    rerank: str | None = None
+    """local:N verifies the N best answers by local features; local, the first 5
+    (docs/verification.md)."""
     max_bytes: int = 20 * 2**20
     """Bytes that a request may have."""
     max_pixels: int = 2**26
     """Pixels that a picture may have; larger ones are not decoded."""
-    verify: bool = True
-    """Check the map's descriptors against their checksums; --no-verify skips that, where files are
-    huge."""
+    checksums: bool = True
+    """Check the map's descriptors against their checksums; --no-checksums skips that, where files
+    are huge."""
 
 
 def run(arguments: Serve) -> None:
@@ -55,6 +62,17 @@ def run(arguments: Serve) -> None:
 
     given = vars(arguments) | {"token": token, "ready": ready}
     given["weights"] = find_given(arguments.weights, quiet=arguments.quiet)
-    for name in ("token_file", "plugin"):
+    given |= {"rerank": _verify_of(arguments), "verify": arguments.checksums}
+    for name in ("token_file", "plugin", "checksums"):
         del given[name]
     serve_map(given.pop("map"), **given)
+
+
+def _verify_of(arguments: Serve) -> Verify | None:
+    """Read --rerank."""
+    if arguments.rerank is None:
+        return None
+    match = _LOCAL.fullmatch(arguments.rerank)
+    if match is None:
+        raise InputError(f"--rerank: found {arguments.rerank}, expected local, or local:N")
+    return Verify(answers=int(match[1] or 5), map_images=arguments.map_images)

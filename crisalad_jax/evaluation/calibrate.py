@@ -1,6 +1,7 @@
 """Calibration of a map: from which similarity on its answers are right to a precision."""
 
 import datetime
+import math
 
 from crisalad_jax.config.checks import takes
 from crisalad_jax.data.benchmarks import Benchmark
@@ -14,6 +15,8 @@ from crisalad_jax.evaluation.operating_point import (
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.calibration import Calibration, write_calibration
 from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.reranking import Reranking
+from crisalad_jax.retrieval.verification.verify import Verifier, Verify
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import lock
 
@@ -28,6 +31,7 @@ def calibrate(
     precision: float = 0.99,
     *,
     model: Model | None = None,
+    verify: Verify | None = None,
     reading: Reading = Reading(),
 ) -> Calibration:
     """Measure from which similarity on answers are right, and let a map remember it.
@@ -43,6 +47,8 @@ def calibrate(
         benchmark: the set, such as `open_benchmark` makes.
         precision: share of the answers that must be right, above 0 to 1.
         model: the model that made the map; None loads it from where it was (`Map.load_model`).
+        verify: measures how many inliers verified answers must have, which the map remembers
+            apart; None measures the similarity.
         reading: how images are read.
 
     Returns:
@@ -74,13 +80,17 @@ def calibrate(
         >>> found.right, found.answered
         (4, 4)
     """
-    (result,) = evaluate(
+    rerank = None
+    if verify is not None:
+        rerank = Reranking("local", verify.answers, matcher=verify.matcher)
+    *_, result = evaluate(
         places.describer(model),
         benchmark,
         groupings=["single"],
         pca=places.components,
         dtype="bits" if places.metadata.is_bits else "float32",
         precision=precision,
+        rerank=rerank,
         reading=reading,
     )
     point = result.operating_point
@@ -88,9 +98,13 @@ def calibrate(
     if not point.reached:
         raise InputError(f"precision: {caveats(point)[0]}, on {benchmark.name}")
     check_supported(point, benchmark.name)
+    measured = {name: getattr(point, name) for name in _MEASURED}
+    if verify is not None:
+        measured["min_inliers"] = math.ceil(measured.pop("min_similarity"))
+        measured |= {"min_similarity": -1.0, "verifier": Verifier(verify).name}
     calibration = Calibration(
         precision=precision,
-        **{name: getattr(point, name) for name in _MEASURED},
+        **measured,
         database=len(benchmark.database),
         benchmark=benchmark.name,
         rule=benchmark.rule,
@@ -99,11 +113,14 @@ def calibrate(
     )
     with lock(places.folder, wait=True):  # an addition removes temporary files there
         write_calibration(places.folder, calibration)
-    places.calibration = calibration
+    if verify is None:
+        places.calibration = calibration
     return calibration
 
 
 def operating_point_of(calibration: Calibration) -> OperatingPoint:
     """Return the operating point that a map remembers."""
     measured = {name: getattr(calibration, name) for name in _MEASURED}
+    if calibration.verifier:
+        measured["min_similarity"] = calibration.min_inliers
     return OperatingPoint(asked=calibration.precision, **measured)

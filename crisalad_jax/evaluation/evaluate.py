@@ -33,7 +33,7 @@ from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.grouping import DEFAULT_GROUPINGS, MASKED, Batches, Grouping
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, shortened
-from crisalad_jax.retrieval.reranking import Reranker, Reranking
+from crisalad_jax.retrieval.reranking import Reranking
 from crisalad_jax.retrieval.search import search, to_unit_vectors
 from crisalad_jax.utils.errors import InputError
 
@@ -92,7 +92,7 @@ def evaluate(
         InputError: parameters of another configuration, bits of a length that is not a multiple of
             8, no ground truth, an image cannot be read
             or none of a side, components that are not for this model or make no unit vectors, such
-            a precision, or what `Grouping.parse`, `Reranking.check` and `Reranker` raise; a
+            a precision, or what `Grouping.parse`, `Reranking.check` and `Reranking.stage` raise; a
             published grouping whose batches are not known for this set.
 
     Example:
@@ -122,7 +122,7 @@ def evaluate(
         check_packable(length, "dtype")
     if rerank is not None:
         rerank.check(config, len(benchmark.database))
-        if rerank.model is None:
+        if rerank.needs_model and rerank.model is None:
             if not isinstance(model, tuple):
                 raise InputError(
                     "rerank: found with a model in another engine, expected weights of its own "
@@ -144,7 +144,7 @@ def evaluate(
     with contextlib.ExitStack() as stack:
         if rerank is not None:
             stages[rerank.label] = stack.enter_context(
-                Reranker(rerank, benchmark.database, benchmark.queries, reading)
+                rerank.stage(benchmark.database, benchmark.queries, reading)
             )
         k = min(max(*KS, rerank.top if rerank else 0), len(benchmark.database))
         results = []

@@ -176,7 +176,7 @@ def test_no_command_prints_the_usage(capfd):
         ("evaluate --data d --batch-size 0", "batch.size: found 0"),
         ("evaluate --data d --seed -1", "seed: found -1"),
         ("extract --weights w --images d --out f.txt", r"f\.txt: suffix.*\.h5, \.npy"),
-        ("info --verify", "--verify: found without --map"),
+        ("info --checksums", "--checksums: found without --map"),
         ("info --image-size 112 98", "56 patches for 64 clusters"),
         (
             "info --trainable last-13-blocks,head",

@@ -130,7 +130,7 @@ def test_a_map_moved_without_its_weights_and_images_is_told_where_they_are(
 
 
 def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd, weights):
-    said = succeeds(capfd, "info", "--map", folder, "--verify", "--json", tmp_path / "info.json")
+    said = succeeds(capfd, "info", "--map", folder, "--checksums", "--json", tmp_path / "info.json")
     # The town's database: one folder, whose names say where they are.
     places = [image.position for image in Map.open(folder).images]
     east, north = ([min(axis), max(axis)] for axis in zip(*places, strict=True))
@@ -149,7 +149,7 @@ def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd, weights):
     path = folder / "segments" / "0000000000.npy"
     path.write_bytes(path.read_bytes()[:-1] + b"!")
     assert "verified" not in succeeds(capfd, "info", "--map", folder)
-    fails(capfd, "info", "--map", folder, "--verify", words=("descriptors 0 to 6 have changed",))
+    fails(capfd, "info", "--map", folder, "--checksums", words=("descriptors 0 to 6 have changed",))
     both = ("info", "--map", folder, "--batch-size", 4)
     fails(capfd, *both, words=("--batch-size: found with --map",))
 

@@ -124,7 +124,7 @@ def test_a_text_is_cut_after_a_clause_and_keeps_its_default(capfd, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     out = succeeds(capfd, "evaluate", "--help")
     assert "... (single,shuffled,sequential,window/single) --batch-size INT" in out
-    assert "--[no-]verify" in succeeds(capfd, "pca", "--help")
+    assert "--[no-]checksums" in succeeds(capfd, "pca", "--help")
 
 
 # Completion

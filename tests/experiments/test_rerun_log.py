@@ -242,7 +242,10 @@ def test_query_and_evaluate_write_recordings(shared, tmp_path, capfd):
         (("a.jpg", "--rerun", "a.png"), "--rerun: found a.png"),
         (("a.jpg", "--rate", "2"), "--rate: found without --camera, expected both"),
         (("--watch", ".", "--rate", "2"), "--rate: found with --watch, expected only one"),
-        (("a.jpg", "--map-images", "."), "--map-images: found without --gallery or --rerun"),
+        (
+            ("a.jpg", "--map-images", "."),
+            "--map-images: found without --gallery, --rerun or --verify",
+        ),
     ],
 )
 def test_what_query_refuses(given, words, capfd, tmp_path):

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int, UInt8
 from matplotlib.axes import Axes
+from matplotlib.patches import ConnectionPatch
 
 from crisalad_jax.config.checks import takes
 from crisalad_jax.data.benchmarks import Benchmark
@@ -33,6 +34,8 @@ from crisalad_jax.utils.output import counted, warn
 _DPI = 120
 _WIDTH, _GAP = 1.7, 0.26
 """Inches of a picture, and between pictures."""
+_LINES = 40
+"""Largest number of lines between inliers."""
 _BOX = 0xC4
 """Grey of a picture that is not there."""
 _NAME = 28
@@ -53,7 +56,8 @@ def show_retrievals(
     """Draw queries, one a row, with what was found for them, best first.
 
     Results of an evaluation are framed green where right and red where wrong, with a mark for
-    readers who cannot tell these. Answers of a map are framed grey: what is right is unknown.
+    readers who cannot tell these. Answers of a map are framed grey: what is right is unknown. Lines
+    join the inliers of a query and its best answer where answers are verified.
 
     Args:
         found: answers of `query`, or one of the results of `evaluate`.
@@ -164,6 +168,16 @@ class _Tile(NamedTuple):
     colour: str = INK
     """Of the caption, and of the frame where it is right or wrong."""
     name: str = ""
+    joined: tuple[np.ndarray, np.ndarray] | None = None
+    """Pixels of inliers in the query's file and in this one."""
+
+
+class _Shown(NamedTuple):
+    """A picture as it is drawn."""
+
+    pixels: UInt8[np.ndarray, "h w 3"]
+    factor: float
+    """Its pixels in one of the file's."""
 
 
 def _captions(found: Answers | GroupingResult, query: int, columns: int) -> Iterator[tuple]:
@@ -179,10 +193,17 @@ def _answers(
     """Yield the tiles of a query and what a map answers."""
     name = found.names[query] if found.known[query] else f"unknown: {found.names[query]}"
     yield _Tile(found.queries[query], f"query {query}", name=name)
+    checks, is_best = iter(found.checks[query] if found.checks else ()), True
     for index, caption in _captions(found, query, columns):
         image = found.images[index]
         file = Path(image.root if root is None else root) / image.name
-        yield _Tile(file, caption, name=image.name)
+        check = next(checks, None)
+        joined = None
+        if check is not None:
+            caption = f"{caption}   {counted(check.inliers, 'inlier')}"
+            joined = (check.query_points, check.database_points) if is_best else None
+        yield _Tile(file, caption, name=image.name, joined=joined)
+        is_best = False
 
 
 def _results(
@@ -210,13 +231,15 @@ def _draw(rows: Sequence[Sequence[_Tile]], title: str, *, strict: bool) -> Pictu
             if strict:
                 raise
             lost.append(error)
-            images[file] = np.full((round(90 * _WIDTH), round(_DPI * _WIDTH), 3), _BOX, np.uint8)
+            box = np.full((round(90 * _WIDTH), round(_DPI * _WIDTH), 3), _BOX, np.uint8)
+            images[file] = _Shown(box, 1.0)
     if lost:
         warn(
             f"{counted(len(lost), 'picture')} shown as a grey box, as of {lost[0]}; --map-images "
             "(root=) says where else"
         )
-    aspect = float(np.median([image.shape[0] / image.shape[1] for image in images.values()]))
+    shapes = [image.pixels.shape for image in images.values()]
+    aspect = float(np.median([shape[0] / shape[1] for shape in shapes]))
     height = _WIDTH * min(max(aspect, 0.5), 1.5)
     # Frames and captions are drawn between the rows.
     below = 0.6 if any(tile.name for row in rows for tile in row) else 0.44
@@ -229,8 +252,31 @@ def _draw(rows: Sequence[Sequence[_Tile]], title: str, *, strict: bool) -> Pictu
     panels = figure.subplots(len(rows), columns, squeeze=False)
     for row, of_row in zip(rows, panels, strict=True):
         for tile, axes in zip(row, of_row, strict=True):
-            _draw_tile(axes, tile, images[tile.file])
+            _draw_tile(axes, tile, images[tile.file].pixels)
+        if len(row) > 1 and row[1].joined is not None:
+            factors = (images[tile.file].factor for tile in row[:2])
+            points = [p * factor for p, factor in zip(row[1].joined, factors, strict=True)]
+            _join(figure, of_row[:2], points)
     return figure
+
+
+def _join(figure: Picture, panels: Sequence[Axes], points: Sequence[np.ndarray]) -> None:
+    """Draw the inliers of two pictures, and lines between some of them."""
+    for axes, each in zip(panels, points, strict=True):
+        axes.plot(*each.T, ".", color=RIGHT, markersize=2)
+    every = -(-len(points[0]) // _LINES) or 1
+    for ours, theirs in zip(*(each[::every] for each in points), strict=True):
+        figure.add_artist(
+            ConnectionPatch(
+                ours,
+                theirs,
+                coordsA=panels[0].transData,
+                coordsB=panels[1].transData,
+                color=RIGHT,
+                linewidth=0.4,
+                alpha=0.7,
+            )
+        )
 
 
 def _draw_tile(axes: Axes, tile: _Tile, image: UInt8[np.ndarray, "h w 3"]) -> None:
@@ -246,8 +292,10 @@ def _draw_tile(axes: Axes, tile: _Tile, image: UInt8[np.ndarray, "h w 3"]) -> No
         axes.annotate(shortened(tile.name, _NAME), (0, 0), color=GREY, **below, **how)
 
 
-def _read(file: Path) -> UInt8[np.ndarray, "h w 3"]:
-    return thumbnail(read_image(file, bit_depth="contrast-stretch"), round(_DPI * _WIDTH))
+def _read(file: Path) -> _Shown:
+    image = read_image(file, bit_depth="contrast-stretch")
+    small = thumbnail(image, round(_DPI * _WIDTH))
+    return _Shown(small, small.shape[1] / image.shape[1])
 
 
 def shortened(text: str, most: int) -> str:

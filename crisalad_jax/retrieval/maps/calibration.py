@@ -1,4 +1,4 @@
-"""A map's calibration: the similarity from which its answers count, and how it was measured."""
+"""A map's calibration: from which similarity, or how many inliers, its answers count."""
 
 import dataclasses
 import pathlib
@@ -11,11 +11,13 @@ from crisalad_jax.utils.files import read_json
 
 CALIBRATION = "calibration.json"
 """Name of the file, beside the map's description."""
+VERIFIED = "calibration-verified.json"
+"""The same for answers that are verified, which count by their inliers."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """The contents of calibration.json: an operating point, and what it was measured on."""
+    """The contents of either file: an operating point, and what it was measured on."""
 
     min_similarity: float
     """A query to which no image of the map is that similar shows no place of the map."""
@@ -38,6 +40,11 @@ class Calibration:
     model: str
     """The `model_hash` of the map, and so of the descriptors that were compared."""
     created: str = ""
+    min_inliers: int = 0
+    """A query whose best answer has fewer inliers shows no place of the map; of verified answers,
+    whose similarity may then be any."""
+    verifier: str = ""
+    """The matcher that found the inliers; empty where answers were not verified."""
     format: Literal[1] = 1
     """Version of the file."""
 
@@ -46,13 +53,20 @@ class Calibration:
         check_min_similarity(self.min_similarity)
 
 
-def read_calibration(folder: pathlib.Path, model: str) -> Calibration | None:
+def read_calibration(
+    folder: pathlib.Path, model: str, name: str = CALIBRATION
+) -> Calibration | None:
     """Read what the map in `folder` remembers; None where it was never calibrated.
+
+    Args:
+        folder: the map's.
+        model: the map's `model_hash`.
+        name: of the file, `CALIBRATION` or `VERIFIED`.
 
     Raises:
         InputError: the file is damaged, of another format, or of another model than the map's.
     """
-    path = folder / CALIBRATION
+    path = folder / name
     if not path.exists():
         return None
     try:
@@ -77,7 +91,8 @@ def write_calibration(folder: pathlib.Path, calibration: Calibration) -> None:
     Raises:
         InputError: the folder cannot be written to.
     """
-    write_record(folder / CALIBRATION, to_plain(calibration), indent=2)
+    name = VERIFIED if calibration.verifier else CALIBRATION
+    write_record(folder / name, to_plain(calibration), indent=2)
 
 
 def check_min_similarity(value: float) -> None:

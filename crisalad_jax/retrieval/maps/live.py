@@ -16,12 +16,15 @@ from crisalad_jax.retrieval.maps.map import Answer, Map
 from crisalad_jax.retrieval.maps.query import (
     Answers,
     answers_of,
-    asked_similarity,
+    asked_thresholds,
     asking,
+    found_at_least,
     json_rows,
     json_text,
+    verified,
 )
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch
+from crisalad_jax.retrieval.verification.verify import Verifier, Verify
 from crisalad_jax.utils.output import counted
 
 if TYPE_CHECKING:  # answers are searched without JAX
@@ -71,6 +74,7 @@ def query_live(
     window: int = 1,
     min_similarity: float | None = None,
     sequence: SequenceSearch | None = None,
+    verify: Verify | None = None,
     ready: Callable[[], None] = lambda: None,
     check: Callable[[], None] = lambda: None,
 ) -> Iterator[LiveAnswer]:
@@ -87,6 +91,7 @@ def query_live(
             describes each alone, as a map's images are.
         min_similarity: see `query`.
         sequence: see `query`; frames that were passed over count for nothing.
+        verify: see `query`.
         ready: called when the first frame can be answered.
         check: called several times a second; it may raise, to end this.
 
@@ -116,10 +121,11 @@ def query_live(
         ['2.png']
     """
     check_count("k", k)
-    least = asked_similarity(places, min_similarity)
+    verifier = None if verify is None else Verifier(verify)
+    thresholds = asked_thresholds(places, min_similarity, verifier)
     model_describer = places.describer(model, groupings=["single" if window == 1 else "window"])
     describer = FrameDescriber(model_describer, window)
-    ask = asking(places, k, sequence)
+    ask = asking(places, found_at_least(k, verifier), sequence)
 
     def answers() -> Iterator[LiveAnswer]:
         blank = np.zeros((*(source.size or places.config.image_size), 3), np.uint8)
@@ -129,7 +135,9 @@ def query_live(
         for frame in source.frames(check):
             asked = [pathlib.Path(frame.name)]
             found = ask(places.shorten(describer(frame.image)), asked)
-            answer = answers_of(places, asked, [found], least)
+            answer = answers_of(places, asked, [found], thresholds)
+            if verifier is not None:
+                answer = verified(answer, verifier, [frame.image], k)
             latency = time.perf_counter() - frame.taken
             yield LiveAnswer(answer, frame, 1000 * latency)
 

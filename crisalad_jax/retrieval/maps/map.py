@@ -55,6 +55,7 @@ from crisalad_jax.retrieval.maps.store import open_store
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import Pca, save_pca
 from crisalad_jax.retrieval.segments import Segments, write_record
+from crisalad_jax.retrieval.verification.results import Verification
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.output import warn
@@ -90,6 +91,8 @@ class Answer(NamedTuple):
     """The image: its name, and where it was taken."""
     probability: float | None = None
     """Probability that the camera is there; None without a filter."""
+    verification: Verification | None = None
+    """What local features show; None where the answer was not verified."""
 
 
 def ranked(

@@ -4,7 +4,7 @@ import itertools
 import json
 import os
 import pathlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count, takes
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.frames import frame_time
+from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import ImageSource, open_sources
@@ -25,13 +26,19 @@ from crisalad_jax.retrieval.describe import (
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage, ranked
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch, SequenceTracker, TrackResult
+from crisalad_jax.retrieval.maps.verified import calibration_of, verify_answers
 from crisalad_jax.retrieval.neighbours import Neighbours
+from crisalad_jax.retrieval.verification.results import MapPose, Verification
+from crisalad_jax.retrieval.verification.verify import Verifier, Verify
 from crisalad_jax.utils.files import atomic_path
+from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.shapes import Bool, Float32, Float64
 
 if TYPE_CHECKING:  # answers are searched without JAX
     from crisalad_jax.nn.model import Model
 
+Thresholds = tuple[float | None, int | None]
+"""The similarity and the inliers that best answers must have; None where any counts."""
 AT_ONCE = 1024
 """Number of queries that are searched for together: the map is read once for so many."""
 
@@ -62,6 +69,18 @@ class Answers(NamedTuple):
     root: pathlib.Path | None = None
     """Folder that names of queries are relative to: of their source or, of several, the one that
     holds all; None where names are whole paths."""
+    checks: Sequence[Sequence[Verification]] | None = None
+    """Verifications of the first answers to each query, in the order of `neighbours`; None where
+    answers were not verified."""
+    poses: Sequence[MapPose | None] | None = None
+    """Where the camera of each query was, where verified answers say so; None as `checks`."""
+    min_inliers: int | None = None
+    """The inliers that a verified best answer must have; None where any number counts."""
+
+    @property
+    def is_thresholded(self) -> bool:
+        """Whether answers must be similar enough, or have enough inliers, to count."""
+        return (self.min_similarity, self.min_inliers) != (None, None)
 
     @property
     def names(self) -> list[str]:
@@ -72,10 +91,16 @@ class Answers(NamedTuple):
 
     @property
     def known(self) -> Bool[np.ndarray, " query"]:
-        """Whether each query shows a place of the map: the most similar image is similar enough."""
+        """Whether each query shows a place of the map.
+
+        The most similar image is similar enough, and a verified best answer has enough inliers.
+        """
         best = self.neighbours.similarities[:, 0] if self.best is None else self.best
         least = -np.inf if self.min_similarity is None else self.min_similarity
-        return best.astype(np.float64) >= least  # float32 would round the least similarity
+        known = best.astype(np.float64) >= least  # float32 would round the least similarity
+        if self.min_inliers is not None and self.checks is not None:
+            known &= [first.inliers >= self.min_inliers for first, *_ in self.checks]
+        return known
 
     def rows(self) -> Iterator[tuple[pathlib.Path, list[Answer]]]:
         """Yield each query with its answers, best first."""
@@ -85,6 +110,9 @@ class Answers(NamedTuple):
             if chances is not None:
                 pairs = zip(answers, chances[number], strict=True)
                 answers = [answer._replace(probability=float(chance)) for answer, chance in pairs]
+            if self.checks is not None:
+                pairs = itertools.zip_longest(answers, self.checks[number])
+                answers = [answer._replace(verification=check) for answer, check in pairs]
             yield query, answers
 
     def position(self, image: MapImage) -> dict[str, float] | None:
@@ -105,6 +133,7 @@ def query(
     exact: bool = False,
     min_similarity: float | None = None,
     sequence: SequenceSearch | None = None,
+    verify: Verify | None = None,
     reading: Reading = Reading(),
 ) -> Answers:
     """Find the images of a map that are most similar to others.
@@ -125,6 +154,8 @@ def query(
             `Answers.known`. None is what `calibrate` measured, and any where it did not; -1 is any.
         sequence: a filter over the map's images in their order, where queries are consecutive
             frames of one camera; None takes every query for itself.
+        verify: how the best answers are verified by local features, and put in order by their
+            inliers (docs/verification.md); None leaves them by similarity.
         reading: how images are read.
 
     Returns:
@@ -132,7 +163,7 @@ def query(
 
     Raises:
         InputError: another model; no image, one that cannot be read, or none that can; a number
-            out of range; or what `Map.search` raises.
+            out of range; or what `Map.search` and `Verifier.check` raise.
 
     Example:
         >>> import jax
@@ -149,12 +180,13 @@ def query(
         ['2.png']
     """
     check_count("k", k)
-    least = asked_similarity(places, min_similarity)
+    verifier = None if verify is None else Verifier(verify)
+    thresholds = asked_thresholds(places, min_similarity, verifier)
     how = {"fps": fps, "topic": topic, "on_bad_image": reading.on_bad_image}
     root, sources = _below_one_root(open_sources(images, **how, position_topic=""))
     paths = list(itertools.chain(*sources))
     describer = places.describer(model, groupings=["single" if window == 1 else "window"])
-    ask = asking(places, k, sequence, exact=exact)
+    ask = asking(places, found_at_least(k, verifier), sequence, exact=exact)
     reading, components = reading.fitted(len(paths)), places.components
     stream = described_sources(describer, sources, reading, window=window, components=components)
     found: list[Sequence[np.ndarray]] = []
@@ -167,7 +199,17 @@ def query(
             found.append(ask(part.descriptors, frames))
             asked += frames
     check_readable("images", len(paths), len(asked))
-    return answers_of(places, asked, found, least, unreadable=unreadable, root=root)
+    answers = answers_of(places, asked, found, thresholds, unreadable=unreadable, root=root)
+    if verifier is None:
+        return answers
+    with progress_bar("verified", len(asked), "queries", quiet=reading.quiet) as bar:
+        return verified(answers, verifier, _read_each(asked, bar), k)
+
+
+def _read_each(paths: Sequence[pathlib.Path], bar: Bar) -> Iterator[np.ndarray]:
+    for path in paths:
+        yield read_pixels(path)
+        bar.advance(1)
 
 
 Ask = Callable[[Float32[np.ndarray, "query d"], Sequence[pathlib.Path]], Neighbours | TrackResult]
@@ -186,7 +228,7 @@ def answers_of(
     places: Map,
     asked: list[pathlib.Path],
     found: Sequence[Sequence[np.ndarray]],
-    least: float | None,
+    thresholds: Thresholds,
     *,
     unreadable: Sequence[pathlib.Path] = (),
     root: pathlib.Path | None = None,
@@ -194,24 +236,78 @@ def answers_of(
     """Join what `asking` found, part by part."""
     indices, similarities, *filtered = map(np.concatenate, zip(*found, strict=True))
     neighbours = Neighbours(indices, similarities)
+    least, inliers = thresholds
     given = (places.images, places.axes, unreadable, least)
-    return Answers(asked, neighbours, *given, *filtered, zone=places.zone, root=root)
+    answers = Answers(asked, neighbours, *given, *filtered, zone=places.zone, root=root)
+    return answers._replace(min_inliers=inliers)
 
 
-def asked_similarity(places: Map, min_similarity: float | None) -> float | None:
-    """Return the similarity that best answers must have; None where any counts.
+def found_at_least(k: int, verifier: Verifier | None) -> int:
+    """Return how many answers are searched for, of which k are left."""
+    return k if verifier is None else max(k, verifier.verify.answers)
+
+
+def verified(answers: Answers, verifier: Verifier, images: Iterable[np.ndarray], k: int) -> Answers:
+    """Verify answers, put the verified ones in order by their inliers, and leave k of each query.
 
     Args:
-        places: the map, which may remember one.
-        min_similarity: as of `query`.
+        answers: as many as `found_at_least` says.
+        verifier: what verifies.
+        images: the queries.
+        k: answers to each query that are left.
 
     Raises:
-        InputError: it is no cosine.
+        InputError: what `Verifier.check` raises.
     """
-    if min_similarity is None:
-        return None if places.calibration is None else places.calibration.min_similarity
-    check_min_similarity(min_similarity)
-    return min_similarity if min_similarity > -1 else None
+    indices, similarities = answers.neighbours
+    rows = np.tile(np.arange(indices.shape[1]), (len(indices), 1))
+    first, checks, poses = verifier.verify.answers, [], []
+    for number, image in enumerate(images):
+        found = [answers.images[i] for i in indices[number, :first]]
+        order, checked, pose = verify_answers(
+            verifier, image, found, similarities[number, :first], answers.axes
+        )
+        rows[number, : len(order)] = order
+        checks.append(checked[:k])
+        poses.append(pose)
+
+    def ordered(column: np.ndarray) -> Any:
+        return np.take_along_axis(column, rows[:, :k], axis=1)
+
+    chances = answers.probabilities
+    return answers._replace(
+        neighbours=Neighbours(ordered(indices), ordered(similarities)),
+        probabilities=None if chances is None else ordered(chances),
+        best=similarities[:, 0] if answers.best is None else answers.best,
+        checks=checks,
+        poses=poses,
+    )
+
+
+def asked_thresholds(
+    places: Map, min_similarity: float | None, verifier: Verifier | None
+) -> Thresholds:
+    """Return the similarity and the inliers that best answers must have; None where any counts.
+
+    Args:
+        places: the map, which may remember them.
+        min_similarity: as of `query`.
+        verifier: what verifies answers, which may say the inliers; None is nothing.
+
+    Raises:
+        InputError: the similarity is no cosine; what `calibration_of` raises.
+    """
+    inliers = None if verifier is None else verifier.verify.min_inliers
+    if min_similarity is None or (verifier is not None and inliers is None):
+        measured = calibration_of(places, verifier)
+        if measured is not None and inliers is None and verifier is not None:
+            inliers = measured.min_inliers
+        if measured is not None and min_similarity is None:
+            min_similarity = measured.min_similarity
+    if min_similarity is not None:
+        check_min_similarity(min_similarity)
+        min_similarity = min_similarity if min_similarity > -1 else None
+    return min_similarity, inliers or None
 
 
 def _below_one_root(
@@ -245,13 +341,17 @@ def position_fields(image: MapImage, axes: tuple[str, str] | None) -> dict[str, 
 
 def answer_fields(answer: Answer, axes: tuple[str, str] | None) -> dict[str, Any]:
     """Return an answer's rank, name, similarity and position, as JSON has them."""
-    probable = {} if answer.probability is None else {"probability": round(answer.probability, 6)}
+    more: dict[str, Any] = {}
+    if answer.probability is not None:
+        more["probability"] = round(answer.probability, 6)
+    if answer.verification is not None:
+        more["verified"] = answer.verification.fields()
     return {
         "rank": answer.rank,
         "name": answer.image.name,
         "similarity": round(answer.similarity, 6),
         "position": position_fields(answer.image, axes),
-        **probable,
+        **more,
     }
 
 
@@ -270,13 +370,17 @@ def json_lines(answers: Answers) -> Iterator[str]:
 def json_rows(answers: Answers) -> Iterator[dict[str, Any]]:
     """Yield what `json_lines` writes of each query."""
     zone = {} if answers.zone is None else {"zone": str(answers.zone)}
-    columns = answers.names, answers.known, answers.rows()
-    for name, known, (path, found) in zip(*columns, strict=True):
+    poses = answers.poses or [None] * len(answers.queries)
+    columns = answers.names, answers.known, poses, answers.rows()
+    for name, known, pose, (path, found) in zip(*columns, strict=True):
         neighbours = [
             answer_fields(answer, answers.axes) | _time(answer.image.name) for answer in found
         ]
         row = {"query": name, **_time(path), **zone, "neighbours": neighbours}
-        yield row if answers.min_similarity is None else row | {"known": bool(known)}
+        if pose is not None:
+            at = dict(zip(answers.axes or (), pose.position, strict=True))
+            row["pose"] = {"position": at, "heading": round(pose.heading, 2)}
+        yield row | {"known": bool(known)} if answers.is_thresholded else row
 
 
 def _time(name: str | os.PathLike[str]) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import os
 import pathlib
 import re
 import shutil
@@ -19,6 +20,8 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, cast_params
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.reranking import divergence, fol, matching, pair_vpr, patch_netvlad
+from crisalad_jax.retrieval.reranking.local import LocalReranker
+from crisalad_jax.retrieval.verification.verify import Verifier, Verify
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.progress import Bar, progress_bar
@@ -57,8 +60,9 @@ _PATCH_NETVLAD = Method(
     _by_features(patch_netvlad.spatial_scores),
     patch_netvlad.standardised_sum,
 )
-_METHODS: Mapping[str, Method] = {
+_METHODS: Mapping[str, Method | None] = {
     "fol": Method("fol", fol.shape, fol.describe, _by_features(fol.count_matches)),
+    "local": None,
     "pair-vpr": Method("pair-vpr", matching.patch_shape, pair_vpr.describe, pair_vpr.scores),
     "patch-netvlad": _PATCH_NETVLAD,
     "patch-netvlad-ransac": dataclasses.replace(
@@ -90,7 +94,7 @@ _METHODS: Mapping[str, Method] = {
     ),
 }
 RERANKERS = tuple(_METHODS)
-"""Names of the second stages."""
+"""Names of the second stages. A method that is None compares local features of no model."""
 _AT_ONCE = 16
 """Largest number of candidates of a query that are scored together."""
 _NUMBERS = 2**25
@@ -110,11 +114,13 @@ class Reranking:
     name: str
     """patch-netvlad, patch-netvlad-ransac or patch-netvlad-sum, by a model with NetVLAD; fol,
     pair-vpr, selavpr or transvpr, by one with that aggregator; selavprpp, by one with
-    selavprpp-hash; sinkhorn-divergence, by one with local tokens."""
+    selavprpp-hash; sinkhorn-divergence, by one with local tokens; local, by SIFT or `matcher`."""
     top: int
     """Number of a query's first retrievals that are re-ranked; the later ones keep their places."""
     model: Model | None = None
     """The model that makes local features; None uses the first stage's."""
+    matcher: str | os.PathLike[str] | None = None
+    """For local, the ONNX file of `Verify.matcher`; None is SIFT."""
 
     def __post_init__(self) -> None:
         """Check the name and the number."""
@@ -129,6 +135,11 @@ class Reranking:
         """Name and number in the form that `parse_reranking` reads."""
         return f"{self.name}:{self.top}"
 
+    @property
+    def needs_model(self) -> bool:
+        """Whether a model makes the local features."""
+        return _METHODS[self.name] is not None
+
     def check(self, config: ModelConfig, database: int | None = None) -> None:
         """Check that this re-ranking fits a first stage of `config`.
 
@@ -138,19 +149,36 @@ class Reranking:
         """
         method, own = _METHODS[self.name], config if self.model is None else self.model.config
         found = own.aggregator.part_name, own.preprocessing.size_rule
-        wanted = method.aggregator or found[0], "fixed"
-        if found != wanted:
+        wanted = (method and method.aggregator) or found[0], "fixed"
+        if method is not None and found != wanted:
             raise InputError(
                 f"rerank: found a model with aggregator {found[0]} and size rule {found[1]}, "
                 f"expected {wanted[0]} and fixed, whose local features {self.name} "
                 "compares (--rerank-weights takes another model than the first stage's)"
             )
-        method.shape(own)
+        if method is not None:
+            method.shape(own)
         if database is not None and self.top > database:
             raise InputError(
                 f"rerank: found {self.label} over a database of {database} images, expected at "
                 f"most {database}"
             )
+
+    def stage(
+        self,
+        database: Sequence[pathlib.Path],
+        queries: Sequence[pathlib.Path],
+        reading: Reading = Reading(),
+    ) -> "Reranker | LocalReranker":
+        """Make the second stage over some images, which is entered before use.
+
+        Raises:
+            InputError: what `check` and `open_matcher` raise.
+        """
+        if self.needs_model:
+            return Reranker(self, database, queries, reading)
+        verifier = Verifier(Verify(answers=self.top, matcher=self.matcher))
+        return LocalReranker(verifier, database, queries, reading)
 
 
 def parse_reranking(text: str) -> Reranking:
@@ -196,13 +224,18 @@ class Reranker:
         """Prepare the second stage, of a re-ranking with a model; enter it before use.
 
         Raises:
-            InputError: what `Reranking.check` raises.
+            InputError: no model, or what `Reranking.check` raises.
         """
-        assert reranking.model is not None
+        method = _METHODS[reranking.name]
+        if method is None or reranking.model is None:
+            raise InputError(
+                f"rerank: found {reranking.label} without a model, expected one whose features are "
+                "compared, or `Reranking.stage`"
+            )
         params, self._config = reranking.model
         reranking.check(self._config, len(database))
         self._top, self._label = reranking.top, reranking.name
-        self._method, self._reading = _METHODS[reranking.name], reading
+        self._method, self._reading = method, reading
         self._devices = devices_for(reading.batch_size)
         self._params = self._devices.replicate(cast_params(params, self._config))
         self._scores: dict[tuple[int, int], float | list[float]] = {}

@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import hashlib
 import io
+import itertools
 import math
 import os
 import pathlib
@@ -20,6 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any
 
 import fastapi
+import numpy as np
 import pydantic
 from fastapi import Query
 from fastapi.exceptions import RequestValidationError
@@ -36,8 +38,9 @@ from crisalad_jax.data.positions import AXES, MOST_METRES, Positions, exif_posit
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.data.tables import number_of
 from crisalad_jax.retrieval.describe import prepare_image
-from crisalad_jax.retrieval.maps.map import Answer
-from crisalad_jax.retrieval.maps.query import answer_fields, position_fields
+from crisalad_jax.retrieval.maps.map import Answer, Map
+from crisalad_jax.retrieval.maps.query import answer_fields, asked_thresholds, position_fields
+from crisalad_jax.retrieval.maps.verified import verify_answers
 from crisalad_jax.retrieval.serve.pictures import (
     check_new_name,
     check_picture,
@@ -51,6 +54,8 @@ from crisalad_jax.retrieval.serve.worker import (
     NameTakenError,
     Question,
 )
+from crisalad_jax.retrieval.verification.results import Verification
+from crisalad_jax.retrieval.verification.verify import Verifier, Verify
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.output import one_line, printable
@@ -98,6 +103,16 @@ HEADERS = {
 
 
 @dataclasses.dataclass(frozen=True)
+class Verified:
+    """What local features show of the picture and an answer."""
+
+    inliers: int
+    matches: int
+    confidence: float
+    """From 0 to 1; at 1 both are views of one scene."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Neighbour:
     """An image of the map."""
 
@@ -110,6 +125,8 @@ class Neighbour:
     """east and north, or x and y, in metres, or lat and lon in degrees."""
     number: int
     """Its picture is at /images/{number}."""
+    verified: Verified | None = None
+    """Of the first answers, where the service verifies them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,6 +197,8 @@ class _NoParameters(pydantic.BaseModel, extra="forbid"):
 class _Asked(pydantic.BaseModel, extra="forbid"):
     k: int | None = pydantic.Field(None, ge=1, le=MOST_ANSWERS)
     """Number of answers; by default the service's, see /map."""
+    verify: int | None = pydantic.Field(None, ge=0, le=MOST_ANSWERS)
+    """Number of best answers that are verified; by default the service's, of --rerank."""
 
 
 def _plain(text: str) -> str:
@@ -247,6 +266,7 @@ def make_app(
     max_bytes: int = 20 * 2**20,
     max_pixels: int = MOST_PIXELS,
     most_waiting: int = 128,
+    rerank: Verify | None = None,
 ) -> ASGIApp:
     """Make the application that answers for a map.
 
@@ -260,6 +280,7 @@ def make_app(
         max_bytes: largest body of a request.
         max_pixels: most pixels of a picture that a request brings.
         most_waiting: number of requests with a picture at once; more are told to come again.
+        rerank: how the best answers are verified; None does not.
 
     Returns:
         An ASGI application.
@@ -268,6 +289,10 @@ def make_app(
     cores = usable_cores()
     lanes = [(most, ThreadPoolExecutor(min(cores, count), "decode")) for most, count in _LANES]
     shown = ThreadPoolExecutor(min(cores, 2), "thumbnails")
+    checking = ThreadPoolExecutor(1, "verify")
+    verifier = None if rerank is None else Verifier(rerank)
+    plain = asked_thresholds(places, None, None)
+    strict = asked_thresholds(places, None, verifier)
     thumbnail = functools.lru_cache(_THUMBNAILS)(read_thumbnail)
     waiting = asyncio.Semaphore(most_waiting)
 
@@ -364,17 +389,34 @@ def make_app(
         data, name = await receive_picture(request, max_bytes)
         async with _room(waiting):
             start = time.perf_counter()
-            question = Question(await prepare(data, name), asked.k or k)
+            answers, count = asked.k or k, 0 if rerank is None else rerank.answers
+            if asked.verify is not None:
+                count = asked.verify
+                if count and verifier is None:
+                    raise InputError("verify: found in a service without --rerank, expected none")
+            question = Question(await prepare(data, name), max(answers, count))
             found = await asyncio.wrap_future(worker.submit(question))
+            best, checks = found[0][1], []
+            if verifier is not None and count:
+                loop = asyncio.get_running_loop()
+                found, checks = await loop.run_in_executor(
+                    checking, _verified, verifier, decode_image(data, name), places, found, count
+                )
+        pairs = itertools.zip_longest(found[:answers], checks[:answers])
         neighbours = [
             Neighbour(
                 **answer_fields(Answer(rank, similarity, places.images[number]), places.axes),
                 number=number,
+                verified=check and Verified(check.inliers, check.matches, check.confidence),
             )
-            for rank, (number, similarity) in enumerate(found, 1)
+            for rank, ((number, similarity), check) in enumerate(pairs, 1)
         ]
-        measured = places.calibration
-        known = None if measured is None else found[0][1] >= measured.min_similarity
+        least, inliers = strict if checks else plain
+        known = None
+        if (least, inliers) != (None, None):
+            known = (least is None or best >= least) and (
+                inliers is None or checks[0].inliers >= inliers
+            )
         return Located(neighbours, known, _milliseconds(start))
 
     @guarded.post("/images", status_code=201, openapi_extra=_BODY)
@@ -409,6 +451,21 @@ def make_app(
 
     app.include_router(guarded)
     return answer
+
+
+def _verified(
+    verifier: Verifier, image: Any, places: Map, found: list[tuple[int, float]], count: int
+) -> tuple[list[tuple[int, float]], list[Verification]]:
+    """Verify the first answers, and put them in order."""
+    first = found[:count]
+    images, similarities = [places.images[number] for number, _ in first], [s for _, s in first]
+    try:
+        order, checks, _ = verify_answers(
+            verifier, image, images, np.array(similarities, np.float32), places.axes
+        )
+    except InputError as error:  # of the map's files, of which clients learn nothing
+        raise MapFailedError(str(error)) from error
+    return [*(first[i] for i in order), *found[count:]], checks
 
 
 def _check_parameters(request: Request) -> None:

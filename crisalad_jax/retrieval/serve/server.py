@@ -27,6 +27,7 @@ from crisalad_jax.retrieval.serve.app import (
     make_app,
 )
 from crisalad_jax.retrieval.serve.worker import MapWorker
+from crisalad_jax.retrieval.verification.verify import Verify
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import most_files
 from crisalad_jax.utils.output import warn
@@ -56,6 +57,7 @@ def serve_map(
     max_bytes: int = 20 * 2**20,
     max_pixels: int = MOST_PIXELS,
     batch_size: int = 16,
+    rerank: Verify | None = None,
     verify: bool = True,
     quiet: bool = False,
     ready: Callable[[str], object] = lambda _: None,
@@ -76,6 +78,7 @@ def serve_map(
         max_bytes: largest body of a request.
         max_pixels: most pixels of a picture that a request brings.
         batch_size: largest number of pictures described together, each as if it were alone.
+        rerank: how the best answers are verified by local features; None does not.
         verify: whether to compare the map's descriptors with their checksums.
         quiet: whether to show no progress bar.
         ready: called with the service's address once it answers.
@@ -118,6 +121,7 @@ def serve_map(
             k=k,
             max_bytes=max_bytes,
             max_pixels=max_pixels,
+            rerank=rerank,
         )
         address = f"http://{bracketed(host)}:{listener.getsockname()[1]}"
         Server(app, stop, lambda: ready(address)).run([listener])

@@ -1,0 +1,93 @@
+"""Verification of the answers of a map: their order by inliers, and the camera's place."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from crisalad_jax.data.metres import Zone
+from crisalad_jax.data.positions import AXES
+from crisalad_jax.retrieval.maps.calibration import VERIFIED, Calibration, read_calibration
+from crisalad_jax.retrieval.maps.map import Map, MapImage
+from crisalad_jax.retrieval.verification.results import MapPose, Verification
+from crisalad_jax.retrieval.verification.verify import Verifier, order_by_inliers
+from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.shapes import Float32, Float64, Int64
+
+
+class VerifiedAnswers(NamedTuple):
+    """The verified answers to one query."""
+
+    order: Int64[np.ndarray, " n"]
+    """Their numbers, as `order_by_inliers` has them."""
+    checks: list[Verification]
+    """In that order."""
+    pose: MapPose | None
+    """Where the query's camera was, as far as two answers say so."""
+
+
+def verify_answers(
+    verifier: Verifier,
+    image: np.ndarray,
+    found: Sequence[MapImage],
+    similarities: Float32[np.ndarray, " n"],
+    axes: tuple[str, str] | None,
+) -> VerifiedAnswers:
+    """Verify answers to a query, put them in order, and compute where its camera was.
+
+    Args:
+        verifier: what verifies.
+        image: the query.
+        found: the answers, best first.
+        similarities: theirs.
+        axes: of their positions; None where there are none.
+
+    Raises:
+        InputError: what `Verifier.check` raises.
+    """
+    names = [(each.root, each.name) for each in found]
+    checks = verifier.check(image, names)
+    inliers = [check.inliers for check in checks]
+    order = order_by_inliers(similarities, inliers)
+    checks, names, found = ([each[i] for i in order] for each in (checks, names, found))
+    known = [each.position for each in found if each.position is not None]
+    zone = None
+    if axes == AXES[1] and known:
+        latitude, longitude = known[0]
+        zone = Zone(int((longitude + 180) // 6) % 60 + 1, latitude < 0)
+    positions = [each.position and _metres(each.position, zone) for each in found]
+    located = verifier.locate(checks, names, positions, image.shape[:2])
+    if located is None:
+        return VerifiedAnswers(order, checks, None)
+    pose, number, translation = located
+    checks[number] = checks[number]._replace(translation=translation)
+    if zone is not None:
+        latitude, longitude = np.concatenate(zone.to_degrees(*np.array([pose.position]).T))
+        pose = pose._replace(position=(float(latitude), float(longitude)))
+    return VerifiedAnswers(order, checks, pose)
+
+
+def _metres(position: tuple[float, float], zone: Zone | None) -> Float64[np.ndarray, " 2"]:
+    """Return a position in metres; None is in metres already."""
+    given = np.array([position])
+    return given[0] if zone is None else np.concatenate(zone.to_metres(*given.T))
+
+
+def calibration_of(places: Map, verifier: Verifier | None) -> Calibration | None:
+    """Return what a map remembers of verified answers or, without that, of similarities.
+
+    A calibration by another matcher is not used, and a note says so.
+
+    Raises:
+        InputError: the file is damaged, or of another model.
+    """
+    if verifier is None:
+        return places.calibration
+    found = read_calibration(places.folder, places.metadata.model, VERIFIED)
+    if found is not None and found.verifier != verifier.name:
+        warn(
+            f"{places.folder / VERIFIED}: found inliers of {found.verifier}, and answers verified "
+            f"by {verifier.name}: it is not used; `crisalad calibrate --verify` measures it again"
+        )
+        return places.calibration
+    return found or places.calibration

@@ -1,0 +1,165 @@
+"""Intrinsics of a camera: from pixels to directions."""
+
+import dataclasses
+import math
+import os
+import pathlib
+from collections.abc import Mapping
+from typing import Any, Self
+
+import cv2
+import numpy as np
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.extras import missing_extra
+from crisalad_jax.utils.files import read_text
+from crisalad_jax.utils.shapes import Float64
+
+_MODELS = ("", "plumb_bob", "rational_polynomial", "radtan")
+"""Distortion models that OpenCV's coefficients describe; "" is none."""
+_EXPECTED = (
+    "fx,fy,cx,cy in pixels, with ,width,height if wanted, or a file .yaml or .json: ROS's "
+    "camera_info, or fx, fy, cx, cy, width and height by name"
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera, with its lens distortion and the size of its images if these are known.
+
+    Images of another size are taken as scaled if they have the same aspect.
+
+    Example:
+        >>> Intrinsics.parse("400,400,320,240,640,480").width
+        640
+    """
+
+    fx: float
+    """Focal lengths, and the principal point, in pixels."""
+    fy: float
+    cx: float
+    cy: float
+    width: int | None = None
+    height: int | None = None
+    distortion: tuple[float, ...] = ()
+    """OpenCV's k1, k2, p1, p2, k3, ...: ROS's plumb_bob and rational_polynomial."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        sized = (self.width is None) == (self.height is None)
+        require(
+            all(map(math.isfinite, numbers))
+            and min(self.fx, self.fy) > 0
+            and sized
+            and (self.width is None or min(self.width, self.height or 0) > 0)
+            and len(self.distortion) in (0, 4, 5, 8, 12, 14),
+            f"intrinsics: found {self}, expected focal lengths above 0, a width and a height or "
+            "neither, and 0, 4, 5, 8, 12 or 14 coefficients of distortion",
+        )
+
+    @classmethod
+    def parse(cls, text: str | os.PathLike[str]) -> Self:
+        """Read intrinsics from fx,fy,cx,cy or fx,fy,cx,cy,width,height, or from a camera's file.
+
+        Args:
+            text: these numbers, or a YAML or JSON file: ROS's camera_info (of camera_calibration,
+                or printed by `ros2 topic echo --once`), or the numbers by name.
+
+        Raises:
+            InputError: it is neither.
+        """
+        parts = os.fspath(text).split(",")
+        if len(parts) in (4, 6):
+            try:
+                numbers = [float(part) for part in parts]
+                return cls(*numbers[:4], *map(int, numbers[4:]))  # pyright: ignore
+            except (ValueError, OverflowError) as error:
+                if isinstance(error, InputError):
+                    raise
+        path = pathlib.Path(text)
+        if not path.suffix:
+            raise InputError(f"intrinsics: found {os.fspath(text)!r}, expected {_EXPECTED}")
+        content = read_text(path, f"intrinsics, {_EXPECTED}")
+        try:
+            import yaml
+        except ModuleNotFoundError as error:
+            raise InputError(missing_extra(error, f"{path}")) from error
+        try:
+            return cls(**_fields(next(yaml.safe_load_all(content))))
+        except (yaml.YAMLError, LookupError, TypeError, ValueError, StopIteration) as error:
+            reason = " ".join(str(error).split())
+            raise InputError(f"{path}: found no intrinsics ({reason}), expected {_EXPECTED}") from (
+                error
+            )
+
+    def directions(
+        self, points: Float64[np.ndarray, "n 2"], size: tuple[int, int], name: str
+    ) -> Float64[np.ndarray, "n 2"]:
+        """Turn pixels of an image into x / z and y / z in the camera's axes, undistorted.
+
+        Args:
+            points: x and y in pixels of the image.
+            size: the image's height and width.
+            name: the image's, for messages.
+
+        Raises:
+            InputError: the camera's images have another aspect, or its principal point is not in
+                the image.
+        """
+        height, width = size
+        factor = 1.0 if self.width is None else width / self.width
+        if self.height is None:
+            fits, own = 0 < self.cx < width and 0 < self.cy < height, ""
+        else:
+            # Rounding a scaled side changes it by less than a pixel.
+            fits = abs(height - factor * self.height) < 1
+            own = f"of {self.width} x {self.height} "
+        require(
+            fits,
+            f"intrinsics: found a camera {own}with its centre at ({self.cx:g}, {self.cy:g}), and "
+            f"{name} of {width} x {height}, expected the camera's size or its aspect",
+        )
+        matrix = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+        if not len(points):
+            return np.zeros((0, 2))
+        own_points = (points + 0.5) / factor - 0.5
+        coefficients = np.array(self.distortion)
+        return cv2.undistortPoints(own_points[:, None], matrix, coefficients)[:, 0]
+
+    def focal(self, width: int) -> float:
+        """Return the mean focal length in pixels of an image of this width."""
+        return (self.fx + self.fy) / 2 * (1.0 if self.width is None else width / self.width)
+
+
+def _fields(content: Any) -> dict[str, Any]:
+    """Read the fields of `Intrinsics` from what a file says, by ROS's names or ours."""
+    if not isinstance(content, Mapping):
+        raise TypeError(f"{type(content).__name__} in place of names and numbers")
+    model = content.get("distortion_model", "")
+    if model not in _MODELS:
+        raise ValueError(f"distortion model {model}")
+    matrix = _data(content, "camera_matrix", "k", "K")
+    names = ("fx", "fy", "cx", "cy")
+    numbers = (
+        [content[name] for name in names] if matrix is None else np.array(matrix)[[0, 4, 2, 5]]
+    )
+    sizes = {
+        name: int(content[each])
+        for name in ("width", "height")
+        for each in (name, f"image_{name}")
+        if each in content
+    }
+    distortion = tuple(map(float, _data(content, "distortion_coefficients", "d", "D") or ()))
+    return {
+        **dict(zip(names, map(float, numbers), strict=True)),
+        **sizes,
+        "distortion": distortion if any(distortion) else (),
+    }
+
+
+def _data(content: Mapping[str, Any], *names: str) -> Any:
+    """Return the numbers under the first of some names that is there; None without any."""
+    found = next((content[name] for name in names if name in content), None)
+    return found["data"] if isinstance(found, Mapping) else found

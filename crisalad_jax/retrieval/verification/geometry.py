@@ -1,0 +1,148 @@
+"""Two-view geometry of matched points: inliers, relative pose, pose from depth, and on a map.
+
+Directions of points are x / z and y / z in the axes of their camera, as `Intrinsics.directions`
+returns them. A pose (rotation, translation) turns the first camera's coordinates to the second's.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from crisalad_jax.retrieval.verification.results import MapPose
+from crisalad_jax.utils.shapes import Bool, Float64, Int64
+
+Points = Float64[np.ndarray, "n 2"]
+LEAST = 8
+"""Fewest matches that an epipolar geometry, and fewest inliers that a pose, is computed from."""
+_SURE, _TRIALS = 0.9999, 10_000
+"""Probability of a sample without outliers at which RANSAC ends, and its most samples."""
+
+
+class Pose(NamedTuple):
+    """A rotation, and a translation of length 1 or in metres."""
+
+    rotation: Float64[np.ndarray, "3 3"]
+    translation: Float64[np.ndarray, " 3"]
+
+    @property
+    def inverse(self) -> "Pose":
+        """The pose from the second camera to the first."""
+        return Pose(self.rotation.T, -self.rotation.T @ self.translation)
+
+
+def epipolar_inliers(first: Points, second: Points, distance: float) -> Bool[np.ndarray, " n"]:
+    """Find the matches that one fundamental matrix explains, by MAGSAC++ from a fixed seed.
+
+    Args:
+        first: pixels in one image.
+        second: the same points in the other.
+        distance: largest distance from an epipolar line, in pixels.
+    """
+    none = np.zeros(len(first), bool)
+    if len(first) < LEAST:
+        return none
+    try:
+        _, mask = cv2.findFundamentalMat(first, second, cv2.USAC_MAGSAC, distance, _SURE, _TRIALS)
+    except cv2.error:  # OpenCV 5.0 asserts that it finds a model
+        return none
+    return none if mask is None else mask[:, 0].astype(bool)
+
+
+def relative_pose(first: Points, second: Points, distance: float) -> Pose | None:
+    """Compute the pose between two cameras, with a translation of length 1; None without enough.
+
+    Args:
+        first: directions of points from the first camera.
+        second: from the second.
+        distance: largest distance from an epipolar line.
+    """
+    if len(first) < LEAST:
+        return None
+    eye = np.eye(3)
+    try:
+        matrix, mask = cv2.findEssentialMat(
+            first, second, eye, cv2.USAC_MAGSAC, _SURE, distance, _TRIALS
+        )
+        if matrix is None or matrix.shape != (3, 3):
+            return None
+        count, rotation, translation, _ = cv2.recoverPose(matrix, first, second, eye, mask=mask)
+    except cv2.error:
+        return None
+    return Pose(rotation, translation[:, 0]) if count >= LEAST else None
+
+
+def pose_from_points(
+    points: Float64[np.ndarray, "n 3"], directions: Points, distance: float
+) -> Pose | None:
+    """Compute the pose from points in metres to the camera that sees them (PnP); None without."""
+    if len(points) < LEAST:
+        return None
+    try:
+        found, turn, shift, inliers = cv2.solvePnPRansac(
+            points,
+            directions,
+            np.eye(3),
+            None,
+            reprojectionError=distance,
+            confidence=_SURE,
+            iterationsCount=_TRIALS,
+            flags=cv2.USAC_MAGSAC,
+        )
+        if not found or inliers is None or len(inliers) < LEAST:
+            return None
+        chosen = np.asarray(inliers[:, 0], int)
+        turn, shift = cv2.solvePnPRefineLM(
+            points[chosen], directions[chosen], np.eye(3), None, turn, shift
+        )
+    except cv2.error:
+        return None
+    return Pose(cv2.Rodrigues(turn)[0], shift[:, 0])
+
+
+def triangulated(first: Points, second: Points, pose: Pose) -> Float64[np.ndarray, "n 3"]:
+    """Compute points in the second camera's axes from their directions from two cameras.
+
+    Those behind a camera are NaN.
+    """
+    to_first = np.column_stack(pose.inverse)
+    found = cv2.triangulatePoints(np.eye(3, 4), to_first, second.T, first.T)
+    points = (found[:3] / found[3]).T
+    depths = points @ to_first[2, :3] + to_first[2, 3]
+    return np.where(((points[:, 2] > 0) & (depths > 0))[:, None], points, np.nan)
+
+
+def common_points(first: Points, second: Points) -> tuple[Int64[np.ndarray, " m"], ...]:
+    """Return the rows of two lists of the same image's keypoints that hold the same ones."""
+    rows = {tuple(point): row for row, point in enumerate(first.tolist())}
+    pairs = [
+        (rows[tuple(point)], row)
+        for row, point in enumerate(second.tolist())
+        if tuple(point) in rows
+    ]
+    ours, theirs = np.array(pairs, int).reshape(-1, 2).T
+    return ours, theirs
+
+
+def pose_on_map(
+    pose: Pose,
+    other: Float64[np.ndarray, " 3"],
+    here: Sequence[float],
+    there: Sequence[float],
+) -> MapPose:
+    """Place a camera on a map, from an answer and the way from it to another; all are level.
+
+    Args:
+        pose: from the camera to the answer's, in metres.
+        other: the way to the other answer's camera, in the answer camera's axes, of any length.
+        here: the answer's position in metres east and north.
+        there: the other's.
+    """
+    east, north = np.subtract(there, here)
+    heading = np.arctan2(east, north) - np.arctan2(other[0], other[2])
+    right, _, ahead = pose.translation
+    sin, cos = np.sin(heading), np.cos(heading)
+    position = here[0] + right * cos + ahead * sin, here[1] - right * sin + ahead * cos
+    looks = heading + np.arctan2(pose.rotation[0, 2], pose.rotation[2, 2])
+    return MapPose((float(position[0]), float(position[1])), float(np.rad2deg(looks) % 360))

@@ -1,0 +1,66 @@
+"""What verification finds: the inliers of a query and an answer, and where the camera was."""
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from crisalad_jax.config.short_repr import brief
+from crisalad_jax.utils.shapes import Float64
+
+
+@brief
+class Verification(NamedTuple):
+    """What matched local features show of a query and one answer.
+
+    Cameras have OpenCV's axes: x to the right, y down, z ahead.
+    """
+
+    inliers: int
+    """Number of matches that one epipolar geometry explains."""
+    matches: int
+    """Number of matches of local features."""
+    confidence: float
+    """inliers / (8 + 0.3 matches), at most 1: at 1 Brown and Lowe (IJCV 2007, section 3.2) take two
+    images for views of one scene."""
+    query_points: Float64[np.ndarray, "inlier 2"]
+    """Pixels of the inliers in the query's file, x and y."""
+    database_points: Float64[np.ndarray, "inlier 2"]
+    """The same points in the answer's file."""
+    rotation: Float64[np.ndarray, "3 3"] | None = None
+    """Turns vectors from the query camera's axes to the answer camera's; None without intrinsics or
+    enough inliers."""
+    direction: Float64[np.ndarray, " 3"] | None = None
+    """Unit vector to the query's camera, in the answer camera's axes; None as `rotation`."""
+    translation: Float64[np.ndarray, " 3"] | None = None
+    """Metres from the answer's camera to the query's, in the answer camera's axes; None without
+    depth, or without a second answer whose distance is known."""
+
+    def fields(self) -> dict[str, Any]:
+        """Return what JSON has of it: not the points, and a quaternion (x, y, z, w)."""
+        fields: dict[str, Any] = {
+            "inliers": self.inliers,
+            "matches": self.matches,
+            "confidence": round(self.confidence, 4),
+        }
+        if self.rotation is not None:
+            vector = cv2.Rodrigues(self.rotation)[0][:, 0]
+            angle = float(np.linalg.norm(vector))
+            # sin(angle / 2) / angle, which has a limit at 0.
+            axis = np.sinc(angle / (2 * np.pi)) / 2 * vector
+            fields["rotation_degrees"] = round(float(np.rad2deg(angle)), 2)
+            fields["quaternion"] = np.round([*axis, np.cos(angle / 2)], 6).tolist()
+        for name, value in (("direction", self.direction), ("translation", self.translation)):
+            if value is not None:
+                fields[name] = np.round(value, 4).tolist()
+        return fields
+
+
+@brief
+class MapPose(NamedTuple):
+    """Where the camera of a query was on the map, from two answers with positions."""
+
+    position: tuple[float, float]
+    """In the map's axes."""
+    heading: float
+    """Degrees clockwise from north (the second axis, y; of degrees, latitude) to where it looks."""

@@ -1,0 +1,326 @@
+"""Verification of a query's answers: how it is done, and what it finds."""
+
+import dataclasses
+import functools
+import itertools
+import os
+import pathlib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from crisalad_jax.config.checks import check_count, require
+from crisalad_jax.config.short_repr import with_field_docs
+from crisalad_jax.data.frames import file_of
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.prepare import as_rgb
+from crisalad_jax.retrieval.verification.camera import Intrinsics
+from crisalad_jax.retrieval.verification.geometry import (
+    Pose,
+    common_points,
+    epipolar_inliers,
+    pose_from_points,
+    pose_on_map,
+    relative_pose,
+    triangulated,
+)
+from crisalad_jax.retrieval.verification.matchers import SIDE, open_matcher
+from crisalad_jax.retrieval.verification.results import MapPose, Verification
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import read_bytes
+from crisalad_jax.utils.shapes import Float, Float64, Int, Int64
+
+_Points = Float64[np.ndarray, "n 2"]
+_DISTANCE = 3.0
+"""Largest distance of an inlier from its epipolar line, in pixels; of larger images than `SIDE`, in
+those of the reduced image."""
+_POSE_DISTANCE = 1.5
+"""The same for poses, which need more precise points."""
+_INLIER, _MOST_INLIERS = 0.002, 50
+"""Similarity that an inlier counts as, and how many of them count."""
+_CACHED = 256
+"""Number of the map's images whose features stay in memory, some 0.5 MB each."""
+_BASELINE = 0.3
+"""Least metres between two answers that say how far away things are."""
+
+
+@with_field_docs
+@dataclasses.dataclass(frozen=True)
+class Verify:
+    """How answers are verified by local features.
+
+    Example:
+        >>> Verify(answers=20).answers
+        20
+    """
+
+    answers: int = 10
+    """Number of each query's best answers that are verified and put in order again, see
+    `order_by_inliers`."""
+    matcher: str | os.PathLike[str] | None = None
+    """ONNX file of a matcher, see `OnnxMatcher`; None is SIFT."""
+    intrinsics: Intrinsics | None = None
+    """Of the camera that took the queries, for rotations and directions; None gives inliers."""
+    map_intrinsics: Intrinsics | None = None
+    """Of the camera that took the map's images; None is that of the queries."""
+    map_images: str | os.PathLike[str] | None = None
+    """Folder of the map's images; None is where they were."""
+    map_depth: str | os.PathLike[str] | None = None
+    """Folder of the depth of the map's images: PNGs of 16 bits in millimetres under the images'
+    names, 0 where it is unknown. Answers with depth have a translation in metres."""
+    min_inliers: int | None = None
+    """A query whose best answer has fewer is of an unknown place; None is what `calibrate`
+    measured, and any where it did not."""
+
+    def __post_init__(self) -> None:
+        """Check the number, and that files are there."""
+        check_count("verify", self.answers)
+        require(
+            self.intrinsics is not None or (self.map_intrinsics, self.map_depth) == (None, None),
+            "intrinsics: found none with map_intrinsics or map_depth, expected the query camera's",
+        )
+        for name in ("map_images", "map_depth"):
+            folder = getattr(self, name)
+            if folder is not None and not pathlib.Path(folder).is_dir():
+                raise InputError(f"{name}: found no folder {folder}, expected one")
+        if self.min_inliers is not None:
+            require(
+                self.min_inliers >= 0,
+                f"min_inliers: found {self.min_inliers}, expected at least 0",
+            )
+
+
+class _View(NamedTuple):
+    """An image that was prepared for matching."""
+
+    prepared: Any
+    size: tuple[int, int]
+    name: str
+
+    @property
+    def factor(self) -> float:
+        """Pixels of a distance for one of the image: thumbnails have no finer ones than theirs."""
+        return min(1.0, SIDE / max(self.size))
+
+
+class Located(NamedTuple):
+    """Where a query's camera was, from two of its answers."""
+
+    pose: MapPose
+    """In metres east and north."""
+    answer: int
+    """Number of the answer that it was computed from."""
+    translation: Float64[np.ndarray, " 3"]
+    """Metres from that answer's camera, as `Verification.translation`."""
+
+
+class Verifier:
+    """Matches queries with images of a map; features of the latter are cached."""
+
+    def __init__(self, verify: Verify) -> None:
+        """Open the matcher.
+
+        Raises:
+            InputError: what `open_matcher` raises.
+        """
+        self.verify = verify
+        self._matcher = open_matcher(verify.matcher)
+        self._camera = verify.intrinsics
+        self._map_camera = verify.map_intrinsics or verify.intrinsics
+        self._read = functools.lru_cache(_CACHED)(
+            lambda file: self._view(read_image(file, bit_depth="contrast-stretch"), str(file))
+        )
+
+    @property
+    def name(self) -> str:
+        """Which matcher: inliers of another one are not comparable."""
+        return self._matcher.name
+
+    def check(self, image: np.ndarray, names: Sequence[tuple[str, str]]) -> list[Verification]:
+        """Verify answers.
+
+        Args:
+            image: the query, of any type that `as_rgb` takes.
+            names: folder and name of the answers' images.
+
+        Returns:
+            The verification of each; without matches where its image cannot be read.
+
+        Raises:
+            InputError: none of them can be read, intrinsics of another image size, or depth that is
+                not of this kind.
+        """
+        query = self._view(as_rgb(image, "contrast-stretch"), "the query")
+        checks, lost = [], []
+        for root, name in names:
+            try:
+                view = self._read(self._file(root, name))
+            except InputError as error:
+                lost.append(error)
+                checks.append(Verification(0, 0, 0.0, np.zeros((0, 2)), np.zeros((0, 2))))
+                continue
+            checks.append(self._check(query, view, name))
+        if len(lost) == len(names):
+            raise InputError(
+                f"{lost[0]}: none of the answers can be verified; --map-images (map_images=) says "
+                "where else they are"
+            )
+        return checks
+
+    def locate(
+        self,
+        checks: Sequence[Verification],
+        names: Sequence[tuple[str, str]],
+        positions: Sequence[Float64[np.ndarray, " 2"] | None],
+        size: tuple[int, int],
+    ) -> Located | None:
+        """Compute where the query's camera was from the first two answers that say so.
+
+        With depth, these are two answers with a translation. Otherwise matches of the two answers,
+        whose distance is known, say how far away things are, and PnP says where the query's camera
+        was.
+
+        Args:
+            checks: from `check`.
+            names: as `check` takes them.
+            positions: of the answers in metres east and north; None where unknown.
+            size: height and width of the query.
+        """
+        known = [
+            number
+            for number, (check, position) in enumerate(zip(checks, positions, strict=True))
+            if check.rotation is not None and position is not None
+        ]
+        for first, second in itertools.combinations(known, 2):
+            here, there = positions[first], positions[second]
+            assert here is not None
+            assert there is not None
+            metres = float(np.hypot(*(there - here)))
+            if metres < _BASELINE:
+                continue
+            pair = checks[first], checks[second]
+            found = _by_depth(*pair) or self._by_motion(
+                pair, names[first], names[second], metres, size
+            )
+            if found is not None:
+                pose, other = found
+                placed = pose_on_map(pose, other, here.tolist(), there.tolist())
+                return Located(placed, first, pose.translation)
+        return None
+
+    def _by_motion(
+        self,
+        checks: tuple[Verification, Verification],
+        first: tuple[str, str],
+        second: tuple[str, str],
+        metres: float,
+        size: tuple[int, int],
+    ) -> tuple[Pose, np.ndarray] | None:
+        """Compute the query's pose in the first answer's axes, and the way to the second answer."""
+        assert self._camera is not None
+        assert self._map_camera is not None
+        here, there = (self._read(self._file(*each)) for each in (first, second))
+        *_, theirs, ours = self._inliers(there, here)
+        rays, map_rays = (
+            self._rays(self._map_camera, *each) for each in ((there, theirs), (here, ours))
+        )
+        pose = relative_pose(rays, map_rays, self._distance(here))
+        if pose is None:
+            return None
+        pose = pose._replace(translation=pose.translation * metres)
+        rows, seen = common_points(ours, checks[0].database_points)
+        points = triangulated(rays[rows], map_rays[rows], pose)
+        near = np.isfinite(points).all(axis=1)
+        view = _View(None, size, "the query")
+        directions = self._rays(self._camera, view, checks[0].query_points[seen[near]])
+        found = pose_from_points(points[near], directions, self._distance(here))
+        return None if found is None else (found.inverse, pose.translation)
+
+    def _file(self, root: str, name: str) -> pathlib.Path:
+        if self.verify.map_images is not None:
+            given = pathlib.Path(self.verify.map_images) / name
+            if file_of(given).is_file():
+                return given
+        return pathlib.Path(root) / name
+
+    def _view(self, image: np.ndarray, name: str) -> _View:
+        return _View(self._matcher.prepare(image), image.shape[:2], name)
+
+    def _check(self, query: _View, database: _View, name: str) -> Verification:
+        checked = Verification(*self._inliers(query, database))
+        if self._camera is None or self._map_camera is None:
+            return checked
+        rays = self._rays(self._camera, query, checked.query_points)
+        map_rays = self._rays(self._map_camera, database, checked.database_points)
+        pose = relative_pose(rays, map_rays, self._distance(database))
+        if pose is not None:
+            checked = checked._replace(rotation=pose.rotation, direction=pose.translation)
+        depths = self._depths(database, name, checked.database_points)
+        known = depths > 0
+        points = depths[:, None] * np.column_stack([map_rays, np.ones(len(depths))])
+        found = pose_from_points(points[known], rays[known], self._distance(database))
+        if found is None:
+            return checked
+        rotation, translation = found.inverse
+        direction = translation / max(float(np.linalg.norm(translation)), 1e-9)
+        return checked._replace(rotation=rotation, direction=direction, translation=translation)
+
+    def _inliers(self, first: _View, second: _View) -> tuple[int, int, float, _Points, _Points]:
+        """Match two images, and return the fields of a `Verification` that need no camera."""
+        ours, theirs = self._matcher.match(first.prepared, second.prepared)
+        mask = epipolar_inliers(ours * first.factor, theirs * second.factor, _DISTANCE)
+        inliers, matches = int(mask.sum()), len(mask)
+        return inliers, matches, min(1.0, inliers / (8 + 0.3 * matches)), ours[mask], theirs[mask]
+
+    def _rays(self, camera: Intrinsics, view: _View, points: _Points) -> _Points:
+        return camera.directions(points, view.size, view.name)
+
+    def _distance(self, view: _View) -> float:
+        """Return the largest distance of an inlier in directions of the map's camera."""
+        assert self._map_camera is not None
+        return _POSE_DISTANCE / (self._map_camera.focal(view.size[1]) * view.factor)
+
+    def _depths(self, view: _View, name: str, points: _Points) -> Float64[np.ndarray, " n"]:
+        """Return the depth in metres at some pixels of an answer, 0 where it is unknown."""
+        if self.verify.map_depth is None:
+            return np.zeros(len(points))
+        file = pathlib.Path(self.verify.map_depth, name).with_suffix(".png")
+        if not file.is_file():
+            return np.zeros(len(points))
+        data = np.frombuffer(read_bytes(file, "depth"), np.uint8)
+        depth = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+        height, width = view.size
+        shape, dtype = ((), None) if depth is None else (depth.shape, depth.dtype)
+        factor = shape[1] / width if len(shape) == 2 else 0.0
+        if depth is None or dtype != np.uint16 or abs(len(depth) - factor * height) >= 1:
+            raise InputError(
+                f"{file}: found {dtype} of shape {shape}, expected millimetres in 16 bits, grey, "
+                f"of the aspect of {view.name}, {width} x {height}"
+            )
+        columns, rows = np.rint((points + 0.5) * factor - 0.5).astype(int).T
+        return depth[rows.clip(0, len(depth) - 1), columns.clip(0, depth.shape[1] - 1)] / 1000
+
+
+def _by_depth(first: Verification, second: Verification) -> tuple[Pose, np.ndarray] | None:
+    """Return the query's pose in the first answer's axes, and the way to the second answer."""
+    if first.translation is None or second.translation is None:
+        return None
+    assert first.rotation is not None
+    assert second.rotation is not None
+    pose, other = Pose(first.rotation, first.translation), Pose(second.rotation, second.translation)
+    return pose, pose.rotation @ other.inverse.translation + pose.translation
+
+
+def order_by_inliers(
+    similarities: Float[np.ndarray, " n"], inliers: Int[np.ndarray, " n"] | Sequence[int]
+) -> Int64[np.ndarray, " n"]:
+    """Return the order of verified answers, best first.
+
+    An inlier counts as 0.002 of similarity, and the first 50 count: 0.1 at most. Inliers without
+    similarity rank worse than similarity without inliers where local features find few, as between
+    seasons (docs/verification.md has the numbers).
+    """
+    scores = similarities + _INLIER * np.minimum(inliers, _MOST_INLIERS)
+    return np.argsort(-scores, kind="stable")
