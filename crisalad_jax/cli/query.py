@@ -94,7 +94,7 @@ class Query(ReadFlags, FrameFlags, JsonFlag):
     """Recording for the viewer Rerun: queries, answers, similarities and the way on the map, along
     time (docs/how-to/from-a-bag-to-a-relocalising-robot.md)."""
     map_images: pathlib.Path | None = None
-    """Folder of the map's images, for --gallery, --rerun and --verify, if they are not where they were."""
+    """Folder of the map's images, for --gallery, --rerun and --verify, if they were moved."""
     verify: int | None = None
     """Number of best answers that are verified by local features: matches, inliers and, with
     --intrinsics, poses (docs/verification.md)."""

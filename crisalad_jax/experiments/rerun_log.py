@@ -21,6 +21,7 @@ from crisalad_jax.data.positions import AXES
 from crisalad_jax.data.prepare import as_rgb
 from crisalad_jax.retrieval.maps.map import MapImage
 from crisalad_jax.retrieval.maps.query import Answers
+from crisalad_jax.retrieval.verification.results import Verification
 from crisalad_jax.utils.errors import InputError, Interrupted
 from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.output import counted, warn
@@ -136,10 +137,19 @@ class Recording:
             scene.next_frame(file)
             name = answers.names[number]
             words = [name if known[number] else f"{name}: unknown"]
-            log("query", _picture(read_pixels(file) if images is None else images[number], name))
+            pixels = read_pixels(file) if images is None else images[number]
+            query = as_rgb(pixels, "contrast-stretch", name)
+            log("query", _encoded(_small(query)[0]))
             for answer in ranked[:_SHOWN]:
-                log(f"answers/{answer.rank}", self._map_picture(answer.image))
+                picture = self._map_picture(answer.image)
+                nothing = rr.Clear(recursive=False)
+                log(
+                    f"answers/{answer.rank}",
+                    nothing if picture is None else _encoded(_small(picture)[0]),
+                )
                 words.append(f"{answer.rank}. {answer.similarity:.3f} {answer.image.name}")
+                if answer.rank == 1 and answers.checks and picture is not None:
+                    scene.log_matches(query, picture, answers.checks[number][0])
             log("words", rr.TextDocument("\n".join(words)))
             best, least = ranked[0].similarity, answers.min_similarity
             log(
@@ -154,15 +164,15 @@ class Recording:
             if known[number] and ranked[0].image.position is not None:
                 scene.move(ranked[0].image.position, _GREEN if is_good else _RED)
 
-    def _map_picture(self, image: MapImage) -> rr.EncodedImage | rr.Clear:
-        """Return a picture of an image of the map, or of nothing where it is not there."""
+    def _map_picture(self, image: MapImage) -> np.ndarray | None:
+        """Read an image of the map; None where it is not there."""
         file = pathlib.Path(image.root if self._root is None else self._root, image.name)
         if file not in self._lost:
             try:
-                return _picture(read_pixels(file), str(file))
+                return as_rgb(read_pixels(file), "contrast-stretch", str(file))
             except InputError as error:
                 self._lost[file] = error
-        return rr.Clear(recursive=False)
+        return None
 
     def finish(self) -> None:
         """Log the ways, and how the viewer lays all out."""
@@ -186,6 +196,7 @@ class _Scene:
         self._stream, self._label = stream, label
         self._at = rr.new_entity_path([label]) if label else ""
         self._frames = 0
+        self._has_matches = False
         self._in_degrees = answers.axes == AXES[1]
         self._way: list[tuple[_Spot, _Colour]] = []
         known = [image.position for image in answers.images if image.position is not None]
@@ -216,6 +227,19 @@ class _Scene:
         self._way.append((spot, colour))
         self.log("map/here", self._points([spot], [colour], 7))
 
+    def log_matches(self, query: np.ndarray, answer: np.ndarray, check: Verification) -> None:
+        """Log two images side by side, and lines between the points that match."""
+        self._has_matches = True
+        (left, ours), (right, theirs) = _small(query), _small(answer)
+        both = np.zeros((max(len(left), len(right)), left.shape[1] + right.shape[1], 3), np.uint8)
+        both[: len(left), : left.shape[1]] = left
+        both[: len(right), left.shape[1] :] = right
+        starts = ours * check.query_points
+        ends = theirs * check.database_points + (left.shape[1], 0)
+        self.log("matches/images", _encoded(both))
+        self.log("matches/lines", rr.LineStrips2D(np.stack([starts, ends], 1), colors=[_GREEN]))
+        self.log("inliers", rr.Scalars(check.inliers))
+
     def finish(self) -> rrb.Container:
         """Log the way so far, and return the views of all."""
         at = self._at or "/"
@@ -228,11 +252,17 @@ class _Scene:
             for rank in range(1, _SHOWN + 1)
         ]
         pictures = rrb.Grid(rrb.Spatial2DView(origin=f"{self._at}/query", name="query"), *answers)
+        if self._has_matches:
+            pictures = rrb.Vertical(
+                pictures, rrb.Spatial2DView(origin=f"{self._at}/matches", name="matches")
+            )
         view = rrb.MapView if self._in_degrees else rrb.Spatial3DView
         numbers = [
             rrb.TimeSeriesView(origin=f"{self._at}/similarity", name="similarity"),
             rrb.TextDocumentView(origin=f"{self._at}/words", name="names"),
         ]
+        if self._has_matches:
+            numbers.append(rrb.TimeSeriesView(origin=f"{self._at}/inliers", name="inliers"))
         below = [view(origin=f"{self._at}/map", name="map")] if self._has_map else []
         return rrb.Horizontal(pictures, rrb.Vertical(*below, *numbers), name=self._label or at)
 
@@ -255,11 +285,13 @@ class _Scene:
         return np.pad(moved, ((0, 0), (0, 3 - moved.shape[1])))
 
 
-def _picture(pixels: np.ndarray, name: str) -> rr.EncodedImage:
-    """Shrink an image, and encode it as JPEG."""
-    image = as_rgb(pixels, "contrast-stretch", name)
-    factor = _SIDE / max(image.shape[:2])
-    if factor < 1:
-        image = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+def _small(image: np.ndarray) -> tuple[np.ndarray, float]:
+    """Shrink an image, and return the pixels of a side that are one of the image's, too."""
+    factor = min(1.0, _SIDE / max(image.shape[:2]))
+    return cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), factor
+
+
+def _encoded(image: np.ndarray) -> rr.EncodedImage:
+    """Encode an image as JPEG."""
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     return rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg")

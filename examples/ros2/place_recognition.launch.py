@@ -16,6 +16,7 @@ ARGUMENTS = {
     "map": None,
     "image_topic": "/camera/image_raw",
     "min_similarity": ".nan",
+    "verify": "0",
     "k": "3",
     "fps": "0.0",
     "sequence": "''",

@@ -27,11 +27,13 @@ from rclpy.task import Future
 from sensor_msgs.msg import CompressedImage, Image, NavSatFix
 
 import crisalad_jax as cj
+from crisalad_jax.retrieval.verification.verify import Verify
 
 PARAMETERS = {
     "map": "",  # folder that `crisalad index` wrote
     "image_topic": "/camera/image_raw",  # CompressedImage if it ends with /compressed
     "min_similarity": math.nan,  # least similarity of a known place; NaN: as `crisalad calibrate`
+    "verify": 0,  # best places that are verified by local features; their images must be there
     "k": 3,  # places in each message, best first
     "fps": 0.0,  # most answers a second; 0: as many as the machine can
     "sequence": "",  # bayes: a filter over the camera's images so far
@@ -92,6 +94,7 @@ class PlaceRecognition(Node):
                 self._latest,
                 k=self._value("k"),
                 min_similarity=None if math.isnan(least) else least,
+                verify=Verify(answers=self._value("verify")) if self._value("verify") else None,
                 sequence=cj.BayesFilter() if self._value("sequence") == "bayes" else None,
                 ready=self._ready.set,
             )
@@ -114,6 +117,8 @@ class PlaceRecognition(Node):
             "latency_ms": round(answer.latency_ms, 1),
             "dropped": answer.frame.dropped,
         }
+        if answer.answers.checks:
+            values["inliers"] = answer.answers.checks[0][0].inliers
         for other in answer.ranked[1:]:
             values[f"place {other.rank}"] = other.image.name
             values[f"similarity {other.rank}"] = round(other.similarity, 4)
