@@ -38,7 +38,7 @@ class Index(ReadFlags, FrameFlags, ModelFlags, JsonFlag):
     default what a table or robot log as --images says, or @UTM names, or EXIF data."""
     position_topic: str | None = None
     """Topic of positions in a robot log, by default the only NavSatFix, else the only odometry or
-    pose; "" takes none."""
+    pose; none takes none."""
     store: str | None = None
     """files, in the map's folder, or milvus:URI, a file name.db or http://host:port; by default the
     map's, and of a new map files."""

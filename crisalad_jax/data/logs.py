@@ -186,14 +186,14 @@ class Log:
         """Return the name of the topic that positions are taken from; None where there is none.
 
         Args:
-            name: the topic's; "" takes none. None is the only one of NavSatFix or, without any of
+            name: the topic's; "none" takes none. None is the only one of NavSatFix or, without any of
                 that type, the only one of odometry or poses; of several a note lists them.
 
         Raises:
             InputError: the log has no such topic, or it is not of positions.
         """
         fixes, poses = self._topics(_FIXES), self._topics(_POSES)
-        if name == "":
+        if name == "none":
             return None
         if name is None:
             found = fixes or poses

@@ -122,15 +122,17 @@ def test_a_robot_log_is_indexed_with_positions_and_queried(shared, tmp_path, cap
     bag, out = write_bag(tmp_path / "walk.bag", walk), tmp_path / "map"
     words = ("found 2 topics of images, expected --topic with one of /left (Image, 4), /right",)
     fails(capfd, *index(shared, bag, out), words=words)
-    said = succeeds(capfd, *index(shared, bag, out, "--topic", "/left", "--fps", 10))
+    said, notes = runs(capfd, *index(shared, bag, out, "--topic", "/left", "--fps", 10))
     assert "4 images added, 4 with positions" in said
+    assert notes.endswith("/gps/fix has positions of 4 of 4 images; the largest gap is 0 s\n")
     names = [f"walk.bag#/left#t={(BEGIN // SECOND) + second}.000000000" for second in range(4)]
     assert positions(out) == {name: (52 + i / 1000, 21.0) for i, name in enumerate(names)}
-    assert "4 were there already" in succeeds(capfd, *index(shared, bag, out, "--topic", "/left"))
+    flags = ("--topic", "/left", "--position-topic", "none")
+    assert "4 were there already" in succeeds(capfd, *index(shared, bag, out, *flags))
 
     folder = write_bag(tmp_path / "walk", walk)
     flags = ("--topic", "/left", "--k", 1, "--json", "-")
-    lines = succeeds(capfd, *query(out, folder, *flags)).splitlines()
+    lines = runs(capfd, *query(out, folder, *flags))[0].splitlines()
     for line, name in zip(lines, names, strict=True):
         answer = json.loads(line)
         assert (answer["query"], answer["time"]) == (

@@ -151,7 +151,7 @@ def query(
     check_count("k", k)
     least = asked_similarity(places, min_similarity)
     how = {"fps": fps, "topic": topic, "on_bad_image": reading.on_bad_image}
-    root, sources = _below_one_root(open_sources(images, **how, position_topic=""))
+    root, sources = _below_one_root(open_sources(images, **how, position_topic="none"))
     paths = list(itertools.chain(*sources))
     describer = places.describer(model, groupings=["single" if window == 1 else "window"])
     ask = asking(places, k, sequence, exact=exact)
