@@ -186,8 +186,8 @@ class Log:
         """Return the name of the topic that positions are taken from; None where there is none.
 
         Args:
-            name: the topic's; "none" takes none. None is the only one of NavSatFix or, without any of
-                that type, the only one of odometry or poses; of several a note lists them.
+            name: the topic's, or "none". None is the only one of NavSatFix or, without any of that
+                type, the only one of odometry or poses; of several a note lists them.
 
         Raises:
             InputError: the log has no such topic, or it is not of positions.

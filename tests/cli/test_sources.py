@@ -142,9 +142,11 @@ def test_a_robot_log_is_indexed_with_positions_and_queried(shared, tmp_path, cap
         assert answer["neighbours"][0]["name"] == name
         assert answer["neighbours"][0]["similarity"] == pytest.approx(1, abs=ROUNDING)
 
-    write_bag(bag.with_name("longer.bag"), walk * 2).replace(bag)
+    more = image(BEGIN + 9 * SECOND, pictures[0], topic="/left")
+    write_bag(bag.with_name("longer.bag"), [*walk, more]).replace(bag)
     words = (f"but the map has '{names[0]}' of", "expected new names for new images")
-    fails(capfd, *index(shared, bag, out, "--topic", "/left"), words=words)
+    flags = ("--topic", "/left", "--position-topic", "none", "--fps", 10)
+    fails(capfd, *index(shared, bag, out, *flags), words=words)
 
 
 def test_a_pattern_and_a_window_of_queries(town_map, tmp_path, capfd, queries):
