@@ -15,6 +15,7 @@ from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.frames import frame_time
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.reading import Reading
+from crisalad_jax.data.remote import is_remote
 from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.retrieval.describe import (
     check_readable,
@@ -26,6 +27,7 @@ from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage, ranked
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch, SequenceTracker, TrackResult
 from crisalad_jax.retrieval.neighbours import Neighbours
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.shapes import Bool, Float32, Float64
 
@@ -221,9 +223,12 @@ def _below_one_root(
     roots = {source.root for source in sources}
     if len(roots) == 1:
         return roots.pop(), _runs([source.paths for source in sources])
+    if len(set(map(is_remote, roots))) > 1:
+        raise InputError("images: found files and addresses, expected only one of the two")
     # Written out, as relative and absolute ones have no folder in common.
-    paths = [[pathlib.Path(os.path.abspath(path)) for path in source.paths] for source in sources]
-    root = pathlib.Path(os.path.commonpath([os.path.abspath(root) for root in roots]))
+    whole = os.fspath if is_remote(min(roots)) else os.path.abspath
+    paths = [[pathlib.Path(whole(path)) for path in source.paths] for source in sources]
+    root = pathlib.Path(os.path.commonpath([whole(root) for root in roots]))
     return root, _runs(paths)
 
 
