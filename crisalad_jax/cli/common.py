@@ -11,7 +11,7 @@ import rich.console
 import rich.table
 
 from crisalad_jax.checkpoints.load import OpenedModel, find_weights, open_model
-from crisalad_jax.cli.flags import ModelFlags, RuntimeName, SetFlags, SizeFlags, Target
+from crisalad_jax.cli.flags import ModelFlags, PlaceFlags, RuntimeName, SetFlags, SizeFlags, Target
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.experiments.tables import Table, write_text
@@ -21,6 +21,7 @@ from crisalad_jax.utils.output import printable
 
 if TYPE_CHECKING:  # commands that load no model of a file start without these
     from crisalad_jax.data.benchmarks import Benchmark
+    from crisalad_jax.data.tracks import Track
     from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.model import Model
 
@@ -164,13 +165,6 @@ def _given(flags: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def waiting_words(result: Any) -> str | None:
-    """Say what a described share of the images waits for; None where all are described."""
-    if result.shares_left:
-        return f"shares still to be done: {result.shares_left}; the last one joins all"
-    return "another process joins all" if result.joined_elsewhere else None
-
-
 def find_given(
     weights: pathlib.Path | None, *, runtime: RuntimeName = "jax", quiet: bool = False
 ) -> pathlib.Path | None:
@@ -179,6 +173,21 @@ def find_given(
     For another runtime a folder is an exported model.
     """
     return None if weights is None else find_weights(weights, engine=runtime, quiet=quiet)
+
+
+def given_positions(flags: PlaceFlags) -> "Track | pathlib.Path | None":
+    """Return the positions that flags give, as the library takes them.
+
+    Raises:
+        InputError: a time without positions; or what `read_track` raises.
+    """
+    start, offset = flags.start_time, flags.time_offset
+    refuse_without("--positions", flags.positions, start_time=start, time_offset=offset)
+    if flags.positions is None or (start is None and offset is None):
+        return flags.positions
+    from crisalad_jax.data.tracks import read_track
+
+    return read_track(flags.positions, start_time=start, time_offset=offset or 0.0)
 
 
 def open_set(flags: Any) -> "Benchmark":

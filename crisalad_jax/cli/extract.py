@@ -4,8 +4,15 @@ import dataclasses
 import pathlib
 from typing import Annotated, Any
 
-from crisalad_jax.cli.common import echo, open_flagged, pick, waiting_words
-from crisalad_jax.cli.flags import FrameFlags, JsonFlag, ModelFlags, ReadFlags, Target
+from crisalad_jax.cli.common import echo, given_positions, open_flagged, pick
+from crisalad_jax.cli.flags import (
+    FrameFlags,
+    JsonFlag,
+    ModelFlags,
+    PlaceFlags,
+    ReadFlags,
+    Target,
+)
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
 from crisalad_jax.utils.output import counted
@@ -20,7 +27,7 @@ SEVERAL = "quote a pattern, or list the images in a .txt"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Extract(ReadFlags, FrameFlags, ModelFlags, JsonFlag):
+class Extract(ReadFlags, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     """Write a descriptor of every image in a folder, in sorted path order."""
 
     images: pathlib.Path
@@ -43,23 +50,18 @@ class Extract(ReadFlags, FrameFlags, ModelFlags, JsonFlag):
     """Pairs of each image; never with itself."""
     pca: pathlib.Path | None = None
     """Components that `crisalad pca` fitted, for shorter descriptors."""
-    share: str | None = None
-    """INDEX/COUNT: describe one share; other processes and hosts take the others, the last one
-    joins all. Of the grouping single."""
 
 
-def run(arguments: Extract) -> dict[str, Any] | None:
+def run(arguments: Extract) -> dict[str, Any]:
     """Describe the images, and print what was written."""
-    out, how = arguments.out, pick(arguments, "grouping", "seed", "pairs", "database", "k", "share")
+    out, how = arguments.out, pick(arguments, "grouping", "seed", "pairs", "database", "k")
     check_extraction(out, **how)
+    positions = given_positions(arguments)
     model, _, file = open_flagged(arguments, groupings=[arguments.grouping])
-    more = pick(arguments, "fps", "topic", "root", "pca", "reading")
-    more |= {"weights": file, "verify": arguments.checksums}
+    more = pick(arguments, "fps", "topic", "every_metres", "root", "pca", "reading")
+    more |= {"weights": file, "verify": arguments.checksums, "positions": positions}
     result = extract(model, arguments.images, out, **how, **more)
     described = counted(len(result.names), "descriptor")
-    if waiting := waiting_words(result):
-        echo(f"{out}: share {arguments.share}: {described}; {waiting}")
-        return None
     pairs = None
     if result.pairs is not None:
         pairs = {"file": str(arguments.pairs), "count": len(result.pairs)}

@@ -143,6 +143,24 @@ class ModelFlags(ComputeFlags, QuietFlag):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class PlaceFlags:
+    """Where images were taken, and how far from each other they have to be."""
+
+    positions: pathlib.Path | None = None
+    """CSV of name,lat,lon or name,east,north or name,x,y (metres), for new images; or a track: GPX,
+    GeoJSON, or CSV of time,lat,lon. By default what a table as --images says, @UTM names, or EXIF
+    data (docs/how-to/image-sources.md)."""
+    start_time: str | None = None
+    """When the video began, for a track as --positions: 2026-05-01T12:00:00+02:00."""
+    time_offset: float | None = None
+    """Seconds to add to images' times, for a track as --positions: -7200 where the camera's clock
+    is two hours ahead of UTC."""
+    every_metres: float | None = None
+    """Take an image only if it is that far from the last one taken of its folder or video; images
+    without a position are taken."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class SetFlags:
     """Which evaluation set, and what is a positive."""
 

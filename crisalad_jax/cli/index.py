@@ -4,8 +4,15 @@ import dataclasses
 import pathlib
 from typing import Annotated, Any, Literal
 
-from crisalad_jax.cli.common import echo, open_flagged, pick, waiting_words
-from crisalad_jax.cli.flags import FOLDER, FrameFlags, JsonFlag, ModelFlags, ReadFlags
+from crisalad_jax.cli.common import echo, given_positions, open_flagged, pick
+from crisalad_jax.cli.flags import (
+    FOLDER,
+    FrameFlags,
+    JsonFlag,
+    ModelFlags,
+    PlaceFlags,
+    ReadFlags,
+)
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
 from crisalad_jax.retrieval.maps.build import Indexed, index
@@ -13,8 +20,8 @@ from crisalad_jax.retrieval.maps.metadata import model_config, read_metadata, we
 from crisalad_jax.utils.output import counted
 
 COMMON = (
-    "images out weights fps positions store dtype pca search share image-size resize batch-size "
-    "runtime compute-dtype on-bad-image json plugin quiet"
+    "images out weights fps positions every-metres novelty store dtype pca search image-size "
+    "resize batch-size runtime compute-dtype on-bad-image json quiet"
 )
 EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
 SEVERAL = "quote a pattern; other folders are added by the same command again"
@@ -22,7 +29,7 @@ SEVERAL = "quote a pattern; other folders are added by the same command again"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Index(ReadFlags, FrameFlags, ModelFlags, JsonFlag):
+class Index(ReadFlags, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     """Make a map of a folder of images, or append to it those that it lacks.
 
     An existing map takes images by the model that made it, at its image size.
@@ -33,12 +40,12 @@ class Index(ReadFlags, FrameFlags, ModelFlags, JsonFlag):
     the map names images by their paths in the folder, subfolders included."""
     out: Annotated[pathlib.Path, FOLDER]
     """The map's folder. After a kill the same command goes on."""
-    positions: pathlib.Path | None = None
-    """CSV of name,east,north (metres) or name,lat,lon or name,x,y, for images that are new; by
-    default what a table or robot log as --images says, or @UTM names, or EXIF data."""
     position_topic: str | None = None
     """Topic of positions in a robot log, by default the only NavSatFix, else the only odometry or
-    pose; "" takes none."""
+    pose; none takes none."""
+    novelty: float | None = None
+    """Take an image only if its similarity to the last one taken of its folder or video is not
+    above that, such as 0.9."""
     store: str | None = None
     """files, in the map's folder, or milvus:URI, a file name.db or http://host:port; by default the
     map's, and of a new map files."""
@@ -50,28 +57,22 @@ class Index(ReadFlags, FrameFlags, ModelFlags, JsonFlag):
     use."""
     search: Literal["exact", "hnsw", "ivf-pq"] | None = None
     """Build an approximate search, and print what it recalls; exact removes it (docs/large.md)."""
-    share: str | None = None
-    """INDEX/COUNT: describe one share; other processes and hosts take the others, the last one
-    joins all."""
 
 
 def run(arguments: Index) -> dict[str, Any]:
     """Index the images, and print what became of them."""
     out, weights, like = arguments.out, None, None
+    positions = given_positions(arguments)
     metadata = read_metadata(out)
     if metadata is not None:
         like = model_config(metadata, out)
         weights = None if arguments.weights else weights_of(metadata, out)
     model, _, file = open_flagged(arguments, weights, like=like)
     config = model.config
-    more = pick(arguments, "fps", "topic", "position_topic", "positions", "store", "dtype", "pca")
-    more |= pick(arguments, "search", "share")
-    result = index(model, arguments.images, out, weights=file, reading=arguments.reading, **more)
-    if waiting := waiting_words(result):
-        described = f"{counted(result.added, 'image')} described"
-        echo(f"{out}: share {arguments.share}: {described}; {waiting}")
-    else:
-        echo(f"{out}: {'; '.join(_words(result, config))}")
+    more = pick(arguments, "fps", "topic", "position_topic", "every_metres", "novelty", "reading")
+    more |= pick(arguments, "store", "dtype", "pca", "search")
+    result = index(model, arguments.images, out, weights=file, positions=positions, **more)
+    echo(f"{out}: {'; '.join(_words(result, config))}")
     counts = {name: value for name, value in result._asdict().items() if name != "metadata"}
     return {
         "out": str(out),
@@ -90,6 +91,10 @@ def _words(result: Indexed, config: ModelConfig) -> list[str]:
         words.append(f"{result.there} were there already")
     if result.stay:
         words.append(f"{result.stay} positions given are of such, and stay as they are")
+    if result.near:
+        words.append(f"{result.near} nearer than --every-metres left out")
+    if result.similar:
+        words.append(f"{result.similar} more similar than --novelty left out")
     if unmatched:
         words.append(
             f"{len(unmatched)} positions given are of no image here, {unmatched[0]!r} the first"

@@ -19,6 +19,7 @@ from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.preprocessing import BitDepth
 from crisalad_jax.data.frames import has_frames, parse_frame
 from crisalad_jax.data.prepare import as_rgb
+from crisalad_jax.data.remote import address_of, is_remote, read_remote
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.data.video import read_frame
 from crisalad_jax.utils.errors import InputError
@@ -122,6 +123,8 @@ def read_pixels(
 ) -> np.ndarray:
     """Read an image file as `read_image` does, in the file's own depth; see `decode_image`."""
     frame = parse_frame(path)
+    if frame is None and is_remote(path):
+        return decode_image(read_remote(path), address_of(path), enough=enough)
     if frame is None:
         return decode_image(read_bytes(path, "an image file"), path, enough=enough)
     if frame.topic is None:

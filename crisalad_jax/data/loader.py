@@ -20,6 +20,7 @@ from crisalad_jax.config.short_repr import brief, with_field_docs
 from crisalad_jax.data.images import OnBadImage, read_pixels
 from crisalad_jax.data.places import JoinedPlaces, Places
 from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.data.remote import AT_ONCE, is_remote
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores
@@ -182,7 +183,9 @@ class Reading:
         def load(slot: int) -> Pixels:
             return cache.read(paths[slot], preparation)
 
-        return self.read(load, slots, slots, slots, preparation, has_frames=_has_frames(paths))
+        far = self.threads and any(map(is_remote, paths))
+        reading = dataclasses.replace(self, threads=max(self.threads, AT_ONCE)) if far else self
+        return reading.read(load, slots, slots, slots, preparation, has_frames=_has_frames(paths))
 
     def read(
         self,

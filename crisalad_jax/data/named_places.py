@@ -20,10 +20,10 @@ import numpy as np
 
 from crisalad_jax.data.benchmarks.msls import MSLS_CITIES, city_folders, read_side
 from crisalad_jax.data.benchmarks.on_disk import find_images, has_sides, has_split, listing
-from crisalad_jax.data.frames import frame_time, has_frames, sequence_of
+from crisalad_jax.data.frames import has_frames, sequence_of
 from crisalad_jax.data.images import OnBadImage, is_image, list_images
 from crisalad_jax.data.metres import comparable
-from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
+from crisalad_jax.data.positions import AXES
 from crisalad_jax.data.sources import ImageSource
 from crisalad_jax.data.tables import Disk, normal_name, read_table
 from crisalad_jax.utils.errors import InputError
@@ -206,7 +206,7 @@ def _read_table(
     path: pathlib.Path, on_bad_image: OnBadImage
 ) -> tuple[tuple[str, ...], list[FoundPlace]]:
     """Read the cities and places of a table; under "skip" a note counts the missing images."""
-    table = read_table(path, "name")
+    table = read_table(path, "name", any_spelling=True)
     given = [column for column in _VIEW if column in table.columns]
     # A heading is of use with a position alone.
     if "place" not in table.columns or given not in ([], ["lat", "lon"], [*_VIEW]):
@@ -248,13 +248,13 @@ def places_by_position(
     Args:
         source: the images.
         radius: in metres.
-        positions: a table (`read_image_table`); None is what the source says, if that is a table,
-            else what @UTM names say, else the EXIF data of JPEGs.
+        positions: a table (`read_image_table`) or track (`read_track`); None is what the source
+            says, if that is a table, else what @UTM names say, else the EXIF data of JPEGs.
 
     Raises:
-        InputError: no image has a position, or what `read_image_table` raises.
+        InputError: no image has a position, or what `positions_of` raises.
     """
-    found = _positions(source, positions)
+    found = source.located(positions)
     names = [name for name in source.names if name in found.of]
     if not names:
         raise InputError(
@@ -297,16 +297,6 @@ def places_by_order(source: ImageSource, frames: int) -> list[FoundPlace]:
             near = [each for each in (number - 1, number + 1) if first <= each <= last]
             places.append(FoundPlace(part[0], dict.fromkeys(part), near))
     return places
-
-
-def _positions(source: ImageSource, table: str | os.PathLike[str] | None) -> Positions:
-    if table is not None:
-        return positions_of(table, source.names, source.root)
-    found = source.positions or utm_positions(source.names)
-    pictures = [path for path in source.paths if frame_time(path) is None]
-    if found.of or len(pictures) < len(source.paths):
-        return found
-    return exif_positions(zip(source.names, pictures, strict=True))
 
 
 def _divide(

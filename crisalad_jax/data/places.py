@@ -134,9 +134,9 @@ def read_places(
             place with the nearest. Centres of a batch are more than four radii apart.
         place_frames: number of consecutive images of a folder, or frames of a video, that are a
             place. The next place is not in a batch with it.
-        positions: table of positions for `place_radius` (`read_image_table`). None is what the
-            source says, if that is a table or a robot log, else what @UTM names say, else the EXIF
-            data of JPEGs.
+        positions: table or track of positions for `place_radius` (`read_image_table`,
+            `read_track`). None is what the source says, if that is a table or a robot log, else
+            what @UTM names say, else the EXIF data of JPEGs.
         fps: frames a second taken of videos and logs; None is one.
         topic: the topic of images in a robot log; None is the only one.
         on_bad_image: "stop" where an image that a table names is missing, or "skip" it.

@@ -10,15 +10,16 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import moment_of
 from crisalad_jax.data.metres import Zone
+from crisalad_jax.data.remote import for_each, is_remote, open_beginning
+from crisalad_jax.data.tables import AXES as AXES
 from crisalad_jax.data.tables import MOST_METRES as MOST_METRES
 from crisalad_jax.data.tables import matched, number_of, read_table
+from crisalad_jax.data.tracks import Track, is_track, read_track, time_of, utc
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float64
-
-AXES = (("east", "north"), ("lat", "lon"), ("x", "y"))
-"""Names of a position's two numbers: metres of UTM, degrees, or metres of a frame of one's own."""
-
 
 _BANDS = "CDEFGHJKLMNPQRSTUVWX"
 """Letters of UTM's bands of latitude, from south to north; N is the first of the north."""
@@ -181,19 +182,28 @@ def utm_positions(names: Sequence[str]) -> Positions:
 
 
 def positions_of(
-    given: Positions | str | os.PathLike[str], names: Sequence[str], images: str | os.PathLike[str]
+    given: Positions | Track | str | os.PathLike[str],
+    names: Sequence[str],
+    paths: Sequence[pathlib.Path],
+    images: str | os.PathLike[str],
 ) -> Positions:
-    """Return given positions, or those of a table, under the names that images have on disk.
+    """Return given positions, or those of a file, under the names that images have on disk.
 
     Args:
         given: by name, or a table's file, which has a position in every row; names of other images
-            stay in it.
+            stay in it. Or by time: a track or its file (`read_track`).
         names: of the images.
+        paths: their files.
         images: where these are, for messages.
 
     Raises:
-        InputError: none of the images is named; or what `read_image_table` raises.
+        InputError: none of the images is named, or was taken along the track; or what
+            `read_image_table` and `read_track` raise.
     """
+    if not isinstance(given, Positions | Track) and is_track(given):
+        given = read_track(given)
+    if isinstance(given, Track):
+        return _along(given, names, paths, images)
     if isinstance(given, Positions):
         source, positions = "positions", given
     else:
@@ -208,14 +218,95 @@ def positions_of(
     return positions._replace(of={meant.get(name, name): at for name, at in positions.of.items()})
 
 
+def _along(
+    track: Track,
+    names: Sequence[str],
+    paths: Sequence[pathlib.Path],
+    images: str | os.PathLike[str],
+) -> Positions:
+    """Interpolate the positions of images along a track, and say in notes how many have any.
+
+    Raises:
+        InputError: none was taken between the track's ends; or what `_times` raises.
+    """
+    times, local = _times(paths, track.start_time, images)
+    times += track.time_offset
+    points, gaps = track.interpolate(times)
+    (there,), (timed,) = np.isfinite(points[:, 0]).nonzero(), np.isfinite(times).nonzero()
+    ends = f"{utc(track.times[0])} to {utc(track.times[-1])}"
+    if not len(there):
+        first, last = utc(times[timed].min()), utc(times[timed].max())
+        raise InputError(
+            f"{track.source}: found a track from {ends}, expected the times of the {len(timed)} "
+            f"images of {images} that have one, {first} to {last} (--time-offset shifts them)"
+        )
+    at = int(there[gaps[there].argmax()])
+    words = [f"{len(there)} of {len(names)} images on the track, {ends}"]
+    if len(timed) > len(there):
+        words.append(f"{len(timed) - len(there)} were taken before or after it")
+    if len(names) > len(timed):
+        words.append(f"{len(names) - len(timed)} have no time")
+    if gaps[at]:
+        before = track.times[track.times < times[at]].max()
+        between = f"{utc(before)} and {utc(before + gaps[at])}"
+        words.append(f"the largest gap is {gaps[at]:.3g} s, between {between}")
+    if local:
+        words.append(f"the times of {local} are taken as UTC (--time-offset)")
+    warn(f"{track.source}: {'; '.join(words)}")
+    of = {names[i]: (float(points[i, 0]), float(points[i, 1])) for i in there.tolist()}
+    return Positions(track.axes, of)
+
+
+def _times(
+    paths: Sequence[pathlib.Path], start: float | None, images: str | os.PathLike[str]
+) -> tuple[Float64[np.ndarray, " image"], int]:
+    """Read when images were taken: a time in the name, or else in EXIF data.
+
+    Returns:
+        Seconds since 1970, NaN where nothing says any; and how many are local times of an unknown
+        zone.
+
+    Raises:
+        InputError: frames of a video without a start, or of several videos; or no image has a time.
+    """
+    times, local = np.full(len(paths), np.nan), 0
+    clocks: set[str] = set()
+    unnamed = [number for number, path in enumerate(paths) if moment_of(path) is None]
+    taken = for_each(exif_time, [paths[number] for number in unnamed])
+    for number, found in zip(unnamed, taken, strict=True):
+        times[number], has_zone = found or (np.nan, True)
+        local += not has_zone
+    for number, path in enumerate(paths):
+        moment = moment_of(path)
+        if moment is None:
+            continue
+        if moment.clock:
+            clocks.add(moment.clock)
+            times[number] = moment.seconds + (start or 0)
+        else:
+            times[number] = moment.seconds
+    if len(clocks) > 1 or (clocks and start is None):
+        raise InputError(
+            f"{images}: found frames of {', '.join(sorted(clocks)[:2])}, expected those of one "
+            "video, and when it began (--start-time 2026-05-01T12:00:00+02:00)"
+        )
+    if np.isnan(times).all():
+        raise InputError(
+            f"{images}: found no time of {len(paths)} images, expected EXIF data, or names of "
+            "seconds since 1970"
+        )
+    return times, local
+
+
 def read_image_table(
     path: str | os.PathLike[str], *, all_positions: bool = False
 ) -> tuple[list[str], Positions | None]:
     """Read a table with a column `name`, and perhaps a position: east,north or lat,lon or x,y.
 
-    Decimals may have commas where semicolons separate the fields. x and y count only where there
-    is neither of the other pairs. A row whose two numbers are both empty has no position. Other
-    columns are ignored.
+    Columns may be in capitals, or have other usual names, such as filename and latitude. Decimals
+    may have commas where semicolons separate the fields. x and y count only where there is neither
+    of the other pairs. A row whose two numbers are both empty has no position. Other columns are
+    ignored.
 
     Args:
         path: the file.
@@ -225,11 +316,11 @@ def read_image_table(
         The images' names in the table's order, and their positions; None without such columns.
 
     Raises:
-        InputError: as `read_table` and `Table.named_rows`; both other pairs of columns or half a
-            pair; or a value that is not a finite number, latitude or longitude.
+        InputError: as `read_table`, `Table.axes` and `Table.named_rows`; or a value that is not a
+            finite number, latitude or longitude.
     """
-    table = read_table(pathlib.Path(path), "name")
-    axes = _axes(table.path, table.columns, all_positions)
+    table = read_table(pathlib.Path(path), "name", any_spelling=True)
+    axes = table.axes("name", must=all_positions)
     rows = list(table.named_rows())
     positions = None
     if axes is not None:
@@ -242,42 +333,53 @@ def read_image_table(
     return [name for name, _ in rows], positions
 
 
-def _axes(path: pathlib.Path, columns: Sequence[str], must: bool) -> tuple[str, str] | None:
-    """Return the columns of the positions; None where no column is of any."""
-    # x and y may be of anything, such as pixels, and count only where nothing else is there.
-    begun = [axes for axes in AXES[:2] if set(axes) & set(columns)]
-    axes = (begun or [AXES[2]])[0]
-    if len(begun) < 2 and set(axes) <= set(columns):
-        return axes
-    if begun or must:
-        raise InputError(
-            f"{path}: found columns {', '.join(columns)}, expected only one of name,east,north or "
-            "name,lat,lon or name,x,y"
-        )
-    return None
-
-
-_GPS = 0x8825
+_GPS, _EXIF = 0x8825, 0x8769
 _LATITUDE, _LONGITUDE, _STATUS = (1, 2, b"NS"), (3, 4, b"EW"), 9
 _VOID = "V"
 """Status of a receiver without a fix."""
+_TAKEN, _ZONE, _DECIMALS = 0x9003, 0x9011, 0x9291
+"""DateTimeOriginal, OffsetTimeOriginal, SubSecTimeOriginal."""
+
+
+def _exif(path: str | os.PathLike[str] | BinaryIO, group: int) -> dict[int, Any]:
+    from PIL import Image
+
+    if isinstance(path, str | os.PathLike) and is_remote(path):
+        with open_beginning(path) as file:
+            return _exif(file, group)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with Image.open(path, formats=("JPEG", "MPO")) as image:
+            return image.getexif().get_ifd(group)
 
 
 def exif_position(path: str | os.PathLike[str] | BinaryIO) -> tuple[float, float] | None:
     """Read latitude and longitude in degrees; None where a file says none that can be right."""
-    from PIL import Image
-
     # EXIF data of any maker may be wrong in any way, and then tells nothing.
-    with contextlib.suppress(Exception), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with Image.open(path, formats=("JPEG", "MPO")) as image:
-            fields = image.getexif().get_ifd(_GPS)
+    with contextlib.suppress(Exception):
+        fields = _exif(path, _GPS)
         if fields.get(_STATUS) == _VOID:
             return None
         latitude, longitude = _degrees(fields, *_LATITUDE), _degrees(fields, *_LONGITUDE)
         # Cameras without a fix write zeros.
         right = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude, longitude) != (0, 0)
         return (latitude, longitude) if right else None
+    return None
+
+
+def exif_time(path: str | os.PathLike[str] | BinaryIO) -> tuple[float, bool] | None:
+    """Read when a JPEG was taken.
+
+    Returns:
+        Seconds since 1970, and whether their zone is known; without one they are taken as UTC.
+        None where a file says no time that can be right.
+    """
+    with contextlib.suppress(Exception):
+        fields = _exif(path, _EXIF)
+        day, time = fields[_TAKEN].strip("\0 ").split(" ")
+        zone = fields.get(_ZONE, "").strip("\0 ")
+        text = f"{day.replace(':', '-')} {time}.{fields.get(_DECIMALS, '').strip(chr(0) + ' ')}"
+        return time_of(f"{text.rstrip('.')}{zone}"), bool(zone)
     return None
 
 
@@ -294,5 +396,7 @@ def exif_positions(images: Iterable[tuple[str, pathlib.Path]]) -> Positions:
     Args:
         images: the name and the file of each.
     """
-    found = ((name, exif_position(path)) for name, path in images)
-    return Positions(AXES[1], {name: position for name, position in found if position is not None})
+    each = list(images)
+    found = for_each(exif_position, [path for _, path in each])
+    of = {name: position for (name, _), position in zip(each, found, strict=True) if position}
+    return Positions(AXES[1], of)

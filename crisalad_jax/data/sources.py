@@ -2,11 +2,14 @@
 
 import collections
 import glob
+import math
 import os
 import pathlib
 import re
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Self
+
+import numpy as np
 
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.frames import (
@@ -16,12 +19,23 @@ from crisalad_jax.data.frames import (
     is_log,
     is_video,
     parse_frame,
+    sequence_of,
     stored_bytes,
 )
-from crisalad_jax.data.images import OnBadImage, list_images, names_in, only_images
+from crisalad_jax.data.images import OnBadImage, is_image, list_images, names_in, only_images
 from crisalad_jax.data.logs import list_log_frames, name_log_frame
-from crisalad_jax.data.positions import Positions, read_image_table
+from crisalad_jax.data.metres import on_ellipsoid
+from crisalad_jax.data.positions import (
+    AXES,
+    Positions,
+    exif_positions,
+    positions_of,
+    read_image_table,
+    utm_positions,
+)
+from crisalad_jax.data.remote import address_of, check_address, is_remote, list_remote
 from crisalad_jax.data.tables import Disk
+from crisalad_jax.data.tracks import Track
 from crisalad_jax.data.video import count_frames, list_frames, name_frame
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, read_text
@@ -31,6 +45,8 @@ _FORMS = (
     "a folder of images, an image, a video, a ROS bag, a pattern such as 'frames/*.jpg', a list "
     "(.txt) or a table (.csv)"
 )
+_ROUNDING = 1e-3
+"""Metres by which two positions that are rounded may be nearer than they say."""
 _PATTERN = re.compile(r"[*?\[]")
 
 
@@ -46,6 +62,60 @@ class ImageSource(NamedTuple):
     """Posix paths relative to the root, each once."""
     positions: Positions | None = None
     """What the columns of a table say, or a topic of a robot log; None without these."""
+
+    def located(self, given: Positions | Track | str | os.PathLike[str] | None = None) -> Positions:
+        """Return where the images were taken, as far as that is known.
+
+        Args:
+            given: as of `positions_of`; None is what the source says, if it is a table, else what
+                @UTM names say, else the EXIF data of JPEGs.
+
+        Raises:
+            InputError: what `positions_of` raises.
+        """
+        if given is not None:
+            return positions_of(given, self.names, self.paths, self.root)
+        found = self.positions or utm_positions(self.names)
+        each = zip(self.names, self.paths, strict=True)
+        pictures = ((name, path) for name, path in each if parse_frame(path) is None)
+        return found if found.of else exif_positions(pictures)
+
+    def spaced(self, positions: Positions, metres: float) -> Self:
+        """Leave out images that are nearer than so many metres to the last one of their sequence.
+
+        A sequence is the images of a folder, or of a video, in order. Images without a position
+        stay.
+
+        Args:
+            positions: where the images were taken.
+            metres: the least distance between two images.
+
+        Raises:
+            InputError: not a distance, or no image has a position.
+        """
+        if not 0 < metres < math.inf:
+            raise InputError(f"--every-metres: found {metres:g}, expected metres above 0")
+        names = [name for name in self.names if name in positions.of]
+        if not names:
+            raise InputError(
+                f"--every-metres: found no position of the {len(self.names)} images of "
+                f"{self.root}, expected some (--positions)"
+            )
+        points = np.array([positions.of[name] for name in names], np.float64)
+        if positions.axes == AXES[1]:
+            points = on_ellipsoid(*points.T)
+        point_of = dict(zip(names, points, strict=True))
+        last: dict[str, np.ndarray] = {}
+        kept: list[int] = []
+        for number, (name, path) in enumerate(zip(self.names, self.paths, strict=True)):
+            point, sequence = point_of.get(name), sequence_of(path)
+            if point is None:
+                kept.append(number)
+            elif sequence not in last or math.dist(point, last[sequence]) >= metres - _ROUNDING:
+                kept.append(number)
+                last[sequence] = point
+        paths, names = ([of[number] for number in kept] for of in (self.paths, self.names))
+        return self._replace(paths=paths, names=names)
 
 
 def open_source(
@@ -66,7 +136,7 @@ def open_source(
         fps: frames a second taken of videos and logs; None is one, and a note says so.
         topic: the topic of images in logs; None is the only one.
         position_topic: the topic of positions in logs; None is the only one of NavSatFix, else the
-            only one of odometry or poses; "" takes none.
+            only one of odometry or poses; "none" takes none.
         on_bad_image: "skip" lists a missing file like the others, and whoever reads it leaves it
             out; "stop" refuses it.
 
@@ -83,6 +153,8 @@ def open_source(
         raise InputError(f"images: found an empty name, expected {_FORMS}")
     check_rate(1.0 if fps is None else fps)
     path = pathlib.Path(images)
+    if is_remote(path):
+        return _remote(path)
     frames = _Frames(path, fps, topic, position_topic)
     if path.is_dir() and is_log(path):
         path = path if path.name.strip(".") else pathlib.Path(os.path.abspath(path))
@@ -101,6 +173,22 @@ def open_source(
         root, found = _matching(path)
     skips: OnBadImage = on_bad_image if suffix else "stop"  # a folder is no image to be skipped
     return _taken(root, frames, found, skips)
+
+
+def _remote(path: pathlib.Path) -> ImageSource:
+    """List the images at an address: one, a folder's or a pattern's.
+
+    Raises:
+        InputError: there are none.
+    """
+    check_address(path)
+    if is_image(path) and not _PATTERN.search(str(path)):
+        return _source(path.parent, [path], path)
+    root, pattern = (_before_pattern(path), path) if _PATTERN.search(str(path)) else (path, None)
+    found = list_remote(root, pattern)
+    shown = [each for each in found if "/." not in f"/{each.relative_to(root).as_posix()}"]
+    images = only_images(shown, address_of(path))
+    return _source(root, sorted(images, key=lambda image: image.relative_to(root).as_posix()), path)
 
 
 def open_sources(
@@ -213,7 +301,7 @@ def check_frames(
     if fps is not None and not frames:
         raise InputError(f"--fps: found {fps:g} without a video among the images, expected both")
     for flag, value in (("--topic", topic), ("--position-topic", position_topic)):
-        if value and not any(frame.topic for frame in frames):
+        if value not in (None, "none") and not any(frame.topic for frame in frames):
             raise InputError(f"{flag}: found {value} without a ROS bag among the images")
 
 
@@ -243,11 +331,16 @@ def _source(
     return ImageSource(root, paths, names, positions)
 
 
-def _matching(pattern: pathlib.Path) -> tuple[pathlib.Path, list[pathlib.Path]]:
-    """Find the images, videos and logs of a pattern, and the folder before its first wildcard."""
+def _before_pattern(pattern: pathlib.Path) -> pathlib.Path:
+    """Return the folder before a pattern's first wildcard."""
     parts = pattern.parts
     first = next(number for number, part in enumerate(parts) if _PATTERN.search(part))
-    root = pathlib.Path(*parts[:first])
+    return pathlib.Path(*parts[:first])
+
+
+def _matching(pattern: pathlib.Path) -> tuple[pathlib.Path, list[pathlib.Path]]:
+    """Find the images, videos and logs of a pattern, and the folder before its first wildcard."""
+    root = _before_pattern(pattern)
     matches = [pathlib.Path(match) for match in glob.glob(str(pattern), recursive=True)]
     files = [match for match in matches if match.is_file() or is_log(match)]
     found = only_images(files, pattern, frames=True)
@@ -262,6 +355,9 @@ def _listed(
     on_bad_image: OnBadImage,
 ) -> ImageSource:
     """List the images that a text or table names, with the positions by the source's own names."""
+    if any(map(is_remote, names)):
+        root, paths = _addresses(source, names)
+        return _source(root, paths, source, positions, names)
     folder, disk = source.parent, Disk()
     found: list[pathlib.Path] = []
     for name in names:
@@ -287,3 +383,26 @@ def _listed(
         paths = [pathlib.Path(os.path.abspath(path)) for path in paths]
         root = pathlib.Path(paths[0].anchor)
     return _source(root, paths, source, positions, names)
+
+
+def _addresses(
+    source: pathlib.Path, names: Sequence[str]
+) -> tuple[pathlib.Path, list[pathlib.Path]]:
+    """Return the paths of addresses in a list or table, and their host or bucket.
+
+    Raises:
+        InputError: some are not images at addresses, or not of one host or bucket.
+    """
+    paths = list(map(pathlib.Path, names))
+    for path in paths:
+        check_address(path)
+    other = next((path for path in paths if not is_remote(path) or has_frames(path)), None)
+    if other is not None:
+        raise InputError(f"{source}: found {other} with addresses, expected images at addresses")
+    roots = sorted({pathlib.Path(*path.parts[:2]) for path in paths})
+    if len(roots) > 1:
+        raise InputError(
+            f"{source}: found addresses of {address_of(roots[0])} and {address_of(roots[1])}, "
+            "expected those of one host or bucket"
+        )
+    return roots[0], paths

@@ -9,19 +9,30 @@ import os
 import pathlib
 import re
 import unicodedata
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from crisalad_jax.data.frames import spelled
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
 
+AXES = (("east", "north"), ("lat", "lon"), ("x", "y"))
+"""Names of a position's two numbers: metres of UTM, degrees, or metres of a frame of one's own."""
 MOST_METRES = 1e8
 """Largest coordinate in metres: twice the Earth's circumference, and its square is finite."""
 _LINE = 2**20
 """Letters after which a line is cut: its rest then has too many fields, or too few."""
 _MOST = {"lat": 90.0, "lon": 180.0} | dict.fromkeys(("east", "north", "x", "y"), MOST_METRES)
 """Largest number of a column of positions."""
+_SPELLINGS = {
+    "name": ("filename", "file", "image", "path"),
+    "lat": ("latitude",),
+    "lon": ("lng", "long", "longitude"),
+    "east": ("easting", "utm_east"),
+    "north": ("northing", "utm_north"),
+    "time": ("timestamp", "t", "date"),
+}
+"""What tables of images and tracks call their columns too; of several the first one counts."""
 
 
 def number_of(text: str) -> float:
@@ -78,6 +89,29 @@ class Table(NamedTuple):
     """Number and fields of every further row, as many as there are columns; they are read once."""
     has_commas: bool
 
+    def axes(self, of: str, *, must: bool) -> tuple[str, str] | None:
+        """Return the columns of positions; None where no column is of any.
+
+        Args:
+            of: the column that they are given by, for the message.
+            must: whether there have to be positions.
+
+        Raises:
+            InputError: both pairs other than x,y, half a pair, or none where there must be one.
+        """
+        # x and y may be of anything, such as pixels, and count only where nothing else is there.
+        begun = [axes for axes in AXES[:2] if set(axes) & set(self.columns)]
+        axes = (begun or [AXES[2]])[0]
+        if len(begun) < 2 and set(axes) <= set(self.columns):
+            return axes
+        if begun or must:
+            expected = " or ".join(f"{of},{','.join(axes)}" for axes in AXES)
+            raise InputError(
+                f"{self.path}: found columns {', '.join(self.columns)}, expected only one of "
+                f"{expected}"
+            )
+        return None
+
     def rows(self) -> Iterator[Row]:
         """Yield the rows with their fields by column, without spaces around them."""
         for line, fields in self.lines:
@@ -100,7 +134,7 @@ class Table(NamedTuple):
             yield name, row
 
 
-def read_table(path: pathlib.Path, *needed: str) -> Table:
+def read_table(path: pathlib.Path, *needed: str, any_spelling: bool = False) -> Table:
     """Read a table whose first row has the names of the columns.
 
     The separator is a comma or, where the header has more of them, a semicolon. A spreadsheet's
@@ -109,6 +143,8 @@ def read_table(path: pathlib.Path, *needed: str) -> Table:
     Args:
         path: the file.
         *needed: columns that it must have; without any, the first row may be one like the others.
+        any_spelling: whether columns may be in capitals, or have other usual names such as
+            latitude; the table's are then name, lat, lon, east, north and time.
 
     Raises:
         InputError: the file cannot be read, lacks a column or has one twice, or a row has other
@@ -117,6 +153,8 @@ def read_table(path: pathlib.Path, *needed: str) -> Table:
     check_source(path, "a table of UTF-8 CSV", largest=LARGEST)
     lines = _lines(path)
     separator, columns = next(lines)
+    if any_spelling:
+        columns = _plain(columns)
     missing = [name for name in needed if name not in columns]
     named = [name for name in columns if name]
     if missing or (needed and len(set(named)) < len(named)):
@@ -124,6 +162,15 @@ def read_table(path: pathlib.Path, *needed: str) -> Table:
         lacking = f"; missing {', '.join(missing)}" if missing else ", expected each once"
         raise InputError(f"{path}: found columns {found}{lacking}")
     return Table(path, columns, lines, separator == ";")
+
+
+def _plain(columns: Sequence[str]) -> list[str]:
+    """Return small letters, and this package's names of the columns of `_SPELLINGS`."""
+    plain = [column.lower() for column in columns]
+    for own, others in _SPELLINGS.items():
+        found = next((each for each in (own, *others) if each in plain), own)
+        plain = [own if column == found else column for column in plain]
+    return plain
 
 
 def _lines(path: pathlib.Path) -> Iterator[tuple[Any, list[str]]]:

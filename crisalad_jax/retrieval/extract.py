@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import itertools
 import os
 import pathlib
 import tempfile
@@ -18,8 +17,11 @@ from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.frames import file_of
 from crisalad_jax.data.images import check_lines, read_pixels
+from crisalad_jax.data.positions import Positions
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.data.sources import open_sources
+from crisalad_jax.data.remote import for_each, state_of, whole_name
+from crisalad_jax.data.sources import ImageSource, open_sources
+from crisalad_jax.data.tracks import Track
 from crisalad_jax.retrieval.chunks import Descriptors, as_rows, check_all_rows, check_rows
 from crisalad_jax.retrieval.describe import (
     check_readable,
@@ -43,14 +45,13 @@ from crisalad_jax.retrieval.grouping import GROUPINGS, batches_of
 from crisalad_jax.retrieval.hloc_pairs import check_names, nearest_pairs, write_pairs
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened
-from crisalad_jax.retrieval.segments import SEGMENT, Segments, Share, Shares, digest_of
+from crisalad_jax.retrieval.segments import SEGMENT, Segments, digest_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import (
     atomic_path,
     check_format,
     check_no_links,
     check_target,
-    real_path,
     wrap_os_errors,
 )
 from crisalad_jax.utils.locks import lock
@@ -61,8 +62,6 @@ if TYPE_CHECKING:
     from crisalad_jax.nn.model import Model
 
 StrPath = str | os.PathLike[str]
-_SHARES = "shares"
-"""Key of the shares' digest in a set's record."""
 
 
 @brief
@@ -77,10 +76,6 @@ class Extracted(NamedTuple):
     """Names of the images that could not be read."""
     pairs: list[tuple[str, str]] | None = None
     """Each image with those most similar to it, best first; None where no pairs were asked for."""
-    shares_left: int = 0
-    """Number of shares that are not there yet; until then this holds the images of one share."""
-    joined_elsewhere: bool = False
-    """Whether another process joins the shares, so that this holds the images of one share."""
 
 
 def extract(
@@ -90,6 +85,8 @@ def extract(
     *,
     fps: float | None = None,
     topic: str | None = None,
+    positions: Positions | Track | StrPath | None = None,
+    every_metres: float | None = None,
     weights: StrPath | None = None,
     grouping: str = "single",
     seed: int = 0,
@@ -98,7 +95,6 @@ def extract(
     database: StrPath | None = None,
     k: int = 20,
     pca: StrPath | Pca | None = None,
-    share: str | None = None,
     verify: bool = True,
     reading: Reading = Reading(),
 ) -> Extracted:
@@ -115,6 +111,9 @@ def extract(
             written next to it, as JSON. None writes nothing.
         fps: frames a second taken of a video or log, which is then expected; None is one.
         topic: the topic of images in a robot log; None is the only one.
+        positions: where images were taken, for `every_metres`, as `index` takes it.
+        every_metres: least distance of an image from the last one of its folder or video that was
+            taken, as of `index`. None takes all.
         weights: the file that the parameters are from, for that JSON and for messages.
         grouping: one of `GROUPINGS`: which images attend to each other.
         seed: draws the order of the grouping "shuffled".
@@ -124,8 +123,6 @@ def extract(
         database: descriptors, .h5 or .npy, of the images to pair these with; None is these.
         k: number of pairs of each image.
         pca: components that shorten the descriptors, or a file of them.
-        share: INDEX/COUNT, to describe one share of the images; processes on any hosts that see the
-            same folders take the others, and the last one to end joins all.
         verify: whether to check the bytes of `database` and `pca` against their checksums.
         reading: how images are read.
 
@@ -147,13 +144,19 @@ def extract(
         (4, 576)
     """
     describer = describer_of(model, [grouping])
-    check_extraction(
-        out, grouping=grouping, seed=seed, pairs=pairs, database=database, k=k, share=share
-    )
+    check_extraction(out, grouping=grouping, seed=seed, pairs=pairs, database=database, k=k)
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca, verify=verify)
     made_by = "--pairs" if pairs is not None else "model" if weights is None else str(weights)
     length, is_unit = shortened(components, describer, made_by, unit=pairs is not None)
-    paths, names = _listed(images, root, fps, topic, reading)
+    sources = open_sources(images, fps=fps, topic=topic, on_bad_image=reading.on_bad_image)
+    if every_metres is not None:
+        require(len(sources) == 1, f"every_metres: found {len(sources)} files, expected one source")
+        sources = [each.spaced(each.located(positions), every_metres) for each in sources]
+    require(
+        positions is None or every_metres is not None,
+        "--positions: found without --every-metres, expected both",
+    )
+    paths, names = _listed(images, sources, root)
     made = {} if out is None and database is None else _made(describer, components)
     others = None if pairs is None else _others(pairs, names, database, length, made, verify=verify)
     reading = reading.fitted(len(paths))
@@ -165,6 +168,7 @@ def extract(
         "weights": None if weights is None else starter.named(weights),
         "images": source,
         "fps": fps,
+        "every_metres": every_metres,
         "topic": topic,
         "grouping": grouping,
         "batch_size": reading.batch_size,
@@ -174,15 +178,14 @@ def extract(
         **made,
     }
 
-    def finish(
-        parts: Sequence[Segments], skipped: list[str], folder: pathlib.Path, **more: Any
-    ) -> Extracted:
-        listed = _names_in(*parts)
+    with _work_folder(out) as folder:
+        rows, skipped = work.resume(folder, resumes=out is not None)
+        listed = [name for stored in rows.records for name in stored["names"]]
         check_readable(source, len(paths), len(listed))
         file = temporary_beside(folder / "rows.npy")
         with in_use(file), contextlib.ExitStack() as staged:
             with wrap_os_errors(folder):
-                write_rows(file, (len(listed), length), work.descriptors(parts, len(listed)))
+                write_rows(file, (len(listed), length), work.descriptors(rows))
             found = Extracted(listed, open_npy(file, verify=False), skipped)
             if pairs is not None:  # staged, so that pairs and descriptors appear, or none
                 between = others or (listed, found.descriptors)
@@ -191,36 +194,9 @@ def extract(
                 found = found._replace(pairs=nearest)
             if out is None:
                 return found._replace(descriptors=np.array(found.descriptors))
-            whole = record | {"skipped": skipped, **more}
+            whole = record | {"skipped": skipped}
             write_descriptors(out, found.descriptors, listed, whole, within=folder, written=file)
             return found
-
-    if share is None or out is None:
-        with _work_folder(out) as folder:
-            rows, skipped = work.resume(folder, resumes=out is not None)
-            return finish([rows], skipped, folder)
-    out = pathlib.Path(out)
-    common = {name: value for name, value in record.items() if name not in ("weights", "images")}
-    folder = out.with_name(f"{out.name}.shares")
-    check_no_links(folder, itself=True)
-    shares = Shares(folder, Share.parse(share), digest_of(names, common | work.settings()))
-    is_there = all(file.exists() for file in targets(out))
-    known = read_record(out) if is_there else {}
-    if known.get(_SHARES) == shares.digest:  # joined from shares of these images and settings
-        listed, descriptors = read_descriptors(out)
-        return Extracted(listed, descriptors, known["skipped"])
-    mine = shares.share.of(len(paths), reading.batch_size)
-    with lock(shares.own):
-        own = dataclasses.replace(work, paths=paths[mine], names=names[mine])
-        rows, skipped = own.resume(shares.own)
-        found = Extracted(_names_in(rows), np.empty((0, length), np.float32), skipped)
-        shares.finish({"skipped": skipped})
-    with shares.joining() as (results, waiting):
-        if results is None:
-            return found._replace(**waiting)
-        parts = [work.opened(shares.path(index)) for index in range(shares.share.count)]
-        skipped = [name for each in results for name in each["skipped"]]
-        return finish(parts, skipped, folder, **{_SHARES: shares.digest})
 
 
 def check_extraction(
@@ -231,7 +207,6 @@ def check_extraction(
     pairs: StrPath | None = None,
     database: StrPath | None = None,
     k: int = 20,
-    share: str | None = None,
 ) -> None:
     """Check what can be checked of an extraction before a model is loaded.
 
@@ -242,12 +217,10 @@ def check_extraction(
         pairs: a file for hloc's pairs.
         database: descriptors of the images to pair these with.
         k: number of pairs of each image.
-        share: one share of the images.
 
     Raises:
-        InputError: an unknown suffix or grouping; a share of a grouping other than "single", or
-            of nothing that is written; a file that cannot be made, or that would take
-            the place of another; a number out of range; or a database without pairs.
+        InputError: an unknown suffix or grouping; a file that cannot be made, or that would
+            take the place of another; a number out of range; or a database without pairs.
 
     Example:
         >>> check_extraction("descriptors.npy", grouping="single")
@@ -264,13 +237,6 @@ def check_extraction(
         check_count("k", k)
     elif database is not None:
         raise InputError("--database: found without --pairs, expected both")
-    if share is not None:
-        Share.parse(share)
-        found = f"grouping {grouping}" if out is not None else "no file to write"
-        require(
-            grouping == "single" and out is not None,
-            f"share: found {found}, expected images of grouping single, into a file",
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -360,37 +326,26 @@ class _Work:
 
     def _digest(self) -> str:
         """Compute a digest of the settings, and of the names, sizes and times of the files."""
-        files = []
-        for path, name in zip(self.paths, self.names, strict=True):
-            with contextlib.suppress(OSError):  # reported when it is read
-                there = file_of(path).stat()
-                files.append(f"{name} {path} {there.st_size} {there.st_mtime_ns}")
+        states = for_each(lambda path: state_of(file_of(path)), self.paths)
+        each = zip(self.names, self.paths, states, strict=True)
+        # A missing file is reported when it is read.
+        files = [f"{name} {path} {state}" for name, path, state in each if state is not None]
         return digest_of(files, self.settings())
 
     def _check(self, rows: np.ndarray, numbers: np.ndarray) -> None:
         check_rows(rows, f"{self.source}: descriptors", numbers, unit=self.is_unit)
 
-    def descriptors(
-        self, parts: Sequence[Segments], count: int
-    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def descriptors(self, stored: Segments) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield the descriptors of stored rows, some at a time, with their numbers."""
         if self.grouping == "single":
-            start = 0
-            for block in itertools.chain.from_iterable(part.blocks() for part in parts):
-                yield np.arange(start, start + len(block)), block
-                start += len(block)
+            for span, block in zip(stored.spans, stored.blocks(), strict=True):
+                yield np.arange(span.first, span.first + span.count), block
             return
-        (tokens,) = parts
-        batches = batches_of(count, self.grouping, self.reading.batch_size, self.seed)
-        for numbers, rows in grouped(self.describer, tokens, batches, quiet=self.reading.quiet):
+        batches = batches_of(len(stored), self.grouping, self.reading.batch_size, self.seed)
+        for numbers, rows in grouped(self.describer, stored, batches, quiet=self.reading.quiet):
             short = rows if self.components is None else self.components.apply(rows)
             self._check(short, numbers)
             yield numbers, short
-
-
-def _names_in(*parts: Segments) -> list[str]:
-    """Return the names whose rows are stored, in order."""
-    return [name for part in parts for record in part.records for name in record["names"]]
 
 
 @contextlib.contextmanager
@@ -437,14 +392,9 @@ def _remove_work(folder: pathlib.Path) -> None:
 
 
 def _listed(
-    images: StrPath | Sequence[StrPath],
-    root: StrPath | None,
-    fps: float | None,
-    topic: str | None,
-    reading: Reading,
+    images: StrPath | Sequence[StrPath], sources: Sequence[ImageSource], root: StrPath | None
 ) -> tuple[list[pathlib.Path], list[str]]:
     """List the images, and their names relative to the root."""
-    sources = open_sources(images, fps=fps, topic=topic, on_bad_image=reading.on_bad_image)
     paths = [path for source in sources for path in source.paths]
     if isinstance(images, str | os.PathLike):
         (source,) = sources
@@ -456,7 +406,7 @@ def _listed(
 
 
 def _inside(path: pathlib.Path, root: StrPath) -> pathlib.PurePath:
-    whole, holder = real_path(path), real_path(root)
+    whole, holder = (pathlib.Path(whole_name(pathlib.Path(each))) for each in (path, root))
     if not whole.is_relative_to(holder):
         raise InputError(f"--root: found {holder}, expected a folder that holds {whole}")
     return whole.relative_to(holder)

@@ -3,18 +3,13 @@
 A segment's rows go to a store. Then its record, JSON with a checksum, appears under its name: that
 single rename commits the segment. Whoever is killed at any moment leaves the rows as they were
 before the segment or after it.
-
-Several processes can work on shares of a collection, each on segments of its own.
 """
 
-import contextlib
 import hashlib
 import json
 import pathlib
-import re
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,9 +17,7 @@ from crisalad_jax.retrieval.chunks import Descriptors
 from crisalad_jax.retrieval.maps.store import Store
 from crisalad_jax.utils.checksums import checksummed_json
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path, read_json, write_json
-from crisalad_jax.utils.locks import BusyFolderError, lock
-from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.files import atomic_path, read_json
 from crisalad_jax.utils.shapes import Int64
 
 SEGMENT = 256
@@ -132,116 +125,9 @@ def _sha256(rows: np.ndarray, dtype: np.dtype) -> str:
     return hashlib.sha256(np.ascontiguousarray(rows, dtype).data).hexdigest()
 
 
-class Share(NamedTuple):
-    """One share of several: a run of a collection's images."""
-
-    index: int
-    """Number of the share, from 0."""
-    count: int
-    """Number of shares."""
-
-    @classmethod
-    def parse(cls, text: str) -> Self:
-        """Read INDEX/COUNT.
-
-        Raises:
-            InputError: anything else, or an index that is not below the count.
-        """
-        match = re.fullmatch(r"(\d{1,6})/(\d{1,6})", text)
-        if match is None or int(match[1]) >= int(match[2]):
-            raise InputError(
-                f"share: found {text!r}, expected INDEX/COUNT, with an index from 0 and below the "
-                "count, such as 0/8"
-            )
-        return cls(int(match[1]), int(match[2]))
-
-    def of(self, images: int, batch_size: int) -> slice:
-        """Return the places of this share's images: whole batches, so that bits stay the same.
-
-        Raises:
-            InputError: there are fewer batches than shares.
-        """
-        batches = -(-images // batch_size)
-        if batches < self.count:
-            raise InputError(
-                f"share: found {self.count} shares of {images} images in batches of {batch_size}, "
-                f"expected at most {batches}, or smaller batches"
-            )
-        ends = (i * batches // self.count * batch_size for i in (self.index, self.index + 1))
-        return slice(*(min(images, end) for end in ends))
-
-
 def digest_of(names: Sequence[str], settings: Mapping[str, Any]) -> str:
-    """Compute a digest of what all shares of one collection have in common."""
+    """Compute a digest of what all rows of a collection depend on."""
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode())
     for name in names:
         digest.update(f"{name}\n".encode(errors="surrogateescape"))
     return digest.hexdigest()
-
-
-class Shares(NamedTuple):
-    """A folder in which several processes work, each on its share, and the last one joins all."""
-
-    folder: pathlib.Path
-    share: Share
-    """The share of this process."""
-    digest: str
-    """Of all that the shares have in common."""
-
-    def path(self, index: int) -> pathlib.Path:
-        """Return the folder of a share's work."""
-        return self.folder / f"{index}-of-{self.share.count}"
-
-    def _marker(self, index: int) -> pathlib.Path:
-        return self.path(index).with_suffix(".json")
-
-    @property
-    def own(self) -> pathlib.Path:
-        """The folder of this process's share."""
-        return self.path(self.share.index)
-
-    def result(self, index: int) -> dict[str, Any] | None:
-        """Return what a share's process recorded at its end; None while it has not ended."""
-        path = self._marker(index)
-        if not path.exists():
-            return None
-        value = read_json(path, "a record of a share")
-        if value.get("shares") != self.digest:
-            warn(
-                f"{path}: found a share of other images or settings; its process has to run again, "
-                "as the others do"
-            )
-            return None
-        return value
-
-    def finish(self, result: Mapping[str, Any]) -> None:
-        """Record that this process's share is done."""
-        write_json(self._marker(self.share.index), {"shares": self.digest, **result})
-
-    @contextlib.contextmanager
-    def joining(self) -> Iterator[tuple[list[dict[str, Any]] | None, dict[str, Any]]]:
-        """Yield the results of all shares while no other process joins them; then remove them.
-
-        Where they cannot be joined now, None is yielded with the reason: `shares_left`, the number
-        of shares that are not done, or `joined_elsewhere`, by another process.
-        """
-        with contextlib.ExitStack() as stack:
-            if left := self._left():
-                yield None, {"shares_left": left}
-                return
-            try:
-                stack.enter_context(lock(self.folder))
-            except BusyFolderError:
-                warn(f"{self.folder}: another process joins the shares")
-                yield None, {"joined_elsewhere": True}
-                return
-            if self._left():  # another process has joined them meanwhile
-                yield None, {"joined_elsewhere": True}
-                return
-            yield [self.result(index) or {} for index in range(self.share.count)], {}
-            for index in range(self.share.count):
-                self._marker(index).unlink()
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-    def _left(self) -> int:
-        return sum(self.result(index) is None for index in range(self.share.count))

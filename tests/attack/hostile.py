@@ -64,7 +64,7 @@ class Try(NamedTuple):
 
 PLACES: Mapping[tuple[str, str, str], str] = {
     ("index", "--out", "map"): "segments segments/0000000000.npy segments/0000000000.json map.json "
-    "approximate calibration.json added added/a shares",
+    "approximate calibration.json added added/a",
     ("query", "--map", "map"): "segments segments/0000000000.npy segments/0000000000.json map.json "
     "approximate calibration.json added",
     ("info", "--map", "map"): "segments segments/0000000000.npy segments/0000000000.json map.json",
@@ -132,16 +132,12 @@ def links() -> Iterator[Try]:
         make = functools.partial(_in_folder, verb, flag, whole, name, how)
         yield Try("links: locks", f"{verb}: {how}, a new folder", make)
     for verb, flag, name in (
-        ("extract", "--out", "d.npy.partial"), ("extract", "--out", "d.npy.shares"),
+        ("extract", "--out", "d.npy.partial"),
         ("demo", "--out", "run"), ("demo", "--out", "city"), ("train", "--out", "state"),
-        ("train", "--out", "best"), ("index", "--out", "segments"), ("index", "--out", "shares"),
+        ("train", "--out", "best"), ("index", "--out", "segments"),
         ("compare", "--out", "gem"),
     ):  # fmt: skip
-        start = functools.partial(_in_folder, verb, flag, "", name, "soft folder")
-
-        def make(world: World, bad: pathlib.Path, start: Make = start, name: str = name) -> Any:
-            return [*start(world, bad), *(["--share", "0/2"] if "shares" in name else [])]
-
+        make = functools.partial(_in_folder, verb, flag, "", name, "soft folder")
         yield Try("links: folders", f"{verb}: {name}, a new folder", make)
     for verb, all_ in TARGETS.items():
         for target, how in itertools.product(all_, ("soft", "hard")):

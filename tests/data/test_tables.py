@@ -58,7 +58,7 @@ def test_every_table_finds_its_images(tmp_path, cafe, written):
     assert source.positions.of == {name: (1, 2)}
     (folder / "list.txt").write_text(f"{written}\n", encoding="utf-8")
     assert open_source(folder / "list.txt").names == [name]
-    assert positions_of(folder / "images.csv", [name], folder).of == {name: (1, 2)}
+    assert positions_of(folder / "images.csv", [name], [folder / name], folder).of == {name: (1, 2)}
 
 
 @pytest.mark.parametrize(("cafe", "written"), WAYS)

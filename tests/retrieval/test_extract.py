@@ -17,8 +17,6 @@ from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.pca import PcaConfig, fit_pca
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.locks import BusyFolderError
-from crisalad_jax.utils.output import Note
 from tests.conftest import BATCH, MODEL, describe_single, read_options
 
 
@@ -132,9 +130,6 @@ def test_what_is_refused(params, images, options, words, tmp_path, monkeypatch):
         ({"database": "d.h5"}, "--database: found without --pairs"),
         ({"pairs": "d.names.txt"}, "--pairs: found d.names.txt, which --out writes"),
         ({"pairs": "p.txt", "k": 0}, "k: found 0, expected at least 1"),
-        ({"share": "3/3"}, "share: found '3/3', expected INDEX/COUNT"),
-        ({"share": "0/3", "grouping": "window"}, "share: found grouping window, expected images"),
-        ({"share": "0/3", "out": None}, "share: found no file to write, expected images"),
     ],
 )
 def test_what_is_known_before_there_is_a_model(options, words, tmp_path, monkeypatch):
@@ -150,47 +145,6 @@ def test_a_descriptor_that_is_not_finite_is_not_written(params, town, tmp_path):
     with pytest.raises(InputError, match=r"descriptors: row 0 is not finite, expected finite unit"):
         run(broken, town, out)
     assert not out.exists()
-
-
-@pytest.mark.parametrize("suffix", [".npy", ".h5"])
-def test_shares_make_the_set_of_one_process(params, town, expected, tmp_path, suffix):
-    out, pairs = tmp_path / f"d{suffix}", tmp_path / "pairs.txt"
-    whole = run(params, town, pairs=tmp_path / "whole.txt", k=2)
-    for share in ("2/3", "0/3"):
-        part = run(params, town, out, share=share, pairs=pairs, k=2)
-        assert part.shares_left > 0
-        assert not out.exists()
-    assert part.names == whole.names[: len(part.names)]
-    found = run(params, town, out, share="1/3", pairs=pairs, k=2)
-    assert (found.shares_left, found.pairs) == (0, whole.pairs)
-    names, descriptors = read_descriptors(out)
-    by_name = dict(zip(names, descriptors, strict=True))
-    assert by_name.keys() == set(whole.names)
-    np.testing.assert_array_equal(np.stack([by_name[n] for n in whole.names]), expected)
-    if suffix == ".npy":
-        assert names == whole.names
-    names = {"d.names.txt"} if suffix == ".npy" else set()
-    left = {path.name for path in tmp_path.iterdir()}
-    assert left == {out.name, f"{out.name}.json", "pairs.txt", "whole.txt", *names}
-    again = run(params, town, out, share="1/3")
-    assert (again.shares_left, set(again.names)) == (0, set(whole.names))
-
-
-def test_a_share_that_another_process_joins_says_so(params, town, tmp_path, monkeypatch):
-    """The lock of all shares is another's."""
-    out = tmp_path / "d.npy"
-    first = run(params, town, out, share="0/2")
-
-    def busy(path):
-        raise BusyFolderError(f"{path}: busy")
-
-    monkeypatch.setattr("crisalad_jax.retrieval.segments.lock", busy)
-    with pytest.warns(Note, match="another process joins the shares"):
-        found = run(params, town, out, share="1/2")
-    assert (found.shares_left, found.joined_elsewhere) == (0, True)
-    assert not first.joined_elsewhere
-    whole = run(params, town).names
-    assert [*first.names, *found.names] == whole
 
 
 def test_memory_does_not_grow_with_the_images(params, town, expected, tmp_path, monkeypatch):

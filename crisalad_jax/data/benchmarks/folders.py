@@ -156,7 +156,7 @@ def _read_positions(
     found, points = [], []
     for table, names_from, images in sides:
         names = _names(names_from, images)
-        positions = positions_of(table, names, folder)
+        positions = positions_of(table, names, images, folder)
         found.append(positions)
         missing = [name for name in names if name not in positions.of]
         if missing or positions.axes != found[0].axes:

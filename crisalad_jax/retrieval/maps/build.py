@@ -1,40 +1,38 @@
 """Build maps from folders of images: each image is described independently, in bounded memory."""
 
-import contextlib
 import dataclasses
 import os
 import pathlib
-import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.frames import frame_time, stored_bytes
+from crisalad_jax.data.frames import frame_time
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.reading import Reading
+from crisalad_jax.data.remote import for_each, size_of, whole_name
 from crisalad_jax.data.sources import ImageSource, open_sources
+from crisalad_jax.data.tracks import Track
 from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import check_search
+from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.map import Map, MapImage, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import (
-    SHARES,
     MapMetadata,
     check_model,
-    has_images,
     model_config,
     new_metadata,
     read_components,
     read_metadata,
 )
+from crisalad_jax.retrieval.maps.novelty import Novelty
 from crisalad_jax.retrieval.maps.store import check_store, store_name
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
-from crisalad_jax.retrieval.segments import SEGMENT, Share, Shares, digest_of
+from crisalad_jax.retrieval.segments import SEGMENT
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.output import warn
-from crisalad_jax.utils.progress import progress_bar
 
 if TYPE_CHECKING:
     from crisalad_jax.nn.config import ModelConfig
@@ -61,28 +59,35 @@ class Indexed(NamedTuple):
     metadata: MapMetadata
     recall: float | None = None
     """What the approximate search recalls, see `Map.build_search`; None where none was asked."""
-    shares_left: int = 0
-    """Number of shares that are not there yet; until then these are counts of one share."""
-    joined_elsewhere: bool = False
-    """Whether another process joins the shares, so that these are counts of one share."""
+    near: int = 0
+    """Number of images left out by `every_metres`."""
+    similar: int = 0
+    """Number of images left out by `novelty`."""
 
 
 def _new_images(
-    maps: Sequence[Map], source: ImageSource
+    target: Map, source: ImageSource, left_out: Mapping[str, int]
 ) -> tuple[list[str], list[int], list[pathlib.Path]]:
-    """List names, sizes and paths of the images that no map has.
+    """List names, sizes and paths of the images that the map lacks.
+
+    Args:
+        target: the map.
+        source: the images.
+        left_out: bytes of images that were left out of the map before, by name.
 
     Raises:
-        InputError: a name in a map is of another image here.
+        InputError: a name in the map is of another image here.
     """
     names, sizes, new = [], [], []
-    for name, path in zip(source.names, source.paths, strict=True):
-        size = stored_bytes(path)  # None is missing: to be skipped
-        known = next(filter(None, (each.image(name) for each in maps)), None)
+    all_sizes = for_each(size_of, source.paths)
+    # A size of None is of a missing file, which is skipped.
+    for name, path, size in zip(source.names, source.paths, all_sizes, strict=True):
+        known = target.image(name)
         if known is None:
-            names.append(name)
-            sizes.append(size or 0)
-            new.append(path)
+            if size is None or left_out.get(name) != size:
+                names.append(name)
+                sizes.append(size or 0)
+                new.append(path)
         elif size not in (None, known.bytes):
             raise InputError(
                 f"{path}: found {size} bytes, but the map has {name!r} of {known.bytes} bytes from "
@@ -100,12 +105,13 @@ def index(
     fps: float | None = None,
     topic: str | None = None,
     position_topic: str | None = None,
-    positions: Positions | str | os.PathLike[str] | None = None,
+    positions: Positions | Track | str | os.PathLike[str] | None = None,
+    every_metres: float | None = None,
+    novelty: float | None = None,
     store: str | None = None,
     dtype: Literal["float32", "float16", "bits"] | None = None,
     pca: Pca | str | os.PathLike[str] | None = None,
     search: Literal["exact", "hnsw", "ivf-pq"] | None = None,
-    share: str | None = None,
     reading: Reading = Reading(),
 ) -> Indexed:
     """Make a map of a folder of images, or append to it those that it lacks.
@@ -123,9 +129,15 @@ def index(
         fps: frames a second taken of a video or log, which is then expected; None is one.
         topic: the topic of images in a robot log; None is the only one.
         position_topic: the topic of positions in a log; see `open_source`.
-        positions: where images were taken, or a table of it. None is what `images` says, if that
-            is a table or a robot log; else what @UTM names say; else what the EXIF data of JPEGs
-            says. Names of several zones of UTM give degrees, or metres of the map's zone.
+        positions: where images were taken, or a table or track of it (`read_track`). None is what
+            `images` says, if that is a table or a robot log; else what @UTM names say; else what
+            the EXIF data of JPEGs says. Names of several zones of UTM give degrees, or metres of
+            the map's zone.
+        every_metres: least distance of an image from the last one of its folder or video that was
+            taken; nearer ones are left out, and those without a position taken. None takes all.
+        novelty: largest cosine similarity of an image to the last one of its folder or video that
+            was taken; more similar ones are left out, so that a robot that stands still does not
+            fill its map. None takes all.
         store: "files", or "milvus:URI". None is the map's, and of a new map "files".
         dtype: type of the stored descriptors; "bits" stores their signs (`pack_bits`), which are
             searched by the Hamming distance. None is the map's, and of a new map "float32".
@@ -133,8 +145,6 @@ def index(
             copy. None is the map's, and of a new map none.
         search: the approximate search that is built from the map's descriptors; "exact" removes
             one. None leaves what there is, which is of no use once the map has grown.
-        share: INDEX/COUNT, to describe one share of the images; processes on any hosts that see the
-            same folders take the others, and the last one to end joins all.
         reading: how images are read.
 
     Returns:
@@ -142,8 +152,8 @@ def index(
 
     Raises:
         InputError: parameters of another configuration; no image, or none that can be read;
-            positions of none of them; a map of another model or of other
-            settings; what `Map.append`, `new_metadata` and `open_for_appending` raise.
+            positions of none of them; a distance or similarity out of range; a map of another model
+            or of other settings; what `Map.append`, `new_metadata` and `open_for_appending` raise.
 
     Example:
         >>> import jax
@@ -157,7 +167,8 @@ def index(
         4
     """
     describer = describer_of(model)
-    part = None if share is None else Share.parse(share)
+    if novelty is not None:
+        check_min_similarity(novelty, "novelty")
     out = pathlib.Path(out)
     metadata = read_metadata(out)
     how = {"fps": fps, "topic": topic, "position_topic": position_topic}
@@ -168,7 +179,13 @@ def index(
         if known.axes == AXES[1] and metadata is None:
             warn(f"{images}: the names are of several zones of UTM: positions become lat, lon")
     else:
-        known = positions_of(table, source.names, images)
+        known = positions_of(table, source.names, source.paths, images)
+    listed = len(source.names)
+    if every_metres is not None:
+        spaced = source.spaced(known if known.of else source.located(), every_metres)
+        near = set(source.names) - set(spaced.names)
+        known = known._replace(of={name: at for name, at in known.of.items() if name not in near})
+        source = spaced
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca)
     if metadata is None:
         options: dict[str, Any] = {"store": store or "files", "dtype": dtype or "float32"}
@@ -182,18 +199,16 @@ def index(
     if table is None and not known.of:
         known = None
     fitted = reading.fitted(len(source.paths))
-    work = _Indexing(describer, source, known, metadata, components, search, fitted)
-    if part is not None:
-        result = work.share(out, part)
-    else:
-        with open_for_appending(out, metadata, components) as target:
-            result = work.into(target)
+    work = _Indexing(describer, source, known, metadata, components, search, fitted, novelty)
+    with open_for_appending(out, metadata, components) as target:
+        result = work.into(target)
     if result.added == result.images and describer.config.cross_image.attends:
         warn(
             f"{out}: a map describes each image alone, and this model attends across images: "
             "recalls that are published for batches are not the map's (`crisalad evaluate "
             "--grouping single` measures those of single images)"
         )
+    result = result._replace(near=listed - len(source.names))
     return result if table is not None else result._replace(stay=0)
 
 
@@ -209,6 +224,8 @@ class _Indexing:
     components: Pca | None
     search: str | None
     reading: Reading
+    novelty: float | None = None
+    """Largest similarity to the last image that was taken; None is any."""
 
     def into(self, target: Map) -> Indexed:
         """Append all images to a map that is open for appending.
@@ -217,15 +234,14 @@ class _Indexing:
             InputError: what `_append` and `_finish` raise.
         """
         known = len(target)
-        unreadable = self._append(target, self.source, target)
+        unreadable = self._append(target)
         result = self._counts(target.images[:known], target.images[known:], unreadable)
         return result._replace(recall=self._finish(target))
 
-    def _append(self, target: Map, source: ImageSource, whole: Map) -> list[str]:
-        """Describe images as the map's are, and append them to `target`, `SEGMENT` at a time.
+    def _append(self, target: Map) -> list[str]:
+        """Describe images as the map's are, and append them, `SEGMENT` at a time.
 
-        Images whose names `target` or the `whole` map has are left out, so that the same call
-        resumes after a kill.
+        Images whose names the map has are left out, so that the same call resumes after a kill.
 
         Returns:
             The names of the images that cannot be read.
@@ -234,25 +250,31 @@ class _Indexing:
             InputError: an image cannot be read; a name in a map is of another image here; or what
                 `Map.append` raises.
         """
-        names, sizes, new = _new_images((target, whole), source)
+        root, total = whole_name(self.source.root), len(self.source.paths)
+        choice = None if self.novelty is None else Novelty(target, self.source, root, self.novelty)
+        names, sizes, new = _new_images(target, self.source, choice.left_out if choice else {})
         positions = self.positions
         if positions is None:
-            positions = _by_exif(whole, zip(names, new, strict=True))
+            positions = _by_exif(target, zip(names, new, strict=True))
         target.fitted(names, positions)  # checks them before any work
         unreadable: list[str] = []
-        root, total, quiet = (
-            real_path(source.root).as_posix(),
-            len(source.paths),
-            self.reading.quiet,
-        )
         stream = described(self.describer, new, self.reading, components=target.components)
         done, quiet = total - len(new), self.reading.quiet
         stream = shown(stream, "images", total, quiet=quiet, done=done)
         for part in joined(stream, SEGMENT):
             unreadable.extend(names[i] for i in part.unreadable)
-            if len(part.indices):
-                some, bytes_ = ([column[i] for i in part.indices] for column in (names, sizes))
-                target.append(some, bytes_, part.descriptors, root=root, positions=positions)
+            if not len(part.indices):
+                continue
+            numbers, rows = part.indices, part.descriptors
+            alike = numbers[:0]
+            if choice is not None:
+                is_new = choice.choose([names[i] for i in numbers], rows)
+                numbers, alike, rows = numbers[is_new], numbers[~is_new], rows[is_new]
+            if len(numbers):
+                some, bytes_ = ([column[i] for i in numbers] for column in (names, sizes))
+                target.append(some, bytes_, rows, root=root, positions=positions)
+            if choice is not None and len(alike):
+                choice.leave_out([names[i] for i in alike], [sizes[i] for i in alike])
         return unreadable
 
     def _counts(
@@ -261,15 +283,18 @@ class _Indexing:
         """Count what became of the images, of a map that had some before."""
         known, listed = {image.name for image in there}, set(self.source.names)
         given = () if self.positions is None else self.positions.of.keys()
+        there_now = len(listed & known)
+        rest = len(listed) - there_now - len(added) - len(unreadable)
         return Indexed(
             added=len(added),
-            there=len(listed & known),
+            there=there_now,
             positions=sum(image.position is not None for image in added),
             stay=len(known.intersection(given)),
             unreadable=unreadable,
             unmatched=[name for name in given if name not in listed],
             images=len(there) + len(added),
             metadata=self.metadata,
+            similar=0 if self.novelty is None else rest,
         )
 
     def _finish(self, target: Map) -> float | None:
@@ -278,69 +303,6 @@ class _Indexing:
         if self.search is None:
             return None
         return target.build_search(self.search, quiet=self.reading.quiet)
-
-    def share(self, out: pathlib.Path, part: Share) -> Indexed:
-        """Index the images of one share in a map of its own; if it is the last one, join all.
-
-        Raises:
-            InputError: a share of other settings is there; what `_append` and `_finish` raise.
-        """
-        metadata, source = self.metadata, self.source
-        settings = {name: getattr(metadata, name) for name in ("dtype", "pca", "config")}
-        settings |= {"batch_size": self.reading.batch_size, "digest": self.describer.digest}
-        shares = Shares(out / SHARES, part, digest_of(source.names, settings))
-        mine = part.of(len(source.paths), self.reading.batch_size)
-        own = source._replace(names=source.names[mine], paths=source.paths[mine])
-        with contextlib.ExitStack() as stack:
-            whole, there = None, []
-            if has_images(out):
-                whole = stack.enter_context(Map.open(out, verify=False, calibrated=False))
-                whole.fitted(source.names, self.positions)
-                there = whole.images
-            result = self._counts(there, [], [])
-            if result.there == len(source.names) and not shares.folder.exists():
-                return result
-            if shares.result(part.index) is None:
-                own_metadata = dataclasses.replace(metadata, store="files")
-                with open_for_appending(shares.own, own_metadata, self.components) as target:
-                    unreadable = self._append(target, own, whole or target)
-                    result = self._counts(there, target.images, unreadable)
-                shares.finish({"unreadable": unreadable})
-        with shares.joining() as (results, waiting):
-            if results is None:
-                return result._replace(**waiting)
-            bar = progress_bar("joining", part.count, "shares", quiet=self.reading.quiet)
-            with open_for_appending(out, metadata, self.components) as target, bar as joining:
-                known = len(target)
-                for index in range(part.count):
-                    _append_share(target, shares.path(index))
-                    joining.advance(1)
-                recall = self._finish(target)
-        unreadable = [name for each in results for name in each["unreadable"]]
-        result = self._counts(target.images[:known], target.images[known:], unreadable)
-        return result._replace(recall=recall)
-
-
-def _append_share(target: Map, folder: pathlib.Path) -> None:
-    """Append the images of a share's map that the whole map lacks, and remove the share's."""
-    if not has_images(folder):
-        return  # it is joined, or had no new image
-    with Map.open(folder) as part:
-        start = 0
-        for rows in part.descriptors:
-            images = part.images[start : start + len(rows)]
-            start += len(rows)
-            new = [i for i, image in enumerate(images) if target.image(image.name) is None]
-            if new:
-                of = {image.name: image.position for image in images if image.position}
-                target.append(
-                    [images[i].name for i in new],
-                    [images[i].bytes for i in new],
-                    rows[new],
-                    root=images[0].root,
-                    positions=None if part.axes is None else Positions(part.axes, of, part.zone),
-                )
-    shutil.rmtree(folder)
 
 
 def _by_exif(target: Map, images: Iterable[tuple[str, pathlib.Path]]) -> Positions:

@@ -95,7 +95,7 @@ def write_calibration(folder: pathlib.Path, calibration: Calibration) -> None:
     write_record(folder / name, to_plain(calibration), indent=2)
 
 
-def check_min_similarity(value: float) -> None:
+def check_min_similarity(value: float, name: str = "min_similarity") -> None:
     """Raise InputError unless a similarity is a cosine."""
     if not -1 <= value <= 1:
-        raise InputError(f"min_similarity: found similarity {value}, expected one from -1 to 1")
+        raise InputError(f"{name}: found similarity {value}, expected one from -1 to 1")

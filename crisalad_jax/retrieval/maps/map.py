@@ -5,6 +5,7 @@ under its name. That single rename commits the addition. A map whose writer is k
 is as it was before the addition or after it. docs/maps.md has the format.
 """
 
+import bisect
 import contextlib
 import dataclasses
 import datetime
@@ -466,6 +467,19 @@ class Map:
         """Descriptors in order, one array for each addition; of bits, unit vectors of the signs."""
         blocks = self._segments.blocks()
         return map(sign_vectors, blocks) if self.metadata.is_bits else blocks
+
+    def as_stored(self, descriptors: Descriptors) -> Float32[np.ndarray, "n d"]:
+        """Round descriptors as the map stores them; of bits, unit vectors of the signs."""
+        rows = self._rows("descriptors", descriptors).astype(self.metadata.row[1], copy=False)
+        return sign_vectors(rows) if self.metadata.is_bits else rows.astype(np.float32, copy=False)
+
+    def descriptor(self, name: str) -> Float32[np.ndarray, " d"]:
+        """Read the stored descriptor of the image of this name."""
+        number, spans = self._numbers[name], self._segments.spans
+        span = spans[bisect.bisect_right(spans, number, key=lambda span: span.first) - 1]
+        row = number - span.first
+        rows = self._segments.store.read(span.first, span.count)[row : row + 1]
+        return self.as_stored(rows)[0]
 
     def verify(self) -> None:
         """Read all descriptors, and compare them with the digests in the records.

@@ -27,10 +27,10 @@ if TYPE_CHECKING:  # a map is searched without JAX
 
 METADATA, SEGMENTS = "map.json", "segments"
 """Names of the metadata's file, and of the folder of additions."""
-COMPONENTS, SHARES = "pca.safetensors", "shares"
-"""Names of the components that shorten descriptors, and of the folder of shares to be joined."""
+COMPONENTS = "pca.safetensors"
+"""Name of the components that shorten descriptors."""
 _PARTS = (
-    *(METADATA, SEGMENTS, COMPONENTS, SHARES, LOCK),
+    *(METADATA, SEGMENTS, COMPONENTS, LOCK),
     *("calibration.json", "approximate", "added"),
 )
 """All names that a map may have in its folder."""
@@ -143,7 +143,7 @@ def read_metadata(folder: str | os.PathLike[str]) -> MapMetadata | None:
         check_no_links(folder / name, itself=True)
     if not path.exists():
         # A process killed before it has made the map leaves its lock and temporary files behind.
-        own = (LOCK, SEGMENTS, COMPONENTS, SHARES)
+        own = (LOCK, SEGMENTS, COMPONENTS)
         there = [*folder.glob("*"), *(folder / SEGMENTS).glob("*")]
         others = [p for p in there if p.name not in own and not is_temporary(p)]
         if others:

@@ -16,6 +16,7 @@ from crisalad_jax.data.frames import frame_time
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.reading import Reading
+from crisalad_jax.data.remote import is_remote
 from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.retrieval.describe import (
     check_readable,
@@ -30,6 +31,7 @@ from crisalad_jax.retrieval.maps.verified import calibration_of, verify_answers
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.verification.results import MapPose, Verification
 from crisalad_jax.retrieval.verification.verify import Verifier, Verify
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.shapes import Bool, Float32, Float64
@@ -183,7 +185,7 @@ def query(
     verifier = None if verify is None else Verifier(verify)
     thresholds = asked_thresholds(places, min_similarity, verifier)
     how = {"fps": fps, "topic": topic, "on_bad_image": reading.on_bad_image}
-    root, sources = _below_one_root(open_sources(images, **how, position_topic=""))
+    root, sources = _below_one_root(open_sources(images, **how, position_topic="none"))
     paths = list(itertools.chain(*sources))
     describer = places.describer(model, groupings=["single" if window == 1 else "window"])
     ask = asking(places, found_at_least(k, verifier), sequence, exact=exact)
@@ -317,9 +319,12 @@ def _below_one_root(
     roots = {source.root for source in sources}
     if len(roots) == 1:
         return roots.pop(), _runs([source.paths for source in sources])
+    if len(set(map(is_remote, roots))) > 1:
+        raise InputError("images: found files and addresses, expected only one of the two")
     # Written out, as relative and absolute ones have no folder in common.
-    paths = [[pathlib.Path(os.path.abspath(path)) for path in source.paths] for source in sources]
-    root = pathlib.Path(os.path.commonpath([os.path.abspath(root) for root in roots]))
+    whole = os.fspath if is_remote(min(roots)) else os.path.abspath
+    paths = [[pathlib.Path(whole(path)) for path in source.paths] for source in sources]
+    root = pathlib.Path(os.path.commonpath([whole(root) for root in roots]))
     return root, _runs(paths)
 
 

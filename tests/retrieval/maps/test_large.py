@@ -1,11 +1,7 @@
-"""Maps in shares, by components, and with an approximate search."""
+"""Maps by components, and with an approximate search."""
 
 import json
 import pathlib
-import shutil
-import subprocess
-import sys
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,8 +14,7 @@ from crisalad_jax.retrieval.maps.query import query
 from crisalad_jax.retrieval.pca import fit_pca, save_pca
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
-from tests.conftest import BATCH, MODEL, describe_single, read_options
-from tests.data.test_sources import write_jpeg
+from tests.conftest import MODEL, describe_single, read_options
 from tests.killed_appends import append_until, metadata, names, rows
 from tests.retrieval.maps.test_stores import brute_force
 
@@ -49,110 +44,6 @@ def contents(folder: pathlib.Path) -> tuple[list, bytes]:
     """Images and descriptors of a map."""
     with Map.open(folder) as places:
         return places.images, np.concatenate(list(places.descriptors)).tobytes()
-
-
-# Shares
-
-
-def test_shares_make_the_map_of_one_process(shared, params, database, whole, tmp_path):
-    out = tmp_path / "map"
-    first = run(shared, params, database, out, share="1/2")
-    assert (first.added, first.shares_left) == (3, 1)
-    with pytest.raises(InputError, match="found no map"):
-        Map.open(out)
-    again = run(shared, params, database, out, share="1/2")
-    assert again.shares_left == 1
-    last = run(shared, params, database, out, share="0/2")
-    assert (last.added, last.positions, last.images, last.shares_left) == (7, 7, 7, 0)
-    assert contents(out) == contents(whole)
-    assert sorted(path.name for path in out.iterdir()) == ["map.json", "segments"]
-    late = run(shared, params, database, out, share="1/2")
-    assert (late.added, late.there, late.shares_left) == (0, 7, 0)
-    assert contents(out) == contents(whole)
-
-
-def test_shares_know_positions_of_exif(shared, params, tmp_path):
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    for number in range(7):
-        write_jpeg(photos / f"{number}.jpg", _2=(52.0, float(number), 0.0))
-    run(shared, params, photos, tmp_path / "one")
-    for share in ("0/2", "1/2"):
-        found = run(shared, params, photos, tmp_path / "two", share=share)
-    assert (found.added, found.positions) == (7, 7)
-    assert contents(tmp_path / "two") == contents(tmp_path / "one")
-    images = contents(tmp_path / "two")[0]
-    expected = [(52 + number / 60, 21.0125) for number in range(7)]  # by hand
-    np.testing.assert_allclose([image.position for image in images], expected, atol=1e-9)
-    # A map that is there takes those of new photographs, too.
-    write_jpeg(photos / "9.jpg", _2=(52.0, 9.0, 0.0))
-    for share in ("0/2", "1/2"):
-        found = run(shared, params, photos, tmp_path / "two", share=share)
-    assert (found.added, found.positions, found.images) == (1, 1, 8)
-
-
-def test_shares_add_to_a_map(shared, params, database, whole, tmp_path):
-    part, out = tmp_path / "part", tmp_path / "map"
-    part.mkdir()
-    for path in list_images(database)[2:5]:
-        (part / path.name).symlink_to(path)
-    run(shared, params, part, out)
-    assert run(shared, params, database, out, share="0/2").added == 2
-    done = run(shared, params, database, out, share="1/2")
-    assert (done.added, done.there, done.images) == (4, 3, 7)
-    found, expected = (
-        {one.name: one.position for one in contents(folder)[0]} for folder in (out, whole)
-    )
-    assert found == expected
-
-
-def test_a_join_that_is_cut_short_goes_on(shared, params, database, whole, tmp_path, monkeypatch):
-    out = tmp_path / "map"
-    run(shared, params, database, out, share="0/2")
-    real = Map.append
-
-    def cut(target: Map, *given: Any, **options: Any) -> None:
-        real(target, *given, **options)
-        if target.folder == out:
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Map, "append", cut)
-        with pytest.raises(KeyboardInterrupt):
-            run(shared, params, database, out, share="1/2")
-    assert len(contents(out)[0]) == 4
-    run(shared, params, database, out, share="1/2")
-    assert contents(out) == contents(whole)
-    assert not (out / "shares").exists()
-
-
-def test_a_kill_after_all_is_joined_leaves_nothing_undone(
-    shared, params, database, tmp_path, monkeypatch
-):
-    out = tmp_path / "map"
-    run(shared, params, database, out, share="0/2")
-
-    def cut(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Map, "build_search", cut)
-        with pytest.raises(KeyboardInterrupt):
-            run(shared, params, database, out, share="1/2", search="hnsw")
-    assert run(shared, params, database, out, share="1/2", search="hnsw").recall == 1.0
-    assert not (out / "shares").exists()
-
-
-def test_a_share_of_other_images_is_not_joined(shared, params, database, tmp_path):
-    images, out = tmp_path / "images", tmp_path / "map"
-    shutil.copytree(database, images)
-    run(shared, params, images, out, share="0/2")
-    shutil.copy(list_images(images)[0], images / "another.jpg")
-    with pytest.warns(Note, match=r"0-of-2\.json: found a share of other images or settings"):
-        left = run(shared, params, images, out, share="1/2").shares_left
-    assert left == 1
-    with pytest.warns(Note, match="found a share of other images"):
-        assert run(shared, params, images, out, share="0/2").images == 8
 
 
 # Components
@@ -307,11 +198,7 @@ def test_the_command_line_says_what_is_recalled(shared, database, tmp_path, capf
     from tests.cli.test_index import query as ask
 
     out = tmp_path / "map"
-    said = succeeds(capfd, *command(shared, database, out, "--share", "0/2"))
-    assert (
-        "share 0/2: 4 images described; shares still to be done: 1; the last one joins all" in said
-    )
-    said = succeeds(capfd, *command(shared, database, out, "--share", "1/2", "--search", "hnsw"))
+    said = succeeds(capfd, *command(shared, database, out, "--search", "hnsw"))
     assert "7 images added, 7 with positions" in said
     assert "approximate search finds 100.0 % of the exact 10 nearest of 7 images" in said
     lines = [
@@ -319,24 +206,3 @@ def test_the_command_line_says_what_is_recalled(shared, database, tmp_path, capf
         for more in ((), ("--exact",))
     ]
     assert lines[0] == lines[1]
-
-
-@pytest.mark.slow
-def test_two_processes_make_one_map(shared, database, whole, tmp_path):
-    """At the same time, on one host; whichever ends last joins."""
-    command = [sys.executable, "-m", "crisalad_jax", "index", "--images", database]
-    command += ["--weights", shared / "weights.safetensors", "--out", tmp_path / "map"]
-    command += ["--batch-size", BATCH, "--quiet", "--share"]
-    running = [
-        subprocess.Popen([*map(str, command), share], cwd=ROOT, stdout=subprocess.PIPE, text=True)
-        for share in ("0/2", "1/2")
-    ]
-    said = [process.communicate()[0] for process in running]
-    assert [process.returncode for process in running] == [0, 0]
-    assert any("7 images added" in words for words in said)
-    assert contents(tmp_path / "map")[0] == contents(whole)[0]
-    found, expected = (
-        np.frombuffer(contents(folder)[1], np.float32) for folder in (tmp_path / "map", whole)
-    )
-    # Those processes' compilers optimise, these tests' does not.
-    np.testing.assert_allclose(found, expected, atol=1e-5)

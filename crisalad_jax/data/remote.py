@@ -1,0 +1,181 @@
+"""Read images at addresses, such as s3://bucket/frames, with fsspec.
+
+A path holds an address as `pathlib` writes it, with one slash: `s3:/bucket/frames`. So names,
+patterns and folders are of paths everywhere, and only what touches files asks here.
+"""
+
+import contextlib
+import functools
+import os
+import pathlib
+import re
+import urllib.parse
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+from crisalad_jax.data.frames import stored_bytes
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.extras import missing_extra
+from crisalad_jax.utils.files import real_path
+
+_T = TypeVar("_T")
+AT_ONCE = 16
+"""Number of files at addresses that are read at a time: most of that is waiting."""
+_ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)", re.I | re.S)  # C:/ is a drive
+_SECRET = re.compile(r"([^:]+://)[^/]*@([^?]*)|(https?://)([^?]*)\?", re.I)
+_HEADER = 2**16
+"""Bytes that are read at a time of a file's beginning, where EXIF data is."""
+
+
+def is_remote(path: str | os.PathLike[str]) -> bool:
+    """Return whether a path stands for an address.
+
+    Example:
+        >>> is_remote(pathlib.Path("s3://bucket/a.jpg")), is_remote("C:/a.jpg")
+        (True, False)
+    """
+    return _ADDRESS.fullmatch(os.fspath(path)) is not None
+
+
+def address_of(path: str | os.PathLike[str]) -> str:
+    """Return the address that a path stands for; other paths as they are.
+
+    Example:
+        >>> address_of(pathlib.Path("s3://bucket/a.jpg"))
+        's3://bucket/a.jpg'
+    """
+    return _ADDRESS.sub(r"\1://\2", os.fspath(path))
+
+
+def whole_name(folder: pathlib.Path) -> str:
+    """Return the address of a folder, or its absolute path without links."""
+    return address_of(folder) if is_remote(folder) else real_path(folder).as_posix()
+
+
+def check_address(path: str | os.PathLike[str]) -> None:
+    """Check that an address has nothing secret, as names and messages repeat it.
+
+    Raises:
+        InputError: it has a user, or a query, which may be a signature.
+    """
+    found = _SECRET.match(address_of(path))
+    if found is not None:
+        raise InputError(
+            f"{''.join(part or '' for part in found.groups())}: found a user or a query in the "
+            "address, expected none: fsspec's configuration can have passwords"
+        )
+
+
+@functools.lru_cache
+def _file_system(root: str) -> Any:
+    """Return what reads a host or bucket: one for all threads, so that it lists a folder once."""
+    import fsspec.core
+
+    return fsspec.core.url_to_fs(root)[0]
+
+
+@contextlib.contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[Any, str]]:
+    """Yield the file system of an address and the path there; its errors become one line.
+
+    Raises:
+        InputError: what `check_address` raises; a package that is missing; or whatever else the
+            file system raises.
+    """
+    check_address(path)
+    address = address_of(path)
+    try:
+        parts = urllib.parse.urlsplit(address)
+        files = _file_system(f"{parts.scheme}://{parts.netloc}")
+        yield files, files._strip_protocol(address)
+    except ModuleNotFoundError as error:
+        raise InputError(missing_extra(error, address)) from error
+    except InputError:
+        raise
+    except Exception as error:  # each file system has its own
+        reason = " ".join(str(error).split()) or type(error).__name__
+        if isinstance(error, FileNotFoundError):
+            reason = "found no such file"
+        raise InputError(f"{address}: cannot be read: {reason}") from error
+
+
+def read_remote(path: str | os.PathLike[str]) -> bytes:
+    """Read the file at an address.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    with _opened(path) as (files, there):
+        return files.cat_file(there)
+
+
+@contextlib.contextmanager
+def open_beginning(path: str | os.PathLike[str]) -> Iterator[Any]:
+    """Open the file at an address to read its beginning alone.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    with _opened(path) as (files, there), files.open(there, block_size=_HEADER) as file:
+        yield file
+
+
+def size_of(path: pathlib.Path) -> int | None:
+    """Return the bytes of the file that holds an image, here or at an address; None for no file.
+
+    Raises:
+        InputError: an address that cannot be asked.
+    """
+    if not is_remote(path):
+        return stored_bytes(path)
+    with _opened(path) as (files, there):
+        try:
+            return files.info(there)["size"]
+        except FileNotFoundError:
+            return None
+
+
+def state_of(path: pathlib.Path) -> str | None:
+    """Return a text that is another one when a file has changed; None where there is none.
+
+    Raises:
+        InputError: an address that cannot be asked.
+    """
+    if not is_remote(path):
+        with contextlib.suppress(OSError):
+            there = path.stat()
+            return f"{there.st_size} {there.st_mtime_ns}"
+        return None
+    with _opened(path) as (files, there):
+        try:
+            return files.ukey(there)
+        except FileNotFoundError:
+            return None
+
+
+def for_each(work: Callable[[pathlib.Path], _T], paths: Sequence[pathlib.Path]) -> Iterable[_T]:
+    """Return the results of a function of files, of several at a time where they are far away."""
+    if not any(map(is_remote, paths)):
+        return map(work, paths)
+    with ThreadPoolExecutor(AT_ONCE) as threads:
+        return list(threads.map(work, paths))
+
+
+def list_remote(path: pathlib.Path, pattern: pathlib.Path | None = None) -> list[pathlib.Path]:
+    """List the files below a folder at an address, or those of a pattern below it.
+
+    Raises:
+        InputError: there is no such folder.
+    """
+    with _opened(pattern or path) as (files, there):
+        files.invalidate_cache()
+        start = len(files._strip_protocol(address_of(path)).rstrip("/"))
+        if pattern is None and not files.isdir(there):
+            raise InputError(
+                f"{address_of(path)}: found no folder there, expected one of images, an image, or "
+                "a pattern"
+            )
+        listing = files.find if pattern is None else files.glob
+        found = listing(there, detail=True).items()
+        return [path / each[start:].lstrip("/") for each, of in found if of["type"] == "file"]

@@ -1,0 +1,269 @@
+"""Read tracks, positions along time: GPX 1.1 (Topografix), GeoJSON (RFC 7946) or a table.
+
+RFC 7946 has no times. They are where togeojson writes them: `coordTimes`, also `times`, of a line,
+and `time` of a point.
+"""
+
+import datetime
+import math
+import os
+import pathlib
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.tables import AXES, MOST_METRES, number_of, read_table
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.files import LARGEST_TEXT, parse_json, read_bytes, read_text
+from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.shapes import Float64
+
+_DEGREES = AXES[1]
+_GEOJSON = (".geojson", ".json")
+_FORMS = "track points with times"
+_Point = tuple[object, Any, Any]
+"""Time, and latitude and longitude or metres."""
+
+
+@brief
+class Track(NamedTuple):
+    """Where something was, along time."""
+
+    source: str
+    """The file, for messages."""
+    axes: tuple[str, str]
+    """Names of a position's two numbers, as of `Positions`."""
+    times: Float64[np.ndarray, " point"]
+    """Seconds since 1970, ascending."""
+    points: Float64[np.ndarray, "point 2"]
+    start_time: float | None = None
+    """When a video of the images began, in seconds since 1970; None where that is unknown."""
+    time_offset: float = 0.0
+    """Seconds that are added to the times of images."""
+
+    def interpolate(
+        self, times: Float64[np.ndarray, " image"]
+    ) -> tuple[Float64[np.ndarray, "image 2"], Float64[np.ndarray, " image"]]:
+        """Compute positions between the track's points, linearly in time.
+
+        Args:
+            times: in seconds since 1970.
+
+        Returns:
+            The positions, NaN before the first point and after the last one; and the seconds
+            between the two points that each lies between, 0 where it is at a point.
+
+        Example:
+            >>> import numpy as np
+            >>> track = Track("a", ("x", "y"), np.array([0.0, 4.0]), np.array([[0.0, 0], [8, 4]]))
+            >>> [each.tolist() for each in track.interpolate(np.array([1.0, 4.0]))]
+            [[[2.0, 1.0], [8.0, 4.0]], [4.0, 0.0]]
+        """
+        first, second = self.points.T
+        if self.axes == _DEGREES:
+            second = np.unwrap(second, period=360)
+        found = [
+            np.interp(times, self.times, axis, left=math.nan, right=math.nan)
+            for axis in (first, second)
+        ]
+        if self.axes == _DEGREES:
+            found[1] = np.round((found[1] + 180) % 360 - 180, 9)
+        last = len(self.times) - 1
+        before = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, last)
+        after = np.clip(np.searchsorted(self.times, times, side="left"), 0, last)
+        return np.stack(found, axis=1), np.maximum(self.times[after] - self.times[before], 0)
+
+
+def is_track(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file of positions has them by time, and not by the names of images.
+
+    Raises:
+        InputError: a table that cannot be read.
+    """
+    path = pathlib.Path(path)
+    if path.suffix.lower() in (".gpx", *_GEOJSON):
+        return True
+    columns = read_table(path, any_spelling=True).columns
+    return "time" in columns and "name" not in columns
+
+
+def read_track(
+    path: str | os.PathLike[str], *, start_time: str | None = None, time_offset: float = 0.0
+) -> Track:
+    """Read a track: GPX, GeoJSON, or a table with a column `time` and positions.
+
+    Times are ISO 8601, of UTC where they have no zone, or in tables also numbers since 1970: of
+    seconds, milli-, micro- or nanoseconds, as their size says.
+
+    Args:
+        path: the file. .gpx has points of tracks with times. .geojson or .json has lines with
+            `coordTimes` or `times`, or points with `time`. A table has the columns time and
+            lat,lon or east,north or x,y, or other usual names of these.
+        start_time: when a video of the images began, such as "2026-05-01T12:00:00+02:00"; without
+            a zone it is UTC, and a note says so.
+        time_offset: seconds that are added to the times of images, for cameras whose clock is
+            wrong or shows local time: -7200 where it is two hours ahead of UTC.
+
+    Returns:
+        The track, which `index` takes as `positions`.
+
+    Raises:
+        InputError: the file cannot be read; it has no points, points without times, times that go
+            back, or positions out of range; or a start or offset that is not a time.
+
+    Example:
+        >>> text = "time,lat,lon\\n2026-05-01T10:00:00Z,52.2,21.0\\n2026-05-01T10:00:10Z,52.3,21.0"
+        >>> _ = (folder / "walk.csv").write_text(text)
+        >>> read_track(folder / "walk.csv").times.tolist()
+        [1777629600.0, 1777629610.0]
+    """
+    if not math.isfinite(time_offset):
+        raise InputError(f"--time-offset: found {time_offset}, expected seconds")
+    start = None if start_time is None else _start_of(start_time)
+    path = pathlib.Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".gpx":
+        axes, found = _DEGREES, list(_gpx_points(path))
+    elif suffix in _GEOJSON:
+        axes, found = _DEGREES, _geojson_points(path)
+    else:
+        axes, found = _table_points(path)
+    without = sum(time is None for time, _, _ in found)
+    if without or not found:
+        points = f"{without} of {len(found)} points without a time" if found else "no point"
+        raise InputError(f"{path}: found {points}, expected {_FORMS}")
+    times = np.array([_time_in(path, time) for time, _, _ in found])
+    points = _numbers(path, axes, [point for _, *point in found])
+    if (back := np.diff(times) < 0).any():
+        at = int(back.argmax())
+        raise InputError(
+            f"{path}: found point {at + 2} at {utc(times[at + 1])}, after one at {utc(times[at])}, "
+            "expected times in order"
+        )
+    return Track(str(path), axes, times, points, start, float(time_offset))
+
+
+def utc(seconds: Any) -> str:
+    """Write a time since 1970 for a message.
+
+    Example:
+        >>> utc(1777629600.25)
+        '2026-05-01 10:00:00.25Z'
+    """
+    try:
+        time = datetime.datetime.fromtimestamp(round(seconds, 3), datetime.UTC)
+    except (ValueError, OverflowError, OSError):
+        return f"{seconds:g} s"
+    text = time.strftime("%Y-%m-%d %H:%M:%S.%f")
+    return f"{text.rstrip('0').rstrip('.')}Z"
+
+
+def time_of(text: str) -> float:
+    """Return the seconds since 1970 of ISO 8601, of UTC where it has no zone.
+
+    Raises:
+        ValueError: it is not a time.
+    """
+    time = datetime.datetime.fromisoformat(text)
+    return (time if time.tzinfo else time.replace(tzinfo=datetime.UTC)).timestamp()
+
+
+def _start_of(text: str) -> float:
+    try:
+        start = time_of(text)
+    except (ValueError, TypeError) as error:
+        raise InputError(
+            f"--start-time: found {text!r}, expected a time such as 2026-05-01T12:00:00+02:00"
+        ) from error
+    if datetime.datetime.fromisoformat(text).tzinfo is None:
+        warn(f"--start-time: {text} has no zone, and is taken as UTC")
+    return start
+
+
+def _time_in(path: pathlib.Path, time: object) -> float:
+    """Return the seconds since 1970 of ISO 8601 or a number."""
+    number = number_of(str(time))
+    if math.isfinite(number):
+        # Nanoseconds of these years are 1e18, and seconds 1e9.
+        return number / 1000 ** sum(number >= most for most in (1e11, 1e14, 1e17))
+    try:
+        return time_of(str(time))
+    except ValueError as error:
+        raise InputError(
+            f"{path}: found time {time!r}, expected one such as 2026-05-01T12:00:00Z"
+        ) from error
+
+
+def _numbers(
+    path: pathlib.Path, axes: tuple[str, str], points: Sequence[Sequence[Any]]
+) -> Float64[np.ndarray, "point 2"]:
+    try:
+        numbers = np.array(points, np.float64)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise InputError(f"{path}: found a point that is not two numbers ({error})") from error
+    most = (90.0, 180.0) if axes == _DEGREES else (MOST_METRES, MOST_METRES)
+    wrong = ~(np.abs(numbers) <= most).all(axis=1)
+    if wrong.any():
+        at = int(wrong.argmax())
+        raise InputError(
+            f"{path}: point {at + 1}: found {', '.join(axes)} {numbers[at].tolist()}, expected "
+            f"numbers of at most {most[0]:g} and {most[1]:g}"
+        )
+    return numbers
+
+
+class _Builder(ElementTree.TreeBuilder):
+    """Builds trees of XML without entities of its own, which can fill any memory."""
+
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
+        """Refuse a document type, which GPX has none of."""
+        raise ValueError("a document type (DOCTYPE)")
+
+
+def _gpx_points(path: pathlib.Path) -> Iterator[_Point]:
+    """Yield the points of all tracks, in the file's order."""
+    data = read_bytes(path, "a track in GPX", largest=LARGEST_TEXT)
+    try:
+        root = ElementTree.fromstring(data, ElementTree.XMLParser(target=_Builder()))
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise InputError(f"{path}: found {error}, expected a track in GPX") from error
+    for point in root.iterfind(".//{*}trkpt"):
+        yield point.findtext("{*}time"), point.get("lat"), point.get("lon")
+
+
+def _geojson_points(path: pathlib.Path) -> list[_Point]:
+    """Return the points of lines and the points with times; others are left out where some are."""
+    expected = "GeoJSON of lines with coordTimes, or of points with time"
+    value = parse_json(read_text(path, expected), str(path), expected)
+    found: list[_Point] = []
+    try:
+        features = value["features"] if value["type"] == "FeatureCollection" else [value]
+        for feature in features:
+            geometry, of = feature["geometry"], feature["properties"] or {}
+            of = {**of, **of.get("coordinateProperties", {})}
+            if geometry["type"] == "Point":
+                lines, times = [[geometry["coordinates"]]], [[of.get("time", of.get("timestamp"))]]
+            elif geometry["type"] in ("LineString", "MultiLineString"):
+                lines, times = geometry["coordinates"], of.get("coordTimes", of.get("times"))
+                if geometry["type"] == "LineString":
+                    lines, times = [lines], times and [times]
+            else:
+                continue
+            for number, line in enumerate(lines):
+                pairs = zip(times[number] if times else [None] * len(line), line, strict=True)
+                found += [(time, at[1], at[0]) for time, at in pairs]
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: found other JSON ({error!r}), expected {expected}") from error
+    return [point for point in found if point[0] is not None] or found
+
+
+def _table_points(path: pathlib.Path) -> tuple[tuple[str, str], list[_Point]]:
+    table = read_table(path, "time", any_spelling=True)
+    axes = table.axes("time", must=True)
+    assert axes is not None
+    first, second = axes
+    rows = table.rows()
+    return axes, [(row.text("time"), row.number(first), row.number(second)) for row in rows]
