@@ -106,6 +106,10 @@ from .retrieval.search import search as search
 from .retrieval.seqslam import SeqSlam as SeqSlam
 from .retrieval.sequence import BayesFilter as BayesFilter
 from .retrieval.serve import serve_map as serve_map
+from .retrieval.verification.camera import Intrinsics as Intrinsics
+from .retrieval.verification.results import MapPose as MapPose
+from .retrieval.verification.results import Verification as Verification
+from .retrieval.verification.verify import Verify as Verify
 from .sinkhorn import SinkhornConfig as SinkhornConfig
 from .sinkhorn import register_dustbin as register_dustbin
 from .sinkhorn import register_gradient as register_gradient

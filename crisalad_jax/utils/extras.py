@@ -6,7 +6,7 @@ _CLI = ("tyro", "rich", "shtab")
 EXTRAS: Mapping[str, tuple[str, ...]] = {
     "report": ("jinja2", "matplotlib", *_CLI),
     "train": ("optax", "orbax", "numba", "tensorboardX", "matplotlib", *_CLI),
-    "maps": ("faiss", "h5py", "PIL", *_CLI),
+    "maps": ("faiss", "h5py", "PIL", "yaml", *_CLI),
     "robot": ("rosbags", "rerun", "fsspec", *_CLI),
     "export": ("flatbuffers", *_CLI),
     "onnx": ("onnx", "onnxruntime", *_CLI),

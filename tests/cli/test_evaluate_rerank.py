@@ -51,7 +51,10 @@ def test_bad_input_is_named_before_any_work(capfd, shared, weights, monkeypatch)
     nowhere = ("evaluate", "--data", shared / "none", "--weights", own, "--quiet")
     for given, words in (
         ((*nowhere, "--rerank", "transvpr"), ("found 'transvpr', expected NAME:TOPK",)),
-        ((*nowhere, "--rerank", "glue:3"), ("found 'glue', expected one of fol, pair-vpr, ",)),
+        (
+            (*nowhere, "--rerank", "glue:3"),
+            ("'glue', expected one of fol, local, pair-vpr, ",),
+        ),
         ((*start, "--rerank", "transvpr:3"), ("aggregator salad", "--rerank-weights")),
         ((*nowhere, "--rerank-weights", weights), ("--rerank-weights: found without --rerank",)),
         (

@@ -50,6 +50,26 @@ def epipolar_inliers(first: Points, second: Points, distance: float) -> Bool[np.
     return none if mask is None else mask[:, 0].astype(bool)
 
 
+def rotation_only(
+    first: Points, second: Points, distance: float
+) -> Float64[np.ndarray, "3 3"] | None:
+    """Compute the rotation between cameras in one place (Kabsch 1976); None if they moved apart.
+
+    Args:
+        first: directions of points from the first camera.
+        second: from the second.
+        distance: largest distance of a point, which nine in ten have to keep.
+    """
+    if len(first) < LEAST:
+        return None
+    ours, theirs = (np.column_stack([each, np.ones(len(each))]) for each in (first, second))
+    ours, theirs = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (ours, theirs))
+    left, _, right = np.linalg.svd(theirs.T @ ours)
+    rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    near = np.linalg.norm(ours @ rotation.T - theirs, axis=1) < distance
+    return rotation if near.mean() >= 0.9 else None
+
+
 def relative_pose(first: Points, second: Points, distance: float) -> Pose | None:
     """Compute the pose between two cameras, with a translation of length 1; None without enough.
 

@@ -28,10 +28,11 @@ class Verification(NamedTuple):
     database_points: Float64[np.ndarray, "inlier 2"]
     """The same points in the answer's file."""
     rotation: Float64[np.ndarray, "3 3"] | None = None
-    """Turns vectors from the query camera's axes to the answer camera's; None without intrinsics or
-    enough inliers."""
+    """Turns vectors from the query camera's axes to the answer camera's; None without intrinsics,
+    or at a confidence below 1."""
     direction: Float64[np.ndarray, " 3"] | None = None
-    """Unit vector to the query's camera, in the answer camera's axes; None as `rotation`."""
+    """Unit vector to the query's camera, in the answer camera's axes; None as `rotation`, and where
+    both were in one place."""
     translation: Float64[np.ndarray, " 3"] | None = None
     """Metres from the answer's camera to the query's, in the answer camera's axes; None without
     depth, or without a second answer whose distance is known."""

@@ -24,6 +24,7 @@ from crisalad_jax.retrieval.verification.geometry import (
     pose_from_points,
     pose_on_map,
     relative_pose,
+    rotation_only,
     triangulated,
 )
 from crisalad_jax.retrieval.verification.matchers import SIDE, open_matcher
@@ -130,7 +131,7 @@ class Verifier:
         self._camera = verify.intrinsics
         self._map_camera = verify.map_intrinsics or verify.intrinsics
         self._read = functools.lru_cache(_CACHED)(
-            lambda file: self._view(read_image(file, bit_depth="contrast-stretch"), str(file))
+            lambda file, _: self._view(read_image(file, bit_depth="contrast-stretch"), str(file))
         )
 
     @property
@@ -156,7 +157,7 @@ class Verifier:
         checks, lost = [], []
         for root, name in names:
             try:
-                view = self._read(self._file(root, name))
+                view = self._seen(root, name)
             except InputError as error:
                 lost.append(error)
                 checks.append(Verification(0, 0, 0.0, np.zeros((0, 2)), np.zeros((0, 2))))
@@ -200,9 +201,8 @@ class Verifier:
             metres = float(np.hypot(*(there - here)))
             if metres < _BASELINE:
                 continue
-            pair = checks[first], checks[second]
-            found = _by_depth(*pair) or self._by_motion(
-                pair, names[first], names[second], metres, size
+            found = _by_depth(checks[first], checks[second]) or self._by_motion(
+                checks[first], names[first], names[second], metres, size
             )
             if found is not None:
                 pose, other = found
@@ -212,7 +212,7 @@ class Verifier:
 
     def _by_motion(
         self,
-        checks: tuple[Verification, Verification],
+        check: Verification,
         first: tuple[str, str],
         second: tuple[str, str],
         metres: float,
@@ -221,7 +221,7 @@ class Verifier:
         """Compute the query's pose in the first answer's axes, and the way to the second answer."""
         assert self._camera is not None
         assert self._map_camera is not None
-        here, there = (self._read(self._file(*each)) for each in (first, second))
+        here, there = self._seen(*first), self._seen(*second)
         *_, theirs, ours = self._inliers(there, here)
         rays, map_rays = (
             self._rays(self._map_camera, *each) for each in ((there, theirs), (here, ours))
@@ -230,20 +230,20 @@ class Verifier:
         if pose is None:
             return None
         pose = pose._replace(translation=pose.translation * metres)
-        rows, seen = common_points(ours, checks[0].database_points)
+        rows, seen = common_points(ours, check.database_points)
         points = triangulated(rays[rows], map_rays[rows], pose)
         near = np.isfinite(points).all(axis=1)
         view = _View(None, size, "the query")
-        directions = self._rays(self._camera, view, checks[0].query_points[seen[near]])
+        directions = self._rays(self._camera, view, check.query_points[seen[near]])
         found = pose_from_points(points[near], directions, self._distance(here))
         return None if found is None else (found.inverse, pose.translation)
 
-    def _file(self, root: str, name: str) -> pathlib.Path:
-        if self.verify.map_images is not None:
-            given = pathlib.Path(self.verify.map_images) / name
-            if file_of(given).is_file():
-                return given
-        return pathlib.Path(root) / name
+    def _seen(self, root: str, name: str) -> _View:
+        """Prepare an image of the map, once until its file changes."""
+        folders = [*([self.verify.map_images] if self.verify.map_images else ()), root]
+        files = [pathlib.Path(folder, name) for folder in folders]
+        file = next((each for each in files if file_of(each).is_file()), files[0])
+        return self._read(file, file_of(file).exists() and file_of(file).stat().st_mtime_ns)
 
     def _view(self, image: np.ndarray, name: str) -> _View:
         return _View(self._matcher.prepare(image), image.shape[:2], name)
@@ -254,8 +254,13 @@ class Verifier:
             return checked
         rays = self._rays(self._camera, query, checked.query_points)
         map_rays = self._rays(self._map_camera, database, checked.database_points)
+        if checked.confidence < 1:
+            return checked
+        turned = rotation_only(rays, map_rays, self._distance(database))
         pose = relative_pose(rays, map_rays, self._distance(database))
-        if pose is not None:
+        if turned is not None:
+            checked = checked._replace(rotation=turned)
+        elif pose is not None:
             checked = checked._replace(rotation=pose.rotation, direction=pose.translation)
         depths = self._depths(database, name, checked.database_points)
         known = depths > 0

@@ -2,6 +2,7 @@
 
 import base64
 import concurrent.futures
+import dataclasses
 import hashlib
 import importlib.resources
 import itertools
@@ -31,6 +32,7 @@ from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.metadata import SEGMENTS
 from crisalad_jax.retrieval.maps.query import answer_fields, query
 from crisalad_jax.retrieval.serve.worker import ADDED
+from crisalad_jax.retrieval.verification.verify import Verify
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.conftest import BATCH, MODEL, read_options, write_video
@@ -58,7 +60,9 @@ def expected(folder, params, pictures):
 
 
 def assert_answers(found, expected):
-    assert [set(one) - {"number"} for one in found] == [set(other) for other in expected]
+    assert [set(one) - {"number", "verified"} for one in found] == [
+        set(other) for other in expected
+    ]
     for one, other in zip(found, expected, strict=True):
         assert one["similarity"] == pytest.approx(other["similarity"], abs=ROUNDING)
         for field in ("rank", "name", "position"):
@@ -113,6 +117,47 @@ def test_a_map_of_the_model_in_the_package_is_served_by_it(sides, pictures, tmp_
             assert_answers(
                 reply.json["neighbours"], [answer_fields(one, answers.axes) for one in ranked]
             )
+
+
+def test_answers_are_verified(own_map, params, pictures):
+    with Map.open(own_map) as places:
+        model = Model(params, places.config)
+        quiet = Reading(batch_size=BATCH, quiet=True)
+        given = {"model": model, "k": 4, "reading": quiet, "verify": Verify(answers=3)}
+        found = query(places, pictures[0], **given)
+        known = Calibration(-1.0, 0.9, 1, 1, 1, 0, 0, 7, "", "", places.metadata.model)
+    inliers = [check.inliers for check in found.checks[0]]
+    ask = "POST", "/locate?k=4", pictures[0].read_bytes()
+    write_calibration(
+        own_map, dataclasses.replace(known, min_inliers=inliers[0] + 1, verifier="sift")
+    )
+    with serving(own_map, params, rerank=Verify(answers=3)) as service:
+        reply = service.ask(*ask).json
+        verified = [each["verified"] for each in reply["neighbours"]]
+        assert [each and each["inliers"] for each in verified] == [*inliers, None]
+        names = [found.images[i].name for i in found.neighbours.indices[0]]
+        assert [each["name"] for each in reply["neighbours"]] == names
+        assert reply["known"] is False
+        less = service.ask("POST", "/locate?k=4&verify=1", ask[2]).json
+        assert [bool(each["verified"]) for each in less["neighbours"]] == [True, *3 * [False]]
+        none = service.ask("POST", "/locate?k=4&verify=0", ask[2]).json
+        assert not any(each["verified"] for each in none["neighbours"])
+        assert none["known"] is None  # of similarities nothing was measured
+        assert service.ask("POST", "/locate?verify=-1", ask[2]).status == 400
+    with serving(own_map, params) as service:
+        reply = service.ask("POST", "/locate?verify=1", ask[2])
+        assert reply.json == {"error": "verify: found in a service without --rerank, expected none"}
+        assert service.ask(*ask).json["neighbours"][0]["verified"] is None
+
+
+def test_files_that_are_gone_are_the_service_s_fault(own_map, params, pictures, tmp_path):
+    """A client does not learn the names of folders."""
+    with serving(own_map, params, rerank=Verify(answers=1)) as service:
+        images = service.worker.places.images
+        images[:] = [image._replace(root=str(tmp_path)) for image in images]
+        reply = service.ask("POST", "/locate", pictures[0].read_bytes())
+        assert reply.status == 500
+        assert str(tmp_path) not in reply.json["error"]
 
 
 def test_a_calibrated_map_knows_what_it_does_not_know(own_map, params, pictures, expected):

@@ -11,6 +11,7 @@ from crisalad_jax.retrieval.verification.geometry import (
     pose_from_points,
     pose_on_map,
     relative_pose,
+    rotation_only,
     triangulated,
 )
 from tests.retrieval.verification.scene import (
@@ -55,6 +56,7 @@ def test_too_few_points_show_nothing(rays, count):
     assert not epipolar_inliers(*few, 1.0).any()
     assert relative_pose(*few, DISTANCE) is None
     assert pose_from_points(np.ones((count, 3)), few[0], DISTANCE) is None
+    assert rotation_only(*few, DISTANCE) is None
 
 
 def test_points_in_one_place_show_nothing(pixels):
@@ -70,6 +72,19 @@ def test_a_relative_pose_is_that_of_the_cameras(rays):
     assert degrees_between(pose.rotation, rotation) < ROTATION
     assert degrees_between(pose.translation, translation) < DIRECTION
     assert np.linalg.norm(pose.translation) == pytest.approx(1)
+
+
+def test_cameras_in_one_place_have_a_rotation_only(rays):
+    """Turned by 20 degrees, with the noise of the scene; those that moved have none."""
+    turn, _ = cv2.Rodrigues(np.deg2rad([3.0, 20, -5]))
+    seen = VIEWS[0].see() @ turn.T
+    noise = np.random.default_rng(0).normal(0, 0.3 / 400, (len(seen), 2))
+    turned = seen[:, :2] / seen[:, 2:] + noise
+    first = VIEWS[0].see()
+    found = rotation_only(first[:, :2] / first[:, 2:], turned, DISTANCE)
+    assert degrees_between(found, turn) < ROTATION
+    assert np.linalg.det(found) == pytest.approx(1)
+    assert rotation_only(*rays, DISTANCE) is None
 
 
 def test_a_pose_from_points_is_in_metres(rays):
