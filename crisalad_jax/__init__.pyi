@@ -21,7 +21,9 @@ from .data.benchmarks import open_benchmark as open_benchmark
 from .data.images import read_image as read_image
 from .data.live import Camera as Camera
 from .data.live import FolderWatch as FolderWatch
+from .data.live import LatestFrame as LatestFrame
 from .data.loader import training_batches as training_batches
+from .data.logs import decode_message as decode_message
 from .data.places import Places as Places
 from .data.places import read_places as read_places
 from .data.query_set import QuerySet as QuerySet
@@ -93,6 +95,7 @@ from .retrieval.maps.corrections import merge_maps as merge_maps
 from .retrieval.maps.corrections import move_images as move_images
 from .retrieval.maps.corrections import remove_images as remove_images
 from .retrieval.maps.corrections import replace_images as replace_images
+from .retrieval.maps.live import latency_words as latency_words
 from .retrieval.maps.live import query_live as query_live
 from .retrieval.maps.map import Map as Map
 from .retrieval.maps.map import MapImage as MapImage

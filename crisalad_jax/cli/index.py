@@ -42,7 +42,7 @@ class Index(ReadFlags, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     """The map's folder. After a kill the same command goes on."""
     position_topic: str | None = None
     """Topic of positions in a robot log, by default the only NavSatFix, else the only odometry or
-    pose; "" takes none."""
+    pose; none takes none."""
     novelty: float | None = None
     """Take an image only if its similarity to the last one taken of its folder or video is not
     above that, such as 0.9."""

@@ -6,7 +6,7 @@ import importlib
 import pathlib
 import sys
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -31,6 +31,10 @@ from crisalad_jax.utils.files import atomic_path, real_path
 from crisalad_jax.utils.output import counted, printable
 from crisalad_jax.utils.signals import defer_signals
 
+if TYPE_CHECKING:  # of an extra
+    from crisalad_jax.experiments.rerun_log import Recording
+
+_RECORDS = "crisalad_jax.experiments.rerun_log"
 _ROWS = 24
 """Largest number of queries in a gallery."""
 _COLUMNS = 8
@@ -39,7 +43,7 @@ _COLUMNS = 8
 
 COMMON = (
     "images map watch camera fps window weights k min-similarity sequence verify json out gallery "
-    "map-images batch-size on-bad-image quiet"
+    "rerun map-images batch-size on-bad-image quiet"
 )
 EXAMPLE = "crisalad query new.jpg --map map --json -"
 
@@ -59,7 +63,9 @@ class Query(ReadFlags, FrameFlags, JsonFlag):
     watch: pathlib.Path | None = None
     """Folder: answer the images that appear in it as they appear, a line of JSON each."""
     camera: str | None = None
-    """Number from 0, URL or video file: answer its newest frame, time and again."""
+    """Number from 0, URL, video or robot log: answer its newest frame, time and again."""
+    rate: float | None = None
+    """How many times as fast as its own pace a file as --camera plays; by default 1."""
     fps: float | None = None
     """Frames a second taken of a video or log, by default 1; the most that --camera answers."""
     window: int = 1
@@ -92,8 +98,11 @@ class Query(ReadFlags, FrameFlags, JsonFlag):
     .geojson, .gpx or .kml, in degrees."""
     gallery: Annotated[pathlib.Path | None, Target((".png", ".svg", ".pdf"))] = None
     """PNG, SVG or PDF of up to 24 queries beside up to 8 answers each."""
+    rerun: Annotated[pathlib.Path | None, Target((".rrd",))] = None
+    """Recording for the viewer Rerun: queries, answers, similarities and the way on the map, along
+    time (docs/how-to/from-a-bag-to-a-relocalising-robot.md)."""
     map_images: pathlib.Path | None = None
-    """Folder of the map's images, for the gallery and --verify, if they are not where they were."""
+    """Folder of the map's images, for --gallery, --rerun and --verify, if they were moved."""
     verify: int | None = None
     """Number of best answers that are verified by local features: matches, inliers and, with
     --intrinsics, poses (docs/verification.md)."""
@@ -124,6 +133,7 @@ def run(arguments: Query) -> None:
     if arguments.watch is not None or arguments.camera is not None:
         _run_live(arguments)
         return
+    refuse_without("--camera", None, rate=arguments.rate)
     _check_files(arguments)
     sequence = _sequence_of(arguments)
     with _opened(arguments) as places:
@@ -162,6 +172,9 @@ def run(arguments: Query) -> None:
             )
             save(figure, staged.enter_context(atomic_path(gallery)))
             written[gallery] = f"{_ROWS} of {asked}" if len(answers.queries) > _ROWS else asked
+        if arguments.rerun is not None:
+            staged.enter_context(_recording(arguments)).add(answers)
+            written[arguments.rerun] = asked
         for path in (file, arguments.out):
             if path not in (None, STDOUT):
                 text, count = format_answers(path, answers)
@@ -172,17 +185,20 @@ def run(arguments: Query) -> None:
 
 
 def _check_files(arguments: Query) -> None:
-    """Check that the gallery has what it needs, and a file of its own."""
-    gallery, file, out = arguments.gallery, arguments.json, arguments.out
+    """Check that pictures have what they need, and a file of their own."""
+    gallery, file, rerun, out = arguments.gallery, arguments.json, arguments.rerun, arguments.out
     require(
         out is None or out.suffix != "",
         f"--out: found {out}, expected a name that ends in {' or '.join(POSITION_SUFFIXES)}",
     )
     if arguments.verify is None:
-        refuse_without("--gallery or --verify", gallery, map_images=arguments.map_images)
+        needs = "--gallery, --rerun or --verify"
+        refuse_without(needs, gallery or rerun, map_images=arguments.map_images)
+    if rerun is not None:
+        importlib.import_module(_RECORDS)  # or its extra is missing
     if gallery is None:
         return
-    importlib.import_module("crisalad_jax.experiments.report")  # or its extra is missing
+    importlib.import_module("crisalad_jax.experiments.report")
     require(
         file in (None, STDOUT) or real_path(file) != real_path(gallery),
         f"--gallery: found {gallery}, as --json, expected two files",
@@ -291,16 +307,15 @@ def _run_live(arguments: Query) -> None:
     """Print an answer for each image that comes, until a signal or the end of a video."""
     name = "--camera" if arguments.watch is None else "--watch"
     require(not arguments.images, f"IMAGE: found with {name}, expected only one of the two")
-    refuse_with(name, **pick(arguments, "gallery", "out", "topic"))
-    if arguments.verify is None:
-        refuse_without("--verify", None, map_images=arguments.map_images)
+    refuse_with(name, gallery=arguments.gallery, out=arguments.out)
     if name == "--watch":
-        refuse_with(name, **pick(arguments, "camera", "fps"))
+        refuse_with(name, **pick(arguments, "camera", "fps", "rate", "topic"))
     require(
         arguments.json in (None, STDOUT),
         f"--json: found {arguments.json} with {name}, expected -: answers go to the standard "
         "output as they come",
     )
+    _check_files(arguments)
     sequence = _sequence_of(arguments)
     with contextlib.ExitStack() as stack:
         # First, for its errors: loading a model takes seconds.
@@ -311,11 +326,16 @@ def _run_live(arguments: Query) -> None:
             words = f"watching {arguments.watch} ({there}, and left out)"
         else:
             assert arguments.camera is not None
-            source = stack.enter_context(Camera(arguments.camera, fps=arguments.fps))
+            more = pick(arguments, "fps", "topic")
+            rate = 1.0 if arguments.rate is None else arguments.rate
+            source = stack.enter_context(Camera(arguments.camera, rate=rate, **more))
             words = f"taking frames from {source.name}"
         places = stack.enter_context(_opened(arguments))
         latencies: list[float] = []
         state = stack.enter_context(defer_signals())
+        recording = None
+        if arguments.rerun is not None:
+            recording = stack.enter_context(_recording(arguments))
 
         def ready() -> None:
             state.has_work = True  # the summary
@@ -334,9 +354,17 @@ def _run_live(arguments: Query) -> None:
             for answer in answers:
                 print(answer.json_line(), flush=True)
                 latencies.append(answer.latency_ms)
+                if recording is not None:
+                    recording.add(answer.answers, [answer.frame.image])
         finally:
-            dropped = f"; {source.dropped} frames passed over" if source.dropped else ""
-            _log(f"{latency_words(latencies)}{dropped}")
+            _log(latency_words(latencies, source.dropped))
+
+
+def _recording(arguments: Query) -> "contextlib.AbstractContextManager[Recording]":
+    from crisalad_jax.experiments.rerun_log import record
+
+    assert arguments.rerun is not None
+    return record(arguments.rerun, root=arguments.map_images)
 
 
 def _log(line: str) -> None:

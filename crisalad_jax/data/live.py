@@ -1,23 +1,24 @@
 """Images as they come: files that appear in a folder, and the newest frame of a camera."""
 
 import contextlib
+import math
 import os
 import pathlib
-import queue
 import threading
 import time
 import urllib.parse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import NamedTuple, Self
 
 import cv2
 import numpy as np
 
-from crisalad_jax.config.checks import PATH, takes
+from crisalad_jax.config.checks import PATH, require, takes
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.frames import check_rate, frame_name
+from crisalad_jax.data.frames import FrameName, check_rate, frame_name, is_log
 from crisalad_jax.data.images import SELF_CHECKED, check_folder, is_image, read_pixels
+from crisalad_jax.data.logs import Log, open_log
 from crisalad_jax.data.video import milliseconds_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
@@ -44,6 +45,8 @@ class Frame(NamedTuple):
     """RGB or grey, upright, in the depth of the file; a camera's of 8 bits."""
     taken: float
     """`time.perf_counter()` when it was in hand: a whole file, or a frame from the camera."""
+    dropped: int = 0
+    """Number of frames that were passed over between the frame taken before and this one."""
 
 
 class FolderWatch:
@@ -135,11 +138,108 @@ class FolderWatch:
         """Do nothing: no file is open."""
 
 
-class Camera:
+_Played = Generator[tuple[float, tuple[np.ndarray, float, str]]]
+"""Seconds from the beginning when a frame is due; its image, time and name."""
+
+
+class LatestFrame:
+    """A queue of one frame: a source that is given frames from outside, such as by a ROS callback.
+
+    A frame that nobody took before the next one came is passed over, and counted. Any thread may
+    `put` frames while another one takes them.
+
+    Example:
+        >>> import numpy as np
+        >>> from crisalad_jax import LatestFrame
+        >>> latest = LatestFrame()
+        >>> for stamp in (1767225600.0, 1767225600.1, 1767225600.2):
+        ...     latest.put(np.zeros((60, 80, 3), np.uint8), stamp)
+        >>> latest.close()
+        >>> [(frame.name, frame.dropped) for frame in latest.frames()]
+        [('camera#t=1767225600.200', 2)]
+    """
+
+    size: Size | None = None
+    """Height and width of all frames; None where that is unknown."""
+
+    def __init__(self, *, fps: float | None = None) -> None:
+        """Begin without a frame.
+
+        Args:
+            fps: most frames a second that `frames` yields; None is as many as are asked for.
+
+        Raises:
+            InputError: a rate out of range.
+        """
+        if fps is not None:
+            check_rate(fps)
+        self._fps = fps
+        self.dropped = 0
+        """Number of frames passed over for newer ones."""
+        self._changed = threading.Condition()
+        self._newest: Frame | None = None
+        self._ended = False
+
+    def __enter__(self) -> Self:
+        """Return the source itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the source."""
+        self.close()
+
+    def put(self, image: np.ndarray, stamp: float, name: str | None = None) -> None:
+        """Give the newest frame, in place of one that waits.
+
+        Args:
+            image: 8-bit RGB (height, width, 3), or what else `prepare_image` takes. It must not
+                change afterwards.
+            stamp: its moment in seconds, such as since 1970.
+            name: what its answer calls it; None is the camera and the time.
+        """
+        taken = time.perf_counter()
+        name = frame_name("camera", round(1000 * stamp)) if name is None else name
+        with self._changed:
+            passed = 0 if self._newest is None else self._newest.dropped + 1
+            self.dropped += passed > 0
+            self._newest = Frame(name, stamp, image, taken, passed)
+            self._changed.notify()
+
+    def frames(self, check: Callable[[], None] = lambda: None) -> Iterator[Frame]:
+        """Yield the newest frame, time and again, until the source is closed or ends.
+
+        Args:
+            check: called several times a second; it may raise, to end this.
+        """
+        due = 0.0
+        while True:
+            check()
+            if (early := due - time.monotonic()) > 0:
+                time.sleep(min(_TURN, early))
+                continue
+            with self._changed:
+                if self._newest is None and not self._ended:
+                    self._changed.wait(_TURN)
+                frame, self._newest = self._newest, None
+                ended = self._ended
+            if frame is not None:
+                due = 0 if self._fps is None else time.monotonic() + 1 / self._fps
+                yield frame
+            elif ended:
+                return
+
+    def close(self) -> None:
+        """End `frames`, after the frame that waits."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+
+
+class Camera(LatestFrame):
     """The newest frame of a camera, whenever one is asked for; older ones are passed over.
 
     A thread takes all frames from the camera, so that none waits in the camera's own queue. A
-    video file plays at its own pace, as if it were a camera.
+    video file or a robot log plays at its own pace, as if it were a camera.
 
     Example:
         >>> import cv2, numpy as np
@@ -154,51 +254,68 @@ class Camera:
     """
 
     @takes(camera=(int, str, os.PathLike))
-    def __init__(self, camera: int | str | os.PathLike[str], *, fps: float | None = None) -> None:
+    def __init__(
+        self,
+        camera: int | str | os.PathLike[str],
+        *,
+        fps: float | None = None,
+        rate: float = 1.0,
+        topic: str | None = None,
+    ) -> None:
         """Open the camera.
 
         Args:
-            camera: its number, from 0, or a URL, or a video file.
+            camera: its number, from 0, or a URL, or a video file, or a robot log (a ROS bag).
             fps: most frames a second that `frames` yields; None is as many as are asked for.
+            rate: how many times as fast as its own pace a file plays.
+            topic: of a robot log, the topic of the images; None is the only one that has any.
 
         Raises:
-            InputError: it cannot be opened, or gives no frame; or a rate out of range.
+            InputError: it cannot be opened, or gives no frame; a rate out of range; or a topic that
+                the log does not have.
         """
-        if fps is not None:
-            check_rate(fps)
-        self._fps = fps
+        super().__init__(fps=fps)
+        require(0 < rate < math.inf, f"rate: found {rate:g}, expected more than 0")
         given = os.fspath(camera) if isinstance(camera, os.PathLike) else str(camera)
-        self._is_file = pathlib.Path(given).is_file()
+        from_log = is_log(given)
+        require(
+            from_log or topic is None,
+            f"topic: found {topic} with {_name(given)}, expected a robot log",
+        )
+        self._is_file = from_log or pathlib.Path(given).is_file()
+        self._rate = rate
         self.name = _name(given)
         """What messages call it: no user or password of a URL."""
         self._begins = pathlib.Path(given).name if self._is_file else self.name
+        self.size: Size | None
+        """Height and width of the frames; None where the camera does not tell."""
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._failure: Exception | None = None
+        self._capture: cv2.VideoCapture | None = None
+        if from_log:
+            log = open_log(given)
+            topic = log.image_topic(topic)
+            first = next(log.images(topic), None)
+            if first is None:
+                raise InputError(f"{given}: found no image in {topic}, expected at least one")
+            self.size = first[1].shape[:2]
+            self._played = self._logged(log, topic)
+            return
         is_number = given.isdecimal() and len(given) < 10 and not self._is_file  # 32 bits
         known = self._is_file or is_number or "://" in given
-        self._capture = cv2.VideoCapture(int(given) if is_number else given)
-        whole = known and self._capture.isOpened() and self._capture.grab()
+        self._capture = capture = cv2.VideoCapture(int(given) if is_number else given)
+        whole = known and capture.isOpened() and capture.grab()
         if not whole:
-            self._capture.release()
+            capture.release()
             raise InputError(
                 f"camera: found no frame from {self.name}, expected a number from 0, a URL or a "
                 "video file"
             )
         sides = (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH)
-        height, width = (int(self._capture.get(side)) for side in sides)
-        self.size: Size | None = (height, width) if height > 0 and width > 0 else None
-        """Height and width of the frames; None where the camera does not tell."""
-        self.dropped = 0
-        """Number of frames passed over for newer ones."""
-        self._newest: queue.Queue[Frame] = queue.Queue(1)
-        self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    def __enter__(self) -> Self:
-        """Return the camera itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close the camera."""
-        self.close()
+        height, width = (int(capture.get(side)) for side in sides)
+        self.size = (height, width) if height > 0 and width > 0 else None
+        self._played = self._captured(capture)
 
     def frames(self, check: Callable[[], None] = lambda: None) -> Iterator[Frame]:
         """Yield the newest frame, time and again, until the camera or the video ends.
@@ -209,51 +326,62 @@ class Camera:
         Raises:
             InputError: a camera, which is no video file, gives no more frames.
         """
-        self._thread = thread = threading.Thread(target=self._take, daemon=True)
-        thread.start()
-        due = 0.0
-        while True:
-            check()
-            if (early := due - time.monotonic()) > 0:
-                time.sleep(min(_TURN, early))
-                continue
-            goes_on = thread.is_alive()
-            try:
-                frame = self._newest.get(timeout=_TURN)
-            except queue.Empty:
-                if goes_on:
-                    continue
-                break
-            due = 0 if self._fps is None else time.monotonic() + 1 / self._fps
-            yield frame
+        self._thread = threading.Thread(target=self._play, daemon=True)
+        self._thread.start()
+        yield from super().frames(check)
+        if self._failure is not None:
+            raise self._failure
         if not self._is_file and not self._closing.is_set():
             raise InputError(f"camera: found no more frames from {self.name}, expected it to go on")
 
-    def _take(self) -> None:
-        """Take frames until there are no more; a video's at their times."""
-        begun, grabbed = time.monotonic(), True  # the first frame was grabbed to try the camera
-        while grabbed and not self._closing.is_set():
-            at = milliseconds_of(self._capture)
-            found, image = self._capture.retrieve()
-            if self._is_file:
-                self._closing.wait(max(0.0, begun + at / 1000 - time.monotonic()))
-            taken = time.perf_counter()
-            when = at if self._is_file else round(1000 * time.time())
-            if found:
-                image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-                with contextlib.suppress(queue.Empty):
-                    self._newest.get_nowait()
-                    self.dropped += 1
-                name = frame_name(self._begins, when)
-                self._newest.put(Frame(name, when / 1000, image, taken))
-            grabbed = self._capture.grab()
-        self._capture.release()
+    def _play(self) -> None:
+        """Put frames until there are no more; a file's at their times."""
+        begun = time.monotonic()
+        try:
+            with contextlib.closing(self._played) as frames:
+                for due, frame in frames:
+                    self._closing.wait(max(0.0, begun + due / self._rate - time.monotonic()))
+                    if self._closing.is_set():
+                        break
+                    self.put(*frame)
+        except Exception as error:  # for `frames` to raise, in the thread that asks
+            self._failure = error
+        finally:
+            super().close()
+
+    def _captured(self, capture: cv2.VideoCapture) -> _Played:
+        """Yield when a camera's or a video's frames are due, and what `put` takes.
+
+        The first is grabbed already.
+        """
+        try:
+            grabbed = True
+            while grabbed:
+                at = milliseconds_of(capture)
+                found, image = capture.retrieve()
+                when = at if self._is_file else round(1000 * time.time())
+                if found:
+                    image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+                    due = at / 1000 if self._is_file else 0.0
+                    yield due, (image, when / 1000, frame_name(self._begins, when))
+                grabbed = capture.grab() and not self._closing.is_set()
+        finally:
+            capture.release()
+
+    def _logged(self, log: Log, topic: str) -> _Played:
+        """Yield when a log's frames are due, and what `put` takes."""
+        begun = None
+        for stamp, image in log.images(topic):
+            begun = stamp if begun is None else begun
+            name = str(FrameName(self._begins, topic, stamp))
+            yield (stamp - begun) / 10**9, (image, stamp / 10**9, name)
 
     def close(self) -> None:
         """Let go of the camera."""
         self._closing.set()
         if self._thread is None:
-            self._capture.release()
+            if self._capture is not None:
+                self._capture.release()
         else:
             self._thread.join(timeout=1)  # a camera that hangs is left to the end of the process
 

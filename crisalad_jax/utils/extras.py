@@ -7,7 +7,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "report": ("jinja2", "matplotlib", *_CLI),
     "train": ("optax", "orbax", "numba", "tensorboardX", "matplotlib", *_CLI),
     "maps": ("faiss", "h5py", "PIL", "yaml", *_CLI),
-    "robot": ("rosbags", "fsspec", *_CLI),
+    "robot": ("rosbags", "rerun", "fsspec", *_CLI),
     "export": ("flatbuffers", *_CLI),
     "onnx": ("onnx", "onnxruntime", *_CLI),
     "openvino": ("openvino", "onnx", *_CLI),

@@ -122,15 +122,17 @@ def test_a_robot_log_is_indexed_with_positions_and_queried(shared, tmp_path, cap
     bag, out = write_bag(tmp_path / "walk.bag", walk), tmp_path / "map"
     words = ("found 2 topics of images, expected --topic with one of /left (Image, 4), /right",)
     fails(capfd, *index(shared, bag, out), words=words)
-    said = succeeds(capfd, *index(shared, bag, out, "--topic", "/left", "--fps", 10))
+    said, notes = runs(capfd, *index(shared, bag, out, "--topic", "/left", "--fps", 10))
     assert "4 images added, 4 with positions" in said
+    assert notes.endswith("/gps/fix has positions of 4 of 4 images; the largest gap is 0 s\n")
     names = [f"walk.bag#/left#t={(BEGIN // SECOND) + second}.000000000" for second in range(4)]
     assert positions(out) == {name: (52 + i / 1000, 21.0) for i, name in enumerate(names)}
-    assert "4 were there already" in succeeds(capfd, *index(shared, bag, out, "--topic", "/left"))
+    flags = ("--topic", "/left", "--position-topic", "none")
+    assert "4 were there already" in succeeds(capfd, *index(shared, bag, out, *flags))
 
     folder = write_bag(tmp_path / "walk", walk)
     flags = ("--topic", "/left", "--k", 1, "--json", "-")
-    lines = succeeds(capfd, *query(out, folder, *flags)).splitlines()
+    lines = runs(capfd, *query(out, folder, *flags))[0].splitlines()
     for line, name in zip(lines, names, strict=True):
         answer = json.loads(line)
         assert (answer["query"], answer["time"]) == (
@@ -140,9 +142,11 @@ def test_a_robot_log_is_indexed_with_positions_and_queried(shared, tmp_path, cap
         assert answer["neighbours"][0]["name"] == name
         assert answer["neighbours"][0]["similarity"] == pytest.approx(1, abs=ROUNDING)
 
-    write_bag(bag.with_name("longer.bag"), walk * 2).replace(bag)
+    more = image(BEGIN + 9 * SECOND, pictures[0], topic="/left")
+    write_bag(bag.with_name("longer.bag"), [*walk, more]).replace(bag)
     words = (f"but the map has '{names[0]}' of", "expected new names for new images")
-    fails(capfd, *index(shared, bag, out, "--topic", "/left"), words=words)
+    flags = ("--topic", "/left", "--position-topic", "none", "--fps", 10)
+    fails(capfd, *index(shared, bag, out, *flags), words=words)
 
 
 def test_a_pattern_and_a_window_of_queries(town_map, tmp_path, capfd, queries):
@@ -194,6 +198,33 @@ def test_a_camera_of_a_video(town_map, tmp_path, capfd):
     ready, summary = error.splitlines()
     assert ready == f"crisalad: ready, taking frames from {video}"
     assert summary.startswith(f"crisalad: {len(lines)} answers, latency median ")
+
+
+def test_a_bag_is_replayed_and_no_frame_is_lost(town_map, tmp_path, capfd):
+    """Forty frames, a hundred a second at twice the bag's rate: each is answered or counted."""
+    flat = [np.full((48, 64, 3), 6 * number, np.uint8) for number in range(40)]
+    step = SECOND // 50
+    bag = write_bag(
+        tmp_path / "walk.mcap",
+        [image(BEGIN + step * number, each) for number, each in enumerate(flat)],
+    )
+    out, error = runs(capfd, *query(town_map, "--camera", bag, "--rate", 2, "--k", 1))
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert len(lines) + sum(line["dropped"] for line in lines) == 40
+    for line in lines:
+        seconds = line["query"].removeprefix("walk.mcap#/camera/image_raw#t=")
+        assert float(seconds) == line["time"]
+        assert line["latency_ms"] > 0
+    assert lines[-1]["time"] == (BEGIN + 39 * step) / SECOND
+    ready, summary = error.splitlines()
+    assert ready == f"crisalad: ready, taking frames from {bag}"
+    assert summary.startswith(f"crisalad: {len(lines)} answer")
+    passed = 40 - len(lines)
+    words = {0: " ms", 1: "; 1 frame passed over"}
+    assert summary.endswith(words.get(passed, f"; {passed} frames passed over"))
+    given = query(town_map, "--camera", bag, "--topic", "/front")
+    fails(capfd, *given, words=("found --topic /front, expected", "/camera/image_raw (Image, 40)"))
+    fails(capfd, *query(town_map, "--camera", bag, "--rate", 0), words=("rate: found 0, expected",))
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,11 @@ import pytest
 
 import crisalad_jax.data.live
 from crisalad_jax.data.images import read_image
-from crisalad_jax.data.live import Camera, FolderWatch
+from crisalad_jax.data.live import Camera, FolderWatch, LatestFrame
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.conftest import write_picture, write_video
+from tests.data.bags import BEGIN, SECOND, image, write_bag
 from tests.data.benchmarks.trees import refused
 from tests.data.test_sources import LEVELS
 
@@ -119,7 +120,7 @@ def test_a_video_plays_as_a_camera(tmp_path):
         assert camera.size == (48, 64)
         found = list(camera.frames())
     assert found[-1].time == 0.7
-    assert len(found) + camera.dropped == 8
+    assert len(found) + camera.dropped == len(found) + sum(frame.dropped for frame in found) == 8
     for frame in found:
         assert frame.name == f"{video.name}#t={frame.time:.3f}"
         assert frame.image.mean() == pytest.approx(100 * frame.time, abs=LEVELS)
@@ -150,6 +151,97 @@ def test_a_camera_at_a_rate(tmp_path):
     assert np.diff(given).min() > 0.25 - 0.01
     assert len(given) + camera.dropped == 7
     assert camera.dropped >= 1
+
+
+def test_a_file_plays_at_a_rate(tmp_path):
+    """Ten frames a second at half the rate are five: never before their time."""
+    begun = time.perf_counter()
+    with Camera(write_video(tmp_path / "a.avi", 5), rate=0.5) as camera:
+        slow = [(frame.time, frame.taken - begun) for frame in camera.frames()]
+    assert all(taken > 2 * at - 0.01 for at, taken in slow)
+    assert slow[-1][0] == 0.4
+
+
+def test_frames_of_several_threads_are_given_or_counted():
+    """Four writers and a slow reader: whatever the order, none is lost."""
+    latest = LatestFrame()
+    image = np.zeros((2, 2, 3), np.uint8)
+
+    def write(writer: int) -> None:
+        for number in range(50):
+            latest.put(image, number, f"{writer}-{number}")
+            time.sleep(0.0005)
+
+    writers = [threading.Thread(target=write, args=(writer,)) for writer in range(4)]
+    for writer in writers:
+        writer.start()
+    threading.Thread(target=lambda: [*(each.join() for each in writers), latest.close()]).start()
+    names, passed = [], 0
+    for frame in latest.frames():
+        names.append(frame.name)
+        passed += frame.dropped
+        time.sleep(0.002)
+    assert len(names) + passed == len(names) + latest.dropped == 200
+    assert len(set(names)) == len(names) > 1
+
+
+def bag_of(path, levels, step=50_000_000, **more):
+    """A bag of flat images, so many nanoseconds apart."""
+    flat = [np.full((4, 6, 3), level, np.uint8) for level in levels]
+    return write_bag(path, [image(BEGIN + step * n, each, **more) for n, each in enumerate(flat)])
+
+
+@pytest.mark.parametrize("form", ["walk", "walk.mcap", "walk.bag"])
+def test_a_log_plays_at_its_own_pace(tmp_path, form):
+    """Each frame is given or counted, and none before its time."""
+    bag = bag_of(tmp_path / form, range(12))
+    begun = time.perf_counter()
+    with Camera(bag, rate=2) as camera:
+        assert camera.size == (4, 6)
+        found = list(camera.frames())
+    assert len(found) + sum(frame.dropped for frame in found) == 12
+    assert sum(frame.dropped for frame in found) == camera.dropped
+    for frame in found:
+        level = int(frame.image[0, 0, 0])
+        stamp = BEGIN + 50_000_000 * level
+        seconds, rest = divmod(stamp, SECOND)
+        assert frame.name == f"{form}#/camera/image_raw#t={seconds}.{rest:09d}"
+        assert frame.time == stamp / SECOND
+        # Of two clocks, which differ by far less than a frame.
+        assert frame.taken - begun > 0.05 * level / 2 - 0.01
+    assert found[-1].image[0, 0, 0] == 11
+
+
+def test_the_topic_of_a_log_is_chosen(tmp_path):
+    two = [image(BEGIN, np.full((4, 6, 3), n, np.uint8), topic=f"/{n}") for n in (7, 9)]
+    bag = write_bag(tmp_path / "two.mcap", two)
+    with Camera(bag, topic="/9") as camera:
+        (frame,) = camera.frames()
+    assert (frame.image[0, 0, 0], frame.name.split("#")[1]) == (9, "/9")
+    for topic in (None, "/8"):
+        with pytest.raises(
+            InputError, match=r"two\.mcap: found .*/7 \(Image, 1\), /9 \(Image, 1\)"
+        ):
+            Camera(bag, topic=topic)
+    with refused("topic: found /9 with camera-0, expected a robot log"):
+        Camera(0, topic="/9")
+
+
+def test_what_is_wrong_in_a_log_is_raised_where_frames_are_asked_for(tmp_path):
+    """Not in the thread that plays it: the frames before it come first."""
+    good = image(BEGIN, np.zeros((4, 6, 3), np.uint8))
+    bad = image(BEGIN + 1, np.zeros((4, 6, 3), np.uint8), "nv21")
+    with Camera(write_bag(tmp_path / "a.mcap", [good, bad])) as camera:
+        frames = camera.frames()
+        assert next(frames).name.endswith(".000000000")
+        with pytest.raises(InputError, match="found an image of encoding 'nv21'"):
+            next(frames)
+
+
+@pytest.mark.parametrize("rate", [0, -1, float("inf"), float("nan")])
+def test_a_rate_that_nothing_plays_at(tmp_path, rate):
+    with refused(f"rate: found {rate:g}, expected more than 0"):
+        Camera(write_video(tmp_path / "a.avi", 2), rate=rate)
 
 
 def test_a_camera_ends_when_it_is_told_to(tmp_path):

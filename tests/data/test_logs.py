@@ -303,7 +303,7 @@ def test_fixes_come_first_and_those_without_one_are_left_out(tmp_path):
         assert found[tenth] == pytest.approx(expected, abs=1e-6)
     with pytest.warns(Note, match="/odom has positions of 1 of 30 images"):
         assert positions_of(bag, position_topic="/odom") == {0: (1.0, 2.0)}
-    assert positions_of(bag, position_topic="") is None
+    assert positions_of(bag, position_topic="none") is None
     listed = r"/gps/fix \(NavSatFix, 5\), /odom \(Odometry, 1\)"
     with refused(f"found --position-topic /gps, expected a topic of positions: {listed}"):
         positions_of(bag, position_topic="/gps")

@@ -10,9 +10,9 @@ import numpy as np
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count, takes
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.live import Camera, FolderWatch
+from crisalad_jax.data.live import FolderWatch, Frame, LatestFrame
 from crisalad_jax.retrieval.describe import FrameDescriber
-from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.map import Answer, Map
 from crisalad_jax.retrieval.maps.query import (
     Answers,
     answers_of,
@@ -37,22 +37,37 @@ class LiveAnswer(NamedTuple):
 
     answers: Answers
     """Of this one query."""
-    time: float
-    """The frame's; see `Frame`."""
+    frame: Frame
+    """Its image, its time, and how many frames were passed over since the answer before."""
     latency_ms: float
     """Milliseconds from the frame in hand to the answer."""
+
+    @property
+    def known(self) -> bool:
+        """Whether the frame shows a place of the map; see `Answers.known`."""
+        return bool(self.answers.known[0])
+
+    @property
+    def ranked(self) -> list[Answer]:
+        """The images of the map that are most similar, best first."""
+        ((_, ranked),) = self.answers.rows()
+        return ranked
 
     def json_line(self) -> str:
         """Return the answer as one line of JSON."""
         (row,) = json_rows(self.answers)
-        more = {"time": round(self.time, 3), "latency_ms": round(self.latency_ms, 1)}
+        more = {
+            "time": round(self.frame.time, 3),
+            "latency_ms": round(self.latency_ms, 1),
+            "dropped": self.frame.dropped,
+        }
         return json_text({"query": row.pop("query")} | more | row)
 
 
 @takes(places=Map)
 def query_live(
     places: Map,
-    source: Camera | FolderWatch,
+    source: LatestFrame | FolderWatch,
     *,
     model: "Model | Runtime | None" = None,
     k: int = 5,
@@ -71,7 +86,7 @@ def query_live(
 
     Args:
         places: the map, open.
-        source: a `Camera` or a `FolderWatch`.
+        source: a `Camera`, a `FolderWatch`, or a `LatestFrame` that another thread fills.
         model: the model that made the map; None loads it from where it was (`Map.load_model`).
         k: number of answers to each frame.
         window: frames that are described together: each with those just answered before it. 1
@@ -128,17 +143,23 @@ def query_live(
             if verifier is not None:
                 answer = verified(answer, verifier, [frame.image], k)
             latency = time.perf_counter() - frame.taken
-            yield LiveAnswer(answer, frame.time, 1000 * latency)
+            yield LiveAnswer(answer, frame, 1000 * latency)
 
     return answers()
 
 
-def latency_words(milliseconds: Sequence[float]) -> str:
-    """Summarise latencies in words."""
+def latency_words(milliseconds: Sequence[float], dropped: int) -> str:
+    """Summarise the latencies of answers, and how many frames were passed over, for a log.
+
+    Example:
+        >>> latency_words([20.0, 21.0, 22.0], 4)
+        '3 answers, latency median 21.0 ms, 95th percentile 21.9 ms; 4 frames passed over'
+    """
+    passed = f"; {counted(dropped, 'frame')} passed over" if dropped else ""
     if not milliseconds:
-        return "no answers"
+        return f"no answers{passed}"
     median, high = np.percentile(milliseconds, (50, 95))
     return (
         f"{counted(len(milliseconds), 'answer')}, latency median {median:.1f} ms, 95th percentile "
-        f"{high:.1f} ms"
+        f"{high:.1f} ms{passed}"
     )

@@ -184,7 +184,7 @@ def query(
     verifier = None if verify is None else Verifier(verify)
     thresholds = asked_thresholds(places, min_similarity, verifier)
     how = {"fps": fps, "topic": topic, "on_bad_image": reading.on_bad_image}
-    root, sources = _below_one_root(open_sources(images, **how, position_topic=""))
+    root, sources = _below_one_root(open_sources(images, **how, position_topic="none"))
     paths = list(itertools.chain(*sources))
     describer = places.describer(model, groupings=["single" if window == 1 else "window"])
     ask = asking(places, found_at_least(k, verifier), sequence, exact=exact)

@@ -13,9 +13,9 @@ import numpy as np
 
 from crisalad_jax.config.checks import check_count, require
 from crisalad_jax.config.short_repr import with_field_docs
+from crisalad_jax.data.frames import file_of
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.prepare import as_rgb
-from crisalad_jax.data.video import file_of
 from crisalad_jax.retrieval.verification.camera import Intrinsics
 from crisalad_jax.retrieval.verification.geometry import (
     Pose,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.images import list_images, read_image
-from crisalad_jax.data.live import Camera, FolderWatch, Frame
+from crisalad_jax.data.live import Camera, FolderWatch, Frame, LatestFrame
 from crisalad_jax.data.video import list_frames
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.build import index
@@ -80,8 +80,32 @@ def test_a_watched_folder_and_a_camera(town_map, shared, params, tmp_path):
         assert line["neighbours"][0]["name"] == image.name
         assert 0 < line["latency_ms"] < 60_000
         with Camera(video) as camera:
-            last = list(live(places, camera, params, k=1))[-1]
-    assert (last.time, json.loads(last.json_line())["query"]) == (0.3, "walk.avi#t=0.300")
+            *before, last = live(places, camera, params, k=1)
+    assert sum(1 + each.frame.dropped for each in (*before, last)) == 4
+    assert json.loads(last.json_line())["dropped"] == last.frame.dropped
+    assert (last.frame.time, json.loads(last.json_line())["query"]) == (0.3, "walk.avi#t=0.300")
+
+
+def test_frames_from_another_thread(town_map, shared, params):
+    """As a callback of ROS puts them: the newest is answered, and those passed over are counted."""
+    paths = list_images(shared / "town" / "images" / "test" / "database")[:5]
+    images = [read_image(path) for path in paths]
+    latest = LatestFrame()
+    with Map.open(town_map) as places:
+        stream = live(places, latest, params, k=1, min_similarity=0.99)
+        for number, image in enumerate(images):
+            latest.put(image, 1767225600.0 + number, str(number))
+        first = next(stream)
+        latest.put(images[2], 1767225610.5)
+        second = next(stream)
+        latest.close()
+        assert list(stream) == []
+    # The map's own images: the last one, and the third.
+    assert (first.ranked[0].image.name, first.known) == (paths[-1].name, True)
+    assert (first.answers.names, first.frame.time, first.frame.dropped) == (["4"], 1767225604.0, 4)
+    assert second.ranked[0].image.name == paths[2].name
+    assert (second.answers.names, second.frame.dropped) == (["camera#t=1767225610.500"], 0)
+    assert latest.dropped == 4
 
 
 @pytest.mark.parametrize("sequence", [None, BayesFilter()])
@@ -126,8 +150,10 @@ def test_a_map_of_a_video_tells_times(shared, params, tmp_path):
 def test_latencies_in_words():
     # By hand: of 1 to 21 the 11th, and the 20th.
     words = "21 answers, latency median 11.0 ms, 95th percentile 20.0 ms"
-    assert latency_words(range(1, 22)) == words
-    assert latency_words([]) == "no answers"
+    assert latency_words(range(1, 22), 0) == words
+    assert latency_words(range(1, 22), 1) == f"{words}; 1 frame passed over"
+    assert latency_words([], 0) == "no answers"
+    assert latency_words([], 3) == "no answers; 3 frames passed over"
 
 
 def test_what_is_refused(town_map, params):
