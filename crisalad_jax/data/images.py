@@ -17,10 +17,11 @@ import numpy as np
 
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.preprocessing import BitDepth
+from crisalad_jax.data.frames import has_frames, parse_frame
 from crisalad_jax.data.prepare import as_rgb
 from crisalad_jax.data.remote import address_of, is_remote, read_remote
 from crisalad_jax.data.resize import resize_image
-from crisalad_jax.data.video import frame_time, is_video, read_frame
+from crisalad_jax.data.video import read_frame
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_bytes, real_path
 from crisalad_jax.utils.output import counted, warn
@@ -92,7 +93,8 @@ def read_image(
     - The first page or frame of several is taken.
 
     Args:
-        path: the image file, or a frame of a video, as in `walk.mp4#t=12.500` (seconds).
+        path: the image file, or a frame of a video, as in `walk.mp4#t=12.500` (seconds), or of a
+            robot log (see docs/how-to/image-sources.md).
         size: height and width in pixels to resize to, by the default of `resize_image`; None keeps
             the file's. Where a model has another way, `prepare_image` follows it.
         enough: height and width in pixels that the image will be resized to; None for full size.
@@ -120,11 +122,16 @@ def read_pixels(
     path: str | os.PathLike[str], *, enough: tuple[int, int] | None = None
 ) -> np.ndarray:
     """Read an image file as `read_image` does, in the file's own depth; see `decode_image`."""
-    if frame_time(path) is not None:
-        return read_frame(path)
-    if is_remote(path):
+    frame = parse_frame(path)
+    if frame is None and is_remote(path):
         return decode_image(read_remote(path), address_of(path), enough=enough)
-    return decode_image(read_bytes(path, "an image file"), path, enough=enough)
+    if frame is None:
+        return decode_image(read_bytes(path, "an image file"), path, enough=enough)
+    if frame.topic is None:
+        return read_frame(path)
+    from crisalad_jax.data.logs import read_log_frame  # which decodes by this module
+
+    return read_log_frame(path, enough=enough)
 
 
 def decode_image(
@@ -318,21 +325,21 @@ def is_image(path: str | os.PathLike[str]) -> bool:
 
 
 def only_images(
-    files: Sequence[pathlib.Path], source: object, *, videos: bool = False
+    files: Sequence[pathlib.Path], source: object, *, frames: bool = False
 ) -> list[pathlib.Path]:
     """Return the images among files, and count the others by suffix in a note.
 
     Args:
         files: what was found.
         source: what the message begins with, such as their folder.
-        videos: whether videos are wanted too.
+        frames: whether videos and robot logs, which have frames, are wanted too.
 
     Raises:
         InputError: no image is among them.
     """
     images, others = [], []
     for file in files:
-        (images if is_image(file) or (videos and is_video(file)) else others).append(file)
+        (images if is_image(file) or (frames and has_frames(file)) else others).append(file)
     # Sidecars of images, such as 1.json or 1.jpg.xmp of 1.jpg, and tables need no note.
     known = {name for image in images for name in (image, image.with_suffix(""))}
     skipped = collections.Counter(

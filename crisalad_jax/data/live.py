@@ -16,8 +16,9 @@ import numpy as np
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.preprocessing import Size
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import check_rate, frame_name
 from crisalad_jax.data.images import SELF_CHECKED, check_folder, is_image, read_pixels
-from crisalad_jax.data.video import check_rate, frame_name, milliseconds_of
+from crisalad_jax.data.video import milliseconds_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 

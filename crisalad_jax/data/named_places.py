@@ -20,12 +20,12 @@ import numpy as np
 
 from crisalad_jax.data.benchmarks.msls import MSLS_CITIES, city_folders, read_side
 from crisalad_jax.data.benchmarks.on_disk import find_images, has_sides, has_split, listing
+from crisalad_jax.data.frames import has_frames, sequence_of
 from crisalad_jax.data.images import OnBadImage, is_image, list_images
 from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.positions import AXES
-from crisalad_jax.data.sources import ImageSource, sequence_of
+from crisalad_jax.data.sources import ImageSource
 from crisalad_jax.data.tables import Disk, normal_name, read_table
-from crisalad_jax.data.video import is_video
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float64, Int64
@@ -181,7 +181,7 @@ def read_named_places(
     """
     if (root / TABLE).is_file():
         root = root / TABLE
-    if root.is_file() and not is_video(root):
+    if root.is_file() and not has_frames(root):
         return root.parent, *_read_table(root, on_bad_image)
     return root, (), _read_folders(root)
 
@@ -285,7 +285,7 @@ def places_by_order(source: ImageSource, frames: int) -> list[FoundPlace]:
 
     A place and the next one of the same folder or video are too near for one batch.
     """
-    sequences: dict[pathlib.Path, list[str]] = collections.defaultdict(list)
+    sequences: dict[str, list[str]] = collections.defaultdict(list)
     for path, name in zip(source.paths, source.names, strict=True):
         sequences[sequence_of(path)].append(name)
     places: list[FoundPlace] = []

@@ -24,7 +24,7 @@ from crisalad_jax.data.named_places import (
     read_msls_places,
     read_named_places,
 )
-from crisalad_jax.data.sources import check_rate_used, open_source
+from crisalad_jax.data.sources import check_frames, open_source
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.output import warn
@@ -177,7 +177,7 @@ def read_places(
         names, found = read_msls_places(root, cities, on_bad_image)
     elif groupings:
         source = open_source(root, fps=fps, on_bad_image=on_bad_image)
-        check_rate_used(fps, source.paths)
+        check_frames(source.paths, fps=fps)
         root = source.root
         if place_radius is not None:
             found = places_by_position(source, place_radius, positions)

@@ -10,13 +10,13 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import moment_of
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.remote import for_each, is_remote, open_beginning
 from crisalad_jax.data.tables import AXES as AXES
 from crisalad_jax.data.tables import MOST_METRES as MOST_METRES
 from crisalad_jax.data.tables import matched, number_of, read_table
 from crisalad_jax.data.tracks import Track, is_track, read_track, time_of, utc
-from crisalad_jax.data.video import moment_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float64

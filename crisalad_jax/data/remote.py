@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
+from crisalad_jax.data.frames import stored_bytes
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.files import real_path
@@ -121,13 +122,13 @@ def open_beginning(path: str | os.PathLike[str]) -> Iterator[Any]:
 
 
 def size_of(path: pathlib.Path) -> int | None:
-    """Return the bytes of a file, here or at an address; None where there is none.
+    """Return the bytes of the file that holds an image, here or at an address; None for no file.
 
     Raises:
         InputError: an address that cannot be asked.
     """
     if not is_remote(path):
-        return path.stat().st_size if path.is_file() else None
+        return stored_bytes(path)
     with _opened(path) as (files, there):
         try:
             return files.info(there)["size"]

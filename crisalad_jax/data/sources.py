@@ -1,4 +1,4 @@
-"""Sources of images: a folder, a file, a pattern, a list, a table or a video."""
+"""Sources of images: a folder, a file, a pattern, a list, a table, a video or a robot log."""
 
 import collections
 import glob
@@ -12,7 +12,18 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import (
+    check_rate,
+    file_of,
+    has_frames,
+    is_log,
+    is_video,
+    parse_frame,
+    sequence_of,
+    stored_bytes,
+)
 from crisalad_jax.data.images import OnBadImage, is_image, list_images, names_in, only_images
+from crisalad_jax.data.logs import list_log_frames, name_log_frame
 from crisalad_jax.data.metres import on_ellipsoid
 from crisalad_jax.data.positions import (
     AXES,
@@ -25,22 +36,14 @@ from crisalad_jax.data.positions import (
 from crisalad_jax.data.remote import address_of, check_address, is_remote, list_remote
 from crisalad_jax.data.tables import Disk
 from crisalad_jax.data.tracks import Track
-from crisalad_jax.data.video import (
-    check_rate,
-    count_frames,
-    file_of,
-    frame_time,
-    is_video,
-    list_frames,
-    name_frame,
-)
+from crisalad_jax.data.video import count_frames, list_frames, name_frame
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source, read_text
 from crisalad_jax.utils.output import warn
 
 _FORMS = (
-    "a folder of images, an image, a video, a pattern such as 'frames/*.jpg', a list (.txt) or a "
-    "table (.csv)"
+    "a folder of images, an image, a video, a ROS bag, a pattern such as 'frames/*.jpg', a list "
+    "(.txt) or a table (.csv)"
 )
 _ROUNDING = 1e-3
 """Metres by which two positions that are rounded may be nearer than they say."""
@@ -54,11 +57,11 @@ class ImageSource(NamedTuple):
     root: pathlib.Path
     """Folder that names are relative to."""
     paths: list[pathlib.Path]
-    """Below the root; frames of videos under the names of `data.video`."""
+    """Below the root; frames of videos and logs under the names of `data.frames`."""
     names: list[str]
     """Posix paths relative to the root, each once."""
     positions: Positions | None = None
-    """What the columns of a table say; None without such columns."""
+    """What the columns of a table say, or a topic of a robot log; None without these."""
 
     def located(self, given: Positions | Track | str | os.PathLike[str] | None = None) -> Positions:
         """Return where the images were taken, as far as that is known.
@@ -74,7 +77,7 @@ class ImageSource(NamedTuple):
             return positions_of(given, self.names, self.paths, self.root)
         found = self.positions or utm_positions(self.names)
         each = zip(self.names, self.paths, strict=True)
-        pictures = ((name, path) for name, path in each if frame_time(path) is None)
+        pictures = ((name, path) for name, path in each if parse_frame(path) is None)
         return found if found.of else exif_positions(pictures)
 
     def spaced(self, positions: Positions, metres: float) -> Self:
@@ -102,7 +105,7 @@ class ImageSource(NamedTuple):
         if positions.axes == AXES[1]:
             points = on_ellipsoid(*points.T)
         point_of = dict(zip(names, points, strict=True))
-        last: dict[pathlib.Path, np.ndarray] = {}
+        last: dict[str, np.ndarray] = {}
         kept: list[int] = []
         for number, (name, path) in enumerate(zip(self.names, self.paths, strict=True)):
             point, sequence = point_of.get(name), sequence_of(path)
@@ -115,21 +118,25 @@ class ImageSource(NamedTuple):
         return self._replace(paths=paths, names=names)
 
 
-def sequence_of(path: pathlib.Path) -> pathlib.Path:
-    """Return what holds the images before and after an image: a video, or else its folder."""
-    return path.parent if frame_time(path) is None else file_of(path)
-
-
 def open_source(
-    images: str | os.PathLike[str], *, fps: float | None = None, on_bad_image: OnBadImage = "stop"
+    images: str | os.PathLike[str],
+    *,
+    fps: float | None = None,
+    topic: str | None = None,
+    position_topic: str | None = None,
+    on_bad_image: OnBadImage = "stop",
 ) -> ImageSource:
     """List the images of a source.
 
     Args:
-        images: a folder, searched with its subfolders; an image; a video; a pattern, where ** is
-            any folders; a list, .txt, of a path a line; or a table, .csv, with a column `name`
-            (see `read_image_table`). Paths in lists and tables are relative to their folder.
-        fps: frames a second taken of videos; None is one, and a note says so.
+        images: a folder, searched with its subfolders; an image; a video; a robot log (`open_log`);
+            a pattern, where ** is any folders; a list, .txt, of a path a line; or a table, .csv,
+            with a column `name` (see `read_image_table`). Paths in lists and tables are relative to
+            their folder.
+        fps: frames a second taken of videos and logs; None is one, and a note says so.
+        topic: the topic of images in logs; None is the only one.
+        position_topic: the topic of positions in logs; None is the only one of NavSatFix, else the
+            only one of odometry or poses.
         on_bad_image: "skip" lists a missing file like the others, and whoever reads it leaves it
             out; "stop" refuses it.
 
@@ -148,20 +155,24 @@ def open_source(
     path = pathlib.Path(images)
     if is_remote(path):
         return _remote(path)
+    frames = _Frames(path, fps, topic, position_topic)
+    if path.is_dir() and is_log(path):
+        path = path if path.name.strip(".") else pathlib.Path(os.path.abspath(path))
+        return _taken(path.parent, frames, [path], on_bad_image)
     if path.is_dir():
         return _source(path, list_images(path), path)
     suffix = path.suffix.lower()
     if suffix == ".txt":
         text = read_text(path, "a list of images, a path a line")
         names = [line.strip() for line in text.splitlines() if line.strip()]
-        return _listed(path, names, None, fps, on_bad_image)
+        return _listed(path, names, None, frames, on_bad_image)
     if suffix == ".csv":
-        return _listed(path, *read_image_table(path), fps, on_bad_image)
-    root, found = path.parent, [path]
-    if _PATTERN.search(str(path)) and not path.exists() and frame_time(path) is None:
+        return _listed(path, *read_image_table(path), frames, on_bad_image)
+    root, found = file_of(path).parent, [path]
+    if _PATTERN.search(str(path)) and not path.exists() and parse_frame(path) is None:
         root, found = _matching(path)
     skips: OnBadImage = on_bad_image if suffix else "stop"  # a folder is no image to be skipped
-    return _source(root, _frames(found, path, _FORMS, fps, skips), path)
+    return _taken(root, frames, found, skips)
 
 
 def _remote(path: pathlib.Path) -> ImageSource:
@@ -184,63 +195,121 @@ def open_sources(
     images: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     *,
     fps: float | None = None,
+    topic: str | None = None,
+    position_topic: str | None = None,
     on_bad_image: OnBadImage = "stop",
 ) -> list[ImageSource]:
     """List the images of one source or of several, as `open_source` does each.
 
     Raises:
-        InputError: no source; a rate without a video among the images; or what `open_source`
-            raises.
+        InputError: no source; what `check_frames` raises, or `open_source`.
     """
     given = [images] if isinstance(images, str | os.PathLike) else list(images)
     if not given:
         raise InputError("images: found none, expected at least one image")
-    sources = [open_source(each, fps=fps, on_bad_image=on_bad_image) for each in given]
-    check_rate_used(fps, [path for source in sources for path in source.paths])
+    how = {"fps": fps, "topic": topic, "position_topic": position_topic}
+    sources = [open_source(each, **how, on_bad_image=on_bad_image) for each in given]
+    check_frames([path for source in sources for path in source.paths], **how)
     return sources
 
 
-def _frames(
-    found: Sequence[pathlib.Path],
-    given: pathlib.Path,
-    expected: str,
-    fps: float | None,
-    on_bad_image: OnBadImage,
-) -> list[pathlib.Path]:
-    """Put a video's frames in its place, and name single frames by their own times.
+class _Frames(NamedTuple):
+    """Which frames of videos and logs are taken."""
 
-    What is missing stays as it is under "skip", to be skipped by who reads it.
-    """
-    paths: list[pathlib.Path] = []
-    taken = there = 0
-    for path in found:
-        if on_bad_image == "skip" and not file_of(path).is_file():
-            paths.append(path)
-            continue
-        check_source(file_of(path), expected)
-        if is_video(path):
-            frames = list_frames(path, 1.0 if fps is None else fps)
-            taken, there = taken + len(frames), there + count_frames(path)
-            paths += frames
-        else:
-            paths.append(name_frame(path))
-    if fps is None and taken < there:
-        warn(f"{given}: {taken} of {there} frames, 1 per second: --fps")
-    return paths
+    given: pathlib.Path
+    """What the user named, for messages."""
+    fps: float | None
+    topic: str | None
+    position_topic: str | None
+
+    def of(
+        self, found: Sequence[pathlib.Path], expected: str, on_bad_image: OnBadImage
+    ) -> tuple[list[pathlib.Path], Positions | None]:
+        """Put the frames of a video or log in its place, and name single frames by their own times.
+
+        What is missing stays as it is under "skip", to be skipped by who reads it.
+
+        Returns:
+            The images, and the positions of those that a log has them of, by path.
+        """
+        paths: list[pathlib.Path] = []
+        positions: Positions | None = None
+        taken = there = 0
+        rate = 1.0 if self.fps is None else self.fps
+        for path in found:
+            file, frame = file_of(path), parse_frame(path)
+            if on_bad_image == "skip" and stored_bytes(file) is None:
+                paths.append(path)
+                continue
+            if not (file.is_dir() and is_log(file)):
+                check_source(file, expected)
+            if frame is not None:
+                paths.append(name_frame(path) if frame.topic is None else name_log_frame(path))
+            elif is_video(path):
+                frames = list_frames(path, rate)
+                taken, there = taken + len(frames), there + count_frames(path)
+                paths += frames
+            elif is_log(path):
+                listed = list_log_frames(
+                    path, rate, topic=self.topic, position_topic=self.position_topic
+                )
+                taken, there = taken + len(listed.paths), there + listed.there
+                paths += listed.paths
+                positions = _joined(positions, listed.positions, path)
+            else:
+                paths.append(path)
+        if self.fps is None and taken < there:
+            warn(f"{self.given}: {taken} of {there} frames, 1 per second: --fps")
+        return paths, positions
 
 
-def check_rate_used(fps: float | None, paths: Iterable[pathlib.Path]) -> None:
-    """Check that a rate is given only where some image is a frame of a video.
+def _joined(
+    positions: Positions | None, more: Positions | None, path: pathlib.Path
+) -> Positions | None:
+    """Add the positions of a log to those of the logs before it."""
+    if positions is None or more is None:
+        return positions or more
+    if positions.axes != more.axes:
+        raise InputError(
+            f"{path}: found positions in {', '.join(more.axes)}, expected "
+            f"{', '.join(positions.axes)} as in the logs before it: --position-topic"
+        )
+    return positions._replace(of=positions.of | more.of)
+
+
+def check_frames(
+    paths: Iterable[pathlib.Path],
+    *,
+    fps: float | None = None,
+    topic: str | None = None,
+    position_topic: str | None = None,
+) -> None:
+    """Check that what chooses frames is given only where some image is such a frame.
 
     Args:
-        fps: the rate; None where none is given.
         paths: the images of all sources.
+        fps: the rate; None where none is given.
+        topic: the topic of images in a log; None where none is given.
+        position_topic: the same of positions.
 
     Raises:
         InputError: it is of no use.
     """
-    if fps is not None and not any(frame_time(path) is not None for path in paths):
+    if (fps, topic, position_topic) == (None, None, None):
+        return
+    frames = [frame for frame in map(parse_frame, paths) if frame is not None]
+    if fps is not None and not frames:
         raise InputError(f"--fps: found {fps:g} without a video among the images, expected both")
+    for flag, value in (("--topic", topic), ("--position-topic", position_topic)):
+        if value is not None and not any(frame.topic for frame in frames):
+            raise InputError(f"{flag}: found {value} without a ROS bag among the images")
+
+
+def _taken(
+    root: pathlib.Path, frames: _Frames, found: list[pathlib.Path], on_bad_image: OnBadImage
+) -> ImageSource:
+    paths, positions = frames.of(found, _FORMS, on_bad_image)
+    return _source(root, paths, frames.given, positions, map(str, paths))
 
 
 def _source(
@@ -248,11 +317,17 @@ def _source(
     paths: list[pathlib.Path],
     given: pathlib.Path,
     positions: Positions | None = None,
+    keys: Iterable[str] = (),
 ) -> ImageSource:
+    """Name the images; the positions of some are by their `keys`."""
     names = names_in(root, paths)
     twice = [name for name, count in collections.Counter(names).items() if count > 1]
     if twice:
         raise InputError(f"{given}: found {twice[0]!r} twice, expected it once")
+    if positions is not None:
+        own = dict(zip(keys, names, strict=True))
+        of = {own[key]: position for key, position in positions.of.items()}
+        positions = positions._replace(of=of) if of else None
     return ImageSource(root, paths, names, positions)
 
 
@@ -264,11 +339,11 @@ def _before_pattern(pattern: pathlib.Path) -> pathlib.Path:
 
 
 def _matching(pattern: pathlib.Path) -> tuple[pathlib.Path, list[pathlib.Path]]:
-    """Find the images and videos of a pattern, and the folder before its first wildcard."""
+    """Find the images, videos and logs of a pattern, and the folder before its first wildcard."""
     root = _before_pattern(pattern)
     matches = [pathlib.Path(match) for match in glob.glob(str(pattern), recursive=True)]
-    files = [match for match in matches if match.is_file()]
-    found = only_images(files, pattern, videos=True)
+    files = [match for match in matches if match.is_file() or is_log(match)]
+    found = only_images(files, pattern, frames=True)
     return root, sorted(found, key=lambda match: match.relative_to(root).as_posix())
 
 
@@ -276,13 +351,13 @@ def _listed(
     source: pathlib.Path,
     names: Sequence[str],
     positions: Positions | None,
-    fps: float | None,
+    frames: _Frames,
     on_bad_image: OnBadImage,
 ) -> ImageSource:
     """List the images that a text or table names, with the positions by the source's own names."""
     if any(map(is_remote, names)):
         root, paths = _addresses(source, names)
-        return _under_own_names(source, names, positions, root, paths)
+        return _source(root, paths, source, positions, names)
     folder, disk = source.parent, Disk()
     found: list[pathlib.Path] = []
     for name in names:
@@ -291,19 +366,23 @@ def _listed(
         file = os.fspath(file_of(text))
         path = disk.find(folder, file) or folder / file
         found.append(pathlib.Path(os.path.normpath(f"{path}{text[len(file) :]}")))
-    if not found or (positions is not None and any(map(is_video, found))):
-        videos = f"the video {next(filter(is_video, found))}" if found else "no image"
-        raise InputError(f"{source}: found {videos}, expected images, or frames as walk.mp4#t=12.5")
+    whole = next(filter(has_frames, found), None) if positions is not None else None
+    if not found or whole is not None:
+        kind = "video" if whole is not None and is_video(whole) else "ROS bag"
+        words = "no image" if whole is None else f"the {kind} {whole}"
+        raise InputError(f"{source}: found {words}, expected images, or frames as walk.mp4#t=12.5")
     try:
-        paths = _frames(found, source, "an image file", fps, on_bad_image)
+        paths, of_logs = frames.of(found, "an image file", on_bad_image)
     except InputError as error:
         raise InputError(f"{source}: {error}") from error
+    if positions is None:
+        positions, names = of_logs, list(map(str, paths))
     root = pathlib.Path(os.path.normpath(folder))
     below = [path.relative_to(root).parts for path in paths if path.is_relative_to(root)]
     if len(below) < len(paths) or any(".." in parts for parts in below):
         paths = [pathlib.Path(os.path.abspath(path)) for path in paths]
         root = pathlib.Path(paths[0].anchor)
-    return _under_own_names(source, names, positions, root, paths)
+    return _source(root, paths, source, positions, names)
 
 
 def _addresses(
@@ -317,7 +396,7 @@ def _addresses(
     paths = list(map(pathlib.Path, names))
     for path in paths:
         check_address(path)
-    other = next((path for path in paths if not is_remote(path) or is_video(path)), None)
+    other = next((path for path in paths if not is_remote(path) or has_frames(path)), None)
     if other is not None:
         raise InputError(f"{source}: found {other} with addresses, expected images at addresses")
     roots = sorted({pathlib.Path(*path.parts[:2]) for path in paths})
@@ -327,18 +406,3 @@ def _addresses(
             "expected those of one host or bucket"
         )
     return roots[0], paths
-
-
-def _under_own_names(
-    source: pathlib.Path,
-    names: Sequence[str],
-    positions: Positions | None,
-    root: pathlib.Path,
-    paths: list[pathlib.Path],
-) -> ImageSource:
-    """Make the source of the images in a list or table, whose positions are by the names there."""
-    if positions is not None:
-        own = dict(zip(names, names_in(root, paths), strict=True))
-        of = {own[name]: position for name, position in positions.of.items()}
-        positions = positions._replace(of=of) if of else None
-    return _source(root, paths, source, positions)

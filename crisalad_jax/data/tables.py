@@ -12,7 +12,7 @@ import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from crisalad_jax.data.video import spelled
+from crisalad_jax.data.frames import spelled
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
 
@@ -119,7 +119,7 @@ class Table(NamedTuple):
             yield Row(self.path, line, by_column, self.has_commas)
 
     def named_rows(self) -> Iterator[tuple[str, Row]]:
-        """Yield the image's name and the row; a frame of a video is written as in `data.video`.
+        """Yield the image's name and the row; a frame of a video is written as in `data.frames`.
 
         Raises:
             InputError: a row has no name, or one that an earlier row has, however it is spelled.

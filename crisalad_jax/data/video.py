@@ -1,22 +1,20 @@
-"""Frames of video files, under names that say when they were taken: `walk.mp4#t=12.500`.
+"""Frames of video files, under the names of `data.frames`: `walk.mp4#t=12.500`.
 
-Such a name stands for an image wherever a path does. Times are those in the file, so that a rate
-that varies does no harm. Every verb names a frame by its own time in whole milliseconds, however a
-user wrote it: `frame_name` writes the name, `milliseconds_of` reads the time, `name_frame` finds
-the frame.
+Times are those in the file, so that a rate that varies does no harm. Every verb names a frame by
+its own time in whole milliseconds, however a user wrote it: `frame_name` writes the name,
+`milliseconds_of` reads the time, `name_frame` finds the frame.
 """
 
 import bisect
 import functools
 import os
 import pathlib
-import re
 import threading
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from crisalad_jax.data.frames import VIDEO_SUFFIXES, frame_name, parse_frame, sampled
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source
 from crisalad_jax.utils.shapes import UInt8
@@ -25,14 +23,7 @@ from crisalad_jax.utils.shapes import UInt8
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
-VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm")
-"""Suffixes of videos, in lower case."""
 _VIDEO = f"a video ({' '.join(VIDEO_SUFFIXES)})"
-_FRAME = re.compile(
-    rf"(.*(?:{'|'.join(map(re.escape, VIDEO_SUFFIXES))}))#t=(\d+(?:\.\d+)?)", re.I | re.S
-)
-FASTEST = 1000.0
-"""Most frames a second: names have milliseconds."""
 _OPEN = 2
 """Number of videos that stay open between frames."""
 _FAR = 30_000
@@ -41,58 +32,9 @@ _BEFORE_KEY = 2_000
 """Milliseconds before a wanted frame that are sought: some decoders arrive late."""
 
 
-def is_video(path: str | os.PathLike[str]) -> bool:
-    """Return whether a name ends as a video's does."""
-    return os.fspath(path).lower().endswith(VIDEO_SUFFIXES)
-
-
-def frame_name(video: str | os.PathLike[str], milliseconds: int) -> str:
-    """Return the name of a frame.
-
-    Example:
-        >>> frame_name("walk.mp4", 12_500)
-        'walk.mp4#t=12.500'
-    """
-    return f"{os.fspath(video)}#t={milliseconds // 1000}.{milliseconds % 1000:03d}"
-
-
-def spelled(name: str) -> str:
-    """Return a frame's name as `frame_name` writes it; other names as they are.
-
-    Example:
-        >>> spelled("walk.mp4#t=12.5"), spelled("a.jpg")
-        ('walk.mp4#t=12.500', 'a.jpg')
-    """
-    time = frame_time(name)
-    return name if time is None else frame_name(_FRAME.sub(r"\1", name), round(1000 * time))
-
-
 def milliseconds_of(capture: cv2.VideoCapture) -> int:
     """Read the time of the frame that a video is at."""
     return round(capture.get(cv2.CAP_PROP_POS_MSEC))
-
-
-def frame_time(path: str | os.PathLike[str]) -> float | None:
-    """Return the seconds in a frame's name; None for other names.
-
-    Example:
-        >>> frame_time("walk.mp4#t=12.500")
-        12.5
-    """
-    match = _FRAME.fullmatch(os.fspath(path))
-    return None if match is None else float(match[2])
-
-
-def file_of(path: str | os.PathLike[str]) -> pathlib.Path:
-    """Return the file that holds an image: of a frame, its video."""
-    match = _FRAME.fullmatch(os.fspath(path))
-    return pathlib.Path(path if match is None else match[1])
-
-
-def check_rate(fps: float) -> None:
-    """Raise InputError for a number of frames a second that no video is sampled at."""
-    if not 0 < fps <= FASTEST:
-        raise InputError(f"fps: found {fps:g}, expected more than 0, and at most {FASTEST:g}")
 
 
 def list_frames(video: str | os.PathLike[str], fps: float = 1.0) -> list[pathlib.Path]:
@@ -110,13 +52,8 @@ def list_frames(video: str | os.PathLike[str], fps: float = 1.0) -> list[pathlib
     Raises:
         InputError: no file, or no video.
     """
-    chosen: list[pathlib.Path] = []
-    due = 0.0
-    for time in _video(video).times:
-        if time + 1 > due:  # times are rounded to a millisecond
-            chosen.append(pathlib.Path(frame_name(video, time)))
-            due = (int((time + 1) * fps / 1000) + 1) * 1000 / fps
-    return chosen
+    times = _video(video).times
+    return [pathlib.Path(frame_name(video, times[index])) for index in sampled(times, fps)]
 
 
 def count_frames(video: str | os.PathLike[str]) -> int:
@@ -132,7 +69,7 @@ def name_frame(path: pathlib.Path) -> pathlib.Path:
     """Name a frame by its own time: of a time between two, the frame that `read_frame` reads.
 
     Args:
-        path: the name of a frame, or another path, which stays as it is.
+        path: the name of a frame of a video.
 
     Returns:
         The name. A time behind the video's last frame stays, for the reader to tell.
@@ -140,13 +77,11 @@ def name_frame(path: pathlib.Path) -> pathlib.Path:
     Raises:
         InputError: the video is missing or does not decode.
     """
-    time = frame_time(path)
-    if time is None:
-        return path
-    video, wanted = file_of(path), round(1000 * time)
-    times = _video(video).times
+    frame = parse_frame(path)
+    assert frame is not None
+    times, wanted = _video(frame.file).times, frame.milliseconds
     at = bisect.bisect_left(times, wanted)
-    return pathlib.Path(frame_name(video, times[at] if at < len(times) else wanted))
+    return pathlib.Path(frame_name(frame.file, times[at] if at < len(times) else wanted))
 
 
 class _Video:
@@ -229,44 +164,11 @@ def read_frame(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
     Raises:
         InputError: no video, or no such frame in it.
     """
-    time = frame_time(path)
-    assert time is not None
-    video = _video(file_of(path))
+    frame = parse_frame(path)
+    assert frame is not None
+    video = _video(frame.file)
     with _lock:
-        image = video.read(round(time * 1000))
+        image = video.read(frame.milliseconds)
     if image is None:
         raise InputError(f"{path}: found no frame there, expected a time in the video")
     return image
-
-
-_IN_VIDEO = re.compile(r"(.+)#t=(\d+(?:\.\d+)?)", re.S)
-_SINCE_1970 = re.compile(r"(?<![\d.])(1\d{9})(?:\.(\d+)|(\d{3}|\d{6}|[_-]?\d{9}))?(?![\d])")
-"""Seconds from 2001 to 2033, then decimals, or the digits of milli-, micro- or nanoseconds.
-ROS writes seconds and nanoseconds apart."""
-
-
-class Moment(NamedTuple):
-    """A time on some clock: moments of two clocks say nothing of each other."""
-
-    clock: str
-    """The video or camera that the time is of; "" is seconds since 1970."""
-    seconds: float
-
-
-def moment_of(name: str | os.PathLike[str]) -> Moment | None:
-    """Read the moment in an image's name; None where it has none, or several.
-
-    Example:
-        >>> moment_of("walk.mp4#t=12.500")
-        Moment(clock='walk.mp4', seconds=12.5)
-        >>> moment_of("left/1403636579763555584.png").seconds  # of EuRoC: nanoseconds
-        1403636579.7635555
-        >>> moment_of("0001.png")
-    """
-    if match := _IN_VIDEO.fullmatch(os.fspath(name)):
-        return Moment(match[1], float(match[2]))
-    found = _SINCE_1970.findall(pathlib.PurePath(name).stem)
-    if len(found) != 1:
-        return None
-    whole, decimals, digits = found[0]
-    return Moment("", float(f"{whole}.{decimals or digits.lstrip('_-') or 0}"))

@@ -15,13 +15,13 @@ from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count, check_seed, choose, require
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import file_of
 from crisalad_jax.data.images import check_lines, read_pixels
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.remote import for_each, state_of, whole_name
 from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.data.tracks import Track
-from crisalad_jax.data.video import file_of
 from crisalad_jax.retrieval.chunks import Descriptors, as_rows, check_all_rows, check_rows
 from crisalad_jax.retrieval.describe import (
     check_readable,

@@ -23,7 +23,7 @@ from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.data.sources import check_rate_used, open_source
+from crisalad_jax.data.sources import check_frames, open_source
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, cast_params, init_crisalad, unit_features
@@ -223,7 +223,7 @@ def build_vocabulary(
         paths = open_source(images, fps=fps, on_bad_image=on_bad_image).paths
     else:
         paths = [pathlib.Path(each) for each in images]
-    check_rate_used(fps, paths)
+    check_frames(paths, fps=fps)
     params = with_vocabulary(
         model,
         paths,

@@ -7,12 +7,12 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "report": ("jinja2", "matplotlib", *_CLI),
     "train": ("optax", "orbax", "numba", "tensorboardX", "matplotlib", *_CLI),
     "maps": ("faiss", "h5py", "PIL", *_CLI),
+    "robot": ("rosbags", "fsspec", *_CLI),
     "export": ("flatbuffers", *_CLI),
     "onnx": ("onnx", "onnxruntime", *_CLI),
     "openvino": ("openvino", "onnx", *_CLI),
     "serve": ("fastapi", "uvicorn", "python_multipart", *_CLI),
     "data": ("huggingface_hub", "kagglehub", *_CLI),
-    "robot": ("fsspec", *_CLI),
     "milvus": ("pymilvus", "milvus_lite"),
     "convert": ("torch", *_CLI),
 }

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import frame_time
 from crisalad_jax.data.positions import AXES, Positions, exif_positions, positions_of, utm_positions
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.remote import for_each, size_of, whole_name
 from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.data.tracks import Track
-from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.approximate import check_search
@@ -79,7 +79,7 @@ def _new_images(
         InputError: a name in the map is of another image here.
     """
     names, sizes, new = [], [], []
-    all_sizes = for_each(lambda path: size_of(file_of(path)), source.paths)
+    all_sizes = for_each(size_of, source.paths)
     # A size of None is of a missing file, which is skipped.
     for name, path, size in zip(source.names, source.paths, all_sizes, strict=True):
         known = target.image(name)

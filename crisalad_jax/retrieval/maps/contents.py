@@ -6,7 +6,7 @@ import pathlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from crisalad_jax.data.video import Moment, moment_of
+from crisalad_jax.data.frames import Moment, moment_of, sequence_of
 
 if TYPE_CHECKING:
     from crisalad_jax.retrieval.maps.map import Map, MapImage
@@ -44,8 +44,7 @@ def contents(places: "Map") -> dict[str, Any]:
     folders: dict[str, list[Moment | None]] = collections.defaultdict(list)
     for image in places.images:
         moment = moment_of(image.name)
-        video = moment.clock if moment else ""
-        folders[video or pathlib.PurePosixPath(image.name).parent.as_posix()].append(moment)
+        folders[sequence_of(pathlib.PurePosixPath(image.name))].append(moment)
     return {
         "folders": [
             {"folder": name, "images": len(moments), **_times(moments)}

@@ -12,11 +12,11 @@ import numpy as np
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import check_count, takes
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import frame_time
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.remote import is_remote
 from crisalad_jax.data.sources import ImageSource, open_sources
-from crisalad_jax.data.video import frame_time
 from crisalad_jax.retrieval.describe import (
     check_readable,
     described_sources,

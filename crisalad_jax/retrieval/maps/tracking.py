@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import moment_of
 from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.positions import AXES, utm_positions
-from crisalad_jax.data.video import moment_of
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.seqslam import SeqSlam
 from crisalad_jax.retrieval.sequence import BayesFilter

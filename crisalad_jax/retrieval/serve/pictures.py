@@ -13,10 +13,10 @@ from PIL import Image
 from starlette.datastructures import UploadFile
 from starlette.types import Message
 
+from crisalad_jax.data.frames import frame_time
 from crisalad_jax.data.images import IMAGE_SUFFIXES, jpeg_scans, read_image
 from crisalad_jax.data.remote import size_of
 from crisalad_jax.data.resize import resize_image
-from crisalad_jax.data.video import file_of, frame_time
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.serve.worker import ADDED
 from crisalad_jax.utils.errors import InputError
@@ -105,7 +105,7 @@ def check_new_name(name: str) -> None:
 
     Raises:
         InputError: a part is empty, hidden or too long, there are too many, the name has control
-            characters or was not UTF-8, or it is a frame's of a video.
+            characters or was not UTF-8, or it is a frame's of a video or log.
 
     Example:
         >>> check_new_name("tuesday/0001.jpg")
@@ -140,7 +140,7 @@ def read_thumbnail(places: Map, images: str | os.PathLike[str] | None, number: i
     # The record of a map keeps its names below a folder.
     folders = [*([] if images is None else [images]), image.root, places.folder / ADDED]
     paths = (pathlib.Path(folder, image.name) for folder in folders)
-    path = next((path for path in paths if size_of(file_of(path)) == image.bytes), None)
+    path = next((path for path in paths if size_of(path) == image.bytes), None)
     if path is None:
         raise InputError(f"{image.name}: found no such picture any more, see --map-images")
     try:

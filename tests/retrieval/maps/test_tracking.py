@@ -6,8 +6,8 @@ import pathlib
 import numpy as np
 import pytest
 
+from crisalad_jax.data.frames import moment_of
 from crisalad_jax.data.positions import Positions, utm_positions
-from crisalad_jax.data.video import moment_of
 from crisalad_jax.retrieval.maps.map import Map, open_for_appending
 from crisalad_jax.retrieval.maps.tracking import SequenceTracker
 from crisalad_jax.retrieval.sequence import BayesFilter

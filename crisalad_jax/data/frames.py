@@ -1,0 +1,207 @@
+"""Names of frames of videos and robot logs, which say when they were taken.
+
+A frame of a video is `walk.mp4#t=12.500`, in seconds of the file. One of a log (a ROS bag) is
+`walk.mcap#/camera/image_raw#t=1700000000.123456789`, with its topic and its stamp. Such a name is
+taken wherever the path of an image is.
+"""
+
+import os
+import pathlib
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from crisalad_jax.utils.errors import InputError
+
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm")
+"""Suffixes of videos, in lower case."""
+LOG_SUFFIXES = (".mcap", ".bag", ".db3")
+"""Suffixes of robot logs, in lower case."""
+FASTEST = 1000.0
+"""Most frames a second: names of videos have milliseconds."""
+_TIME = re.compile(r"(.+)#t=(\d+)(?:\.(\d+))?", re.S)
+_TOPIC = re.compile(r"(.+)#([^#\s]+)", re.S)
+_OF_BAGS = b"rosbag2_bagfile_information"
+"""What `metadata.yaml` of a bag that is a folder begins with."""
+_SINCE_1970 = re.compile(r"(?<![\d.])(1\d{9})(?:\.(\d+)|(\d{3}|\d{6}|[_-]?\d{9}))?(?![\d])")
+"""Seconds from 2001 to 2033, then decimals, or the digits of milli-, micro- or nanoseconds.
+ROS writes seconds and nanoseconds apart."""
+_UNIX = 1_000_000_000
+"""Seconds since 1970 from which stamps are of that clock, in 2001; a simulation starts at 0."""
+
+
+class FrameName(NamedTuple):
+    """A frame's name in parts."""
+
+    file: str
+    """The video or log."""
+    topic: str | None
+    """The topic in a log; None in a video."""
+    nanoseconds: int
+
+    @property
+    def milliseconds(self) -> int:
+        """The time as videos have it."""
+        return round(self.nanoseconds / 1_000_000)
+
+    def __str__(self) -> str:
+        """Return the name as every verb writes it."""
+        if self.topic is None:
+            return f"{self.file}#t={self.milliseconds / 1000:.3f}"
+        seconds, rest = divmod(self.nanoseconds, 10**9)
+        return f"{self.file}#{self.topic}#t={seconds}.{rest:09d}"
+
+
+def is_video(path: str | os.PathLike[str]) -> bool:
+    """Return whether a name ends as a video's does."""
+    return os.fspath(path).lower().endswith(VIDEO_SUFFIXES)
+
+
+def is_log(path: str | os.PathLike[str]) -> bool:
+    """Return whether a name ends as a robot log's does, or is that of a ROS 2 bag's folder."""
+    about = pathlib.Path(path, "metadata.yaml")
+    if not about.is_file():
+        return os.fspath(path).lower().endswith(LOG_SUFFIXES) and not os.path.isdir(path)
+    with about.open("rb") as file:
+        return _OF_BAGS in file.read(4096)
+
+
+def has_frames(path: str | os.PathLike[str]) -> bool:
+    """Return whether a name is that of a video or a robot log."""
+    return is_video(path) or is_log(path)
+
+
+def parse_frame(path: str | os.PathLike[str]) -> FrameName | None:
+    """Read the name of a frame, with any number of decimals; None for other names.
+
+    Example:
+        >>> parse_frame("walk.bag#/camera#t=1700000000.5")
+        FrameName(file='walk.bag', topic='/camera', nanoseconds=1700000000500000000)
+    """
+    timed = _TIME.fullmatch(os.fspath(path))
+    if timed is None:
+        return None
+    file, seconds, decimals = timed.groups("")
+    nanoseconds = int(seconds) * 10**9 + int(decimals[:9].ljust(9, "0"))
+    if is_video(file):
+        return FrameName(file, None, nanoseconds)
+    of_log = _TOPIC.fullmatch(file)
+    return of_log and FrameName(of_log[1], of_log[2], nanoseconds)
+
+
+def frame_name(video: str | os.PathLike[str], milliseconds: int) -> str:
+    """Return the name of a frame of a video.
+
+    Example:
+        >>> frame_name("walk.mp4", 12_500)
+        'walk.mp4#t=12.500'
+    """
+    return str(FrameName(os.fspath(video), None, milliseconds * 1_000_000))
+
+
+def spelled(name: str) -> str:
+    """Return a frame's name as every verb writes it; other names as they are.
+
+    Example:
+        >>> spelled("walk.mp4#t=12.5"), spelled("a.jpg")
+        ('walk.mp4#t=12.500', 'a.jpg')
+    """
+    frame = parse_frame(name)
+    return name if frame is None else str(frame)
+
+
+def frame_time(path: str | os.PathLike[str]) -> float | None:
+    """Return the seconds in a frame's name; None for other names.
+
+    Example:
+        >>> frame_time("walk.mp4#t=12.500")
+        12.5
+    """
+    frame = parse_frame(path)
+    return None if frame is None else frame.nanoseconds / 10**9
+
+
+def file_of(path: str | os.PathLike[str]) -> pathlib.Path:
+    """Return the file that holds an image: of a frame, its video or log, which may be a folder."""
+    frame = parse_frame(path)
+    return pathlib.Path(path if frame is None else frame.file)
+
+
+def stored_bytes(path: str | os.PathLike[str]) -> int | None:
+    """Return the bytes of the file that holds an image, as `file_of`; None where there is none."""
+    file = file_of(path)
+    files = file.iterdir() if file.is_dir() and is_log(file) else [file]
+    sizes = [each.stat().st_size for each in files if each.is_file()]
+    return sum(sizes) if sizes else None
+
+
+def sequence_of(path: pathlib.PurePath) -> str:
+    """Return what an image is one of: of a frame, its video, or its log and topic; else its folder.
+
+    Example:
+        >>> sequence_of(pathlib.PurePosixPath("a/walk.bag#/camera#t=1700000000.5"))
+        'a/walk.bag#/camera'
+    """
+    is_frame = parse_frame(path) is not None
+    return path.as_posix().rpartition("#t=")[0] if is_frame else path.parent.as_posix()
+
+
+def check_rate(fps: float) -> None:
+    """Raise InputError for a number of frames a second that no video is sampled at."""
+    if not 0 < fps <= FASTEST:
+        raise InputError(f"fps: found {fps:g}, expected more than 0, and at most {FASTEST:g}")
+
+
+def sampled(milliseconds: Sequence[int], fps: float) -> list[int]:
+    """Choose the frames that are nearest after each 1 / fps seconds.
+
+    Args:
+        milliseconds: times of all frames, in order.
+        fps: as `check_rate` takes it; more than there are chooses all.
+
+    Returns:
+        Their indices.
+
+    Example:
+        >>> sampled([0, 400, 800, 1200, 1600, 2000], 1)
+        [0, 3, 5]
+    """
+    chosen: list[int] = []
+    due = 0.0
+    for index, time in enumerate(milliseconds):
+        if time + 1 > due:  # times are rounded to a millisecond
+            chosen.append(index)
+            due = (int((time + 1) * fps / 1000) + 1) * 1000 / fps
+    return chosen
+
+
+class Moment(NamedTuple):
+    """A time on some clock: moments of two clocks say nothing of each other."""
+
+    clock: str
+    """The video, camera or simulation that the time is of; "" is seconds since 1970."""
+    seconds: float
+
+
+def moment_of(name: str | os.PathLike[str]) -> Moment | None:
+    """Read the moment in an image's name; None where it has none, or several.
+
+    Example:
+        >>> moment_of("walk.mp4#t=12.500")
+        Moment(clock='walk.mp4', seconds=12.5)
+        >>> moment_of("walk.bag#/camera#t=1700000000.500000000")
+        Moment(clock='', seconds=1700000000.5)
+        >>> moment_of("left/1403636579763555584.png").seconds  # of EuRoC: nanoseconds
+        1403636579.7635555
+        >>> moment_of("0001.png")
+    """
+    if timed := _TIME.fullmatch(os.fspath(name)):
+        frame = parse_frame(name)
+        seconds = float(f"{timed[2]}.{timed[3] or 0}")
+        is_unix = frame is not None and frame.topic is not None and seconds >= _UNIX
+        return Moment("" if is_unix else timed[1], seconds)
+    found = _SINCE_1970.findall(pathlib.PurePath(name).stem)
+    if len(found) != 1:
+        return None
+    whole, decimals, digits = found[0]
+    return Moment("", float(f"{whole}.{decimals or digits.lstrip('_-') or 0}"))

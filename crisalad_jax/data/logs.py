@@ -1,0 +1,528 @@
+"""Images and positions of robot logs: ROS 1 bags (.bag), ROS 2 bags (.mcap, .db3, or a folder).
+
+The fields of messages are those of ROS's common_interfaces, the encodings of images those of its
+`sensor_msgs/image_encodings.hpp` and of cv_bridge.
+"""
+
+import contextlib
+import functools
+import os
+import pathlib
+import threading
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import LOG_SUFFIXES, FrameName, parse_frame, sampled, stored_bytes
+from crisalad_jax.data.images import decode_image
+from crisalad_jax.data.positions import AXES, Positions
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.extras import missing_extra
+from crisalad_jax.utils.files import check_source
+from crisalad_jax.utils.output import counted, warn
+from crisalad_jax.utils.shapes import Float64, Int64
+
+_LOG = f"a ROS bag ({' '.join(LOG_SUFFIXES)}, or the folder of a ROS 2 bag)"
+_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+_FIXES = ("sensor_msgs/msg/NavSatFix",)
+_POSES = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/PoseStamped",
+)
+_READ = (*_IMAGES, *_FIXES, *_POSES)
+_NO_FIX = -1
+"""STATUS_NO_FIX of NavSatStatus."""
+_OPEN = 2
+"""Number of logs that stay open between frames."""
+_FAR = 30 * 10**9
+"""Nanoseconds ahead from which opening a log there beats reading all that is between."""
+_BGR, _BGRA = cv2.COLOR_BGR2RGB, cv2.COLOR_BGRA2RGB
+_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
+    "rgb8": ("u1", 3, None),
+    "bgr8": ("u1", 3, _BGR),
+    "rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB),
+    "bgra8": ("u1", 4, _BGRA),
+    "mono8": ("u1", 1, None),
+    "mono16": ("u2", 1, None),
+    "rgb16": ("u2", 3, None),
+    "bgr16": ("u2", 3, _BGR),
+    "bayer_rggb8": ("u1", 1, cv2.COLOR_BayerRGGB2RGB),
+    "bayer_bggr8": ("u1", 1, cv2.COLOR_BayerBGGR2RGB),
+    "bayer_gbrg8": ("u1", 1, cv2.COLOR_BayerGBRG2RGB),
+    "bayer_grbg8": ("u1", 1, cv2.COLOR_BayerGRBG2RGB),
+    "yuv422": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
+    "8UC1": ("u1", 1, None),
+    "8UC3": ("u1", 3, _BGR),
+    "8UC4": ("u1", 4, _BGRA),
+    "16UC1": ("u2", 1, None),
+    "32FC1": ("f4", 1, None),
+}
+"""Type of a value, values of a pixel, and OpenCV's conversion to RGB."""
+
+
+class Topic(NamedTuple):
+    """A topic of a log."""
+
+    name: str
+    type: str
+    """As ROS 2 writes it, such as sensor_msgs/msg/Image."""
+    count: int
+    """Number of its messages."""
+
+    def __str__(self) -> str:
+        """Return its name, type and number of messages, for a list."""
+        return f"{self.name} ({self.type.rpartition('/')[2]}, {self.count})"
+
+
+@brief
+class Track(NamedTuple):
+    """Positions along time, in the order of time."""
+
+    axes: tuple[str, str]
+    """Of the points: `lat`, `lon` in degrees, or `x`, `y` in metres."""
+    times: Int64[np.ndarray, " n"]
+    """Nanoseconds, ascending."""
+    points: Float64[np.ndarray, "n 2"]
+
+    def at(self, times: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, "m 2"]:
+        """Interpolate the positions at other times, NaN before the first and after the last.
+
+        Longitudes are interpolated the short way around, across 180 degrees too.
+
+        Example:
+            >>> track = Track(("lat", "lon"), np.array([0, 10]), np.array([[1, 179], [2, -179.0]]))
+            >>> track.at(np.array([5, 11])).tolist()
+            [[1.5, -180.0], [nan, nan]]
+        """
+        first, second = self.points.T
+        is_degrees = self.axes == AXES[1]
+        second = np.unwrap(second, period=360) if is_degrees else second
+        # Relative, because 64-bit floats have a quarter of a microsecond today.
+        known, wanted = self.times - self.times[0], times - self.times[0]
+        found = np.stack(
+            [np.interp(wanted, known, axis, np.nan, np.nan) for axis in (first, second)], axis=1
+        )
+        if is_degrees:
+            found[:, 1] -= 360 * np.round(found[:, 1] / 360)
+        return found
+
+    def gap(self, times: Int64[np.ndarray, " m"]) -> float:
+        """Return the largest number of seconds between the positions around any of the times."""
+        inside = times[(times >= self.times[0]) & (times <= self.times[-1])]
+        after = np.searchsorted(self.times, inside).clip(1)
+        steps = np.diff(self.times)[after - 1] if len(self.times) > 1 else np.zeros(1)
+        return float(steps.max(initial=0) / 10**9)
+
+
+class _Frames(NamedTuple):
+    """The images of a topic."""
+
+    stamps: Int64[np.ndarray, " n"]
+    """In order, each once."""
+    numbers: Int64[np.ndarray, " n"]
+    """Of each, the number of its message in the log's order."""
+    logged: Int64[np.ndarray, " m"]
+    """When each message was logged, in the log's order."""
+
+
+class Log:
+    """A robot log: its topics, the images of one, and the positions of another.
+
+    Stamps are nanoseconds since 1970: of the message's header or, where that has none, of when it
+    was logged. Nothing but headers stays in memory, and threads may share it.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        """Open a log, as `open_log` does."""
+        self.path = pathlib.Path(path)
+        with _reader(self.path) as reader:
+            found: dict[str, Topic] = {}
+            for each in reader.connections:
+                count = each.msgcount + (found[each.topic].count if each.topic in found else 0)
+                found[each.topic] = Topic(each.topic, each.msgtype, count)
+        self.topics: Sequence[Topic] = sorted(found.values())
+        """All topics, by name."""
+        self._lock = threading.RLock()
+        self._rows: dict[str, list[tuple[float, ...]]] = {}
+        self._known: dict[str, _Frames] = {}
+        self._stream: Iterator[tuple[int, Any]] = iter(())
+        self._begun: tuple[str, int] = ("", 0)
+        """Topic of the stream, and when its first message was logged."""
+        self._next = 0
+        """Number of the message that the stream is at."""
+
+    def image_topic(self, name: str | None = None) -> str:
+        """Return the name of the topic that images are taken from.
+
+        Args:
+            name: the topic's; None is the only one that has images.
+
+        Raises:
+            InputError: no such topic, one without images, or several and no name.
+        """
+        found = self._topics(_IMAGES)
+        if name is None and len(found) == 1:
+            return found[0].name
+        chosen = next((each.name for each in found if each.name == name), None)
+        if chosen is None:
+            raise self._no_topic(name, found, "images", "--topic")
+        return chosen
+
+    def position_topic(self, name: str | None = None) -> str | None:
+        """Return the name of the topic that positions are taken from; None where there is none.
+
+        Args:
+            name: the topic's; None is the only one of NavSatFix or, without any of that type, the
+                only one of odometry or poses. Where there are several a note lists them.
+
+        Raises:
+            InputError: the log has no such topic, or it is not of positions.
+        """
+        fixes, poses = self._topics(_FIXES), self._topics(_POSES)
+        if name is None:
+            found = fixes or poses
+            if len(found) > 1:
+                listed = ", ".join(map(str, found))
+                warn(f"{self.path}: took no positions from {listed}: --position-topic chooses one")
+            return found[0].name if len(found) == 1 else None
+        if name not in (each.name for each in fixes + poses):
+            raise self._no_topic(name, fixes + poses, "positions", "--position-topic")
+        return name
+
+    def _topics(self, types: Sequence[str]) -> list[Topic]:
+        return [topic for topic in self.topics if topic.type in types and topic.count]
+
+    def _no_topic(
+        self, name: str | None, there: Sequence[Topic], kind: str, flag: str
+    ) -> InputError:
+        listed = ", ".join(map(str, there or self.topics)) or "none"
+        if not there:
+            words = f"no topic of {kind} among {listed}, expected one"
+        elif name is None:
+            words = f"{len(there)} topics of {kind}, expected {flag} with one of {listed}"
+        else:
+            words = f"{flag} {name}, expected a topic of {kind}: {listed}"
+        return InputError(f"{self.path}: found {words}")
+
+    def images(self, topic: str | None = None) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield the stamp and the pixels of every image of a topic, in the log's order.
+
+        Args:
+            topic: as of `image_topic`.
+
+        Raises:
+            InputError: what `image_topic` raises; or an image or the log cannot be read.
+        """
+        name = self.image_topic(topic)
+        for _, logged, message in self._messages([name]):
+            stamp = _stamp(message, logged)
+            yield stamp, _decoded(message, str(FrameName(str(self.path), name, stamp)))
+
+    def stamps(self, topic: str) -> Int64[np.ndarray, " n"]:
+        """Return the stamps of a topic's images, in order, each once; notes say what was not so.
+
+        Raises:
+            InputError: the log cannot be read.
+        """
+        return self._frames(topic).stamps
+
+    def read(self, topic: str, stamp: int, *, enough: tuple[int, int] | None = None) -> np.ndarray:
+        """Read the first image of a topic at or after a stamp, as `read_pixels` returns it.
+
+        Raises:
+            InputError: there is none, or it cannot be decoded.
+        """
+        name = str(FrameName(str(self.path), topic, stamp))
+        self.image_topic(topic)
+        with self._lock:
+            frames = self._frames(topic)
+            at = int(np.searchsorted(frames.stamps, stamp))
+            if at == len(frames.stamps):
+                raise InputError(f"{name}: found no image there, expected a stamp in the log")
+            message = self._message(topic, int(frames.numbers[at]), frames.logged)
+        return _decoded(message, name, enough)
+
+    def positions(self, topic: str | None = None) -> Track | None:
+        """Read positions along time; None where the log has none.
+
+        Messages without a fix, or with numbers that are not finite, are left out.
+
+        Args:
+            topic: as of `position_topic`.
+
+        Raises:
+            InputError: what `position_topic` raises, no position in the topic, or the log cannot be
+                read.
+        """
+        name = self.position_topic(topic)
+        if name is None:
+            return None
+        self.scan(name)
+        rows = self._rows[name]
+        if not rows:
+            if topic is None:
+                warn(f"{self.path}: took no positions: {name} has no message with a fix")
+                return None
+            raise InputError(f"{self.path}: found no fix in {name}, expected at least one")
+        times, first = np.unique(np.array([row[0] for row in rows], np.int64), return_index=True)
+        is_fix = name in (each.name for each in self._topics(_FIXES))
+        return Track(AXES[1 if is_fix else 2], times, np.array([row[1:] for row in rows])[first])
+
+    def scan(self, *topics: str) -> None:
+        """Read stamps and positions of topics in one pass for all; later calls need none.
+
+        Raises:
+            InputError: the log cannot be read.
+        """
+        with self._lock:
+            new = [topic for topic in topics if topic not in self._rows]
+            rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in new}
+            for topic, logged, message in self._messages(new) if new else ():
+                stamp = _stamp(message, logged)
+                if message.__msgtype__ in _IMAGES:
+                    rows[topic].append((stamp, logged))
+                elif (position := _position(message)) is not None:
+                    rows[topic].append((stamp, *position))
+            self._rows |= rows
+
+    def _frames(self, topic: str) -> _Frames:
+        with self._lock:
+            if topic not in self._known:
+                self.scan(topic)
+                times = np.array(self._rows[topic], np.int64).reshape(-1, 2)
+                if not len(times):
+                    raise InputError(f"{self.path}: found no image in {topic}, expected some")
+                self._known[topic] = _Frames(*self._ordered(topic, times[:, 0]), times[:, 1])
+            return self._known[topic]
+
+    def _ordered(self, topic: str, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sort stamps, and leave out those that were there before."""
+        ordered, numbers = np.unique(stamps, return_index=True)
+        back = -np.diff(stamps)[np.diff(stamps) < 0]
+        if len(back):
+            warn(
+                f"{self.path}: the stamps of {topic} go back {counted(len(back), 'time')}, by up "
+                f"to {back.max() / 10**9:.6g} s: its images are in the order of their stamps"
+            )
+        if len(ordered) < len(stamps):
+            warn(
+                f"{self.path}: left out {len(stamps) - len(ordered)} of {len(stamps)} images of "
+                f"{topic}, whose stamps are of earlier ones"
+            )
+        return ordered, numbers
+
+    def _message(self, topic: str, number: int, logged: np.ndarray) -> Any:
+        """Read a message, forwards from the last one where it is not far ahead."""
+        time, (of, start) = int(logged[number]), self._begun
+        self._begun = ("", 0)  # a stream that fails is left
+        forwards = of == topic and time >= start and number >= self._next
+        if not forwards or time > logged[self._next] + _FAR:
+            numbers, start = np.flatnonzero(logged >= time).tolist(), time
+            messages = (message for _, _, message in self._messages([topic], start))
+            self._stream = zip(numbers, messages, strict=False)
+        for found, message in self._stream:
+            if found == number:
+                self._begun, self._next = (topic, start), found + 1
+                return message
+        raise InputError(f"{self.path}: found another file than before, expected the same log")
+
+    def _messages(
+        self, topics: Sequence[str], start: int | None = None
+    ) -> Iterator[tuple[str, int, Any]]:
+        """Yield topic, time of logging and content of messages logged from a time on."""
+        read = _typestore(self.path.suffix.lower() == ".bag")
+        with _reader(self.path) as reader:
+            there = [each for each in reader.connections if each.msgtype in _READ]
+            chosen = [each for each in there if each.topic in topics]
+            for connection, logged, data in reader.messages(chosen, start=start):
+                yield connection.topic, logged, read(data, connection.msgtype)
+
+
+def open_log(path: str | os.PathLike[str]) -> Log:
+    """Open a robot log; the last ones stay open.
+
+    Args:
+        path: a ROS 1 bag (.bag), or a ROS 2 bag: a file .mcap or .db3, or its folder.
+
+    Raises:
+        InputError: no such file, one that is not whole, or the extra `robot` is not installed.
+    """
+    path = pathlib.Path(path)
+    if not path.is_dir():
+        check_source(path, _LOG)
+    files = [path, *(path.iterdir() if path.is_dir() else ())]
+    changed = max(file.stat().st_mtime_ns for file in files)
+    return _as_of(os.path.abspath(path), stored_bytes(path), changed)
+
+
+@functools.lru_cache(maxsize=_OPEN)
+def _as_of(path: str, size: int | None, changed: int) -> Log:
+    """Open a log of this size and time of change."""
+    return Log(path)
+
+
+@contextlib.contextmanager
+def _reader(path: pathlib.Path) -> Iterator[Any]:
+    """Open a reader of a log; whatever is wrong with the file becomes an InputError."""
+    try:
+        from rosbags import rosbag1, rosbag2
+    except ModuleNotFoundError as error:
+        raise InputError(missing_extra(error, str(path))) from error
+    # Of a damaged file, rosbags raises what its parsers, decompressors and SQLite do.
+    try:
+        with (rosbag1 if path.suffix.lower() == ".bag" else rosbag2).Reader(path) as reader:
+            yield reader
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(
+            f"{path}: found a log that cannot be read ({type(error).__name__}: {error}), expected "
+            f"{_LOG} that is whole; `mcap recover`, `rosbag reindex` or `ros2 bag reindex` may "
+            "repair it"
+        ) from error
+
+
+@functools.cache
+def _typestore(is_ros1: bool) -> Any:
+    """Return what reads a message of a type of ROS 1 or 2; the common types are in all releases."""
+    from rosbags.typesys import Stores, get_typestore
+
+    if is_ros1:
+        return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
+    return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
+
+
+def _stamp(message: Any, logged: int) -> int:
+    stamp = message.header.stamp
+    nanoseconds = stamp.sec * 10**9 + stamp.nanosec
+    return nanoseconds if nanoseconds > 0 else logged
+
+
+def _position(message: Any) -> tuple[float, float] | None:
+    """Return latitude and longitude, or x and y; None without a fix."""
+    if message.__msgtype__ in _FIXES:
+        at = message.latitude, message.longitude
+        is_fix = message.status.status != _NO_FIX and abs(at[0]) <= 90 and abs(at[1]) <= 180
+        return at if is_fix else None
+    pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
+    at = pose.position.x, pose.position.y
+    return at if np.isfinite(at).all() else None
+
+
+def _decoded(message: Any, name: str, enough: tuple[int, int] | None = None) -> np.ndarray:
+    """Decode an image message as `read_pixels` decodes a file."""
+    if message.__msgtype__ == _IMAGES[1]:
+        return decode_image(message.data.tobytes(), f"{name} ({message.format!r})", enough=enough)
+    if message.encoding not in _ENCODINGS:
+        raise InputError(
+            f"{name}: found an image of encoding {message.encoding!r}, expected one of "
+            f"{', '.join(_ENCODINGS)}"
+        )
+    kind, channels, conversion = _ENCODINGS[message.encoding]
+    dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
+    height, width, step = message.height, message.width, message.step
+    row = width * channels * dtype.itemsize
+    if not (height and 0 < row <= step and height * step <= message.data.size):
+        raise InputError(
+            f"{name}: found {message.data.size} bytes of {height} rows of {step}, expected rows of "
+            f"at least {row}, for {width} pixels of {message.encoding}"
+        )
+    rows = np.array(message.data[: height * step].reshape(height, step)[:, :row])
+    pixels = rows.view(dtype).astype(dtype.newbyteorder("="), copy=False)
+    image = pixels if channels == 1 else pixels.reshape(height, width, channels)
+    try:
+        return image if conversion is None else cv2.cvtColor(image, conversion)
+    except cv2.error as error:  # such as an odd width of YUV 4:2:2
+        raise InputError(f"{name}: found {' '.join(error.err.split())}") from error
+
+
+def read_log_frame(
+    path: str | os.PathLike[str], *, enough: tuple[int, int] | None = None
+) -> np.ndarray:
+    """Read the image of a log's frame, in the depth that the log has; see `read_pixels`.
+
+    Raises:
+        InputError: no log, or no such frame in it.
+    """
+    frame = parse_frame(path)
+    assert frame is not None
+    assert frame.topic is not None
+    return open_log(frame.file).read(frame.topic, frame.nanoseconds, enough=enough)
+
+
+def name_log_frame(path: pathlib.Path) -> pathlib.Path:
+    """Name a log's frame by its own stamp: the first at or after the time in `path`.
+
+    Returns:
+        The name. A time behind the last frame stays, for the reader to report.
+
+    Raises:
+        InputError: the log cannot be read, or has no such topic.
+    """
+    frame = parse_frame(path)
+    assert frame is not None
+    log = open_log(frame.file)
+    stamps = log.stamps(log.image_topic(frame.topic))
+    at = int(np.searchsorted(stamps, frame.nanoseconds))
+    own = int(stamps[at]) if at < len(stamps) else frame.nanoseconds
+    return pathlib.Path(str(frame._replace(nanoseconds=own)))
+
+
+class ListedFrames(NamedTuple):
+    """Frames that were taken of a log."""
+
+    paths: list[pathlib.Path]
+    there: int
+    """Number of all frames of the topic."""
+    positions: Positions | None
+    """By the paths."""
+
+
+def list_log_frames(
+    path: pathlib.Path,
+    fps: float = 1.0,
+    *,
+    topic: str | None = None,
+    position_topic: str | None = None,
+) -> ListedFrames:
+    """List the images of a log that are nearest after each 1 / fps seconds, with their positions.
+
+    Args:
+        path: the log.
+        fps: as of `list_frames`, counted from the first image.
+        topic: as of `Log.image_topic`.
+        position_topic: as of `Log.position_topic`.
+
+    Raises:
+        InputError: the log cannot be read; what `image_topic` and `position_topic` raise.
+    """
+    log = open_log(path)
+    name, place = log.image_topic(topic), log.position_topic(position_topic)
+    log.scan(name, *([] if place is None else [place]))
+    stamps = log.stamps(name)
+    since = (stamps - stamps[0]) // 1_000_000
+    chosen = stamps[sampled(since.tolist(), fps)]
+    paths = [pathlib.Path(str(FrameName(str(path), name, each))) for each in chosen.tolist()]
+    track = None if place is None else log.positions(position_topic)
+    if track is None:
+        return ListedFrames(paths, len(stamps), None)
+    points = track.at(chosen)
+    outside = int(np.isnan(points[:, 0]).sum())
+    warn(
+        f"{path}: {place} has positions of {len(chosen) - outside} of {len(chosen)} images"
+        + (f", {outside} are outside of its time" if outside else "")
+        + f" (interpolated, largest gap {track.gap(chosen):.3g} s)"
+    )
+    of = {
+        str(each): (float(at[0]), float(at[1]))
+        for each, at in zip(paths, points, strict=True)
+        if np.isfinite(at).all()
+    }
+    return ListedFrames(paths, len(stamps), Positions(track.axes, of) if of else None)
