@@ -5,7 +5,14 @@ import pathlib
 from typing import Annotated, Any
 
 from crisalad_jax.cli.common import echo, given_positions, open_flagged, pick
-from crisalad_jax.cli.flags import JsonFlag, ModelFlags, PlaceFlags, ReadFlags, Target
+from crisalad_jax.cli.flags import (
+    FrameFlags,
+    JsonFlag,
+    ModelFlags,
+    PlaceFlags,
+    ReadFlags,
+    Target,
+)
 from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
 from crisalad_jax.utils.output import counted
@@ -20,16 +27,14 @@ SEVERAL = "quote a pattern, or list the images in a .txt"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Extract(ReadFlags, ModelFlags, PlaceFlags, JsonFlag):
+class Extract(ReadFlags, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     """Write a descriptor of every image in a folder, in sorted path order."""
 
     images: pathlib.Path
-    """Folder, searched with its subfolders; or a file, a pattern, a list, a table or a video
-    (docs/how-to/image-sources.md)."""
+    """Folder, searched with its subfolders; or a file, a pattern, a list, a table, a video
+    or a robot log (docs/how-to/image-sources.md)."""
     out: Annotated[pathlib.Path, Target()]
     """descriptors.npy (with names in .names.txt) or features.h5 (hloc)."""
-    fps: float | None = None
-    """Frames a second taken of a video, by default 1."""
     grouping: str = "single"
     """single, shuffled, sequential, or window (an image with those just before it, --batch-size in
     all): a cross-image model's descriptors depend on it."""
@@ -53,7 +58,7 @@ def run(arguments: Extract) -> dict[str, Any]:
     check_extraction(out, **how)
     positions = given_positions(arguments)
     model, _, file = open_flagged(arguments, groupings=[arguments.grouping])
-    more = pick(arguments, "fps", "every_metres", "root", "pca", "verify", "reading")
+    more = pick(arguments, "fps", "topic", "every_metres", "root", "pca", "verify", "reading")
     result = extract(model, arguments.images, out, weights=file, positions=positions, **how, **more)
     described = counted(len(result.names), "descriptor")
     pairs = None

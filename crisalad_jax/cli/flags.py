@@ -87,6 +87,16 @@ class ReadFlags(DecodeFlags):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class FrameFlags:
+    """Which frames of videos and robot logs are taken."""
+
+    fps: float | None = None
+    """Frames a second taken of a video or robot log, by default 1."""
+    topic: str | None = None
+    """Topic of images in a robot log (ROS bag), by default the only one."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class SizeFlags:
     """At which size images are described, and how they get it."""
 

@@ -5,7 +5,14 @@ import pathlib
 from typing import Annotated, Any, Literal
 
 from crisalad_jax.cli.common import echo, given_positions, open_flagged, pick
-from crisalad_jax.cli.flags import FOLDER, JsonFlag, ModelFlags, PlaceFlags, ReadFlags
+from crisalad_jax.cli.flags import (
+    FOLDER,
+    FrameFlags,
+    JsonFlag,
+    ModelFlags,
+    PlaceFlags,
+    ReadFlags,
+)
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.maps.approximate import NEIGHBOURS, SAMPLE
 from crisalad_jax.retrieval.maps.build import Indexed, index
@@ -22,19 +29,20 @@ SEVERAL = "quote a pattern; other folders are added by the same command again"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Index(ReadFlags, ModelFlags, PlaceFlags, JsonFlag):
+class Index(ReadFlags, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     """Make a map of a folder of images, or append to it those that it lacks.
 
     An existing map takes images by the model that made it, at its image size.
     """
 
     images: pathlib.Path
-    """Folder, file, pattern, list, table or video (docs/how-to/image-sources.md); the map names
-    images by their paths in the folder, subfolders included."""
+    """Folder, file, pattern, list, table, video or robot log (docs/how-to/image-sources.md);
+    the map names images by their paths in the folder, subfolders included."""
     out: Annotated[pathlib.Path, FOLDER]
     """The map's folder. After a kill the same command goes on."""
-    fps: float | None = None
-    """Frames a second taken of a video, by default 1."""
+    position_topic: str | None = None
+    """Topic of positions in a robot log, by default the only NavSatFix, else the only odometry or
+    pose; "" takes none."""
     novelty: float | None = None
     """Take an image only if its similarity to the last one taken of its folder or video is not
     above that, such as 0.9."""
@@ -61,7 +69,7 @@ def run(arguments: Index) -> dict[str, Any]:
         weights = None if arguments.weights else weights_of(metadata, out)
     model, _, file = open_flagged(arguments, weights, like=like)
     config = model.config
-    more = pick(arguments, "fps", "every_metres", "novelty", "reading")
+    more = pick(arguments, "fps", "topic", "position_topic", "every_metres", "novelty", "reading")
     more |= pick(arguments, "store", "dtype", "pca", "search")
     result = index(model, arguments.images, out, weights=file, positions=positions, **more)
     echo(f"{out}: {'; '.join(_words(result, config))}")

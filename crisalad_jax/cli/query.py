@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from crisalad_jax.cli.common import STDOUT, echo, find_given, pick, refuse_with, refuse_without
-from crisalad_jax.cli.flags import JsonFlag, ReadFlags, RuntimeName, Target
+from crisalad_jax.cli.flags import FrameFlags, JsonFlag, ReadFlags, RuntimeName, Target
 from crisalad_jax.config.checks import require
 from crisalad_jax.data.live import Camera, FolderWatch
 from crisalad_jax.retrieval.maps.live import latency_words, query_live
@@ -38,13 +38,14 @@ EXAMPLE = "crisalad query new.jpg --map map --json -"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Query(ReadFlags, JsonFlag):
+class Query(ReadFlags, FrameFlags, JsonFlag):
     """Find the images of a map that are most similar to others, and say where they were taken."""
 
     images: Annotated[
         tuple[pathlib.Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE...")
     ]
-    """Images, or folders of them, patterns, lists, tables or videos (docs/how-to/image-sources.md).
+    """Images, or folders of them, patterns, lists, tables, videos or robot logs
+    (docs/how-to/image-sources.md).
     None with --watch and --camera."""
     map: pathlib.Path
     """Folder that `crisalad index` wrote."""
@@ -53,7 +54,7 @@ class Query(ReadFlags, JsonFlag):
     camera: str | None = None
     """Number from 0, URL or video file: answer its newest frame, time and again."""
     fps: float | None = None
-    """Frames a second taken of a video, by default 1; the most that --camera answers."""
+    """Frames a second taken of a video or log, by default 1; the most that --camera answers."""
     window: int = 1
     """Frames described together, each with those just before it: a moving camera's."""
     weights: pathlib.Path | None = None
@@ -105,7 +106,7 @@ def run(arguments: Query) -> None:
             places,
             arguments.images,
             sequence=sequence,
-            **pick(arguments, "k", "fps", "window", "exact", "min_similarity", "reading"),
+            **pick(arguments, "k", "fps", "topic", "window", "exact", "min_similarity", "reading"),
         )
     if answers.unreadable:
         echo(f"{len(answers.unreadable)} unreadable left out, {answers.unreadable[0]} the first")
@@ -232,7 +233,7 @@ def _run_live(arguments: Query) -> None:
     """Print an answer for each image that comes, until a signal or the end of a video."""
     name = "--camera" if arguments.watch is None else "--watch"
     require(not arguments.images, f"IMAGE: found with {name}, expected only one of the two")
-    refuse_with(name, **pick(arguments, "gallery", "map_images"))
+    refuse_with(name, **pick(arguments, "gallery", "map_images", "topic"))
     if name == "--watch":
         refuse_with(name, **pick(arguments, "camera", "fps"))
     require(

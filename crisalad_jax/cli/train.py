@@ -52,7 +52,9 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     """CSV of name,east,north (metres) or name,lat,lon or name,x,y, for --place-radius; by default
     what a table as --data says, or @UTM names, or EXIF data."""
     fps: float | None = None
-    """Frames a second taken of a video as --data."""
+    """Frames a second taken of a video or robot log as --data."""
+    topic: str | None = None
+    """Topic of images in a robot log as --data, by default the only one."""
     data_images: pathlib.Path | None = None
     """Folder of the images that a .mat file at --data names; by default beside it."""
     val: pathlib.Path | None = None
@@ -214,7 +216,7 @@ def run(arguments: Train) -> dict[str, Any] | None:
         images=arguments.data_images,
         validation=arguments.val,
         validation_images=arguments.val_images,
-        **pick(arguments, "place_radius", "place_frames", "positions", "fps"),
+        **pick(arguments, "place_radius", "place_frames", "positions", "fps", "topic"),
         **pick(arguments, "weights", "backbone", "on_bad_image", "num_threads", "shard_state"),
         callbacks=arguments.callback,
         quiet=arguments.quiet,

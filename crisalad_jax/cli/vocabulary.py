@@ -5,7 +5,7 @@ import pathlib
 from typing import Annotated, Any
 
 from crisalad_jax.cli.common import echo, find_given, load_model, pick, refuse_with
-from crisalad_jax.cli.flags import WEIGHTS, JsonFlag, ReadFlags, SizeFlags
+from crisalad_jax.cli.flags import WEIGHTS, FrameFlags, JsonFlag, ReadFlags, SizeFlags
 from crisalad_jax.nn.model import Model
 from crisalad_jax.training.vocabulary import IMAGES, build_vocabulary, start_vocabulary
 
@@ -22,7 +22,7 @@ SEVERAL = "quote a pattern, or list the images in a .txt"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Vocabulary(ReadFlags, SizeFlags, JsonFlag):
+class Vocabulary(ReadFlags, FrameFlags, SizeFlags, JsonFlag):
     """Build AnyLoc's vocabulary from images, or words of SIFT or ORB: a model; or NetVLAD's."""
 
     images: pathlib.Path
@@ -30,8 +30,6 @@ class Vocabulary(ReadFlags, SizeFlags, JsonFlag):
     (docs/how-to/image-sources.md). Not of images that are evaluated on."""
     out: Annotated[pathlib.Path, WEIGHTS]
     """A .safetensors file."""
-    fps: float | None = None
-    """Frames a second taken of a video, by default 1."""
     weights: pathlib.Path | None = None
     """A model of AnyLoc, NetVLAD or a part of yours with a vocabulary, for another one; a file, or
     a published model's name."""
@@ -65,7 +63,8 @@ def run(arguments: Vocabulary) -> dict[str, Any]:
         model,
         arguments.images,
         arguments.out,
-        **pick(arguments, "fps", "max_images", "seed", "batch_size", "on_bad_image", "quiet"),
+        **pick(arguments, "fps", "topic", "max_images", "seed", "batch_size"),
+        **pick(arguments, "on_bad_image", "quiet"),
     )
     config, name = model.config, model.config.aggregator.part_name
     echo(

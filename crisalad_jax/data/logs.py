@@ -83,42 +83,49 @@ class Topic(NamedTuple):
 
 @brief
 class Track(NamedTuple):
-    """Positions along time, in the order of time."""
+    """Where something was, along time."""
 
+    source: str
+    """The file and the topic, for messages."""
     axes: tuple[str, str]
-    """Of the points: `lat`, `lon` in degrees, or `x`, `y` in metres."""
-    times: Int64[np.ndarray, " n"]
-    """Nanoseconds, ascending."""
-    points: Float64[np.ndarray, "n 2"]
+    """Names of a position's two numbers, as of `Positions`."""
+    times: Float64[np.ndarray, " point"]
+    """Seconds since 1970, ascending."""
+    points: Float64[np.ndarray, "point 2"]
 
-    def at(self, times: Int64[np.ndarray, " m"]) -> Float64[np.ndarray, "m 2"]:
-        """Interpolate the positions at other times, NaN before the first and after the last.
+    def interpolate(
+        self, times: Float64[np.ndarray, " image"]
+    ) -> tuple[Float64[np.ndarray, "image 2"], Float64[np.ndarray, " image"]]:
+        """Compute positions between the track's points, linearly in time.
 
-        Longitudes are interpolated the short way around, across 180 degrees too.
+        Longitudes go the short way around, across 180 degrees too.
+
+        Args:
+            times: in seconds since 1970.
+
+        Returns:
+            The positions, NaN before the first point and after the last one; and the seconds
+            between the two points that each lies between, 0 where it is at a point.
 
         Example:
-            >>> track = Track(("lat", "lon"), np.array([0, 10]), np.array([[1, 179], [2, -179.0]]))
-            >>> track.at(np.array([5, 11])).tolist()
-            [[1.5, -180.0], [nan, nan]]
+            >>> import numpy as np
+            >>> points = np.array([[0.0, 179.0], [8.0, -177.0]])
+            >>> track = Track("a", ("lat", "lon"), np.array([0.0, 4.0]), points)
+            >>> [each.tolist() for each in track.interpolate(np.array([1.0, 3.0]))]
+            [[[2.0, 180.0], [6.0, -178.0]], [4.0, 4.0]]
         """
         first, second = self.points.T
         is_degrees = self.axes == AXES[1]
         second = np.unwrap(second, period=360) if is_degrees else second
-        # Relative, because 64-bit floats have a quarter of a microsecond today.
-        known, wanted = self.times - self.times[0], times - self.times[0]
         found = np.stack(
-            [np.interp(wanted, known, axis, np.nan, np.nan) for axis in (first, second)], axis=1
+            [np.interp(times, self.times, axis, np.nan, np.nan) for axis in (first, second)], axis=1
         )
         if is_degrees:
             found[:, 1] -= 360 * np.round(found[:, 1] / 360)
-        return found
-
-    def gap(self, times: Int64[np.ndarray, " m"]) -> float:
-        """Return the largest number of seconds between the positions around any of the times."""
-        inside = times[(times >= self.times[0]) & (times <= self.times[-1])]
-        after = np.searchsorted(self.times, inside).clip(1)
-        steps = np.diff(self.times)[after - 1] if len(self.times) > 1 else np.zeros(1)
-        return float(steps.max(initial=0) / 10**9)
+        last = len(self.times) - 1
+        before = (np.searchsorted(self.times, times, side="right") - 1).clip(0, last)
+        after = np.searchsorted(self.times, times).clip(0, last)
+        return found, (self.times[after] - self.times[before]).clip(0)
 
 
 class _Frames(NamedTuple):
@@ -179,13 +186,15 @@ class Log:
         """Return the name of the topic that positions are taken from; None where there is none.
 
         Args:
-            name: the topic's; None is the only one of NavSatFix or, without any of that type, the
-                only one of odometry or poses. Where there are several a note lists them.
+            name: the topic's; "" takes none. None is the only one of NavSatFix or, without any of
+                that type, the only one of odometry or poses; of several a note lists them.
 
         Raises:
             InputError: the log has no such topic, or it is not of positions.
         """
         fixes, poses = self._topics(_FIXES), self._topics(_POSES)
+        if name == "":
+            return None
         if name is None:
             found = fixes or poses
             if len(found) > 1:
@@ -223,7 +232,7 @@ class Log:
         name = self.image_topic(topic)
         for _, logged, message in self._messages([name]):
             stamp = _stamp(message, logged)
-            yield stamp, _decoded(message, str(FrameName(str(self.path), name, stamp)))
+            yield stamp, decode_message(message, str(FrameName(str(self.path), name, stamp)))
 
     def stamps(self, topic: str) -> Int64[np.ndarray, " n"]:
         """Return the stamps of a topic's images, in order, each once; notes say what was not so.
@@ -247,7 +256,7 @@ class Log:
             if at == len(frames.stamps):
                 raise InputError(f"{name}: found no image there, expected a stamp in the log")
             message = self._message(topic, int(frames.numbers[at]), frames.logged)
-        return _decoded(message, name, enough)
+        return decode_message(message, name, enough=enough)
 
     def positions(self, topic: str | None = None) -> Track | None:
         """Read positions along time; None where the log has none.
@@ -271,9 +280,10 @@ class Log:
                 warn(f"{self.path}: took no positions: {name} has no message with a fix")
                 return None
             raise InputError(f"{self.path}: found no fix in {name}, expected at least one")
-        times, first = np.unique(np.array([row[0] for row in rows], np.int64), return_index=True)
         is_fix = name in (each.name for each in self._topics(_FIXES))
-        return Track(AXES[1 if is_fix else 2], times, np.array([row[1:] for row in rows])[first])
+        times, first = np.unique([row[0] for row in rows], return_index=True)
+        points = np.array([row[1:] for row in rows])[first]
+        return Track(f"{self.path}#{name}", AXES[1 if is_fix else 2], times / 10**9, points)
 
     def scan(self, *topics: str) -> None:
         """Read stamps and positions of topics in one pass for all; later calls need none.
@@ -416,10 +426,26 @@ def _position(message: Any) -> tuple[float, float] | None:
     return at if np.isfinite(at).all() else None
 
 
-def _decoded(message: Any, name: str, enough: tuple[int, int] | None = None) -> np.ndarray:
-    """Decode an image message as `read_pixels` decodes a file."""
-    if message.__msgtype__ == _IMAGES[1]:
-        return decode_image(message.data.tobytes(), f"{name} ({message.format!r})", enough=enough)
+def decode_message(
+    message: Any, name: str = "message", *, enough: tuple[int, int] | None = None
+) -> np.ndarray:
+    """Decode an image message of ROS as `read_pixels` decodes a file.
+
+    Args:
+        message: sensor_msgs/Image or CompressedImage, of rosbags or of rclpy.
+        name: what messages begin with.
+        enough: as of `read_image`.
+
+    Returns:
+        RGB, or grey (height, width), of 8 bits, or of what `mono16` and such have.
+
+    Raises:
+        InputError: an encoding that is unknown, fewer bytes than the image needs, or compressed
+            data that does not decode.
+    """
+    data = np.frombuffer(message.data, np.uint8)
+    if not hasattr(message, "encoding"):
+        return decode_image(data.tobytes(), f"{name} ({message.format!r})", enough=enough)
     if message.encoding not in _ENCODINGS:
         raise InputError(
             f"{name}: found an image of encoding {message.encoding!r}, expected one of "
@@ -429,12 +455,12 @@ def _decoded(message: Any, name: str, enough: tuple[int, int] | None = None) -> 
     dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     height, width, step = message.height, message.width, message.step
     row = width * channels * dtype.itemsize
-    if not (height and 0 < row <= step and height * step <= message.data.size):
+    if not (height and 0 < row <= step and height * step <= data.size):
         raise InputError(
-            f"{name}: found {message.data.size} bytes of {height} rows of {step}, expected rows of "
-            f"at least {row}, for {width} pixels of {message.encoding}"
+            f"{name}: found {data.size} bytes of {height} rows of {step}, expected rows of at "
+            f"least {row}, for {width} pixels of {message.encoding}"
         )
-    rows = np.array(message.data[: height * step].reshape(height, step)[:, :row])
+    rows = np.array(data[: height * step].reshape(height, step)[:, :row])
     pixels = rows.view(dtype).astype(dtype.newbyteorder("="), copy=False)
     image = pixels if channels == 1 else pixels.reshape(height, width, channels)
     try:
@@ -513,16 +539,13 @@ def list_log_frames(
     track = None if place is None else log.positions(position_topic)
     if track is None:
         return ListedFrames(paths, len(stamps), None)
-    points = track.at(chosen)
-    outside = int(np.isnan(points[:, 0]).sum())
+    points, gaps = track.interpolate(chosen / 10**9)
+    (inside,) = np.isfinite(points[:, 0]).nonzero()
+    outside = len(chosen) - len(inside)
     warn(
-        f"{path}: {place} has positions of {len(chosen) - outside} of {len(chosen)} images"
+        f"{path}: {place} has positions of {len(inside)} of {len(chosen)} images"
         + (f", {outside} are outside of its time" if outside else "")
-        + f" (interpolated, largest gap {track.gap(chosen):.3g} s)"
+        + (f"; the largest gap is {gaps[inside].max():.3g} s" if len(inside) else "")
     )
-    of = {
-        str(each): (float(at[0]), float(at[1]))
-        for each, at in zip(paths, points, strict=True)
-        if np.isfinite(at).all()
-    }
+    of = {str(paths[i]): (float(points[i, 0]), float(points[i, 1])) for i in inside}
     return ListedFrames(paths, len(stamps), Positions(track.axes, of) if of else None)

@@ -103,6 +103,7 @@ def read_places(
     place_frames: int | None = None,
     positions: str | os.PathLike[str] | None = None,
     fps: float | None = None,
+    topic: str | None = None,
     on_bad_image: OnBadImage = "stop",
 ) -> Places:
     """Read a folder in the layout of GSV-Cities, of MSLS or of your own.
@@ -134,9 +135,10 @@ def read_places(
         place_frames: number of consecutive images of a folder, or frames of a video, that are a
             place. The next place is not in a batch with it.
         positions: table or track of positions for `place_radius` (`read_image_table`,
-            `read_track`). None is what the source says, if that is a table, else what @UTM names
-            say, else the EXIF data of JPEGs.
-        fps: frames a second taken of videos; None is one.
+            `read_track`). None is what the source says, if that is a table or a robot log, else
+            what @UTM names say, else the EXIF data of JPEGs.
+        fps: frames a second taken of videos and logs; None is one.
+        topic: the topic of images in a robot log; None is the only one.
         on_bad_image: "stop" where an image that a table names is missing, or "skip" it.
 
     Returns:
@@ -158,13 +160,13 @@ def read_places(
     if (
         groupings + has_cities > 1
         or (positions is not None and place_radius is None)
-        or (fps is not None and not groupings)
+        or ((fps, topic) != (None, None) and not groupings)
         or (cities is not None and not has_cities)
     ):
         raise InputError(
             f"{root}: found arguments that do not fit each other, expected --cities for the layout "
             "of GSV-Cities or MSLS; for other images --place-radius, perhaps with --positions, or "
-            "--place-frames, and --fps with either"
+            "--place-frames, and --fps or --topic with either"
         )
     if place_radius is not None and not 0 < place_radius < math.inf:
         raise InputError(f"--place-radius: found {place_radius:g}, expected metres above 0")
@@ -176,8 +178,8 @@ def read_places(
     elif has_cities:
         names, found = read_msls_places(root, cities, on_bad_image)
     elif groupings:
-        source = open_source(root, fps=fps, on_bad_image=on_bad_image)
-        check_frames(source.paths, fps=fps)
+        source = open_source(root, fps=fps, topic=topic, on_bad_image=on_bad_image)
+        check_frames(source.paths, fps=fps, topic=topic)
         root = source.root
         if place_radius is not None:
             found = places_by_position(source, place_radius, positions)

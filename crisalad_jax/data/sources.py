@@ -136,7 +136,7 @@ def open_source(
         fps: frames a second taken of videos and logs; None is one, and a note says so.
         topic: the topic of images in logs; None is the only one.
         position_topic: the topic of positions in logs; None is the only one of NavSatFix, else the
-            only one of odometry or poses.
+            only one of odometry or poses; "" takes none.
         on_bad_image: "skip" lists a missing file like the others, and whoever reads it leaves it
             out; "stop" refuses it.
 
@@ -301,7 +301,7 @@ def check_frames(
     if fps is not None and not frames:
         raise InputError(f"--fps: found {fps:g} without a video among the images, expected both")
     for flag, value in (("--topic", topic), ("--position-topic", position_topic)):
-        if value is not None and not any(frame.topic for frame in frames):
+        if value and not any(frame.topic for frame in frames):
             raise InputError(f"{flag}: found {value} without a ROS bag among the images")
 
 

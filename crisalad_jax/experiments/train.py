@@ -31,6 +31,7 @@ def train(
     place_frames: int | None = None,
     positions: Path | None = None,
     fps: float | None = None,
+    topic: str | None = None,
     images: Path | None = None,
     validation: Path | None = None,
     validation_images: Path | None = None,
@@ -51,10 +52,11 @@ def train(
             in such layouts; for a recipe that mines tuples, a set that `open_benchmark` reads, such
             as pitts30k_train.mat.
         place_radius: metres within which images of a source with positions are a place; see
-            `read_places`, as for the three that follow.
+            `read_places`, as for the four that follow.
         place_frames: number of consecutive images that are a place.
         positions: table of positions.
-        fps: frames a second taken of videos.
+        fps: frames a second taken of videos and logs.
+        topic: the topic of images in a log.
         images: folder of the images that such a file names.
         out: folder of the run; see `fit`.
         validation: evaluation set for early stopping, in any layout that `open_benchmark` reads.
@@ -99,6 +101,7 @@ def train(
         place_frames=place_frames,
         positions=positions,
         fps=fps,
+        topic=topic,
     )
     if (weights, backbone) == (None, None) and config.trainable != "all":
         say(

@@ -84,6 +84,7 @@ def extract(
     out: StrPath | None = None,
     *,
     fps: float | None = None,
+    topic: str | None = None,
     positions: Positions | Track | StrPath | None = None,
     every_metres: float | None = None,
     weights: StrPath | None = None,
@@ -108,7 +109,8 @@ def extract(
             (docs/how-to/image-sources.md), or a list of files.
         out: a file .npy, with the names in another, or .h5, as hloc reads it. How it was made is
             written next to it, as JSON. None writes nothing.
-        fps: frames a second taken of a video, which is then expected; None is one.
+        fps: frames a second taken of a video or log, which is then expected; None is one.
+        topic: the topic of images in a robot log; None is the only one.
         positions: where images were taken, for `every_metres`, as `index` takes it.
         every_metres: least distance of an image from the last one of its folder or video that was
             taken, as of `index`. None takes all.
@@ -146,7 +148,7 @@ def extract(
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca, verify=verify)
     made_by = "--pairs" if pairs is not None else "model" if weights is None else str(weights)
     length, is_unit = shortened(components, describer, made_by, unit=pairs is not None)
-    sources = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
+    sources = open_sources(images, fps=fps, topic=topic, on_bad_image=reading.on_bad_image)
     if every_metres is not None:
         require(len(sources) == 1, f"every_metres: found {len(sources)} files, expected one source")
         sources = [each.spaced(each.located(positions), every_metres) for each in sources]
@@ -167,6 +169,7 @@ def extract(
         "images": source,
         "fps": fps,
         "every_metres": every_metres,
+        "topic": topic,
         "grouping": grouping,
         "batch_size": reading.batch_size,
         "seed": seed,

@@ -182,6 +182,7 @@ def build_vocabulary(
     out: str | os.PathLike[str],
     *,
     fps: float | None = None,
+    topic: str | None = None,
     max_images: int = IMAGES,
     seed: int = 0,
     batch_size: int = 16,
@@ -195,7 +196,8 @@ def build_vocabulary(
         images: the folder, searched with its subfolders, or another source of images
             (docs/how-to/image-sources.md), or a list of files; not of images that are evaluated on.
         out: the .safetensors file to write.
-        fps: frames a second taken of a video, which is then expected; None is one.
+        fps: frames a second taken of a video or log, which is then expected; None is one.
+        topic: the topic of images in a robot log; None is the only one.
         max_images: number of images that are read at most, drawn at random.
         seed: as `with_vocabulary` takes it, and so are the others.
         batch_size: number of images described at a time.
@@ -220,10 +222,10 @@ def build_vocabulary(
     """
     check_target(out, ".safetensors")
     if isinstance(images, str | os.PathLike):
-        paths = open_source(images, fps=fps, on_bad_image=on_bad_image).paths
+        paths = open_source(images, fps=fps, topic=topic, on_bad_image=on_bad_image).paths
     else:
         paths = [pathlib.Path(each) for each in images]
-    check_frames(paths, fps=fps)
+    check_frames(paths, fps=fps, topic=topic)
     params = with_vocabulary(
         model,
         paths,

@@ -615,6 +615,7 @@ def test_extract_writes_descriptors_names_and_configuration(
         "seed": 0,
         "fps": None,
         "every_metres": None,
+        "topic": None,
         "pca": None,
         "skipped": [],
         "model": to_plain(MODEL),

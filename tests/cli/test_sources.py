@@ -19,6 +19,7 @@ from crisalad_jax.retrieval.maps.map import Map
 from tests.cli.test_cli import extract, fails, runs, succeeds
 from tests.cli.test_index import index, query
 from tests.conftest import BATCH, random_params, write_video
+from tests.data.bags import BEGIN, SECOND, fix, image, write_bag
 from tests.data.test_sources import write_jpeg
 from tests.retrieval.maps.test_stores import ROUNDING
 from tests.training.test_vocabulary import ANYLOC
@@ -104,6 +105,44 @@ def test_a_video_is_extracted_and_described_as_its_frames(tmp_path, capfd, weigh
     assert again == names[::-1]
     # float32 sums of other batches.
     np.testing.assert_allclose(found[::-1], descriptors, atol=ROUNDING)
+
+
+def test_a_robot_log_is_indexed_with_positions_and_queried(shared, tmp_path, capfd):
+    """Two cameras and a receiver; the map's images are found again in the same walk as a folder."""
+    pictures = np.random.default_rng(0).integers(0, 256, (4, 60, 80, 3), np.uint8)
+    walk = [
+        message
+        for second, picture in enumerate(pictures)
+        for message in (
+            image(BEGIN + second * SECOND, picture, topic="/left"),
+            image(BEGIN + second * SECOND, picture[::-1], topic="/right"),
+            fix(BEGIN + second * SECOND, 52 + second / 1000, 21.0),
+        )
+    ]
+    bag, out = write_bag(tmp_path / "walk.bag", walk), tmp_path / "map"
+    words = ("found 2 topics of images, expected --topic with one of /left (Image, 4), /right",)
+    fails(capfd, *index(shared, bag, out), words=words)
+    said = succeeds(capfd, *index(shared, bag, out, "--topic", "/left", "--fps", 10))
+    assert "4 images added, 4 with positions" in said
+    names = [f"walk.bag#/left#t={(BEGIN // SECOND) + second}.000000000" for second in range(4)]
+    assert positions(out) == {name: (52 + i / 1000, 21.0) for i, name in enumerate(names)}
+    assert "4 were there already" in succeeds(capfd, *index(shared, bag, out, "--topic", "/left"))
+
+    folder = write_bag(tmp_path / "walk", walk)
+    flags = ("--topic", "/left", "--k", 1, "--json", "-")
+    lines = succeeds(capfd, *query(out, folder, *flags)).splitlines()
+    for line, name in zip(lines, names, strict=True):
+        answer = json.loads(line)
+        assert (answer["query"], answer["time"]) == (
+            name.replace("walk.bag", "walk"),
+            answer["neighbours"][0]["time"],
+        )
+        assert answer["neighbours"][0]["name"] == name
+        assert answer["neighbours"][0]["similarity"] == pytest.approx(1, abs=ROUNDING)
+
+    write_bag(bag.with_name("longer.bag"), walk * 2).replace(bag)
+    words = (f"but the map has '{names[0]}' of", "expected new names for new images")
+    fails(capfd, *index(shared, bag, out, "--topic", "/left"), words=words)
 
 
 def test_a_pattern_and_a_window_of_queries(town_map, tmp_path, capfd, queries):

@@ -1,6 +1,7 @@
 """ROS bags for tests, written by rosbags and, as an independent writer, by mcap-ros2-support."""
 
 import pathlib
+import shutil
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -119,14 +120,14 @@ def write_bag(path: pathlib.Path, messages: Iterable[Message], **options: Any) -
         store, serialize = ROS1, ROS1.serialize_ros1
         writer: Any = Writer1(path)
         if options:
-            writer.set_compression(options["compression"])
+            writer.set_compression(*options["compression"])
     else:
         store, serialize = ROS2, ROS2.serialize_cdr
         folder = path if not path.suffix else path.with_name(f"{path.name}-folder")
         kind = StoragePlugin.SQLITE3 if path.suffix == ".db3" else StoragePlugin.MCAP
         writer = Writer2(folder, version=9, storage_plugin=kind)
         if options:
-            writer.set_compression(**options)
+            writer.set_compression(*options["compression"])
     with writer:
         connections: dict[str, Any] = {}
         for topic, logged, kind, fields in messages:
@@ -135,6 +136,7 @@ def write_bag(path: pathlib.Path, messages: Iterable[Message], **options: Any) -
             writer.write(connections[topic], logged, serialize(_made(store, kind, fields), kind))
     if path.suffix in (".db3", ".mcap"):
         next(folder.glob(f"*{path.suffix}")).rename(path)
+        shutil.rmtree(folder)
     return path
 
 

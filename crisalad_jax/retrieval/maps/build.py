@@ -103,6 +103,8 @@ def index(
     *,
     weights: str | os.PathLike[str],
     fps: float | None = None,
+    topic: str | None = None,
+    position_topic: str | None = None,
     positions: Positions | Track | str | os.PathLike[str] | None = None,
     every_metres: float | None = None,
     novelty: float | None = None,
@@ -124,10 +126,13 @@ def index(
             Or another source of images (docs/how-to/image-sources.md).
         out: the map's folder.
         weights: the file that the parameters are from, which queries load by default.
-        fps: frames a second taken of a video, which is then expected; None is one.
+        fps: frames a second taken of a video or log, which is then expected; None is one.
+        topic: the topic of images in a robot log; None is the only one.
+        position_topic: the topic of positions in a log; see `open_source`.
         positions: where images were taken, or a table or track of it (`read_track`). None is what
-            `images` says, if that is a table; else what @UTM names say; else what the EXIF data of
-            JPEGs says. Names of several zones of UTM give degrees, or metres of the map's zone.
+            `images` says, if that is a table or a robot log; else what @UTM names say; else what
+            the EXIF data of JPEGs says. Names of several zones of UTM give degrees, or metres of
+            the map's zone.
         every_metres: least distance of an image from the last one of its folder or video that was
             taken; nearer ones are left out, and those without a position taken. None takes all.
         novelty: largest cosine similarity of an image to the last one of its folder or video that
@@ -166,7 +171,8 @@ def index(
         check_min_similarity(novelty, "novelty")
     out = pathlib.Path(out)
     metadata = read_metadata(out)
-    (source,) = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
+    how = {"fps": fps, "topic": topic, "position_topic": position_topic}
+    (source,) = open_sources(images, **how, on_bad_image=reading.on_bad_image)
     table = source.positions if positions is None else positions
     if table is None:
         known = utm_positions(source.names)

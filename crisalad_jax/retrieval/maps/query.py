@@ -102,6 +102,7 @@ def query(
     model: "Model | Runtime | None" = None,
     k: int = 5,
     fps: float | None = None,
+    topic: str | None = None,
     window: int = 1,
     exact: bool = False,
     min_similarity: float | None = None,
@@ -116,7 +117,8 @@ def query(
             (docs/how-to/image-sources.md), or a list of these.
         model: the model that made the map; None loads it from where it was (`Map.load_model`).
         k: number of answers to each query.
-        fps: frames a second taken of a video, which is then expected; None is one.
+        fps: frames a second taken of a video or log, which is then expected; None is one.
+        topic: the topic of images in a robot log; None is the only one.
         window: frames that are described together: each with those just before it in its source,
             as a moving camera has them. Files listed one after the other are one source. 1
             describes each independently, as a map's images are.
@@ -150,9 +152,8 @@ def query(
     """
     check_count("k", k)
     least = asked_similarity(places, min_similarity)
-    root, sources = _below_one_root(
-        open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
-    )
+    how = {"fps": fps, "topic": topic, "on_bad_image": reading.on_bad_image}
+    root, sources = _below_one_root(open_sources(images, **how, position_topic=""))
     paths = list(itertools.chain(*sources))
     describer = places.describer(model, groupings=["single" if window == 1 else "window"])
     ask = asking(places, k, sequence, exact=exact)
