@@ -15,15 +15,15 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.frames import LOG_SUFFIXES, FrameName, parse_frame, sampled, stored_bytes
 from crisalad_jax.data.images import decode_image
 from crisalad_jax.data.positions import AXES, Positions
+from crisalad_jax.data.tracks import Track
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.files import check_source
 from crisalad_jax.utils.output import counted, warn
-from crisalad_jax.utils.shapes import Float64, Int64
+from crisalad_jax.utils.shapes import Int64
 
 _LOG = f"a ROS bag ({' '.join(LOG_SUFFIXES)}, or the folder of a ROS 2 bag)"
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -79,53 +79,6 @@ class Topic(NamedTuple):
     def __str__(self) -> str:
         """Return its name, type and number of messages, for a list."""
         return f"{self.name} ({self.type.rpartition('/')[2]}, {self.count})"
-
-
-@brief
-class Track(NamedTuple):
-    """Where something was, along time."""
-
-    source: str
-    """The file and the topic, for messages."""
-    axes: tuple[str, str]
-    """Names of a position's two numbers, as of `Positions`."""
-    times: Float64[np.ndarray, " point"]
-    """Seconds since 1970, ascending."""
-    points: Float64[np.ndarray, "point 2"]
-
-    def interpolate(
-        self, times: Float64[np.ndarray, " image"]
-    ) -> tuple[Float64[np.ndarray, "image 2"], Float64[np.ndarray, " image"]]:
-        """Compute positions between the track's points, linearly in time.
-
-        Longitudes go the short way around, across 180 degrees too.
-
-        Args:
-            times: in seconds since 1970.
-
-        Returns:
-            The positions, NaN before the first point and after the last one; and the seconds
-            between the two points that each lies between, 0 where it is at a point.
-
-        Example:
-            >>> import numpy as np
-            >>> points = np.array([[0.0, 179.0], [8.0, -177.0]])
-            >>> track = Track("a", ("lat", "lon"), np.array([0.0, 4.0]), points)
-            >>> [each.tolist() for each in track.interpolate(np.array([1.0, 3.0]))]
-            [[[2.0, 180.0], [6.0, -178.0]], [4.0, 4.0]]
-        """
-        first, second = self.points.T
-        is_degrees = self.axes == AXES[1]
-        second = np.unwrap(second, period=360) if is_degrees else second
-        found = np.stack(
-            [np.interp(times, self.times, axis, np.nan, np.nan) for axis in (first, second)], axis=1
-        )
-        if is_degrees:
-            found[:, 1] -= 360 * np.round(found[:, 1] / 360)
-        last = len(self.times) - 1
-        before = (np.searchsorted(self.times, times, side="right") - 1).clip(0, last)
-        after = np.searchsorted(self.times, times).clip(0, last)
-        return found, (self.times[after] - self.times[before]).clip(0)
 
 
 class _Frames(NamedTuple):
