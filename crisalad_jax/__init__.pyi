@@ -34,6 +34,8 @@ from .data.resize import resize_image as resize_image
 from .data.samplers import Draw as Draw
 from .data.samplers import Sampler as Sampler
 from .data.samplers import register_sampler as register_sampler
+from .data.tracks import Track as Track
+from .data.tracks import read_track as read_track
 from .evaluation.calibrate import calibrate as calibrate
 from .evaluation.difference import paired_difference as paired_difference
 from .evaluation.evaluate import evaluate as evaluate

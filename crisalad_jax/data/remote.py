@@ -127,13 +127,9 @@ def size_of(path: pathlib.Path) -> int | None:
     Raises:
         InputError: an address that cannot be asked.
     """
-    if not is_remote(path):
-        return stored_bytes(path)
-    with _opened(path) as (files, there):
-        try:
-            return files.info(there)["size"]
-        except FileNotFoundError:
-            return None
+    if is_remote(path):
+        return _if_there(path, lambda files, there: files.info(there)["size"])
+    return stored_bytes(path)
 
 
 def state_of(path: pathlib.Path) -> str | None:
@@ -147,9 +143,13 @@ def state_of(path: pathlib.Path) -> str | None:
             there = path.stat()
             return f"{there.st_size} {there.st_mtime_ns}"
         return None
+    return _if_there(path, lambda files, there: files.ukey(there))
+
+
+def _if_there(path: pathlib.Path, ask: Callable[[Any, str], _T]) -> _T | None:
     with _opened(path) as (files, there):
         try:
-            return files.ukey(there)
+            return ask(files, there)
         except FileNotFoundError:
             return None
 

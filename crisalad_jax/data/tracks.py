@@ -4,6 +4,7 @@ RFC 7946 has no times. They are where togeojson writes them: `coordTimes`, also 
 and `time` of a point.
 """
 
+import contextlib
 import datetime
 import math
 import os
@@ -15,15 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from crisalad_jax.config.short_repr import brief
-from crisalad_jax.data.tables import AXES, MOST_METRES, number_of, read_table
+from crisalad_jax.data.tables import AXES, number_of, read_table
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST_TEXT, parse_json, read_bytes, read_text
-from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float64
 
 _DEGREES = AXES[1]
 _GEOJSON = (".geojson", ".json")
-_FORMS = "track points with times"
 _Point = tuple[object, Any, Any]
 """Time, and latitude and longitude or metres."""
 
@@ -102,8 +101,7 @@ def read_track(
         path: the file. .gpx has points of tracks with times. .geojson or .json has lines with
             `coordTimes` or `times`, or points with `time`. A table has the columns time and
             lat,lon or east,north or x,y, or other usual names of these.
-        start_time: when a video of the images began, such as "2026-05-01T12:00:00+02:00"; without
-            a zone it is UTC, and a note says so.
+        start_time: when a video of the images began, with the zone: "2026-05-01T12:00:00+02:00".
         time_offset: seconds that are added to the times of images, for cameras whose clock is
             wrong or shows local time: -7200 where it is two hours ahead of UTC.
 
@@ -134,9 +132,10 @@ def read_track(
     without = sum(time is None for time, _, _ in found)
     if without or not found:
         points = f"{without} of {len(found)} points without a time" if found else "no point"
-        raise InputError(f"{path}: found {points}, expected {_FORMS}")
+        raise InputError(f"{path}: found {points}, expected track points with times")
     times = np.array([_time_in(path, time) for time, _, _ in found])
-    points = _numbers(path, axes, [point for _, *point in found])
+    numbers = [point for _, *point in found]
+    points = _as_degrees(path, numbers) if axes == _DEGREES else np.array(numbers)
     if (back := np.diff(times) < 0).any():
         at = int(back.argmax())
         raise InputError(
@@ -151,14 +150,9 @@ def utc(seconds: Any) -> str:
 
     Example:
         >>> utc(1777629600.25)
-        '2026-05-01 10:00:00.25Z'
+        '2026-05-01T10:00:00.250Z'
     """
-    try:
-        time = datetime.datetime.fromtimestamp(round(seconds, 3), datetime.UTC)
-    except (ValueError, OverflowError, OSError):
-        return f"{seconds:g} s"
-    text = time.strftime("%Y-%m-%d %H:%M:%S.%f")
-    return f"{text.rstrip('0').rstrip('.')}Z"
+    return f"{np.datetime64(round(1000 * seconds), 'ms')}".removesuffix(".000") + "Z"
 
 
 def time_of(text: str) -> float:
@@ -172,21 +166,19 @@ def time_of(text: str) -> float:
 
 
 def _start_of(text: str) -> float:
-    try:
-        start = time_of(text)
-    except (ValueError, TypeError) as error:
-        raise InputError(
-            f"--start-time: found {text!r}, expected a time such as 2026-05-01T12:00:00+02:00"
-        ) from error
-    if datetime.datetime.fromisoformat(text).tzinfo is None:
-        warn(f"--start-time: {text} has no zone, and is taken as UTC")
-    return start
+    with contextlib.suppress(ValueError, TypeError):
+        start = datetime.datetime.fromisoformat(text)
+        if start.tzinfo is not None:
+            return start.timestamp()
+    raise InputError(
+        f"--start-time: found {text!r}, expected a time and its zone: 2026-05-01T12:00:00+02:00"
+    )
 
 
 def _time_in(path: pathlib.Path, time: object) -> float:
     """Return the seconds since 1970 of ISO 8601 or a number."""
     number = number_of(str(time))
-    if math.isfinite(number):
+    if abs(number) < 1e20:
         # Nanoseconds of these years are 1e18, and seconds 1e9.
         return number / 1000 ** sum(number >= most for most in (1e11, 1e14, 1e17))
     try:
@@ -197,22 +189,21 @@ def _time_in(path: pathlib.Path, time: object) -> float:
         ) from error
 
 
-def _numbers(
-    path: pathlib.Path, axes: tuple[str, str], points: Sequence[Sequence[Any]]
+def _as_degrees(
+    path: pathlib.Path, points: Sequence[Sequence[Any]]
 ) -> Float64[np.ndarray, "point 2"]:
     try:
-        numbers = np.array(points, np.float64)
+        degrees = np.array(points, np.float64)
     except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{path}: found a point that is not two numbers ({error})") from error
-    most = (90.0, 180.0) if axes == _DEGREES else (MOST_METRES, MOST_METRES)
-    wrong = ~(np.abs(numbers) <= most).all(axis=1)
-    if wrong.any():
-        at = int(wrong.argmax())
+    right = (np.abs(degrees) <= [90, 180]).all(axis=1)
+    if not right.all():
+        at = int(right.argmin())
         raise InputError(
-            f"{path}: point {at + 1}: found {', '.join(axes)} {numbers[at].tolist()}, expected "
-            f"numbers of at most {most[0]:g} and {most[1]:g}"
+            f"{path}: found {degrees[at].tolist()} as point {at + 1}, expected a latitude and a "
+            "longitude in degrees"
         )
-    return numbers
+    return degrees
 
 
 class _Builder(ElementTree.TreeBuilder):

@@ -617,6 +617,7 @@ def test_extract_writes_descriptors_names_and_configuration(
         "batch_size": BATCH,
         "seed": 0,
         "fps": None,
+        "every_metres": None,
         "topic": None,
         "pca": None,
         "skipped": [],

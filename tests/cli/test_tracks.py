@@ -36,12 +36,12 @@ def place(seconds: float) -> list[float]:
 
 def test_from_photographs_and_a_track_to_a_map_with_positions(shared, photos, tmp_path, capfd):
     given = index(shared, photos, tmp_path / "map", "--positions", tmp_path / "walk.gpx")
-    fails(capfd, *given, words=("found a track from 2026-05-01 10:00:00Z", "--time-offset"))
+    fails(capfd, *given, words=("found a track from 2026-05-01T10:00:00Z", "--time-offset"))
     assert not (tmp_path / "map").exists()
     shift = ("--time-offset", -7200, "--every-metres", 50)
     said, notes = runs(capfd, *given, *shift, "--json", tmp_path / "done.json")
     assert "13 of 13 images on the track" in notes
-    assert "the largest gap is 45 s, between 2026-05-01 10:00:15Z and 2026-05-01 10:01:00Z" in notes
+    assert "the largest gap is 45 s, between 2026-05-01T10:00:15Z and 2026-05-01T10:01:00Z" in notes
     done = json.loads((tmp_path / "done.json").read_text())
     assert (done["added"] + done["near"], done["positions"]) == (13, done["added"])
     assert f"{done['near']} nearer than --every-metres left out" in said

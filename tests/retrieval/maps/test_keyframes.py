@@ -17,6 +17,7 @@ from crisalad_jax.retrieval.maps.build import Indexed, index
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.novelty import SIMILAR
 from tests.conftest import MODEL
+from tests.data.bags import BEGIN, SECOND, image, pose, write_bag
 from tests.data.benchmarks.trees import refused
 
 DEGREES = [
@@ -201,3 +202,20 @@ def test_distance_comes_first_and_gaps_are_counted(images, tmp_path):
     assert (again.added, again.near, again.similar) == (0, found.near, found.similar)
     with refused("novelty: found similarity 2, expected one from -1 to 1"):
         build(tmp_path / "map", images, novelty=2)
+
+
+def test_a_log_by_distance(tmp_path):
+    """A robot that stands for a second, then drives half a metre each fifth of a second."""
+    step, easts = SECOND // 5, [0.0] * 5 + [0.5 * number for number in range(1, 8)]
+    messages = [pose(BEGIN + number * step, east, 7.0) for number, east in enumerate(easts)]
+    messages += [
+        image(BEGIN + number * step, np.full((28, 28, 3), 10 * number, np.uint8))
+        for number in range(len(easts))
+    ]
+    bag = write_bag(tmp_path / "walk.mcap", messages)
+    given = {"every_metres": 1.0, "fps": 100.0, "novelty": None}
+    found = build(tmp_path / "map", bag, **given)
+    with Map.open(tmp_path / "map") as places:
+        assert [image.position for image in places.images] == [(east, 7.0) for east in range(4)]
+    assert (found.added, found.near) == (4, 8)
+    assert build(tmp_path / "map", bag, **given).added == 0
