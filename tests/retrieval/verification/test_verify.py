@@ -106,6 +106,8 @@ def test_two_answers_with_positions_locate_the_camera(names):
     # One position, or both in one place, say nothing.
     assert verifier.locate(checks, names, [POSITIONS[0], None, None], SIZE) is None
     assert verifier.locate(checks, names, [POSITIONS[0]] * 3, SIZE) is None
+    near = [POSITIONS[0], POSITIONS[0] + 0.2, None]  # less than the baseline that is asked for
+    assert verifier.locate(checks, names, near, SIZE) is None
 
 
 @pytest.mark.parametrize("axes", [("east", "north"), ("lat", "lon")])
