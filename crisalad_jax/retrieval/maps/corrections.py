@@ -311,7 +311,7 @@ def merge_maps(
 
     Args:
         folder: the map's.
-        *others: the others'.
+        others: the others'.
         quiet: no progress bar.
 
     Returns:
