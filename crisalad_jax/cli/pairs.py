@@ -55,8 +55,8 @@ class Pairs(ReadFlags, JsonFlag):
     """Frames a second taken of a video, by default 1."""
     runtime: RuntimeName = "jax"
     """What computes the model: jax, onnxruntime or openvino (docs/export.md)."""
-    verify: bool = True
-    """Check files against their checksums; --no-verify skips that, where they are huge."""
+    checksums: bool = True
+    """Check files against their checksums; --no-checksums skips that, where they are huge."""
 
 
 def needs_jax(arguments: Pairs) -> bool:
@@ -108,7 +108,7 @@ def _index(arguments: Pairs, folder: pathlib.Path) -> list[str]:
     from crisalad_jax.checkpoints.load import open_model
     from crisalad_jax.retrieval.maps.build import index
 
-    options = pick(arguments, "verify", "quiet")
+    options = {"verify": arguments.checksums, "quiet": arguments.quiet}
     model, _, file = open_model(arguments.weights, arguments.runtime, lambda same: same, **options)
     options = pick(arguments, "fps", "reading")
     assert arguments.images is not None

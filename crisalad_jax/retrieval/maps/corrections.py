@@ -276,14 +276,13 @@ def move_images(
 
     Example:
         >>> import jax
-        >>> from crisalad_jax import (
-        ...     PRESETS, Model, Positions, Reading, index, init_crisalad, save_weights
-        ... )
+        >>> from crisalad_jax import PRESETS, Model, Reading, index, init_crisalad, save_weights
         >>> model = Model(init_crisalad(jax.random.key(0), PRESETS["tiny"]), PRESETS["tiny"])
         >>> weights = folder / "weights.safetensors"
         >>> save_weights(weights, model)
         >>> _ = index(model, pictures, folder / "map", weights=weights, reading=Reading(quiet=True))
-        >>> move_images(folder / "map", Positions(("x", "y"), {"1.png": (2.0, 3.5)})).names
+        >>> _ = (folder / "poses.csv").write_text("name,x,y\\n1.png,2,3.5")
+        >>> move_images(folder / "map", folder / "poses.csv").names
         ['1.png']
     """
     with _open_existing(folder) as places:
@@ -314,7 +313,7 @@ def merge_maps(
 
     Args:
         folder: the map's.
-        *others: the others'.
+        others: the others'.
         quiet: no progress bar.
 
     Returns:
