@@ -79,7 +79,7 @@ def run(arguments: Pairs) -> dict[str, Any]:
             folder = pathlib.Path(scratch, "map")
             unreadable = _index(arguments, folder)
             images = None
-        verify = arguments.verify
+        verify = arguments.checksums
         places = stack.enter_context(Map.open(folder, verify=verify, calibrated=False))
         if images is not None:
             runtime = arguments.runtime

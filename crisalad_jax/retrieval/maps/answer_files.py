@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from crisalad_jax.data.frames import moment_of
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import AXES, utm_degrees
-from crisalad_jax.data.frames import moment_of
 from crisalad_jax.retrieval.maps.map import Answer
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, json_text
 from crisalad_jax.utils.errors import InputError

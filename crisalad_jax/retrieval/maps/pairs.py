@@ -12,11 +12,11 @@ import numpy as np
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.checks import require, takes
 from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.frames import file_of, moment_of
 from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.positions import AXES
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import ImageSource, open_sources
-from crisalad_jax.data.frames import file_of, moment_of
 from crisalad_jax.retrieval.chunks import Block, Descriptors
 from crisalad_jax.retrieval.chunks import joined as joined_blocks
 from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
