@@ -237,7 +237,10 @@ class _Scene:
         starts = ours * check.query_points
         ends = theirs * check.database_points + (left.shape[1], 0)
         self.log("matches/images", _encoded(both))
-        self.log("matches/lines", rr.LineStrips2D(np.stack([starts, ends], 1), colors=[_GREEN]))
+        self.log(
+            "matches/lines",
+            rr.LineStrips2D(np.stack([starts, ends], 1, dtype=np.float32), colors=[_GREEN]),
+        )
         self.log("inliers", rr.Scalars(check.inliers))
 
     def finish(self) -> rrb.Container:
