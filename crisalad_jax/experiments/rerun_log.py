@@ -238,7 +238,8 @@ class _Scene:
         ends = theirs * check.database_points + (left.shape[1], 0)
         self.log("matches/images", _encoded(both))
         self.log(
-            "matches/lines", rr.LineStrips2D(list(np.stack([starts, ends], 1)), colors=[_GREEN])
+            "matches/lines",
+            rr.LineStrips2D(np.stack([starts, ends], 1, dtype=np.float32), colors=[_GREEN]),
         )
         self.log("inliers", rr.Scalars(check.inliers))
 
