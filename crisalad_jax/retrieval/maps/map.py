@@ -734,14 +734,6 @@ class Map:
         rows = self._rows("descriptors", descriptors).astype(self.metadata.row[1], copy=False)
         return sign_vectors(rows) if self.metadata.is_bits else rows.astype(np.float32, copy=False)
 
-    def descriptor(self, name: str) -> Float32[np.ndarray, " d"]:
-        """Read the stored descriptor of the image of this name."""
-        row = int(self.removed.rows_of(np.array([self._numbers[name]]))[0])
-        spans = self._segments.spans
-        span = spans[bisect.bisect_right(spans, row, key=lambda span: span.first) - 1]
-        rows = self._segments.store.read(span.first, span.count)[[row - span.first]]
-        return self.as_stored(rows)[0]
-
     def verify(self) -> None:
         """Read all descriptors, and compare them with the digests in the records.
 

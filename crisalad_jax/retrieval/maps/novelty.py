@@ -65,7 +65,7 @@ class Novelty:
         sequence = sequence_of(self._paths[name])
         last = self._last.get(sequence)
         if isinstance(last, str):
-            last = self._map.descriptor(last)
+            last = self._map.descriptors_of([last])[0]
         if last is not None and last @ row > self._settings["novelty"]:
             return False
         self._last[sequence] = row
