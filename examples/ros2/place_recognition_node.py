@@ -27,7 +27,6 @@ from rclpy.task import Future
 from sensor_msgs.msg import CompressedImage, Image, NavSatFix
 
 import crisalad_jax as cj
-from crisalad_jax.retrieval.verification.verify import Verify
 
 PARAMETERS = {
     "map": "",  # folder that `crisalad index` wrote
@@ -94,7 +93,7 @@ class PlaceRecognition(Node):
                 self._latest,
                 k=self._value("k"),
                 min_similarity=None if math.isnan(least) else least,
-                verify=Verify(answers=self._value("verify")) if self._value("verify") else None,
+                verify=cj.Verify(answers=self._value("verify")) if self._value("verify") else None,
                 sequence=cj.BayesFilter() if self._value("sequence") == "bayes" else None,
                 ready=self._ready.set,
             )
