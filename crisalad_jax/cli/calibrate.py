@@ -57,7 +57,8 @@ def run(arguments: Calibrate) -> dict[str, Any]:
         )
     point = operating_point_of(calibration)
     name = "single" if verify is None else f"single + local:{verify.answers}"
-    show_tables(points_table({name: point}), latex=arguments.latex)
+    asked = "similarity" if verify is None else "inliers"
+    show_tables(points_table({name: point}, asked), latex=arguments.latex)
     for words in caveats(point):
         echo(words)
     if verify is None:

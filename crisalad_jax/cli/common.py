@@ -11,7 +11,14 @@ import rich.console
 import rich.table
 
 from crisalad_jax.checkpoints.load import OpenedModel, find_weights, open_model
-from crisalad_jax.cli.flags import ModelFlags, PlaceFlags, RuntimeName, SetFlags, SizeFlags, Target
+from crisalad_jax.cli.flags import (
+    ModelFlags,
+    PositionFlags,
+    RuntimeName,
+    SetFlags,
+    SizeFlags,
+    Target,
+)
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.experiments.tables import Table, write_text
@@ -175,7 +182,7 @@ def find_given(
     return None if weights is None else find_weights(weights, engine=runtime, quiet=quiet)
 
 
-def given_positions(flags: PlaceFlags) -> "Track | pathlib.Path | None":
+def given_positions(flags: PositionFlags) -> "Track | pathlib.Path | None":
     """Return the positions that flags give, as the library takes them.
 
     Raises:

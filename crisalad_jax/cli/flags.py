@@ -143,8 +143,8 @@ class ModelFlags(ComputeFlags, QuietFlag):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PlaceFlags:
-    """Where images were taken, and how far from each other they have to be."""
+class PositionFlags:
+    """Where images were taken."""
 
     positions: pathlib.Path | None = None
     """CSV of name,lat,lon or name,east,north or name,x,y (metres), for new images; or a track: GPX,
@@ -155,6 +155,12 @@ class PlaceFlags:
     time_offset: float | None = None
     """Seconds to add to images' times, for a track as --positions: -7200 where the camera's clock
     is two hours ahead of UTC."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlaceFlags(PositionFlags):
+    """Where images were taken, and how far from each other they have to be."""
+
     every_metres: float | None = None
     """Take an image only if it is that far from the last one taken of its folder or video; images
     without a position are taken."""

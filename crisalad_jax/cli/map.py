@@ -10,8 +10,15 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from crisalad_jax.cli.common import echo, open_flagged, pick, refuse_with, show_tables
-from crisalad_jax.cli.flags import JsonFlag, ModelFlags, ReadFlags
+from crisalad_jax.cli.common import (
+    echo,
+    given_positions,
+    open_flagged,
+    pick,
+    refuse_with,
+    show_tables,
+)
+from crisalad_jax.cli.flags import JsonFlag, ModelFlags, PositionFlags, ReadFlags
 from crisalad_jax.config.checks import require
 from crisalad_jax.experiments.tables import Cell, Table
 from crisalad_jax.retrieval.maps.contents import contents
@@ -35,7 +42,7 @@ EXAMPLE = "crisalad map remove corridor.map 'monday/*'"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Map(ReadFlags, ModelFlags, JsonFlag):
+class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):
     """List what is in a map, remove, replace or move some of its images, or merge maps.
 
     Each change is there as a whole or not at all, also after a kill (docs/how-to/correct-a-map.md).
@@ -57,7 +64,8 @@ class Map(ReadFlags, ModelFlags, JsonFlag):
     names: bool = False
     """With list: the names of the images, too."""
     addition: int | None = None
-    """With list and remove: only images of this addition, numbered as `list` does."""
+    """With list and remove: only images of this addition, numbered as `list` does: what was added
+    of one folder on one day."""
     day: str | None = None
     """With list and remove: only images that were added on this day, as YYYY-MM-DD (UTC)."""
     images: pathlib.Path | None = None
@@ -65,8 +73,6 @@ class Map(ReadFlags, ModelFlags, JsonFlag):
     it."""
     fps: float | None = None
     """With replace: frames a second taken of a video, by default 1."""
-    positions: pathlib.Path | None = None
-    """With move: CSV of name,east,north (metres) or name,lat,lon or name,x,y."""
 
 
 _OF = {
@@ -77,6 +83,8 @@ _OF = {
     "fps": ("replace",),
     "weights": ("replace",),
     "positions": ("move",),
+    "start_time": ("move",),
+    "time_offset": ("move",),
 }
 """Which actions a flag is for."""
 
@@ -145,7 +153,7 @@ def _replace(arguments: Map) -> MapChange:
 
 
 def _move(arguments: Map) -> MapChange:
-    positions = arguments.positions
+    positions = given_positions(arguments)
     require(positions is not None, "--positions: found none, expected a table of new positions")
     assert positions is not None
     return move_images(arguments.map, positions)

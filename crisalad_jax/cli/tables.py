@@ -68,10 +68,10 @@ def _points(difference: float) -> str:
     return f"{100 * difference:+.1f}"
 
 
-def points_table(points: Mapping[str, OperatingPoint]) -> Table:
-    """Make a table of operating points by name: the similarity to ask for, and what that leaves."""
+def points_table(points: Mapping[str, OperatingPoint], asked: str = "similarity") -> Table:
+    """Make a table of operating points by name: what to ask for, and what that leaves."""
     names = (
-        "similarity\nto ask for",
+        f"{asked}\nto ask for",
         "precision\n95 % sure of",
         "recall left,\nof all queries",
         "right of\nanswered",

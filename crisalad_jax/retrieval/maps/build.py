@@ -181,6 +181,8 @@ def index(
         check_min_similarity(novelty, "novelty")
     out = pathlib.Path(out)
     metadata = read_metadata(out)
+    if positions is not None and position_topic is None:
+        position_topic = "none"  # those of a log would not be used
     how = {"fps": fps, "topic": topic, "position_topic": position_topic}
     (source,) = open_sources(images, **how, on_bad_image=reading.on_bad_image)
     table = source.positions if positions is None else positions

@@ -417,7 +417,7 @@ def in_x(names_: list[str]) -> Positions:
         ),
         (
             lambda m: made(m, {"p.jpg": 9}, positions=in_x(["p.jpg"])),
-            "/others: found positions in x, y, expected lat, lon as in the map",
+            "/other: found positions in x, y, expected lat, lon as in the map",
         ),
     ],
 )
