@@ -155,7 +155,7 @@ def test_info_says_what_a_map_is(folder, shared, tmp_path, capfd, weights):
     day = json.loads((folder / "segments" / "0000000000.json").read_text())["added"][:10]
     root = (shared / "town" / "images" / "test" / "database").resolve()
     for words in (
-        "images 7 positions 7 axes east, north",
+        "images 7 removed 0 positions 7 axes east, north",
         f"additions day {day}, root {root}, images 7",
         f"extent east {east[0]:.9g} to {east[1]:.9g}, north {north[0]:.9g} to {north[1]:.9g}",
         "verified yes",
@@ -220,7 +220,10 @@ def test_a_map_keeps_its_settings(shared, folder, database, capfd, flags, words)
         (("{map}/none.jpg",), "none.jpg: found no such file, expected"),
         (("{map}/segments",), "segments: found no image"),
         (("{images}", "--gallery", "{map}"), "map: found a folder, expected a file"),
-        (("{images}", "--map-images", "{map}"), "--map-images: found without --gallery, expected"),
+        (
+            ("{images}", "--map-images", "{map}"),
+            "--map-images: found without --gallery, --rerun or --verify, expected",
+        ),
         (
             ("{images}", "--json", "{map}/x", "--gallery", "{map}/../map/x"),
             "x, as --json, expected two files",

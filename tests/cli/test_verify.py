@@ -62,7 +62,7 @@ def test_what_does_not_go_together_is_one_line(folder, queries, tmp_path, capfd)
     for given, words in (
         (("--matcher", "m.onnx"), "--matcher: found without --verify"),
         (("--min-inliers", 0), "--min-inliers: found without --verify"),
-        (("--map-images", tmp_path), "--map-images: found without --gallery or --verify"),
+        (("--map-images", tmp_path), "--map-images: found without --gallery, --rerun or --verify"),
         (("--verify", 0), "verify: found 0, expected at least 1"),
         (("--verify", 1, "--map-depth", tmp_path), "intrinsics: found none with map_intrinsics"),
         (("--verify", 1, "--matcher", "m.onnx"), "m.onnx"),

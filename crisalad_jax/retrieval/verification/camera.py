@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from crisalad_jax.config.checks import require
+from crisalad_jax.config.short_repr import with_field_docs
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.files import read_text
@@ -24,6 +25,7 @@ _EXPECTED = (
 )
 
 
+@with_field_docs
 @dataclasses.dataclass(frozen=True)
 class Intrinsics:
     """A pinhole camera, with its lens distortion and the size of its images if these are known.
