@@ -195,14 +195,15 @@ def replace_images(
             none that can; or what `open_for_appending` raises.
 
     Example:
-        >>> import jax, shutil
+        >>> import cv2, jax
         >>> from crisalad_jax import PRESETS, Model, Reading, index, init_crisalad, save_weights
         >>> model = Model(init_crisalad(jax.random.key(0), PRESETS["tiny"]), PRESETS["tiny"])
         >>> weights, quiet = folder / "weights.safetensors", Reading(quiet=True)
         >>> save_weights(weights, model)
         >>> _ = index(model, pictures, folder / "map", weights=weights, reading=quiet)
         >>> (folder / "new").mkdir()
-        >>> _ = shutil.copy(pictures / "1.png", folder / "new" / "3.png")
+        >>> changed = cv2.imread(str(pictures / "1.png"))[::2]
+        >>> _ = cv2.imwrite(str(folder / "new" / "3.png"), changed)
         >>> new = folder / "new"
         >>> replace_images(model, new, folder / "map", weights=weights, reading=quiet).names
         ['3.png']

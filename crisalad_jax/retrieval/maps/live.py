@@ -151,6 +151,13 @@ def query_live(
 def latency_words(milliseconds: Sequence[float], dropped: int) -> str:
     """Summarise the latencies of answers, and how many frames were passed over, for a log.
 
+    Args:
+        milliseconds: the latency of each answer.
+        dropped: number of frames that were passed over.
+
+    Returns:
+        The summary in one line.
+
     Example:
         >>> latency_words([20.0, 21.0, 22.0], 4)
         '3 answers, latency median 21.0 ms, 95th percentile 21.9 ms; 4 frames passed over'
