@@ -108,8 +108,13 @@ def _index(arguments: Pairs, folder: pathlib.Path) -> list[str]:
     from crisalad_jax.checkpoints.load import open_model
     from crisalad_jax.retrieval.maps.build import index
 
-    options = {"verify": arguments.checksums, "quiet": arguments.quiet}
-    model, _, file = open_model(arguments.weights, arguments.runtime, lambda same: same, **options)
+    model, _, file = open_model(
+        arguments.weights,
+        arguments.runtime,
+        lambda same: same,
+        verify=arguments.checksums,
+        quiet=arguments.quiet,
+    )
     options = pick(arguments, "fps", "reading")
     assert arguments.images is not None
     return index(model, arguments.images, folder, weights=file, **options).unreadable
