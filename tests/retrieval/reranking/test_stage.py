@@ -266,7 +266,10 @@ def test_the_first_stages_model_serves_where_it_can(name: str, benchmark) -> Non
         ("transvpr:-3", "expected NAME:TOPK"),
         ("transvpr:" + 5000 * "1", "expected NAME:TOPK"),
         ("transvpr:1", "found transvpr:1, expected at least 2 retrievals"),
-        ("superglue:10", "rerank: found 'superglue', expected one of fol, pair-vpr, patch-n"),
+        (
+            "superglue:10",
+            "rerank: found 'superglue', expected one of fol, local, pair-vpr, patch-n",
+        ),
     ],
 )
 def test_what_cannot_be_read_is_named(text: str, words: str) -> None:

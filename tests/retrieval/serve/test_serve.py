@@ -320,7 +320,8 @@ def test_the_map_is_drawn_in_any_window(width, height):
                                  positions_known: 2 }}, answers: [], near: false }};
         const shown = [];
         const svg = {{ clientWidth: {width}, clientHeight: {height}, replaceChildren() {{}},
-                       setAttribute(_, value) {{ shown.push(value); }}, append() {{}} }};
+                       setAttribute(_, value) {{ shown.push(value); }}, append() {{}},
+                       classList: {{ toggle() {{}} }} }};
         const at = (id) => id === "svg" ? svg : {{}};
         const draw = (_, attributes, text) => shown.push(...Object.values(attributes), text);
         {"".join(functions)}
