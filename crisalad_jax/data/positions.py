@@ -270,21 +270,16 @@ def _times(
         InputError: frames of a video without a start, or of several videos; or no image has a time.
     """
     times, local = np.full(len(paths), np.nan), 0
-    clocks: set[str] = set()
-    unnamed = [number for number, path in enumerate(paths) if moment_of(path) is None]
+    moments = [moment_of(path) for path in paths]
+    unnamed = [number for number, moment in enumerate(moments) if moment is None]
     taken = for_each(exif_time, [paths[number] for number in unnamed])
     for number, found in zip(unnamed, taken, strict=True):
         times[number], has_zone = found or (np.nan, True)
         local += not has_zone
-    for number, path in enumerate(paths):
-        moment = moment_of(path)
-        if moment is None:
-            continue
-        if moment.clock:
-            clocks.add(moment.clock)
-            times[number] = moment.seconds + (start or 0)
-        else:
-            times[number] = moment.seconds
+    for number, moment in enumerate(moments):
+        if moment is not None:
+            times[number] = moment.seconds + ((start or 0) if moment.clock else 0)
+    clocks = {moment.clock for moment in moments if moment is not None and moment.clock}
     if len(clocks) > 1 or (clocks and start is None):
         raise InputError(
             f"{images}: found frames of {', '.join(sorted(clocks)[:2])}, expected those of one "

@@ -137,7 +137,7 @@ def _geojson(answers: Answers) -> tuple[str, int]:
         if place.position is not None:
             latitude, longitude = place.position
             geometry = {"type": "Point", "coordinates": [longitude, latitude]}
-        more = {} if answers.min_similarity is None else {"known": place.known}
+        more = {"known": place.known} if answers.is_thresholded else {}
         more |= {} if place.time is None else {"time": place.time}
         properties = {"query": place.query, **place.answer, **more}
         features.append({"type": "Feature", "geometry": geometry, "properties": properties})

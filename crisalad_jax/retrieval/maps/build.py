@@ -248,11 +248,9 @@ class _Indexing:
         """
         known = len(target)
         unreadable = self._append(target)
-        result = self._counts(target.images[:known], target.images[known:], unreadable)
         removed = sum(map(target.was_removed, self.source.names))
-        if self.novelty is not None:
-            result = result._replace(similar=result.similar - removed)
-        return result._replace(recall=self._finish(target), removed=removed)
+        result = self._counts(target.images[:known], target.images[known:], unreadable, removed)
+        return result._replace(recall=self._finish(target))
 
     def _append(self, target: Map) -> list[str]:
         """Describe images as the map's are, and append them, `SEGMENT` at a time.
@@ -295,13 +293,17 @@ class _Indexing:
         return unreadable
 
     def _counts(
-        self, there: Sequence[MapImage], added: Sequence[MapImage], unreadable: list[str]
+        self,
+        there: Sequence[MapImage],
+        added: Sequence[MapImage],
+        unreadable: list[str],
+        removed: int,
     ) -> Indexed:
         """Count what became of the images, of a map that had some before."""
         known, listed = {image.name for image in there}, set(self.source.names)
         given = () if self.positions is None else self.positions.of.keys()
         there_now = len(listed & known)
-        rest = len(listed) - there_now - len(added) - len(unreadable)
+        rest = len(listed) - there_now - len(added) - len(unreadable) - removed
         return Indexed(
             added=len(added),
             there=there_now,
@@ -311,6 +313,7 @@ class _Indexing:
             unmatched=[name for name in given if name not in listed],
             images=len(there) + len(added),
             metadata=self.metadata,
+            removed=removed,
             similar=0 if self.novelty is None else rest,
         )
 

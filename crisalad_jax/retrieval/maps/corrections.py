@@ -384,11 +384,10 @@ def _merge(target: Map, others: Sequence[Map], *, quiet: bool) -> MapChange:
     sources = {image.name: target for image in target.images}
     merged, there, stay_out = list[str](), 0, 0
     total = sum(map(len, others))
-    axes, zone = target.axes, target.zone
     with progress_bar("merging", total, "images", quiet=quiet) as bar:
 
         def parts() -> Iterator[NewImages]:
-            nonlocal there, stay_out, axes, zone
+            nonlocal there, stay_out
             for other in others:
                 for part in other.parts():
                     known = [name in sources for name in part.names]
@@ -397,9 +396,6 @@ def _merge(target: Map, others: Sequence[Map], *, quiet: bool) -> MapChange:
                     new = part.only([not any(pair) for pair in zip(known, gone, strict=True)])
                     there += sum(known)
                     stay_out += sum(gone)
-                    if new.positions is not None:
-                        placed = new.positions.fitted(other.folder, axes, zone)
-                        axes, zone = axes or placed.axes, zone or placed.zone
                     if new.names:
                         yield new
                     merged.extend(new.names)

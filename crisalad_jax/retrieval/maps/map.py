@@ -96,6 +96,8 @@ class NewImages(NamedTuple):
     positions: Positions | None = None
     added: str | None = None
     """The time when they were described; None is now."""
+    source: object = None
+    """What messages call them; None is their root."""
 
     def only(self, chosen: Sequence[bool]) -> "NewImages":
         """Return those of the images that are chosen."""
@@ -621,7 +623,9 @@ class Map:
                     gone.update(self._numbers[name] for name in part.names)
                     taken.difference_update(part.names)
                 if part.positions is not None:
-                    positions = part.positions.fitted(part.root, record["axes"], record["zone"])
+                    positions = part.positions.fitted(
+                        part.source or part.root, record["axes"], record["zone"]
+                    )
                     part = part._replace(positions=positions)
                     record["axes"] = positions.axes
                     record["zone"] = positions.zone or record["zone"]
@@ -727,7 +731,8 @@ class Map:
                 continue
             names = [image.name for image in self.images[start:end]]
             sizes = [image.bytes for image in self.images[start:end]]
-            yield NewImages(names, sizes, next(blocks), root, self.positions_of(names), added)
+            positions = self.positions_of(names)
+            yield NewImages(names, sizes, next(blocks), root, positions, added, self.folder)
 
     def as_stored(self, descriptors: Descriptors) -> Float32[np.ndarray, "n d"]:
         """Round descriptors as the map stores them; of bits, unit vectors of the signs."""

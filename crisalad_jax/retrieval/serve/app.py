@@ -300,6 +300,8 @@ def make_app(
     checking = ThreadPoolExecutor(1, "verify")
     verifier = None if rerank is None else Verifier(rerank)
     thumbnail = functools.lru_cache(_THUMBNAILS)(read_thumbnail)
+    # Of one map, with and without verification: a calibration of inliers is a file.
+    thresholds = functools.lru_cache(2)(asked_thresholds)
     waiting = asyncio.Semaphore(most_waiting)
 
     async def check_access(request: Request, given: _Bearer) -> None:
@@ -423,7 +425,7 @@ def make_app(
             )
             for rank, ((number, similarity), check) in enumerate(pairs, 1)
         ]
-        least, inliers = asked_thresholds(places, None, verifier if checks else None)
+        least, inliers = thresholds(places, None, verifier if checks else None)
         known = None
         if (least, inliers) != (None, None):
             known = (least is None or best >= least) and (
