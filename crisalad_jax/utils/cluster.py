@@ -31,10 +31,11 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 _ADDRESS = re.compile(r"(ray://)?(\[[^\]]+\]|[^:/\s\[\]]+)(?::(\d{1,5}))?")
 _CLIENT_PORT = 10001
-_QUIET = {
+_SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",  # no telemetry
     "RAY_SCHEDULER_EVENTS": "0",  # nor the autoscaler's lines
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # nor a warning of it
+    "RAY_raylet_start_wait_time_s": "120",  # 30 are too few for a busy machine
 }
 CONNECT, ANSWER, START, RESULT = 60.0, 120.0, 300.0, 1800.0
 """Seconds to wait at most: for a cluster, for its nodes' answers, for the first worker, and for any
@@ -80,7 +81,7 @@ def connected(address: str) -> Iterator[Any]:
             version of Ray or Python; or it is lost during the block.
     """
     there = check_cluster(address)
-    for name, value in _QUIET.items():
+    for name, value in _SETTINGS.items():
         os.environ.setdefault(name, value)
     what = f"--cluster {address}"
     try:
