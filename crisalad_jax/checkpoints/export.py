@@ -25,6 +25,7 @@ from crisalad_jax.checkpoints.runtime import ATTEND, DESCRIBE, FORMAT, MANIFEST,
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
 from crisalad_jax.config.checks import PATH, check_count, check_types, takes
 from crisalad_jax.config.io import to_plain
+from crisalad_jax.config.preprocessing import IMAGENET_DEVIATION, IMAGENET_MEAN
 from crisalad_jax.config.short_repr import short_repr
 from crisalad_jax.data.prepare import normalised
 from crisalad_jax.nn.config import ModelConfig
@@ -89,6 +90,9 @@ class ExportConfig:
     pixels: Literal["bytes", "floats"] | None = None
     """8-bit pixels, which the program normalises, or floats that already are; None is what the
     model resizes."""
+    for_colmap: bool = False
+    """Whether an ONNX program has the inputs and outputs that COLMAP's draft of retrieval by global
+    descriptors reads: normalised floats (batch, 3, height, width) to `descriptor`."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -104,6 +108,12 @@ class ExportConfig:
             )
         if self.batch_size is not None:
             check_count("batch size", self.batch_size)
+        given = (self.format, self.grouping, self.pixels or "floats")
+        if self.for_colmap and given != ("onnx", "single", "floats"):
+            raise InputError(
+                f"for colmap: found {', '.join(given)}, expected format onnx, grouping single and "
+                "pixels floats"
+            )
 
 
 def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -> None:
@@ -111,8 +121,9 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
 
     Raises:
         InputError: parameters of another configuration; weights inside of 2 GiB or more; transport
-            that must converge; normalisation by neighbourhoods, and floats in; or products that
-            are not of float32, in another format than StableHLO.
+            that must converge; normalisation by neighbourhoods, and floats in; other than
+            ImageNet's, for COLMAP; or products that are not of float32, in another format than
+            StableHLO.
     """
     check_params(params, config)
     size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(params))
@@ -123,7 +134,11 @@ def check_exportable(params: Crisalad, config: ModelConfig, how: ExportConfig) -
     if sinkhorn is not None and sinkhorn.throw:
         raise InputError("SinkhornConfig.throw: found True, expected False in a program")
     chain, dtype = config.preprocessing, config.compute_dtype
-    if how.pixels == "floats" and chain.normalisation != "mean-deviation":
+    if how.for_colmap and (chain.mean, chain.deviation) != (IMAGENET_MEAN, IMAGENET_DEVIATION):
+        found = f"mean {chain.mean} and deviation {chain.deviation}"
+        raise InputError(f"for colmap: found {found}, expected ImageNet's, by which COLMAP divides")
+    has_floats = how.pixels == "floats" or how.for_colmap
+    if has_floats and chain.normalisation != "mean-deviation":
         found = f"floats with normalisation {chain.normalisation}"
         raise InputError(f"pixels: found {found}, expected bytes")
     if how.format != "stablehlo" and dtype != "float32":
@@ -167,10 +182,12 @@ def _whole_program(model: Model, how: ExportConfig) -> _Program:
     config = model.config
 
     def run(params: Crisalad, images: Images) -> Float[Array, "image descriptor"]:
+        images = jnp.moveaxis(images, 1, 3) if how.for_colmap else images
         mask = self_mask(images.shape[0]) if how.grouping == "single" else None
         return describe(params, images, config, mask=mask)
 
-    return _program(run, model.params, {"images": _images_shape(config, how)}, "descriptors")
+    images = {"images": _images_shape(config, how)}
+    return _program(run, model.params, images, "descriptor" if how.for_colmap else "descriptors")
 
 
 def _program(
@@ -195,11 +212,16 @@ def _images_shape(config: ModelConfig, how: ExportConfig) -> jax.ShapeDtypeStruc
     if batch is None:
         (batch,) = export.symbolic_shape("batch")
     dtype = jnp.uint8 if _takes_bytes(config, how) else jnp.float32
-    return jax.ShapeDtypeStruct((batch, *config.input_size, 3), dtype)
+    return jax.ShapeDtypeStruct((batch, *_sides(config, how)), dtype)
+
+
+def _sides(config: ModelConfig, how: ExportConfig) -> tuple[int, ...]:
+    """Return the shape of an image, as the program takes it."""
+    return (3, *config.input_size) if how.for_colmap else (*config.input_size, 3)
 
 
 def _takes_bytes(config: ModelConfig, how: ExportConfig) -> bool:
-    return (how.pixels or config.preprocessing.pixels) == "bytes"
+    return not how.for_colmap and (how.pixels or config.preprocessing.pixels) == "bytes"
 
 
 @contextlib.contextmanager
@@ -407,7 +429,7 @@ def _difference(
     )
     alone, together = np.eye(count, dtype=bool), np.ones((count, count), bool)
     masks = {"single": [alone], "batch": [together], "any": [alone, together]}[how.grouping]
-    found = first(images)
+    found = first(np.ascontiguousarray(np.moveaxis(images, 3, 1)) if how.for_colmap else images)
     worst = 0.0
     for mask in masks:
         expected = np.asarray(describe(params, images, config, mask=jnp.asarray(mask)))
@@ -422,10 +444,10 @@ def _images(config: ModelConfig, how: ExportConfig) -> dict[str, Any]:
     chain, size = config.preprocessing, config.input_size
     fixed = dataclasses.replace(chain, size_rule="fixed", round_to_patch=False)
     values = {
-        "shape": [how.batch_size or "batch", *config.input_size, 3],
+        "shape": [how.batch_size or "batch", *_sides(config, how)],
         "resize": f"{fixed.in_words(size)}, aspect ratio not kept",
     }
-    layout = "RGB, rows from the top,"
+    layout = f"RGB, {'by channel, ' if how.for_colmap else ''}rows from the top,"
     if _takes_bytes(config, how):
         return values | {"dtype": "uint8", "layout": f"{layout} not normalised"}
     return values | {

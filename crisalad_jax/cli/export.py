@@ -37,6 +37,9 @@ class Export(ComputeFlags, PluginFlag, JsonFlag):
     pixels: Literal["bytes", "floats"] | None = None
     """Bytes, which the program normalises, or floats that already are; by default what the model
     resizes."""
+    for_colmap: bool = False
+    """Of onnx: the inputs and outputs that COLMAP's draft of retrieval by global descriptors reads
+    (docs/export.md)."""
     int8: pathlib.Path | None = None
     """Photographs to quantise products with, of onnx or openvino: a folder or another source of
     some dozens like those to be described, of a video a frame a second. Costs recall
@@ -56,7 +59,7 @@ def run(arguments: Export) -> dict[str, Any]:
     how = ExportConfig(
         batch_size=None if arguments.batch_size == "symbolic" else arguments.batch_size,
         platforms=tuple(dict.fromkeys((arguments.platforms or "cpu,cuda").split(","))),  # pyright: ignore
-        **pick(arguments, "grouping", "weights_inside", "format", "pixels"),
+        **pick(arguments, "grouping", "weights_inside", "format", "pixels", "for_colmap"),
     )
     model = load_model(arguments.weights, arguments)
     calibration = arguments.int8 and read_calibration(arguments.int8, model.config)

@@ -18,6 +18,7 @@ from crisalad_jax.checkpoints import export as exports
 from crisalad_jax.checkpoints.engines import import_openvino, load_program
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
 from crisalad_jax.checkpoints.onnx_format.program import write_onnx
+from crisalad_jax.checkpoints.runtime import open_runtime
 from crisalad_jax.nn.aggregators.conv_ap import ConvApConfig
 from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
@@ -319,3 +320,42 @@ def test_eight_bits_of_a_program_that_takes_one_number_of_images(
     how = ExportConfig(format="onnx", batch_size=2)
     with pytest.raises(InputError, match=r"^int8: found with format stablehlo, grouping any"):
         write_export(tmp_path / "out", Model(params, MODEL), how, calibration=pictures(2))
+
+
+# COLMAP
+
+
+def test_a_program_has_the_inputs_and_outputs_that_colmap_reads(params, tmp_path):
+    """As in colmap/colmap#4544: names, shapes and types, of images that are normalised by it."""
+    how = ExportConfig(format="onnx", for_colmap=True)
+    manifest = write_export(tmp_path / "out", Model(params, MODEL), how)
+    assert manifest["images"]["shape"] == ["batch", 3, 42, 56]
+    session = onnxruntime.InferenceSession(tmp_path / "out" / "describe.onnx")
+    ((image,), (descriptor,)) = session.get_inputs(), session.get_outputs()
+    assert (image.name, image.type, image.shape[1:]) == ("images", "tensor(float)", [3, 42, 56])
+    dim = MODEL.descriptor_dim
+    assert (descriptor.name, descriptor.shape[1:]) == ("descriptor", [dim])
+    assert not isinstance(image.shape[0], int)
+    assert not isinstance(descriptor.shape[0], int)
+    given = pictures(3)
+    mean, deviation = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
+    prepared = ((given / 255 - mean) / deviation).transpose(0, 3, 1, 2).astype(np.float32)
+    (found,) = session.run(None, {"images": prepared})
+    np.testing.assert_allclose(found, alone(params, given), atol=TOLERANCE, rtol=0)
+    with pytest.raises(InputError, match="found a program for images of 3 x 42, float32"):
+        open_runtime(tmp_path / "out", "onnxruntime")
+
+
+@pytest.mark.parametrize(
+    "changes", [{"format": "openvino"}, {"grouping": "batch"}, {"pixels": "bytes"}]
+)
+def test_colmap_reads_no_other_programs(changes):
+    with pytest.raises(InputError, match=r"for colmap: found .* expected format onnx, grouping"):
+        ExportConfig(**{"format": "onnx", "for_colmap": True} | changes)
+
+
+def test_colmap_normalises_as_imagenet(params, tmp_path):
+    chain = dataclasses.replace(MODEL.preprocessing, mean=(0.5, 0.5, 0.5))
+    model = Model(params, dataclasses.replace(MODEL, preprocessing=chain))
+    with pytest.raises(InputError, match=r"for colmap: found mean .* expected ImageNet's"):
+        write_export(tmp_path / "out", model, ExportConfig(format="onnx", for_colmap=True))
