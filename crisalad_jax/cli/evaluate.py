@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import importlib
 import pathlib
 from typing import Annotated, Literal
 
@@ -18,7 +19,7 @@ from crisalad_jax.cli.common import (
     refuse_without,
     show_tables,
 )
-from crisalad_jax.cli.flags import FOLDER, ModelFlags, ReadFlags, SetFlags, TableFlags
+from crisalad_jax.cli.flags import FOLDER, ModelFlags, ReadFlags, SetFlags, TableFlags, Target
 from crisalad_jax.evaluation.evaluate import check_evaluation, evaluate
 from crisalad_jax.evaluation.record import evaluation_record
 from crisalad_jax.evaluation.similarity import FirstSimilarities
@@ -27,7 +28,7 @@ from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.grouping import DEFAULT_GROUPINGS
 from crisalad_jax.retrieval.pca import load_pca
 from crisalad_jax.retrieval.reranking import Reranking, parse_reranking
-from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.files import atomic_path, write_json
 from crisalad_jax.utils.locks import staged_folder
 
 COMMON = (
@@ -75,6 +76,8 @@ class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     report: Annotated[pathlib.Path | None, FOLDER] = None
     """Folder for a page of all results, index.html, that needs no other file and no network; and
     its pictures."""
+    rerun: Annotated[pathlib.Path | None, Target((".rrd",))] = None
+    """Recording for the viewer Rerun: queries, retrievals and similarities, right ones in green."""
 
 
 def run(arguments: Evaluate) -> None:
@@ -134,6 +137,10 @@ def run(arguments: Evaluate) -> None:
                 settings=record.settings,
                 similarities=similarities.map,
             )
+        if arguments.rerun is not None:
+            from crisalad_jax.experiments.rerun_log import record_results
+
+            record_results(staged.enter_context(atomic_path(arguments.rerun)), readable, results)
         emit_latex(arguments.latex, *tables)
         emit_json(arguments.json, record.values)
     if arguments.report is not None:
@@ -146,6 +153,8 @@ def _check_flags(arguments: Evaluate) -> None:
         refuse_with("--weights", preset=arguments.preset)
     if arguments.runtime != "jax":
         refuse_with(f"--runtime {arguments.runtime}", **pick(arguments, "report", "preset"))
+    if arguments.rerun is not None:
+        importlib.import_module("crisalad_jax.experiments.rerun_log")  # or its extra is missing
     refuse_without("--rerank", arguments.rerank, rerank_weights=arguments.rerank_weights)
 
 

@@ -8,6 +8,7 @@ import contextlib
 import os
 import pathlib
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -25,15 +26,20 @@ from crisalad_jax.utils.errors import InputError, Interrupted
 from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.output import counted, warn
 
+if TYPE_CHECKING:
+    from crisalad_jax.data.benchmarks import Benchmark
+    from crisalad_jax.evaluation.results import GroupingResult
+
 _SHOWN = 3
 """Largest number of answers to a query whose images are recorded."""
 _SIDE = 480
 """Pixels of a recorded image's longer side."""
-_GREY, _GREEN = (150, 150, 150), (40, 160, 70)
+_GREY, _GREEN, _RED = (150, 150, 150), (40, 160, 70), (210, 50, 40)
 _SINCE_1970 = 1e9
 """Seconds from which on a time is a date."""
 
 _Spot = Sequence[float]
+_Colour = tuple[int, int, int]
 
 
 @contextlib.contextmanager
@@ -68,32 +74,67 @@ def record(
         raise interrupted
 
 
+def record_results(
+    path: str | os.PathLike[str], benchmark: "Benchmark", results: Sequence["GroupingResult"]
+) -> None:
+    """Write the results of an evaluation as a recording.
+
+    Args:
+        path: the file, `.rrd`.
+        benchmark: what was evaluated on, without unreadable images.
+        results: what `evaluate` returned.
+
+    Raises:
+        InputError: an image cannot be read, or the file cannot be made.
+    """
+    truth = benchmark.ground_truth()
+    spots = benchmark.database_positions
+    places: Sequence = [None] * len(benchmark.database) if spots is None else spots.tolist()
+    pairs = zip(benchmark.database, places, strict=True)
+    images = [MapImage(str(file), 0, spot, "") for file, spot in pairs]
+    axes = None if spots is None else AXES[0]
+    with record(path) as recording:
+        for result in results:
+            answers = Answers(list(benchmark.queries), result.neighbours, images, axes)
+            firsts = result.neighbours.indices[:, 0].tolist()
+            right = [first in of for first, of in zip(firsts, truth, strict=True)]
+            recording.add(answers, right=right, label=result.label)
+
+
 class Recording:
-    """A recording of queries to one map, and their answers, that is being written."""
+    """A recording of queries and their answers that is being written."""
 
     def __init__(self, stream: rr.RecordingStream, root: str | os.PathLike[str] | None) -> None:
         """Begin without a query; see `record`."""
         self._stream, self._root = stream, root
+        self._scenes: dict[str, _Scene] = {}
         self._lost: dict[pathlib.Path, InputError] = {}
-        self._frames = 0
-        self._has_map = self._has_matches = self._in_degrees = False
-        self._way: list[_Spot] = []
 
-    def add(self, answers: Answers, images: Sequence[np.ndarray] | None = None) -> None:
+    def add(
+        self,
+        answers: Answers,
+        images: Sequence[np.ndarray] | None = None,
+        *,
+        right: Sequence[bool] | None = None,
+        label: str = "",
+    ) -> None:
         """Add queries with their answers, each as the next frame.
 
         Args:
-            answers: what `query` found.
+            answers: what `query` found; of one map for each label.
             images: pixels of the queries; None reads their files.
+            right: whether each query's first answer is right; None is whether its place is known.
+            label: first part of the names of these entities, such as a grouping; "" is none.
 
         Raises:
             InputError: a query's file cannot be read.
         """
-        if not self._frames:
-            self._log_map(answers)
-        log, known = self._log, answers.known.tolist()
+        if label not in self._scenes:
+            self._scenes[label] = _Scene(self._stream, label, answers)
+        scene = self._scenes[label]
+        log, known = scene.log, answers.known.tolist()
         for number, (file, ranked) in enumerate(answers.rows()):
-            self._next_frame(file)
+            scene.next_frame(file)
             name = answers.names[number]
             words = [name if known[number] else f"{name}: unknown"]
             pixels = read_pixels(file) if images is None else images[number]
@@ -108,7 +149,7 @@ class Recording:
                 )
                 words.append(f"{answer.rank}. {answer.similarity:.3f} {answer.image.name}")
                 if answer.rank == 1 and answers.checks and picture is not None:
-                    self._log_matches(query, picture, answers.checks[number][0])
+                    scene.log_matches(query, picture, answers.checks[number][0])
             log("words", rr.TextDocument("\n".join(words)))
             best, least = ranked[0].similarity, answers.min_similarity
             log(
@@ -119,19 +160,9 @@ class Recording:
                 log("similarity/least", rr.Scalars(least))
             if ranked[0].probability is not None:
                 log("similarity/probability", rr.Scalars(ranked[0].probability))
+            is_good = known[number] if right is None else right[number]
             if known[number] and ranked[0].image.position is not None:
-                self._way.append(ranked[0].image.position)
-                log("map/here", self._points(self._way[-1:], _GREEN, 7))
-
-    def _log_map(self, answers: Answers) -> None:
-        """Log the positions of the map's images, which do not change."""
-        self._in_degrees = answers.axes == AXES[1]
-        known = [image.position for image in answers.images if image.position is not None]
-        self._has_map = bool(known)
-        # A viewer's points have 24 bits, and metres of UTM need more.
-        self._origin = np.round(np.median(known, axis=0)) if known else 0
-        if known:
-            self._log("map/images", self._points(known, _GREY, 2), static=True)
+                scene.move(ranked[0].image.position, _GREEN if is_good else _RED)
 
     def _map_picture(self, image: MapImage) -> np.ndarray | None:
         """Read an image of the map; None where it is not there."""
@@ -143,11 +174,43 @@ class Recording:
                 self._lost[file] = error
         return None
 
-    def _log(self, name: str, entity: rr.AsComponents, *, static: bool = False) -> None:
-        """Log an entity at the present frame."""
-        self._stream.log(f"/{name}", entity, static=static)
+    def finish(self) -> None:
+        """Log the ways, and how the viewer lays all out."""
+        if self._lost:
+            first = next(iter(self._lost.values()))
+            warn(
+                f"{counted(len(self._lost), 'picture')} left out, as of {first}; --map-images "
+                "(root=) says where else"
+            )
+        views = [scene.finish() for scene in self._scenes.values()]
+        if views:
+            panel = rrb.TimePanel(timeline="frame")
+            self._stream.send_blueprint(rrb.Blueprint(rrb.Tabs(*views), panel))
 
-    def _next_frame(self, file: pathlib.Path) -> None:
+
+class _Scene:
+    """What a recording has of one map: its positions, and the way through it."""
+
+    def __init__(self, stream: rr.RecordingStream, label: str, answers: Answers) -> None:
+        """Log the positions of the map's images, which do not change."""
+        self._stream, self._label = stream, label
+        self._at = rr.new_entity_path([label]) if label else ""
+        self._frames = 0
+        self._has_matches = False
+        self._in_degrees = answers.axes == AXES[1]
+        self._way: list[tuple[_Spot, _Colour]] = []
+        known = [image.position for image in answers.images if image.position is not None]
+        self._has_map = bool(known)
+        # A viewer's points have 24 bits, and metres of UTM need more.
+        self._origin = np.round(np.median(known, axis=0)) if known else 0
+        if known:
+            self.log("map/images", self._points(known, [_GREY], 2), static=True)
+
+    def log(self, name: str, entity: rr.AsComponents, *, static: bool = False) -> None:
+        """Log an entity at the present frame."""
+        self._stream.log(f"{self._at}/{name}", entity, static=static)
+
+    def next_frame(self, file: pathlib.Path) -> None:
         """Set the times of what is logged from here on."""
         self._stream.reset_time()
         self._stream.set_time("frame", sequence=self._frames)
@@ -159,7 +222,12 @@ class Recording:
         else:
             self._stream.set_time("time", timestamp=moment.seconds)
 
-    def _log_matches(self, query: np.ndarray, answer: np.ndarray, check: Verification) -> None:
+    def move(self, spot: _Spot, colour: _Colour) -> None:
+        """Log where the camera is."""
+        self._way.append((spot, colour))
+        self.log("map/here", self._points([spot], [colour], 7))
+
+    def log_matches(self, query: np.ndarray, answer: np.ndarray, check: Verification) -> None:
         """Log two images side by side, and lines between the points that match."""
         self._has_matches = True
         (left, ours), (right, theirs) = _small(query), _small(answer)
@@ -168,52 +236,46 @@ class Recording:
         both[: len(right), left.shape[1] :] = right
         starts = ours * check.query_points
         ends = theirs * check.database_points + (left.shape[1], 0)
-        self._log("matches/images", _encoded(both))
-        self._log(
+        self.log("matches/images", _encoded(both))
+        self.log(
             "matches/lines",
             rr.LineStrips2D(np.stack([starts, ends], 1, dtype=np.float32), colors=[_GREEN]),
         )
-        self._log("inliers", rr.Scalars(check.inliers))
+        self.log("inliers", rr.Scalars(check.inliers))
 
-    def finish(self) -> None:
-        """Log the way so far, and how the viewer lays all out."""
-        if self._lost:
-            first = next(iter(self._lost.values()))
-            warn(
-                f"{counted(len(self._lost), 'picture')} left out, as of {first}; --map-images "
-                "(root=) says where else"
-            )
-        if not self._frames:
-            return
+    def finish(self) -> rrb.Container:
+        """Log the way so far, and return the views of all."""
+        at = self._at or "/"
         if self._way:
-            self._log("map/way", self._line(self._way), static=True)
-            self._log("map/found", self._points(self._way, _GREEN, 4), static=True)
+            spots, colours = zip(*self._way, strict=True)
+            self.log("map/way", self._line(spots), static=True)
+            self.log("map/found", self._points(spots, colours, 4), static=True)
         answers = [
-            rrb.Spatial2DView(origin=f"/answers/{rank}", name=f"answer {rank}")
+            rrb.Spatial2DView(origin=f"{self._at}/answers/{rank}", name=f"answer {rank}")
             for rank in range(1, _SHOWN + 1)
         ]
-        pictures = rrb.Grid(rrb.Spatial2DView(origin="/query", name="query"), *answers)
+        pictures = rrb.Grid(rrb.Spatial2DView(origin=f"{self._at}/query", name="query"), *answers)
+        if self._has_matches:
+            pictures = rrb.Vertical(
+                pictures, rrb.Spatial2DView(origin=f"{self._at}/matches", name="matches")
+            )
         view = rrb.MapView if self._in_degrees else rrb.Spatial3DView
         numbers = [
-            rrb.TimeSeriesView(origin="/similarity", name="similarity"),
-            rrb.TextDocumentView(origin="/words", name="names"),
+            rrb.TimeSeriesView(origin=f"{self._at}/similarity", name="similarity"),
+            rrb.TextDocumentView(origin=f"{self._at}/words", name="names"),
         ]
         if self._has_matches:
-            matches = rrb.Spatial2DView(origin="/matches", name="matches")
-            pictures = rrb.Vertical(pictures, matches)
-            numbers.append(rrb.TimeSeriesView(origin="/inliers", name="inliers"))
-        below = [view(origin="/map", name="map")] if self._has_map else []
-        views = rrb.Horizontal(pictures, rrb.Vertical(*below, *numbers))
-        panel = rrb.TimePanel(timeline="frame")
-        self._stream.send_blueprint(rrb.Blueprint(views, panel))
+            numbers.append(rrb.TimeSeriesView(origin=f"{self._at}/inliers", name="inliers"))
+        below = [view(origin=f"{self._at}/map", name="map")] if self._has_map else []
+        return rrb.Horizontal(pictures, rrb.Vertical(*below, *numbers), name=self._label or at)
 
     def _points(
-        self, spots: Sequence[_Spot], colour: tuple[int, int, int], pixels: float
+        self, spots: Sequence[_Spot], colours: Sequence[_Colour], pixels: float
     ) -> rr.AsComponents:
         radii = rr.Radius.ui_points(pixels)
         if self._in_degrees:
-            return rr.GeoPoints(lat_lon=spots, colors=[colour], radii=radii)
-        return rr.Points3D(self._flat(spots), colors=[colour], radii=radii)
+            return rr.GeoPoints(lat_lon=spots, colors=colours, radii=radii)
+        return rr.Points3D(self._flat(spots), colors=colours, radii=radii)
 
     def _line(self, spots: Sequence[_Spot]) -> rr.AsComponents:
         if self._in_degrees:

@@ -12,14 +12,16 @@ import pytest
 
 from crisalad_jax.cli import main
 from crisalad_jax.data.images import list_images, read_image
-from crisalad_jax.experiments.rerun_log import record
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.experiments.rerun_log import record, record_results
+from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.map import MapImage
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.verification.results import Verification
 from crisalad_jax.utils.errors import InputError, Interrupted
 from crisalad_jax.utils.output import Note
-from tests.conftest import write_video
+from tests.conftest import MODEL, read_options, write_video
 
 rr = pytest.importorskip("rerun")
 
@@ -196,6 +198,25 @@ def test_a_signal_leaves_a_whole_recording_and_an_error_none(answers, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.rrd"]
 
 
+def test_an_evaluation_is_recorded_by_grouping(benchmark, params, tmp_path):
+    groupings = ["single", "sequential"]
+    options = read_options({})
+    results = evaluate(Model(params, MODEL), benchmark, groupings=groupings, **options)
+    record_results(tmp_path / "a.rrd", benchmark, results)
+    found = read(tmp_path / "a.rrd")
+    for result in results:
+        at = f"/{rr.escape_entity_path_part(result.label)}"
+        best = column(found[f"{at}/similarity/best"], "Scalars:scalars")
+        np.testing.assert_allclose(best, result.neighbours.similarities[:, 0], rtol=1e-6)
+        colours = column(found[f"{at}/map/found"], "Points3D:colors")[0]
+        truth = benchmark.ground_truth()
+        firsts = result.neighbours.indices[:, 0]
+        right = [first in of for first, of in zip(firsts, truth, strict=True)]
+        # Packed as red, green, blue and alpha: what is right has more green than red.
+        channels = [((colour >> 24) & 255, (colour >> 16) & 255) for colour in colours]
+        assert [green > red for red, green in channels] == right
+
+
 def test_rerun_opens_it(answers, tmp_path):
     """Its command line, which is in the wheel: each message decodes."""
     out = tmp_path / "a.rrd"
@@ -208,7 +229,7 @@ def test_rerun_opens_it(answers, tmp_path):
     assert subprocess.run(command, capture_output=True, check=False).returncode
 
 
-def test_query_writes_recordings(shared, tmp_path, capfd):
+def test_query_and_evaluate_write_recordings(shared, tmp_path, capfd):
     weights, town = shared / "weights.safetensors", shared / "town"
     images, out = town / "images" / "test", tmp_path / "map"
     quiet = ("--batch-size", 4, "--quiet")
@@ -229,6 +250,9 @@ def test_query_writes_recordings(shared, tmp_path, capfd):
     rows = read(tmp_path / "c.rrd")["/query"]
     assert len(rows) == len(said.splitlines()) >= 1
     assert rows[-1]["time"].total_seconds() == 0.4
+    given = ("evaluate", "--weights", weights, "--data", town, "--grouping", "single", *quiet)
+    crisalad(*given, "--rerun", tmp_path / "e.rrd")
+    assert len(read(tmp_path / "e.rrd")["/single/query"]) == 5
 
 
 @pytest.mark.parametrize(
@@ -251,8 +275,9 @@ def test_what_query_refuses(given, words, capfd, tmp_path):
 def test_without_rerun_one_line_says_what_to_install(monkeypatch, capfd, tmp_path):
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.delitem(sys.modules, "crisalad_jax.experiments.rerun_log", raising=False)
-    given = ["query", "a.jpg", "--map", "m", "--rerun", str(tmp_path / "a.rrd")]
-    assert main(given) == 2
-    error = capfd.readouterr().err
-    assert error.count("\n") == 1
-    assert "pip install 'crisalad-jax[robot]'" in error
+    asked = (["query", "a.jpg", "--map", "m"], ["evaluate", "--data", "d", "--preset", "tiny"])
+    for given in asked:
+        assert main([*given, "--rerun", str(tmp_path / "a.rrd")]) == 2
+        error = capfd.readouterr().err
+        assert error.count("\n") == 1
+        assert "pip install 'crisalad-jax[robot]'" in error
