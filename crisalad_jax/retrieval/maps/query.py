@@ -25,7 +25,8 @@ from crisalad_jax.retrieval.describe import (
     shown,
 )
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
-from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage, ranked
+from crisalad_jax.retrieval.maps.images import MapImage
+from crisalad_jax.retrieval.maps.map import Answer, Map, ranked
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch, SequenceTracker, TrackResult
 from crisalad_jax.retrieval.maps.verified import calibration_of, verify_answers
 from crisalad_jax.retrieval.neighbours import Neighbours
