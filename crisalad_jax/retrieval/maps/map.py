@@ -122,6 +122,7 @@ class Map:
         """The components that shorten descriptors, and those of queries; None is none."""
         self._calibrated = False
         self._approximate: Approximate | None = None
+        self._left_out = Where(), self.images, 0, Removed()
         self._describer: tuple[object, Describer] | None = None
         """A model that is known to be the one that made the map, and what describes with it."""
         me = weakref.proxy(self)  # in a circle it would not close as soon as nothing refers to it
@@ -330,10 +331,8 @@ class Map:
         """
         check_count("k", k)
         queries = self._rows("queries", queries)
-        out, where = self.removed, Where.parse(where) if isinstance(where, str) else where
-        if where is not None:
-            out = where.left_out(self.images, self.axes)
-        k, count = min(k, self.images.rows - len(out.rows)), self.images.rows
+        out, count = self.removed if where is None else self.left_out(where), self.images.rows
+        k = min(k, count - len(out.rows))
         if self._approximate is not None and not exact:
             found = self._approximate.search(queries, k, count, out)
         else:
@@ -341,6 +340,18 @@ class Map:
         if where is None:
             return found
         return found._replace(indices=self.removed.numbers_of(out.rows_of(found.indices)))
+
+    def left_out(self, where: Where | str) -> Removed:
+        """Return the rows that a search with conditions leaves out, those of the last one at once.
+
+        Raises:
+            InputError: no image is left; what `Where.parse` and `Where.left_out` raise.
+        """
+        conditions = Where.parse(where) if isinstance(where, str) else where
+        asked = conditions, self.images, self.images.rows
+        if self._left_out[:3] != asked:
+            self._left_out = *asked, conditions.left_out(self.images, self.axes)
+        return self._left_out[3]
 
     @property
     def search_kind(self) -> str:
