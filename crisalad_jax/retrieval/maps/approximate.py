@@ -34,6 +34,8 @@ NEIGHBOURS, SAMPLE = 10, 100
 _CANDIDATES = {"hnsw": (2, 16), "ivf-pq": (10, 100)}
 """Of each kind: candidates for each neighbour, and at least so many; the best of them by exact
 similarity are the answer."""
+_SEARCHED = 10
+"""Of this many descriptors one is left at least where the index is searched."""
 _SEED = 0
 Additions = Sequence[tuple[int, int, str]]
 """First number, count and SHA-256 of each addition to a map."""
@@ -51,14 +53,17 @@ class Approximate(NamedTuple):
     def search(self, queries: Queries, k: int, count: int, removed: Removed = NONE) -> Neighbours:
         """Find the k most similar of `count` descriptors: candidates, ranked exactly.
 
-        Queries with fewer than k candidates are searched exactly. What was removed is no candidate,
-        and its room in the search goes to others.
+        Queries with fewer than k candidates are searched exactly, and so are all where less than a
+        tenth is left. What was removed is no candidate; more are looked at in its place.
 
         Raises:
             InputError: the store is damaged or gone.
         """
         each, least = _CANDIDATES[self.kind]
-        candidates = min(count - len(removed.rows), max(least, each * k))
+        left = count - len(removed.rows)
+        if left < count // _SEARCHED:
+            return self.store.search(queries, k, count, removed)
+        candidates = min(left, max(least, each * k) * count // left)
         numbers = self.index.search(queries, candidates, without=removed.rows).indices
         query, found = np.nonzero(numbers >= 0)
         similarities = np.full(numbers.shape, -np.inf, np.float32)

@@ -159,7 +159,7 @@ class Images(Sequence[MapImage]):
         ]
 
     def _named(self, rows: Int64[np.ndarray, " n"]) -> list[str]:
-        data, ends = memoryview(self._names.values), self._ends.values
+        data, ends = self._names.values.data, self._ends.values
         spans = zip(ends[rows].tolist(), ends[rows + 1].tolist(), strict=True)
         return [str(data[start:end], *_NAMES) for start, end in spans]
 
