@@ -101,7 +101,7 @@ def joined(
     paths = [*filter(None, read), *(name for name in loaded_plugins() if name.endswith(".py"))]
     with connected(address) as ray:
         absolute = [path if "://" in path else os.path.abspath(path) for path in paths]
-        check_nodes(ray, read=absolute, write=os.path.abspath(write))
+        check_nodes(ray, read=absolute, write=write.absolute())
         share = share_of([node["Resources"] for node in ray.nodes() if node["Alive"]], jobs)
         first = ray.remote(_nothing).options(**share.options).remote()
         if not ray.wait([first], timeout=START)[0]:

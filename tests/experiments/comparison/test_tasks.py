@@ -109,7 +109,7 @@ def test_tasks_end_once_each_and_a_lost_worker_is_replaced(tmp_path, monkeypatch
 
 
 def program(flags, out, plugin, *more: object) -> list[str]:
-    given = (*flags, "--out", out, "--plugin", plugin, *more)
+    given = (*flags, "--methods", "gem", "--out", out, "--plugin", plugin, *more)
     return [sys.executable, "-m", "crisalad_jax", *map(str, given)]
 
 
@@ -156,15 +156,28 @@ def holder_of(folder: pathlib.Path) -> int:
 def start(command: list[str], out: pathlib.Path) -> tuple[subprocess.Popen[str], list[int]]:
     """Start it; return it and the processes of its two runs, which both train."""
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    folders = [out / "crisalad" / f"seed-{seed}" for seed in (0, 1)]
+    folders = [out / "gem" / f"seed-{seed}" for seed in (0, 1)]
     metrics = [folder / "run" / "metrics.jsonl" for folder in folders]
-    wait_for(lambda: all(path.exists() and path.stat().st_size for path in metrics))
+
+    def begun() -> bool:
+        return all(path.exists() and path.stat().st_size for path in metrics)
+
+    wait_for(lambda: begun() or process.poll() is not None)
+    assert process.poll() is None, process.communicate()
     return process, [holder_of(folder) for folder in folders]
 
 
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory):
+    """A folder of compiled programs, so that each is compiled once."""
+    return tmp_path_factory.mktemp("programs")
+
+
 @pytest.fixture
-def long(flags, tmp_path, plugin):
+def long(flags, tmp_path, plugin, programs, monkeypatch):
     """A command that trains two runs at once, for some time."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(programs))
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     return program(flags, tmp_path / "out", plugin, "--jobs", 2, "--epochs", 400)
 
 
