@@ -139,6 +139,7 @@ def in_tasks(
         Interrupted: a signal asked for the end.
     """
     import ray
+    from ray.exceptions import RayError, RayTaskError
 
     task = ray.remote(_carry_out).options(**share.options)
     settings = {name: getattr(jax.config, name) for name in _JAX}
@@ -158,9 +159,9 @@ def in_tasks(
                     given = running.pop(ended)
                     try:
                         result, notes = ray.get(ended)
-                    except ray.exceptions.RayTaskError as error:
+                    except RayTaskError as error:
                         raise error.cause from error
-                    except ray.exceptions.RayError as error:
+                    except RayError as error:
                         lost[given] += 1
                         words = f"a worker of the cluster was lost ({type(error).__name__})"
                         if lost[given] == _TRIES:
