@@ -15,7 +15,7 @@ import socket
 import tempfile
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 from crisalad_jax.utils.errors import InputError, few
@@ -44,13 +44,13 @@ _TRIES = 5
 """Times that a piece, or the start of a worker, may end with its worker's death."""
 
 
-def check_cluster(address: str) -> tuple[str, int] | None:
-    """Return host and port of a cluster's address; None for "local" and "auto".
+def check_cluster(address: str | None) -> tuple[str, int] | None:
+    """Return host and port of a cluster's address; None for None, "local" and "auto".
 
     Raises:
         InputError: it is not an address.
     """
-    if address in ("local", "auto"):
+    if address in (None, "local", "auto"):
         return None
     found = _ADDRESS.fullmatch(address)
     if found is None or not (found[1] or found[3]):
@@ -83,6 +83,7 @@ def connected(address: str, *, cores: int | None = None) -> Iterator[Any]:
     what = f"--cluster {address}"
     try:
         import ray
+        import ray.exceptions
     except ModuleNotFoundError as error:
         raise InputError(missing_extra(error, what)) from error
     if there is not None and not ray.is_initialized():
@@ -93,7 +94,7 @@ def connected(address: str, *, cores: int | None = None) -> Iterator[Any]:
             _join(ray, address, what, cores)
         yield ray
     except (ray.exceptions.RayError, ConnectionError) as error:
-        raise InputError(f"{what}: {one_line(error)}") from error
+        raise InputError(f"{what}: {_reason(error)}") from error
     finally:
         if joins:
             _within(CONNECT, ray.shutdown)
@@ -129,9 +130,15 @@ def _join(ray: Any, address: str, what: str, cores: int | None) -> None:
                 return
             joined = _within(CONNECT, lambda: ray.init(address, **options))
         except Exception as error:  # Ray raises many
-            raise InputError(f"{what}: cannot be joined: {one_line(error)}") from error
+            raise InputError(f"{what}: cannot be joined: {_reason(error)}") from error
     if not joined:
         raise InputError(f"{what}: found no answer of a Ray cluster within {CONNECT:.0f} s")
+
+
+def _reason(error: Exception) -> str:
+    """Say in one line what Ray says, or the last line of a remote traceback."""
+    lines = str(error).strip().splitlines()
+    return one_line(lines[-1] if "Traceback" in str(error) else error)
 
 
 def _within(seconds: float, work: Callable[[], Any]) -> bool:
@@ -172,7 +179,7 @@ def check_nodes(ray: Any, *, read: Sequence[str] = (), write: pathlib.Path | Non
         look = _look_by_value()
         here, _ = look((), None)
         asked = {
-            ray.remote(look).options(**_on(ray, node, num_cpus=0)).remote(tuple(read), mark): node
+            ray.remote(look).options(**_on(node, num_cpus=0)).remote(tuple(read), mark): node
             for node in _nodes(ray)
         }
         answered, silent = ray.wait(list(asked), num_returns=len(asked), timeout=ANSWER)
@@ -244,7 +251,7 @@ def _name(node: dict[str, Any]) -> str:
     return f"node {node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
 
 
-def _on(ray: Any, node: dict[str, Any], **options: Any) -> dict[str, Any]:
+def _on(node: dict[str, Any], **options: Any) -> dict[str, Any]:
     """Return the options of a task or an actor that runs on this node, or not at all."""
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -255,18 +262,16 @@ def _on(ray: Any, node: dict[str, Any], **options: Any) -> dict[str, Any]:
 class _Actor:
     """What calls a function in a process of a node."""
 
-    def start(self, folder: str, prepare: Callable[[], None], held: Sequence[Any]) -> None:
-        """Prepare the process in a folder, where there is such a one, and take the function.
-
-        Args:
-            folder: of relative paths.
-            prepare: called before the function is unpickled.
-            held: a reference to the function.
-        """
-        import ray
-
+    def __init__(self, folder: str, environment: Mapping[str, str]) -> None:
+        """Take the folder of relative paths, if it exists here, and variables."""
+        os.environ.update(environment)
         with contextlib.suppress(OSError):
             os.chdir(folder)
+
+    def start(self, prepare: Callable[[], None], held: Sequence[Any]) -> None:
+        """Prepare the process, and take the function, to which there is a reference."""
+        import ray
+
         prepare()
         self._work: Callable[[Any], Any] = ray.get(held[0])  # pyright: ignore
 
@@ -298,14 +303,23 @@ def _places(ray: Any) -> list[_Place]:
     return places
 
 
+class _How(NamedTuple):
+    """What a worker's process needs to begin."""
+
+    environment: Mapping[str, str]
+    prepare: Callable[[], None]
+    held: Any
+    """A reference to the function that it calls."""
+
+
 class _Worker:
     """An actor in its place, with the items that it has."""
 
-    def __init__(self, ray: Any, place: _Place, arguments: Sequence[Any], starts: int) -> None:
+    def __init__(self, ray: Any, place: _Place, how: _How, starts: int) -> None:
         """Start it: the reference `started` is ready once it can work."""
-        actor = ray.remote(_Actor).options(**_on(ray, place.node, **place.resources))
-        self.place, self.actor = place, actor.remote()
-        self.started: Any = self.actor.start.remote(*arguments)
+        actor = ray.remote(_Actor).options(**_on(place.node, **place.resources))
+        self.place, self.actor = place, actor.remote(os.getcwd(), how.environment)
+        self.started: Any = self.actor.start.remote(how.prepare, [how.held])
         self.starts = starts
         """How often one was started here since the last that worked."""
         self.is_ready = False
@@ -322,6 +336,7 @@ def map_in_order(
     items: Sequence[_Item],
     *,
     prepare: Callable[[], None],
+    environment: Mapping[str, str],
 ) -> Iterator[_Result]:
     """Yield the result of `work` for each item, in the order of the items.
 
@@ -332,13 +347,14 @@ def map_in_order(
         ray: of `connected`.
         work: a function that pickle can send.
         items: what to work on.
-        prepare: called in each process before the function is unpickled.
+        prepare: called in each process before `work` is unpickled.
+        environment: variables that are set in each process before that.
 
     Raises:
         InputError: what `work` raises as one, with the node's name; no worker can be started, or
             they end again and again; or none has finished an item within `PIECE` seconds.
     """
-    pool = _Pool(ray, (os.getcwd(), prepare, [ray.put(work)]), items)
+    pool = _Pool(ray, _How(environment, prepare, ray.put(work)), items)
     try:
         for number in range(len(items)):
             yield pool.result(number)
@@ -350,10 +366,10 @@ def map_in_order(
 class _Pool:
     """Workers that share items."""
 
-    def __init__(self, ray: Any, arguments: Sequence[Any], items: Sequence[Any]) -> None:
+    def __init__(self, ray: Any, how: _How, items: Sequence[Any]) -> None:
         """Start a worker in each place."""
-        self._ray, self._arguments, self._items = ray, arguments, items
-        self.workers = [_Worker(ray, place, arguments, 1) for place in _places(ray)]
+        self._ray, self._how, self._items = ray, how, items
+        self.workers = [_Worker(ray, place, how, 1) for place in _places(ray)]
         self._most = 2 * _QUEUED * len(self.workers)
         """Number of items that are begun before the first of them is asked for."""
         self._waiting = list(range(len(items)))
@@ -441,7 +457,7 @@ class _Pool:
             raise InputError(f"{worker}: workers ended {_TRIES} times at the same item: {reason}")
         is_alive = place.node["NodeID"] in {node["NodeID"] for node in _nodes(ray)}
         if is_alive and worker.starts < _TRIES:
-            self.workers.append(_Worker(ray, place, self._arguments, worker.starts + 1))
+            self.workers.append(_Worker(ray, place, self._how, worker.starts + 1))
         elif self.workers:
             warn(f"{worker}: lost, its images go to other nodes: {reason}")
         else:
