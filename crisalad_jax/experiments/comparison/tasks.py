@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 
 import jax
 
-from crisalad_jax.config.plugins import load_entry_points, load_plugin, loaded_plugins
+from crisalad_jax.config.checks import require
+from crisalad_jax.config.plugins import load_plugins, loaded_plugins
+from crisalad_jax.data.images import MAX_PIXELS
 from crisalad_jax.utils.cluster import START, check_nodes, connected
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note, counted, warn
@@ -27,7 +29,7 @@ _JAX = (
     *("jax_platforms", "jax_num_cpu_devices", "jax_compilation_cache_dir"),
     "jax_persistent_cache_min_compile_time_secs",
 )
-"""Settings of JAX that a worker takes from this process, so that a run has the same bits."""
+"""Settings of JAX that a worker takes from this process, as variables: a run has the same bits."""
 
 
 class Share(NamedTuple):
@@ -41,12 +43,6 @@ class Share(NamedTuple):
     """Number of tasks at once."""
     beside: bool
     """Whether tasks share a device; without GPUs, whether a node may have two of them."""
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Ray's options of a task."""
-        reserved = {"num_cpus": 0, f"num_{self.device.lower()}s": self.size}
-        return {**reserved, "max_retries": 0, "scheduling_strategy": "SPREAD"}
 
 
 def share_of(nodes: Sequence[Mapping[str, float]], jobs: int | None) -> Share:
@@ -62,12 +58,16 @@ def share_of(nodes: Sequence[Mapping[str, float]], jobs: int | None) -> Share:
     Returns:
         The share of each task.
 
+    Raises:
+        InputError: no node has any.
+
     Example:
         >>> share_of([{"CPU": 16, "GPU": 2}], 4)
         Share(device='GPU', size=0.5, at_once=4, beside=True)
     """
     device = "GPU" if any(node.get("GPU") for node in nodes) else "CPU"
     counts = [int(node[device]) for node in nodes if node.get(device)]
+    require(bool(counts), "--cluster: found no node with a GPU or a CPU, expected one")
 
     def fits(size: int) -> int:
         return sum(count // size for count in counts)
@@ -103,7 +103,7 @@ def joined(
         absolute = [path if "://" in path else os.path.abspath(path) for path in paths]
         check_nodes(ray, read=absolute, write=write.absolute())
         share = share_of([node["Resources"] for node in ray.nodes() if node["Alive"]], jobs)
-        first = ray.remote(_nothing).options(**share.options).remote()
+        first = ray.remote(_nothing).options(**_options(share)).remote()
         if not ray.wait([first], timeout=START)[0]:
             raise InputError(
                 f"--cluster {address}: found no {share.size:g} free {share.device} within "
@@ -141,9 +141,8 @@ def in_tasks(
     import ray
     from ray.exceptions import RayError, RayTaskError
 
-    task = ray.remote(_carry_out).options(**share.options)
-    settings = {name: getattr(jax.config, name) for name in _JAX}
-    surroundings = os.getcwd(), share, settings, loaded_plugins()
+    task = ray.remote(_carry_out).options(**_options(share))
+    here = os.getcwd(), loaded_plugins()
     reference = [ray.put((work, shared))]  # in a list: a task reads it after its plug-ins
     left, running, results, lost = deque(each), {}, [], Counter()
     with defer_signals() as stop:
@@ -154,7 +153,7 @@ def in_tasks(
                 while left and len(running) < share.at_once:
                     given = left.popleft()
                     begin(*given)
-                    running[task.remote(surroundings, reference, given)] = given
+                    running[task.remote(*here, reference, given)] = given
                 for ended in ray.wait([*running], timeout=0.2)[0]:
                     given = running.pop(ended)
                     try:
@@ -196,29 +195,32 @@ def in_turn(
     return results
 
 
+def _options(share: Share) -> dict[str, Any]:
+    """Return Ray's options of a task: what it reserves, and the variables of its process."""
+    values = {name.upper(): getattr(jax.config, name) for name in _JAX}
+    values[MAX_PIXELS] = os.environ[MAX_PIXELS]
+    if share.device == "GPU" and share.size < 1:
+        values["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{_MEMORY * share.size:.3f}"
+    given = {name: str(value) for name, value in values.items() if value is not None}
+    return {
+        **{"num_cpus": 0, f"num_{share.device.lower()}s": share.size},
+        **{"max_retries": 0, "scheduling_strategy": "SPREAD", "runtime_env": {"env_vars": given}},
+    }
+
+
 def _nothing() -> None:
     """Start a worker."""
 
 
 def _carry_out(
-    surroundings: tuple[str, Share, Mapping[str, Any], Iterable[str]],
-    reference: list[Any],
-    given: tuple[Any, ...],
+    folder: str, plugins: Sequence[str], reference: list[Any], given: tuple[Any, ...]
 ) -> tuple[Any, list[str]]:
     """Carry out a call in a worker; return its result, and its notes."""
     import ray
 
-    folder, share, settings, plugins = surroundings
-    with contextlib.suppress(OSError):  # a node without this folder is given whole paths alone
+    with contextlib.suppress(OSError):  # a node without this folder is given whole paths
         os.chdir(folder)
-    if share.device == "GPU" and share.size < 1:
-        os.environ["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{_MEMORY * share.size:.3f}"
-    for name, value in settings.items():
-        if getattr(jax.config, name) != value:  # a worker's later tasks find them
-            jax.config.update(name, value)
-    load_entry_points()
-    for plugin in plugins:
-        load_plugin(plugin)
+    load_plugins(plugins)
     work, shared = ray.get(reference[0])
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always", Note)
