@@ -48,7 +48,7 @@ class FileCache:
             InputError: it is in neither, or the address cannot be asked.
         """
         name = _digest(address_of(path).encode()).hex()
-        file = self._folder / name[:2] / name[2:]
+        file = self._folder / str(int(name, 16) % _FOLDERS) / name
         state = data = b""
         used = 0.0
         # Another process may remove the file at any moment; what is open stays readable.

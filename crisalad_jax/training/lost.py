@@ -34,7 +34,7 @@ for line in sys.stdin.buffer:
         aborted = aborted or (of_jax and line[:1] == b"F")
     if of_jax:
         page += line
-    else:
+    elif not line.startswith(b"[Gloo] Rank "):
         sys.stderr.buffer.write(line)
         sys.stderr.buffer.flush()
 if aborted:
@@ -50,18 +50,20 @@ class LostProcessError(InputError):
 
 
 def filter_aborts() -> None:
-    """Let a small program of its own write what C++ writes to standard error, JAX's page as a line.
+    """Let a small program write to standard error what C++ writes, and a line for JAX's page.
 
-    What Python writes there goes where it went before.
+    What Python writes goes where it went before.
     """
-    before = os.dup(2)
     program = subprocess.Popen(
         [sys.executable, "-ISc", _FILTER, _NEXT], stdin=subprocess.PIPE, start_new_session=True
     )
     assert program.stdin is not None
-    sys.stderr.flush()
-    sys.stderr.buffer.raw.__init__(before, "w", closefd=False)  # pyright: ignore
-    os.dup2(program.stdin.fileno(), 2)
+    for number, stream in ((1, sys.stdout), (2, sys.stderr)):
+        stream.flush()
+        # The stream stays the same object, which others hold. Without a buffer, it is the file.
+        file = getattr(stream.buffer, "raw", stream.buffer)
+        file.__init__(os.dup(number), "w", closefd=False)
+        os.dup2(program.stdin.fileno(), number)
     program.stdin.close()
     _filters.append(program)
 
