@@ -122,7 +122,7 @@ def index(
     store: str | None = None,
     dtype: Literal["float32", "float16", "bits"] | None = None,
     pca: Pca | str | os.PathLike[str] | None = None,
-    search: Literal["exact", "hnsw", "ivf-pq"] | None = None,
+    search: Literal["auto", "exact", "hnsw", "ivf-rabitq"] | None = None,
     again: bool = False,
     reading: Reading = Reading(),
     cluster: str | None = None,
@@ -156,8 +156,9 @@ def index(
             searched by the Hamming distance. None is the map's, and of a new map "float32".
         pca: components that shorten the descriptors, or a file of them, of which the map stores a
             copy. None is the map's, and of a new map none.
-        search: the approximate search that is built from the map's descriptors; "exact" removes
-            one. None leaves what there is, which is of no use once the map has grown.
+        search: the approximate search that is built from the map's descriptors, or extended by new
+            ones, see `Map.build_search`; "exact" removes one. None leaves what there is, which is
+            of no use once the map has grown.
         again: whether to add images that were removed from the map, too (`remove_images`).
         reading: how images are read.
         cluster: the Ray cluster that describes them, as `extract` takes it; None describes here.
