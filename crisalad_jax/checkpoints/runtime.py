@@ -320,7 +320,7 @@ def _exported(
     folder = user_cache() / "exports" / key[:32]
     if not (folder / MANIFEST).is_file():
         _check_fixed(weights, model["preprocessing"]["size_rule"])
-        with lock(folder.parent, wait=True):
+        with lock(folder.parent, wait=3600):
             if not (folder / MANIFEST).is_file():
                 _export(weights, model, how, folder)
     return folder

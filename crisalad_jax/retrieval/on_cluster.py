@@ -7,7 +7,7 @@ import pathlib
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from crisalad_jax.config.plugins import load_entry_points, load_plugin, loaded_plugins
+from crisalad_jax.config.plugins import load_plugins, loaded_plugins
 from crisalad_jax.data.frames import file_of
 from crisalad_jax.data.images import MAX_PIXELS
 from crisalad_jax.data.reading import Reading
@@ -51,7 +51,10 @@ class Describing(NamedTuple):
         size = max(1, SEGMENT // self.reading.batch_size) * self.reading.batch_size
         pieces = [(first, paths[first : first + size]) for first in range(0, len(paths), size)]
         environment = {MAX_PIXELS: os.environ[MAX_PIXELS]}  # before OpenCV is imported
-        how = {"prepare": functools.partial(_prepare, loaded_plugins()), "environment": environment}
+        how = {
+            "prepare": functools.partial(load_plugins, loaded_plugins()),
+            "environment": environment,
+        }
         # A cache is of this process.
         work = self._replace(reading=dataclasses.replace(self.reading, cache=None))
         with cluster.connected(address) as ray:
@@ -82,10 +85,3 @@ class Describing(NamedTuple):
 def _whole(path: pathlib.Path) -> str:
     file = file_of(path)
     return address_of(file) if is_remote(file) else os.path.abspath(file)
-
-
-def _prepare(plugins: Sequence[str]) -> None:
-    """Load what the model in a worker's process may be made of, before it is unpickled."""
-    load_entry_points()
-    for plugin in plugins:
-        load_plugin(plugin)
