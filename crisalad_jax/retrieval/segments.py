@@ -133,7 +133,7 @@ class Segments:
     def _append(self, record: Mapping[str, Any], rows: Descriptors, path: pathlib.Path) -> None:
         rows = np.ascontiguousarray(rows, self._dtype)
         whole = {**record, "sha256": _sha256(rows, self._dtype)}
-        self.store.add(len(self), rows)
+        self.store.add(len(self), rows, whole)
         write_record(path, whole)
         self._take(whole, path)
 

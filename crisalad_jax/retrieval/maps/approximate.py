@@ -5,17 +5,19 @@ not used, so that a map that grew never answers from an old index.
 """
 
 import hashlib
+import math
 import pathlib
 import shutil
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import Queries, sample
-from crisalad_jax.retrieval.maps.file_store import FileStore
+from crisalad_jax.retrieval.maps.milvus_store import MilvusIndex, MilvusStore
 from crisalad_jax.retrieval.maps.removed import NONE, Removed
+from crisalad_jax.retrieval.maps.store import Store
 from crisalad_jax.retrieval.neighbours import Neighbours, similarities_of
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
@@ -25,13 +27,13 @@ from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 if TYPE_CHECKING:
     from crisalad_jax.retrieval.faiss_index import Index
 
-SEARCHES: dict[str, None] = dict.fromkeys(("exact", "hnsw", "ivf-pq"))
+SEARCHES: dict[str, None] = dict.fromkeys(("exact", "hnsw", "ivf-pq", "diskann"))
 """How a map is searched: every descriptor is compared; by a graph over the descriptors, which are
 all in memory; or by codes of at most 128 bytes in memory, and the files rank the answers."""
 FOLDER = "approximate"
 NEIGHBOURS, SAMPLE = 10, 100
 """Recall is measured over the 10 nearest others of so many of the map's images."""
-_CANDIDATES = {"hnsw": (2, 16), "ivf-pq": (10, 100)}
+_CANDIDATES = {"hnsw": (2, 16), "ivf-pq": (10, 100), "ivf-rabitq": (10, 100), "diskann": (2, 16)}
 """Of each kind: candidates for each neighbour, and at least so many; the best of them by exact
 similarity are the answer."""
 _SEED = 0
@@ -40,11 +42,11 @@ Additions = Sequence[tuple[int, int, str]]
 
 
 class Approximate(NamedTuple):
-    """An approximate search of a map's descriptors, which are in files."""
+    """An approximate search of a map's descriptors."""
 
-    kind: Literal["hnsw", "ivf-pq"]
-    index: "Index"
-    store: FileStore
+    kind: str
+    index: "Index | MilvusIndex"
+    store: Store
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
 
@@ -83,6 +85,8 @@ def open_approximate(
     Raises:
         InputError: it is damaged, or changed where `verify` asks for that.
     """
+    if isinstance(segments.store, MilvusStore):
+        return _served(segments.store)
     path = _current(folder, segments.spans)
     if path is None:
         return None
@@ -90,7 +94,7 @@ def open_approximate(
 
     index = load_index(path, verify=verify)
     recall = float(_record(path)["recall"])
-    return Approximate(index.kind, index, cast(FileStore, segments.store), recall)
+    return Approximate(index.kind, index, segments.store, recall)
 
 
 def indexed_images(folder: pathlib.Path) -> list[tuple[pathlib.Path, int]]:
@@ -119,8 +123,8 @@ def check_search(kind: str, store: str, dtype: str) -> None:
     choose("search", kind, SEARCHES)
     if kind != "exact" and dtype == "bits":
         raise InputError(f"search: found {kind} for a map of bits, expected exact")
-    if kind != "exact" and store != "files":
-        raise InputError(f"search: found {kind}, expected exact, as {store} is searched by Milvus")
+    if kind == "diskann" and store == "files":
+        raise InputError(f"search: found {kind} for a map in files, which is an index of Milvus")
 
 
 def build_approximate(
@@ -137,32 +141,55 @@ def build_approximate(
     Raises:
         InputError: too few descriptors; a full disk.
     """
+    if isinstance(segments.store, MilvusStore):
+        segments.store.build(kind, quiet=quiet)
+        built = _served(segments.store)
+        return built and built._replace(recall=_recall(built, len(segments)))
     if kind == "exact":
         shutil.rmtree(folder / FOLDER, ignore_errors=True)
         return None
     path = folder / FOLDER / f"{kind}-{_digest(segments.spans)}.index"
     if path.exists():
         return open_approximate(folder, segments, verify=True)
-    from crisalad_jax.retrieval.faiss_index import build, recall_against_exact, save_index
+    from crisalad_jax.retrieval.faiss_index import build, save_index
 
-    count, store = len(segments), cast(FileStore, segments.store)
+    count = len(segments)
     index = build(cast(Any, kind), segments.blocks, seed=_SEED, quiet=quiet)
-    built = Approximate(index.kind, index, store, 0.0)
-    places = sample(count, min(SAMPLE, count), _SEED)
-    k = min(NEIGHBOURS + 1, count)
-    queries = store.rows(places).astype(np.float32)
-    sides = (each.search(queries, k, count).indices for each in (built, store))
-    found, exact = (_others(places, side) for side in sides)
-    built = built._replace(recall=recall_against_exact(found, exact) if exact.size else 1.0)
+    built = Approximate(index.kind, index, segments.store, 0.0)
+    built = built._replace(recall=_recall(built, count))
     with made_folder(path.parent):
         remove_temporaries(path.parent)
-        value = {"kind": kind, "images": count, "recall": built.recall, "queries": len(places)}
+        value = {
+            "kind": kind,
+            "images": count,
+            "recall": built.recall,
+            "queries": min(SAMPLE, count),
+        }
         write_json(path.with_suffix(".json"), value)
         save_index(path, index)
     for other in path.parent.iterdir():
         if other.stem != path.stem:
             other.unlink()
     return built
+
+
+def _served(store: MilvusStore) -> Approximate | None:
+    """Return the approximate search that Milvus does of a map, whose recall is not known yet."""
+    if store.kind == "exact":
+        return None
+    return Approximate(store.kind, MilvusIndex(store), store, math.nan)
+
+
+def _recall(built: Approximate, count: int) -> float:
+    """Measure the share of the exact nearest others of some images that a search finds."""
+    from crisalad_jax.retrieval.faiss_index import recall_against_exact
+
+    places = sample(count, min(SAMPLE, count), _SEED)
+    k = min(NEIGHBOURS + 1, count)
+    queries = built.store.rows(places).astype(np.float32)
+    sides = (each.search(queries, k, count).indices for each in (built, built.store))
+    found, exact = (_others(places, side) for side in sides)
+    return recall_against_exact(found, exact) if exact.size else 1.0
 
 
 def _others(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
