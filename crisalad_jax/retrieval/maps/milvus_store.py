@@ -171,15 +171,16 @@ class MilvusStore:
             words = " ".join(words.split())
             raise InputError(f"{self._address}: Milvus says: {words} (while {doing})") from error
 
-    def _ask(self, doing: str, method: str, *, wait: float = _ANSWER, **options: Any) -> Any:
+    def _ask(self, doing: str, method: str, *, wait: float = 0, **options: Any) -> Any:
         """Call a method of the client; again where a server is coming back.
 
         Raises:
             InputError: Milvus refuses, or does not come back in `_ANSWER` seconds.
         """
+        import grpc
         import pymilvus
 
-        end = None
+        end, wait = None, wait or _ANSWER
         while True:
             with self._one_line(doing):
                 try:
@@ -193,9 +194,10 @@ class MilvusStore:
                     words = f"Milvus says {error.message}; waiting for up to {_ANSWER:g} s"
                     warn_once(self._address, " ".join(words.split()))
             time.sleep(0.5)
+            wait = max(1.0, end - time.monotonic())
             if self._loaded:
-                with contextlib.suppress(pymilvus.MilvusException):
-                    self._client.load_collection(self._collection, timeout=_ANSWER)
+                with contextlib.suppress(pymilvus.MilvusException, grpc.RpcError):
+                    self._client.load_collection(self._collection, timeout=wait)
 
     def _create(self) -> None:
         from pymilvus import DataType

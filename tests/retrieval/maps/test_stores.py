@@ -17,11 +17,13 @@ from crisalad_jax.retrieval.maps.store import Store, check_store, open_store, st
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.search import search
 from crisalad_jax.utils.errors import InputError
+from tests.retrieval.maps.milvus_server import ADDRESS
 
 LENGTH = 24
 # Sums of 24 products of float32 below one, in whatever order.
 ROUNDING = 2e-6
-STORES = ("files", "milvus:rows.db")
+SERVER = pytest.param(f"milvus:{ADDRESS}", marks=pytest.mark.slow)
+STORES = ("files", "milvus:rows.db", SERVER)
 
 
 def unit_rows(count: int, seed: int = 0, length: int = LENGTH) -> np.ndarray:
@@ -36,6 +38,8 @@ def opened(folder: pathlib.Path, name: str, **options) -> Store:
 
 @pytest.fixture(params=STORES)
 def store(request, tmp_path):
+    if "http" in request.param:
+        request.getfixturevalue("milvus_server")
     found = opened(tmp_path, request.param)
     yield found
     found.close()
