@@ -4,12 +4,20 @@ import dataclasses
 import datetime
 import math
 import re
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
 
 from crisalad_jax.config.short_repr import short_repr
+from crisalad_jax.data.positions import AXES
 from crisalad_jax.data.tables import number_of
 from crisalad_jax.data.tracks import time_of
+from crisalad_jax.retrieval.maps.removed import Removed
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.shapes import Bool
+
+if TYPE_CHECKING:
+    from crisalad_jax.retrieval.maps.images import Images
 
 Interval = tuple[float, float]
 """Seconds since 1970, of which the first counts and the last does not."""
@@ -77,6 +85,52 @@ class Where:
         folder = self.folder.rstrip("/")
         return f"{folder}/", f"{folder}#"
 
+    def left_out(self, images: "Images", axes: tuple[str, str] | None) -> Removed:
+        """Find the rows that do not count: of images that do not meet all conditions, or removed.
+
+        Args:
+            images: the map's.
+            axes: of their positions; None where they have none.
+
+        Raises:
+            InputError: no image counts; a box where there are no positions, or in metres with its
+                west larger than its east.
+        """
+        masks: dict[str, Bool[np.ndarray, " row"]] = {}
+        if self.folder:
+            masks["folder"] = images.begin_with(self.prefixes)
+        if self.added != ALWAYS:
+            masks["added"] = _within(images.added, self.added)
+        if self.time != ALWAYS:
+            masks["time"] = _within(images.taken, self.time)
+        if self.box is not None:
+            masks["box"] = self._in_box(images, axes)
+        out = images.left_out(np.logical_and.reduce([np.ones(images.rows, bool), *masks.values()]))
+        if len(out.rows) == images.rows:
+            left = {name: images.rows - len(images.left_out(masks[name]).rows) for name in masks}
+            counts = ", ".join(f"{count} by {name}" for name, count in left.items())
+            raise InputError(
+                f"where: found none of {len(images)} images ({counts}), expected at least one; "
+                "`crisalad map list` has the map's folders and times"
+            )
+        return out
+
+    def _in_box(self, images: "Images", axes: tuple[str, str] | None) -> Bool[np.ndarray, " row"]:
+        assert self.box is not None
+        west, south, east, north = self.box
+        if axes is None:
+            raise InputError(
+                "where: found a box, expected none: no image of the map has a position"
+            )
+        x, y = images.positions.T[:: -1 if axes == AXES[1] else 1]
+        if west <= east:
+            is_between = (x >= west) & (x <= east)
+        elif axes == AXES[1]:
+            is_between = (x >= west) | (x <= east)
+        else:
+            raise InputError(f"where: found box {self.box} of {axes[0]}, expected west <= east")
+        return is_between & (y >= south) & (y <= north)
+
 
 def _interval(sign: str, text: str) -> Interval:
     """Return the times that a comparison with a day or a time takes."""
@@ -94,6 +148,10 @@ def _interval(sign: str, text: str) -> Interval:
         ) from error
     first = {">=": start, "=": start, ">": end}.get(sign, -math.inf)
     return first, {"<": start, "=": end, "<=": end}.get(sign, math.inf)
+
+
+def _within(times: np.ndarray, interval: Interval) -> Bool[np.ndarray, " row"]:
+    return (times >= interval[0]) & (times < interval[1])  # NaN is in none
 
 
 def _overlap(one: Interval, other: Interval) -> Interval:

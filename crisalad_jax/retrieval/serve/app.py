@@ -16,7 +16,7 @@ import re
 import secrets
 import sys
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any
 
@@ -38,7 +38,7 @@ from crisalad_jax.data.positions import AXES, MOST_METRES, Positions, exif_posit
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.data.tables import number_of
 from crisalad_jax.retrieval.describe import prepare_image
-from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage
+from crisalad_jax.retrieval.maps.map import Answer, Map
 from crisalad_jax.retrieval.maps.query import answer_fields, asked_thresholds, position_fields
 from crisalad_jax.retrieval.maps.verified import verify_answers
 from crisalad_jax.retrieval.serve.pictures import (
@@ -362,17 +362,17 @@ def make_app(
     def describe_map(_: _Nothing) -> Places:
         """Tell how large the map is, and where its images were taken."""
         places = worker.places
-        known = [
-            (int(row), *image.position)
-            for row, image in zip(*_by_row(places), strict=True)
-            if image.position is not None
-        ]
+        positions, gone = places.images.positions, places.removed.rows  # by row
+        is_known = ~np.isnan(positions[:, 0])
+        is_known[gone] = False
+        known = np.flatnonzero(is_known)
+        shown = known[:: -(-len(known) // _DOTS) or 1]
         return Places(
             name=printable(places.folder.resolve().name),
             images=len(places),
             axes=places.axes,
             zone=None if places.zone is None else str(places.zone),
-            positions=known[:: -(-len(known) // _DOTS) or 1],
+            positions=[(row, *positions[row].tolist()) for row in shown.tolist()],
             positions_known=len(known),
             appends=appends,
             k=k,
@@ -470,12 +470,6 @@ def make_app(
 
 def _row(places: Map, number: int) -> int:
     return int(places.removed.rows_of(np.array(number)))
-
-
-def _by_row(places: Map) -> tuple[Sequence[int], list[MapImage]]:
-    """List images, of which others may be appended meanwhile, and their rows."""
-    images = places.images[:]
-    return places.removed.rows_of(np.arange(len(images))).tolist(), images
 
 
 def _verified(

@@ -9,7 +9,7 @@ import contextlib
 import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float32
@@ -18,6 +18,7 @@ from crisalad_jax.data.positions import Positions
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.retrieval.describe import describe_prepared, prepare_image
 from crisalad_jax.retrieval.describer import Describer
+from crisalad_jax.retrieval.maps.appending import AppendableMap
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, real_path
@@ -151,7 +152,7 @@ class MapWorker:
 
     def _commit(self, works: Sequence[Addition], descriptors: Float32[np.ndarray, "n d"]) -> None:
         """Write the files of images, and append these to the map: all of them, or none."""
-        places, root = self.places, self.places.folder / ADDED
+        places, root = cast(AppendableMap, self.places), self.places.folder / ADDED
         for work in works:
             self._check_name(work.name)
         fitted = [

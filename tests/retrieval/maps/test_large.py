@@ -8,8 +8,9 @@ import pytest
 
 from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.build import Indexed, index
-from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import query
 from crisalad_jax.retrieval.pca import fit_pca, save_pca
 from crisalad_jax.utils.errors import InputError

@@ -26,10 +26,11 @@ from crisalad_jax.data.images import IMAGE_SUFFIXES, list_images, read_image
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.calibration import Calibration, write_calibration
 from crisalad_jax.retrieval.maps.corrections import remove_images
-from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.metadata import SEGMENTS
 from crisalad_jax.retrieval.maps.query import answer_fields, query
 from crisalad_jax.retrieval.serve.worker import ADDED
