@@ -8,14 +8,14 @@ import hashlib
 import math
 import pathlib
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import Queries, sample
-from crisalad_jax.retrieval.maps.milvus_store import MilvusIndex, MilvusStore
+from crisalad_jax.retrieval.maps.milvus_store import MilvusStore
 from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.maps.store import Store
 from crisalad_jax.retrieval.neighbours import Neighbours, similarities_of
@@ -45,7 +45,8 @@ class Approximate(NamedTuple):
     """An approximate search of a map's descriptors."""
 
     kind: str
-    index: "Index | MilvusIndex"
+    ask: Callable[[Queries, int, Removed], Neighbours]
+    """Finds candidates: so many of each query, whose numbers are -1 where there are fewer."""
     store: Store
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
@@ -61,7 +62,7 @@ class Approximate(NamedTuple):
         """
         each, least = _CANDIDATES[self.kind]
         candidates = min(count - len(removed.rows), max(least, each * k))
-        numbers = self.index.search(queries, candidates, without=removed.rows).indices
+        numbers = self.ask(queries, candidates, removed).indices
         query, found = np.nonzero(numbers >= 0)
         similarities = np.full(numbers.shape, -np.inf, np.float32)
         similarities[query, found] = similarities_of(
@@ -94,7 +95,7 @@ def open_approximate(
 
     index = load_index(path, verify=verify)
     recall = float(_record(path)["recall"])
-    return Approximate(index.kind, index, segments.store, recall)
+    return Approximate(index.kind, _asking(index), segments.store, recall)
 
 
 def indexed_images(folder: pathlib.Path) -> list[tuple[pathlib.Path, int]]:
@@ -155,7 +156,7 @@ def build_approximate(
 
     count = len(segments)
     index = build(cast(Any, kind), segments.blocks, seed=_SEED, quiet=quiet)
-    built = Approximate(index.kind, index, segments.store, 0.0)
+    built = Approximate(index.kind, _asking(index), segments.store, 0.0)
     built = built._replace(recall=_recall(built, count))
     with made_folder(path.parent):
         remove_temporaries(path.parent)
@@ -173,11 +174,15 @@ def build_approximate(
     return built
 
 
+def _asking(index: "Index") -> Callable[[Queries, int, Removed], Neighbours]:
+    return lambda queries, k, removed: index.search(queries, k, without=removed.rows)
+
+
 def _served(store: MilvusStore) -> Approximate | None:
     """Return the approximate search that Milvus does of a map, whose recall is not known yet."""
     if store.kind == "exact":
         return None
-    return Approximate(store.kind, MilvusIndex(store), store, math.nan)
+    return Approximate(store.kind, store.ask, store, math.nan)
 
 
 def _recall(built: Approximate, count: int) -> float:

@@ -67,6 +67,9 @@ def condition_of(where: Where) -> list[str]:
 
 def left_in(count: int, removed: Removed) -> str:
     """Return Milvus' filter for the numbers below `count` that were not removed."""
+    if removed.asked is not None:
+        where, gone = removed.asked
+        return " and ".join([*condition_of(where), left_in(count, Removed(gone))])
     if not len(removed.rows):
         return f"id < {count}"
     if 2 * len(removed.rows) > count:

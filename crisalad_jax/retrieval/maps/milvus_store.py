@@ -188,7 +188,9 @@ class MilvusStore:
                     return call(self._collection, timeout=wait, **options)
                 except pymilvus.MilvusException as error:
                     end = end or time.monotonic() + _ANSWER
-                    passes = error.retriable or error.code in _PASSING
+                    # 2.3 has no code for parts of it that do not find each other yet.
+                    passes = error.retriable or "unrecoverable error" in error.message
+                    passes |= error.code in _PASSING
                     if not passes or self._is_file or time.monotonic() > end:
                         raise
                     words = f"Milvus says {error.message}; waiting for up to {_ANSWER:g} s"
@@ -349,17 +351,12 @@ class MilvusStore:
 
         Milvus does it with its index FLAT; with others all descriptors are read.
         """
-        left = count - len(removed.rows)
         if k > _MOST:
             raise InputError(f"k: found {k}, expected at most {_MOST}, of which Milvus gives")
         if self.kind != "exact":
             return self._search_here(queries, k, count, removed)
-        condition = left_in(count, removed)
-
-        def ask(queries: Queries, k: int) -> Neighbours:
-            return self.candidates(queries, k, condition)
-
-        found = break_ties(ask, queries, k, min(left, _MOST))
+        left = min(count - len(removed.rows), _MOST)
+        found = break_ties(lambda some, k: self.ask(some, k, removed, count), queries, k, left)
         return found._replace(indices=removed.numbers_of(found.indices))
 
     def _search_here(self, queries: Queries, k: int, count: int, removed: Removed) -> Neighbours:
@@ -373,8 +370,19 @@ class MilvusStore:
 
         return nearest(stream, queries, k, read, self._rows)
 
-    def candidates(self, queries: Queries, k: int, condition: str) -> Neighbours:
-        """Search by Milvus' index; where it finds fewer than k, the last indices are -1."""
+    def ask(
+        self, queries: Queries, k: int, removed: Removed, count: int | None = None
+    ) -> Neighbours:
+        """Search by Milvus' index; where it finds fewer than k, the last numbers are -1.
+
+        Args:
+            queries: unit descriptors.
+            k: neighbours of each.
+            removed: rows that are left out.
+            count: number of descriptors, those included; None is all that count.
+        """
+        k = min(k, _MOST)
+        condition = left_in(self.size if count is None else count, removed)
         # Answers are bounded too: 12 bytes for each neighbour, and 8 for its number again.
         size = max(1, min(self._rows, _MESSAGE_BYTES // (20 * k)))
         indices = np.full((len(queries), k), -1, np.int64)
@@ -403,19 +411,6 @@ class MilvusStore:
             from milvus_lite.server_manager import server_manager_instance
 
             server_manager_instance.release_server(self._address)
-
-
-class MilvusIndex(NamedTuple):
-    """The index of a store, as an approximate search of a map uses it."""
-
-    store: MilvusStore
-
-    def search(
-        self, queries: Queries, k: int, *, without: Int64[np.ndarray, " rows"]
-    ) -> Neighbours:
-        """Find nearly the k most similar descriptors; where there are fewer, indices are -1."""
-        condition = left_in(self.store.size, Removed(without))
-        return self.store.candidates(queries, min(k, _MOST), condition)
 
 
 def break_ties(

@@ -19,10 +19,11 @@ import pymilvus
 import pytest
 
 from crisalad_jax.retrieval.maps import milvus_store
-from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.appending import open_for_appending
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.milvus_filter import among, columns_of, condition_of, left_in
 from crisalad_jax.retrieval.maps.milvus_store import MilvusStore, choose_kind
-from crisalad_jax.retrieval.maps.removed import Removed
+from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.maps.where import Where
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
@@ -237,7 +238,7 @@ def test_a_server_of_2_6_has_codes_of_bits(monkeypatch):
         "metric_type": "IP",
         **{"nlist": 1024, "refine": True, "refine_type": "SQ8"},
     }
-    store.candidates(np.ones((1, 512), np.float32), 3, "id < 5")
+    store.ask(np.ones((1, 512), np.float32), 3, NONE, 5)
     asked = client.last("search")
     assert asked["search_params"]["params"] == {"nprobe": 64, "refine_k": 4}
     assert (asked["limit"], asked["guarantee_timestamp"]) == (3, 17)
