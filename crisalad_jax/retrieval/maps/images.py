@@ -113,6 +113,8 @@ class Images(Sequence[MapImage]):
             _Column(kind) for kind in (np.int64, np.int64, np.float64)
         )
         self._positions = _Column(np.float64, 2)
+        self.has_moved = False
+        """Whether an image has another position than its record of images says."""
         self._ends.extend([0])
         self._order = np.empty(0, np.int64)
         """The first rows, by the hashes of their names."""
@@ -287,6 +289,7 @@ class Images(Sequence[MapImage]):
         gone[np.array(removed, np.int64)] = True
         new.removed = Removed(np.flatnonzero(gone))
         if moved:
+            new.has_moved = True
             new._positions = copy.deepcopy(self._positions)
             new._positions.values[moved] = checked_positions(positions, axes)
         return new
