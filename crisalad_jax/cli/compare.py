@@ -11,7 +11,7 @@ from crisalad_jax.cli.flags import FOLDER, ReadFlags, SizeFlags, TableFlags
 
 COMMON = (
     "test out train methods weights backbone preset seeds epochs image-size grouping batch-size "
-    "rerank reference jobs page json latex on-bad-image quiet"
+    "rerank reference jobs cluster page json on-bad-image quiet"
 )
 EXAMPLE = "crisalad compare --test pitts30k_test.mat --weights salad megaloc --out compared"
 
@@ -42,9 +42,12 @@ class ComparisonFlags(ReadFlags, SizeFlags, TableFlags):
     reference: str | None = None
     """Which line differences, speeds and training times are relative to; by default crisalad, or
     the first where that is not compared."""
-    jobs: int = 1
-    """Runs at once, each in a process of its own: on a GPU of its own where there are as many, else
-    sharing one. Other hosts that run the same command on a shared folder take runs too."""
+    jobs: int | None = None
+    """Runs at once, each a task of Ray (extra ray) with its share of the devices. By default 1; of
+    a cluster one for each GPU, or for each node without any."""
+    cluster: str | None = None
+    """Do the runs on a Ray cluster whose nodes all see the files and --out: auto (this machine's),
+    ray://HOST[:PORT] or HOST:PORT. local starts one on this machine, as --jobs does."""
     page: pathlib.Path | None = None
     """Also put the tables into this Markdown page, between its comments <!-- NAME --> and <!-- end
     of NAME -->, where NAME is the name of the folder --out."""
@@ -90,7 +93,7 @@ def run_comparison(
     summary = compare(
         config,
         flags.out,
-        **pick(flags, "page", "jobs", "quiet"),
+        **pick(flags, "page", "jobs", "cluster", "quiet"),
         say=lambda line: notes.print(line, soft_wrap=True, highlight=False),
     )
     show_tables(*tables_of(summary).values(), latex=flags.latex)

@@ -28,6 +28,7 @@ from crisalad_jax.retrieval.maps.approximate import (
     Approximate,
     build_approximate,
     check_search,
+    choose_search,
     open_approximate,
     stale_kind,
 )
@@ -355,7 +356,7 @@ class Map:
 
     @property
     def search_kind(self) -> str:
-        """How `search` searches: "exact", "hnsw" or "ivf-pq"."""
+        """How `search` searches: "exact", "hnsw" or "ivf-rabitq"."""
         return "exact" if self._approximate is None else self._approximate.kind
 
     @property
@@ -371,7 +372,8 @@ class Map:
         """Build the map's approximate search from its descriptors, where it is not there yet.
 
         Args:
-            kind: "hnsw" or "ivf-pq"; "exact" removes what there is.
+            kind: "hnsw" or "ivf-rabitq"; "exact" removes what there is; "auto" chooses by the
+                size of the descriptors and the memory available, and a note says why.
             quiet: whether to show no progress bar.
 
         Returns:
@@ -379,9 +381,14 @@ class Map:
             an exact search.
 
         Raises:
-            InputError: an unknown kind, too few images, or a map of bits or in Milvus.
+            InputError: an unknown kind, or a map of bits or in Milvus.
         """
-        check_search(kind, self.metadata.store, self.metadata.dtype)
+        metadata = self.metadata
+        check_search(kind, metadata.store, metadata.dtype)
+        if kind == "auto":
+            size = len(self._segments), metadata.descriptor_length
+            kind, why = choose_search(*size, metadata.dtype, metadata.store)
+            warn(f"{self.folder}: --search auto takes {kind}: {why}")
         self._approximate = build_approximate(self.folder, kind, self._segments, quiet=quiet)
         return None if self._approximate is None else self._approximate.recall
 

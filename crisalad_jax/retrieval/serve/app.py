@@ -166,7 +166,7 @@ class Health:
     model: str
     """Digest of the model that made the map."""
     search: str
-    """exact, hnsw or ivf-pq."""
+    """exact, hnsw or ivf-rabitq."""
     stale_search: str | None
     """An approximate search that lacks images and is not used; build it again. Else null."""
     uptime_s: float
