@@ -20,8 +20,10 @@ import crisalad_jax.retrieval.maps.file_store
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.corrections import merge_maps, move_images, remove_images
-from crisalad_jax.retrieval.maps.map import Map, NewImages, open_for_appending
+from crisalad_jax.retrieval.maps.images import NewImages
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.metadata import MapMetadata, read_metadata
 from crisalad_jax.utils.errors import InputError
 

@@ -1,6 +1,7 @@
 """Nodes of a Ray cluster on this machine, each a raylet of its own, pinned to one core."""
 
 import contextlib
+import ctypes
 import os
 import pathlib
 import shutil
@@ -84,6 +85,7 @@ def ray_nodes(
         "PYTHONPATH": str(root),
         "RAY_USAGE_STATS_ENABLED": "0",
         "RAY_AUTH_MODE": "disabled",
+        "RAY_raylet_start_wait_time_s": "200",  # tests share a machine
     }
     port, client = _free_port(), 20000 + _free_port() % 10000
     processes: list[subprocess.Popen[bytes]] = []
@@ -107,6 +109,7 @@ def ray_nodes(
                     stdout=log,
                     stderr=subprocess.STDOUT,
                     start_new_session=True,
+                    preexec_fn=_end_with_parent,
                 )
             )
             log.close()
@@ -119,6 +122,11 @@ def ray_nodes(
                     each.send_signal(signal.SIGKILL)
             process.wait(30)
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _end_with_parent() -> None:
+    """Let the kernel end a node when this process is killed; `--block` ends what it started."""
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
 
 
 def _wait_for(words: str, log: pathlib.Path, process: subprocess.Popen[bytes]) -> None:

@@ -56,8 +56,9 @@ class Index(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag
     pca: pathlib.Path | None = None
     """Components of `crisalad pca`, for shorter descriptors; the map keeps a copy, which queries
     use."""
-    search: Literal["exact", "hnsw", "ivf-pq"] | None = None
-    """Build an approximate search, and print what it recalls; exact removes it (docs/large.md)."""
+    search: Literal["auto", "exact", "hnsw", "ivf-rabitq"] | None = None
+    """Build an approximate search, and print what it recalls; exact removes it, and auto chooses by
+    size and memory (docs/large.md)."""
     again: bool = False
     """Add images that `crisalad map remove` removed, too."""
 

@@ -150,19 +150,8 @@ def extract(
     made = {} if out is None else _made(describer, components)
     reading = reading.fitted(len(paths))
     source = str(images) if isinstance(images, str | os.PathLike) else "images"
-    work = _Work(
-        describer,
-        components,
-        cluster,
-        length,
-        is_unit,
-        grouping,
-        seed,
-        reading,
-        source,
-        paths,
-        names,
-    )
+    how = (describer, components, cluster, length, is_unit, grouping, seed, reading)
+    work = _Work(*how, source, paths, names)
     record = {
         "weights": None if weights is None else starter.named(weights),
         "images": source,

@@ -451,7 +451,7 @@ def describes(bench: Bench, verb: str, name: str, marks: Marks, module: Any) -> 
 INDEXING = Marks(
     {
         "opening the map": "crisalad_jax.retrieval.maps.build:open_for_appending",
-        "appending": "crisalad_jax.retrieval.maps.map:Map.append",
+        "appending": "crisalad_jax.retrieval.maps.appending:AppendableMap.append",
         "a descriptors' file": "crisalad_jax.retrieval.maps.file_store:FileStore.add",
         "a record": "crisalad_jax.retrieval.segments:write_record",
     }
@@ -513,7 +513,7 @@ def attack_maps(bench: Bench, scale: float) -> list[Row]:
 CHANGING = Marks(
     {
         "opening the map": "crisalad_jax.retrieval.maps.corrections:open_for_appending",
-        "changing": "crisalad_jax.retrieval.maps.map:Map.change",
+        "changing": "crisalad_jax.retrieval.maps.appending:AppendableMap.change",
         "a descriptors' file": "crisalad_jax.retrieval.maps.file_store:FileStore.add",
         "a record": "crisalad_jax.retrieval.segments:write_record",
     }

@@ -1,13 +1,14 @@
 """Approximate search of a map: an index of FAISS beside its descriptors, made from them.
 
 The index's name holds a digest of the additions that it was built from. One of other additions is
-not used, so that a map that grew never answers from an old index.
+not used, so that a map that grew never answers from an old index. Building adds what is new to one
+of the first additions.
 """
 
 import hashlib
 import pathlib
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 import numpy as np
@@ -20,20 +21,31 @@ from crisalad_jax.retrieval.neighbours import Neighbours, similarities_of
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
+from crisalad_jax.utils.host import available_memory
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 if TYPE_CHECKING:
     from crisalad_jax.retrieval.faiss_index import Index
 
-SEARCHES: dict[str, None] = dict.fromkeys(("exact", "hnsw", "ivf-pq"))
-"""How a map is searched: every descriptor is compared; by a graph over the descriptors, which are
-all in memory; or by codes of at most 128 bytes in memory, and the files rank the answers."""
+SEARCHES: dict[str, None] = dict.fromkeys(("auto", "exact", "hnsw", "ivf-rabitq"))
+"""How a map is searched: as `choose_search` chooses; every descriptor is compared; by a graph over
+the descriptors, which are all in memory; or by their signs in memory, and the files rank the
+answers."""
+_EXACT_BYTES = 2**26
+"""Largest size of descriptors that `choose_search` has searched exactly: all are read for a query,
+in less than a tenth of a second."""
+_GRAPH_BYTES = 2**30
+"""Largest size of a graph that `choose_search` takes: a larger one takes hours to build."""
+_LINK_BYTES = 272
+"""Size of the links of a descriptor in a graph."""
 FOLDER = "approximate"
 NEIGHBOURS, SAMPLE = 10, 100
 """Recall is measured over the 10 nearest others of so many of the map's images."""
-_CANDIDATES = {"hnsw": (2, 16), "ivf-pq": (10, 100)}
+_CANDIDATES = {"hnsw": (2, 16), "ivf-rabitq": (10, 100)}
 """Of each kind: candidates for each neighbour, and at least so many; the best of them by exact
 similarity are the answer."""
+_SEARCHED = 10
+"""Of this many descriptors one is left at least where the index is searched."""
 _SEED = 0
 Additions = Sequence[tuple[int, int, str]]
 """First number, count and SHA-256 of each addition to a map."""
@@ -42,7 +54,7 @@ Additions = Sequence[tuple[int, int, str]]
 class Approximate(NamedTuple):
     """An approximate search of a map's descriptors, which are in files."""
 
-    kind: Literal["hnsw", "ivf-pq"]
+    kind: Literal["hnsw", "ivf-rabitq"]
     index: "Index"
     store: FileStore
     recall: float
@@ -51,14 +63,17 @@ class Approximate(NamedTuple):
     def search(self, queries: Queries, k: int, count: int, removed: Removed = NONE) -> Neighbours:
         """Find the k most similar of `count` descriptors: candidates, ranked exactly.
 
-        Queries with fewer than k candidates are searched exactly. What was removed is no candidate,
-        and its room in the search goes to others.
+        Queries with fewer than k candidates are searched exactly, and so are all where less than a
+        tenth is left. What was removed is no candidate; more are looked at in its place.
 
         Raises:
             InputError: the store is damaged or gone.
         """
         each, least = _CANDIDATES[self.kind]
-        candidates = min(count - len(removed.rows), max(least, each * k))
+        left = count - len(removed.rows)
+        if left < count // _SEARCHED:
+            return self.store.search(queries, k, count, removed)
+        candidates = min(left, max(least, each * k) * count // left)
         numbers = self.index.search(queries, candidates, without=removed.rows).indices
         query, found = np.nonzero(numbers >= 0)
         similarities = np.full(numbers.shape, -np.inf, np.float32)
@@ -117,10 +132,33 @@ def check_search(kind: str, store: str, dtype: str) -> None:
         InputError: an unknown kind, or an approximate search of bits or of descriptors in Milvus.
     """
     choose("search", kind, SEARCHES)
-    if kind != "exact" and dtype == "bits":
+    if kind not in ("auto", "exact") and dtype == "bits":
         raise InputError(f"search: found {kind} for a map of bits, expected exact")
-    if kind != "exact" and store != "files":
+    if kind not in ("auto", "exact") and store != "files":
         raise InputError(f"search: found {kind}, expected exact, as {store} is searched by Milvus")
+
+
+def choose_search(count: int, length: int, dtype: str, store: str) -> tuple[str, str]:
+    """Choose how descriptors are searched by their size and the memory that is available.
+
+    Args:
+        count: number of descriptors.
+        length: of each.
+        dtype: what they are stored as.
+        store: "files", or one that searches by itself.
+
+    Returns:
+        One of `SEARCHES`, and why it was chosen.
+    """
+    if dtype == "bits" or store != "files":
+        return "exact", "no other search is built here of bits, or of descriptors in Milvus"
+    size, graph = count * length * np.dtype(dtype).itemsize, count * (4 * length + _LINK_BYTES)
+    if size <= _EXACT_BYTES:
+        return "exact", f"a query reads {size / 1e6:.1f} MB, of {_EXACT_BYTES / 1e6:.0f} MB at most"
+    memory = available_memory()
+    most = min(_GRAPH_BYTES, memory // 4)
+    why = f"a graph in memory takes {graph / 1e9:.2f} GB, of {most / 1e9:.2f} GB at most"
+    return ("hnsw" if graph <= most else "ivf-rabitq"), f"{why} ({memory / 1e9:.1f} GB available)"
 
 
 def build_approximate(
@@ -146,7 +184,9 @@ def build_approximate(
     from crisalad_jax.retrieval.faiss_index import build, recall_against_exact, save_index
 
     count, store = len(segments), cast(FileStore, segments.store)
-    index = build(cast(Any, kind), segments.blocks, seed=_SEED, quiet=quiet)
+    index = _extended(folder, kind, segments, quiet=quiet)
+    if index is None:
+        index = build(cast(Any, kind), segments.blocks, seed=_SEED, quiet=quiet)
     built = Approximate(index.kind, index, store, 0.0)
     places = sample(count, min(SAMPLE, count), _SEED)
     k = min(NEIGHBOURS + 1, count)
@@ -165,6 +205,24 @@ def build_approximate(
     return built
 
 
+def _extended(
+    folder: pathlib.Path, kind: str, segments: Segments, *, quiet: bool
+) -> "Index | None":
+    """Add what is new to the index of a map's first additions; None where it has no fitting one."""
+    for length, digest in enumerate(_digests(segments.spans), 1):
+        path = folder / FOLDER / f"{kind}-{digest}.index"
+        if path.exists():
+            from crisalad_jax.retrieval.faiss_index import load_index
+
+            index, more = load_index(path), segments.spans[length:]
+            if not index.has_room_for(len(segments)):
+                return None
+            new = (segments.store.read(each.first, each.count) for each in more)
+            index.add(new, len(segments) - index.size, quiet=quiet)
+            return index
+    return None
+
+
 def _others(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     """Drop each image itself from its neighbours, or the last one where it is not among them."""
     kept = numbers != places[:, None]
@@ -172,9 +230,16 @@ def _others(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     return numbers[kept].reshape(len(numbers), -1)
 
 
+def _digests(additions: Additions) -> Iterator[str]:
+    """Yield a digest of the first addition, of the first two, and so on."""
+    digest = hashlib.sha256()
+    for first, count, rows in additions:
+        digest.update(f"{first} {count} {rows}\n".encode())
+        yield digest.hexdigest()[:16]
+
+
 def _digest(additions: Additions) -> str:
-    lines = (f"{first} {count} {digest}\n" for first, count, digest in additions)
-    return hashlib.sha256("".join(lines).encode()).hexdigest()[:16]
+    return ["none", *_digests(additions)][-1]
 
 
 def _indices(folder: pathlib.Path) -> list[pathlib.Path]:

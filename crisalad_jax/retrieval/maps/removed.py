@@ -13,6 +13,11 @@ class Removed(NamedTuple):
     rows: Int64[np.ndarray, " removed"] = np.empty(0, np.int64)
     """In ascending order."""
 
+    def has(self, row: int) -> bool:
+        """Return whether a row was removed."""
+        place = int(np.searchsorted(self.rows, row))
+        return place < len(self.rows) and self.rows[place] == row
+
     def numbers_of(self, rows: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
         """Return the number of each row that is left."""
         return rows - np.searchsorted(self.rows, rows)
