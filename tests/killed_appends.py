@@ -30,14 +30,14 @@ from crisalad_jax.utils.errors import InputError
 LENGTH = 48
 
 
-def metadata(store: str) -> MapMetadata:
+def metadata(store: str, collection: str = "crisalad_map") -> MapMetadata:
     return MapMetadata(
         model="0" * 64,
         weights="w.safetensors",
         config=to_plain(ModelConfig()),
         descriptor_length=LENGTH,
         store=store,
-        collection="crisalad_map",
+        collection=collection,
     )
 
 
@@ -54,7 +54,8 @@ def names(first: int, count: int) -> list[str]:
 
 def append_until(folder: pathlib.Path, total: int, store: str = "files") -> None:
     """In segments of one to five."""
-    with open_for_appending(folder, metadata(store)) as target:
+    # One server has the collections of all maps.
+    with open_for_appending(folder, metadata(store, f"crisalad_map{folder.name}")) as target:
         while (first := len(target)) < total:
             count = min(1 + first % 5, total - first)
             new = names(first, count)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import rich.console
 
 from crisalad_jax.cli.common import echo, find_given, pick, show_tables
-from crisalad_jax.cli.flags import FOLDER, ReadFlags, SizeFlags, TableFlags
+from crisalad_jax.cli.flags import FOLDER, ClusterFlag, ReadFlags, SizeFlags, TableFlags
 
 COMMON = (
     "test out train methods weights backbone preset seeds epochs image-size grouping batch-size "
@@ -17,7 +17,7 @@ EXAMPLE = "crisalad compare --test pitts30k_test.mat --weights salad megaloc --o
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ComparisonFlags(ReadFlags, SizeFlags, TableFlags):
+class ComparisonFlags(ReadFlags, SizeFlags, TableFlags, ClusterFlag):
     """The flags of both commands."""
 
     test: tuple[pathlib.Path, ...]
@@ -43,11 +43,8 @@ class ComparisonFlags(ReadFlags, SizeFlags, TableFlags):
     """Which line differences, speeds and training times are relative to; by default crisalad, or
     the first where that is not compared."""
     jobs: int | None = None
-    """Runs at once, each a task of Ray (extra ray) with its share of the devices. By default 1; of
-    a cluster one for each GPU, or for each node without any."""
-    cluster: str | None = None
-    """Do the runs on a Ray cluster whose nodes all see the files and --out: auto (this machine's),
-    ray://HOST[:PORT] or HOST:PORT. local starts one on this machine, as --jobs does."""
+    """Runs at once, each a task of Ray (extra ray) with its share of the devices; without --cluster
+    on this machine. By default 1; on a cluster one for each GPU, or for each node without any."""
     page: pathlib.Path | None = None
     """Also put the tables into this Markdown page, between its comments <!-- NAME --> and <!-- end
     of NAME -->, where NAME is the name of the folder --out."""

@@ -56,7 +56,7 @@ class Index(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag
     pca: pathlib.Path | None = None
     """Components of `crisalad pca`, for shorter descriptors; the map keeps a copy, which queries
     use."""
-    search: Literal["auto", "exact", "hnsw", "ivf-rabitq"] | None = None
+    search: Literal["auto", "exact", "hnsw", "ivf-rabitq", "diskann"] | None = None
     """Build an approximate search, and print what it recalls; exact removes it, and auto chooses by
     size and memory (docs/large.md)."""
     again: bool = False

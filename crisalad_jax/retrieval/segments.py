@@ -156,7 +156,7 @@ class Segments:
     ) -> tuple[Mapping[str, Any], pathlib.Path]:
         rows = np.ascontiguousarray(rows, self._dtype)
         whole = {**record, "sha256": _sha256(rows, self._dtype)}
-        self.store.add(len(self), rows)
+        self.store.add(len(self), rows, whole)
         write_record(path, whole)
         self._take(whole, path)
         return whole, path

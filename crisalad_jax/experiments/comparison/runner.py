@@ -12,7 +12,7 @@ import functools
 import os
 import pathlib
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from crisalad_jax.checkpoints.public import with_backbone_of
@@ -124,14 +124,15 @@ def compare(
         runs = runs_of(prepared, out)
         start = config.backbone or "nothing"
         say(f"{len(runs)} runs to compare; what is trained starts from {start}")
-        left = [(number,) for number, run in enumerate(runs) if not run.is_done]
 
-        def begin(number: int) -> None:
-            done = sum(run.is_done for run in runs)
-            run = runs[number]
-            say(f"{run.variant.run}, seed {run.seed}: {done} of {len(runs)} runs done")
+        def left() -> Iterator[tuple[int]]:
+            for number, run in enumerate(runs):
+                if not run.is_done:
+                    done = sum(each.is_done for each in runs)
+                    say(f"{run.variant.run}, seed {run.seed}: {done} of {len(runs)} runs done")
+                    yield (number,)
 
-        do(_complete, (prepared, runs, quiet, beside), left, begin)
+        do(_complete, (prepared, runs, quiet, beside), left())
         speed = _measured(prepared, runs, out / "speed.json")
         if speed is None:
             say("images described a second, all models in turns")

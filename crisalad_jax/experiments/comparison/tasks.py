@@ -5,7 +5,7 @@ import math
 import os
 import pathlib
 import warnings
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -112,61 +112,62 @@ def joined(
         yield share
 
 
+def in_turn(
+    work: Callable[..., Any], shared: tuple[Any, ...], each: Iterable[tuple[Any, ...]] = ((),)
+) -> list[Any]:
+    """Call a function for each of some arguments, after those that all calls share."""
+    return [work(*shared, *given) for given in each]
+
+
 def in_tasks(
     share: Share,
     work: Callable[..., Any],
     shared: tuple[Any, ...],
     each: Iterable[tuple[Any, ...]] = ((),),
-    begin: Callable[..., None] = lambda *given: None,
 ) -> list[Any]:
-    """Call a function for each of some arguments, each call in a task of the cluster.
+    """Do the same by tasks of the cluster; return the results in the order in which they end.
 
-    A task whose worker is lost is begun again. At a signal the tasks get Ctrl-C, and time to save
-    their work; a second signal does not wait for it. An error ends the others likewise.
-
-    Args:
-        share: what a task gets.
-        work: a function of this package.
-        shared: first arguments of each call.
-        each: further arguments of each.
-        begin: is called with these before a task.
-
-    Returns:
-        The results, in the order in which the calls ended.
+    Arguments are taken from `each` as tasks begin. A task whose worker is lost is begun again. At a
+    signal the tasks get Ctrl-C, and time to save their work; a second signal does not wait for it.
+    An error of one ends the others likewise.
 
     Raises:
         InputError: what a call raises as one; or one has lost too many workers.
         Interrupted: a signal asked for the end.
     """
     import ray
-    from ray.exceptions import RayError, RayTaskError
+    from ray.exceptions import RayError, RayTaskError, UnserializableException
 
     task = ray.remote(_carry_out).options(**_options(share))
     here = os.getcwd(), loaded_plugins()
     reference = [ray.put((work, shared))]  # in a list: a task reads it after its plug-ins
-    left, running, results, lost = deque(each), {}, [], Counter()
+    waiting, again, lost = iter(each), [], Counter()
+    running, results = {}, []
     with defer_signals() as stop:
         stop.has_work = True
         try:
-            while left or running:
+            while True:
                 stop.check()
-                while left and len(running) < share.at_once:
-                    given = left.popleft()
-                    begin(*given)
+                while len(running) < share.at_once:
+                    given = again.pop() if again else next(waiting, None)
+                    if given is None:
+                        break
                     running[task.remote(*here, reference, given)] = given
+                if not running:
+                    return results
                 for ended in ray.wait([*running], timeout=0.2)[0]:
                     given = running.pop(ended)
                     try:
                         result, notes = ray.get(ended)
-                    except RayTaskError as error:
-                        raise error.cause from error
+                    except (RayTaskError, UnserializableException) as error:
+                        raise getattr(error, "cause", error) from error
                     except RayError as error:
                         lost[given] += 1
                         words = f"a worker of the cluster was lost ({type(error).__name__})"
                         if lost[given] == _TRIES:
                             raise InputError(f"{words}, {_TRIES} times in the same work") from None
                         warn(f"{words}; its work is begun again where it was saved")
-                        left.appendleft(given)
+                        again.append(given)
                     else:
                         results.append(result)
                         for note in notes:
@@ -178,21 +179,6 @@ def in_tasks(
             for ended in running:
                 ray.cancel(ended)
             ray.wait([*running], num_returns=len(running), timeout=_PATIENCE)
-    return results
-
-
-def in_turn(
-    work: Callable[..., Any],
-    shared: tuple[Any, ...],
-    each: Iterable[tuple[Any, ...]] = ((),),
-    begin: Callable[..., None] = lambda *given: None,
-) -> list[Any]:
-    """Do the same in this process, one call after the other."""
-    results = []
-    for given in each:
-        begin(*given)
-        results.append(work(*shared, *given))
-    return results
 
 
 def _options(share: Share) -> dict[str, Any]:

@@ -6,17 +6,19 @@ of the first additions.
 """
 
 import hashlib
+import math
 import pathlib
 import shutil
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import Queries, sample
-from crisalad_jax.retrieval.maps.file_store import FileStore
+from crisalad_jax.retrieval.maps.milvus_store import MilvusStore
 from crisalad_jax.retrieval.maps.removed import NONE, Removed
+from crisalad_jax.retrieval.maps.store import Store
 from crisalad_jax.retrieval.neighbours import Neighbours, similarities_of
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
@@ -27,10 +29,10 @@ from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 if TYPE_CHECKING:
     from crisalad_jax.retrieval.faiss_index import Index
 
-SEARCHES: dict[str, None] = dict.fromkeys(("auto", "exact", "hnsw", "ivf-rabitq"))
+SEARCHES: dict[str, None] = dict.fromkeys(("auto", "exact", "hnsw", "ivf-rabitq", "diskann"))
 """How a map is searched: as `choose_search` chooses; every descriptor is compared; by a graph over
 the descriptors, which are all in memory; or by their signs in memory, and the files rank the
-answers."""
+answers. Milvus has a graph on its disk, too."""
 _EXACT_BYTES = 2**26
 """Largest size of descriptors that `choose_search` has searched exactly: all are read for a query,
 in less than a tenth of a second."""
@@ -41,7 +43,7 @@ _LINK_BYTES = 272
 FOLDER = "approximate"
 NEIGHBOURS, SAMPLE = 10, 100
 """Recall is measured over the 10 nearest others of so many of the map's images."""
-_CANDIDATES = {"hnsw": (2, 16), "ivf-rabitq": (10, 100)}
+_CANDIDATES = {"hnsw": (2, 16), "ivf-rabitq": (10, 100), "diskann": (2, 16)}
 """Of each kind: candidates for each neighbour, and at least so many; the best of them by exact
 similarity are the answer."""
 _SEARCHED = 10
@@ -52,11 +54,12 @@ Additions = Sequence[tuple[int, int, str]]
 
 
 class Approximate(NamedTuple):
-    """An approximate search of a map's descriptors, which are in files."""
+    """An approximate search of a map's descriptors."""
 
-    kind: Literal["hnsw", "ivf-rabitq"]
-    index: "Index"
-    store: FileStore
+    kind: str
+    ask: Callable[[Queries, int, Removed], Neighbours]
+    """Finds candidates: so many of each query, whose numbers are -1 where there are fewer."""
+    store: Store
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
 
@@ -74,7 +77,7 @@ class Approximate(NamedTuple):
         if left < count // _SEARCHED:
             return self.store.search(queries, k, count, removed)
         candidates = min(left, max(least, each * k) * count // left)
-        numbers = self.index.search(queries, candidates, without=removed.rows).indices
+        numbers = self.ask(queries, candidates, removed).indices
         query, found = np.nonzero(numbers >= 0)
         similarities = np.full(numbers.shape, -np.inf, np.float32)
         similarities[query, found] = similarities_of(
@@ -98,6 +101,8 @@ def open_approximate(
     Raises:
         InputError: it is damaged, or changed where `verify` asks for that.
     """
+    if isinstance(segments.store, MilvusStore):
+        return _served(segments.store)
     path = _current(folder, segments.spans)
     if path is None:
         return None
@@ -105,7 +110,7 @@ def open_approximate(
 
     index = load_index(path, verify=verify)
     recall = float(_record(path)["recall"])
-    return Approximate(index.kind, index, cast(FileStore, segments.store), recall)
+    return Approximate(index.kind, _asking(index), segments.store, recall)
 
 
 def indexed_images(folder: pathlib.Path) -> list[tuple[pathlib.Path, int]]:
@@ -129,29 +134,28 @@ def check_search(kind: str, store: str, dtype: str) -> None:
     """Check that the descriptors in a store can be searched so.
 
     Raises:
-        InputError: an unknown kind, or an approximate search of bits or of descriptors in Milvus.
+        InputError: an unknown kind, an approximate search of bits, or one that files lack.
     """
     choose("search", kind, SEARCHES)
     if kind not in ("auto", "exact") and dtype == "bits":
         raise InputError(f"search: found {kind} for a map of bits, expected exact")
-    if kind not in ("auto", "exact") and store != "files":
-        raise InputError(f"search: found {kind}, expected exact, as {store} is searched by Milvus")
+    if kind == "diskann" and store == "files":
+        raise InputError(f"search: found {kind} for a map in files, which is an index of Milvus")
 
 
-def choose_search(count: int, length: int, dtype: str, store: str) -> tuple[str, str]:
-    """Choose how descriptors are searched by their size and the memory that is available.
+def choose_search(count: int, length: int, dtype: str) -> tuple[str, str]:
+    """Choose how descriptors in files are searched by their size and the memory available.
 
     Args:
         count: number of descriptors.
         length: of each.
         dtype: what they are stored as.
-        store: "files", or one that searches by itself.
 
     Returns:
         One of `SEARCHES`, and why it was chosen.
     """
-    if dtype == "bits" or store != "files":
-        return "exact", "no other search is built here of bits, or of descriptors in Milvus"
+    if dtype == "bits":
+        return "exact", "no other search is built of bits"
     size, graph = count * length * np.dtype(dtype).itemsize, count * (4 * length + _LINK_BYTES)
     if size <= _EXACT_BYTES:
         return "exact", f"a query reads {size / 1e6:.1f} MB, of {_EXACT_BYTES / 1e6:.0f} MB at most"
@@ -175,28 +179,32 @@ def build_approximate(
     Raises:
         InputError: too few descriptors; a full disk.
     """
+    if isinstance(segments.store, MilvusStore):
+        segments.store.build(kind, quiet=quiet)
+        built = _served(segments.store)
+        return built and built._replace(recall=_recall(built, len(segments)))
     if kind == "exact":
         shutil.rmtree(folder / FOLDER, ignore_errors=True)
         return None
     path = folder / FOLDER / f"{kind}-{_digest(segments.spans)}.index"
     if path.exists():
         return open_approximate(folder, segments, verify=True)
-    from crisalad_jax.retrieval.faiss_index import build, recall_against_exact, save_index
+    from crisalad_jax.retrieval.faiss_index import build, save_index
 
-    count, store = len(segments), cast(FileStore, segments.store)
+    count = len(segments)
     index = _extended(folder, kind, segments, quiet=quiet)
     if index is None:
         index = build(cast(Any, kind), segments.blocks, seed=_SEED, quiet=quiet)
-    built = Approximate(index.kind, index, store, 0.0)
-    places = sample(count, min(SAMPLE, count), _SEED)
-    k = min(NEIGHBOURS + 1, count)
-    queries = store.rows(places).astype(np.float32)
-    sides = (each.search(queries, k, count).indices for each in (built, store))
-    found, exact = (_others(places, side) for side in sides)
-    built = built._replace(recall=recall_against_exact(found, exact) if exact.size else 1.0)
+    built = Approximate(index.kind, _asking(index), segments.store, 0.0)
+    built = built._replace(recall=_recall(built, count))
     with made_folder(path.parent):
         remove_temporaries(path.parent)
-        value = {"kind": kind, "images": count, "recall": built.recall, "queries": len(places)}
+        value = {
+            "kind": kind,
+            "images": count,
+            "recall": built.recall,
+            "queries": min(SAMPLE, count),
+        }
         write_json(path.with_suffix(".json"), value)
         save_index(path, index)
     for other in path.parent.iterdir():
@@ -221,6 +229,29 @@ def _extended(
             index.add(new, len(segments) - index.size, quiet=quiet)
             return index
     return None
+
+
+def _asking(index: "Index") -> Callable[[Queries, int, Removed], Neighbours]:
+    return lambda queries, k, removed: index.search(queries, k, without=removed.rows)
+
+
+def _served(store: MilvusStore) -> Approximate | None:
+    """Return the approximate search that Milvus does of a map, whose recall is not known yet."""
+    if store.kind == "exact":
+        return None
+    return Approximate(store.kind, store.ask, store, math.nan)
+
+
+def _recall(built: Approximate, count: int) -> float:
+    """Measure the share of the exact nearest others of some images that a search finds."""
+    from crisalad_jax.retrieval.faiss_index import recall_against_exact
+
+    places = sample(count, min(SAMPLE, count), _SEED)
+    k = min(NEIGHBOURS + 1, count)
+    queries = built.store.rows(places).astype(np.float32)
+    sides = (each.search(queries, k, count).indices for each in (built, built.store))
+    found, exact = (_others(places, side) for side in sides)
+    return recall_against_exact(found, exact) if exact.size else 1.0
 
 
 def _others(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:

@@ -122,7 +122,7 @@ def index(
     store: str | None = None,
     dtype: Literal["float32", "float16", "bits"] | None = None,
     pca: Pca | str | os.PathLike[str] | None = None,
-    search: Literal["auto", "exact", "hnsw", "ivf-rabitq"] | None = None,
+    search: Literal["auto", "exact", "hnsw", "ivf-rabitq", "diskann"] | None = None,
     again: bool = False,
     reading: Reading = Reading(),
     cluster: str | None = None,

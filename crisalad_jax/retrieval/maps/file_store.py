@@ -3,7 +3,8 @@
 import functools
 import math
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -50,8 +51,9 @@ class FileStore:
     def _path(self, first: int) -> pathlib.Path:
         return self._folder / f"{first:010d}.npy"
 
-    def add(self, first: int, descriptors: Descriptors) -> None:
+    def add(self, first: int, descriptors: Descriptors, record: Mapping[str, Any]) -> None:
         """Write descriptors to a file; see `Store.add`."""
+        del record  # the map's own has it
         path = self._path(first)
         with atomic_path(path, durable=True) as temporary:
             write_npy(temporary, descriptors.astype(self._dtype))

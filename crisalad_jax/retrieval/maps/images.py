@@ -113,6 +113,8 @@ class Images(Sequence[MapImage]):
             _Column(kind) for kind in (np.int64, np.int64, np.float64)
         )
         self._positions = _Column(np.float64, 2)
+        self.has_moved = False
+        """Whether an image has another position than its record of images says."""
         self._ends.extend([0])
         self._order = np.empty(0, np.int64)
         """The first rows, by the hashes of their names."""
@@ -151,12 +153,11 @@ class Images(Sequence[MapImage]):
     def in_rows(self, rows: Int64[np.ndarray, " n"]) -> list[MapImage]:
         """Return the images in some rows, also those that were removed."""
         places = np.searchsorted(self._firsts.values, rows, side="right") - 1
-        columns = (self._sizes.values[rows], self._positions.values[rows], places)
-        each = zip(self._named(rows), *(column.tolist() for column in columns), strict=True)
-        return [
-            MapImage(name, size, None if at[0] != at[0] else (at[0], at[1]), self.parts[place].root)
-            for name, size, at, place in each
-        ]
+        at = self._positions.values[rows].tolist()
+        spots = [None if first != first else (first, second) for first, second in at]  # of NaN
+        roots = [self.parts[place].root for place in places.tolist()]
+        sizes = self._sizes.values[rows].tolist()
+        return list(map(MapImage, self._named(rows), sizes, spots, roots))
 
     def _named(self, rows: Int64[np.ndarray, " n"]) -> list[str]:
         data, ends = self._names.values.data, self._ends.values
@@ -241,7 +242,7 @@ class Images(Sequence[MapImage]):
         for column, new in columns:
             column.extend(new)
         self._recent.update(zip(names, range(first, self.rows), strict=True))
-        if len(self._recent) > _RECENT + len(self._order) // 4:
+        if len(self._recent) > _RECENT + len(self._order) // 2:
             self._sort()
 
     def _sort(self) -> None:
@@ -287,6 +288,7 @@ class Images(Sequence[MapImage]):
         gone[np.array(removed, np.int64)] = True
         new.removed = Removed(np.flatnonzero(gone))
         if moved:
+            new.has_moved = True
             new._positions = copy.deepcopy(self._positions)
             new._positions.values[moved] = checked_positions(positions, axes)
         return new

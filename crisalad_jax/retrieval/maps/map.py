@@ -372,8 +372,9 @@ class Map:
         """Build the map's approximate search from its descriptors, where it is not there yet.
 
         Args:
-            kind: "hnsw" or "ivf-rabitq"; "exact" removes what there is; "auto" chooses by the
-                size of the descriptors and the memory available, and a note says why.
+            kind: "hnsw" or "ivf-rabitq", of Milvus also "diskann"; "exact" removes what there is;
+                "auto" chooses by the size of the descriptors and the memory available, or by what
+                Milvus' version has, and a note says why.
             quiet: whether to show no progress bar.
 
         Returns:
@@ -381,13 +382,13 @@ class Map:
             an exact search.
 
         Raises:
-            InputError: an unknown kind, or a map of bits or in Milvus.
+            InputError: an unknown kind, one that Milvus lacks, or a map of bits.
         """
         metadata = self.metadata
         check_search(kind, metadata.store, metadata.dtype)
-        if kind == "auto":
+        if kind == "auto" and metadata.store == "files":
             size = len(self._segments), metadata.descriptor_length
-            kind, why = choose_search(*size, metadata.dtype, metadata.store)
+            kind, why = choose_search(*size, metadata.dtype)
             warn(f"{self.folder}: --search auto takes {kind}: {why}")
         self._approximate = build_approximate(self.folder, kind, self._segments, quiet=quiet)
         return None if self._approximate is None else self._approximate.recall

@@ -113,7 +113,8 @@ class Where:
                 f"where: found none of {len(images)} images ({counts}), expected at least one; "
                 "`crisalad map list` has the map's folders and times"
             )
-        return out
+        as_added = self.box is None or not images.has_moved
+        return out._replace(asked=(self, images.removed.rows)) if as_added else out
 
     def _in_box(self, images: "Images", axes: tuple[str, str] | None) -> Bool[np.ndarray, " row"]:
         assert self.box is not None

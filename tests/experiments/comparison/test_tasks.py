@@ -18,6 +18,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note, warn
 from tests.cli.test_cli import fails
 from tests.conftest import MODEL
+from tests.ray_nodes import ray_nodes
 
 SMALL = f"""
 import json
@@ -92,15 +93,14 @@ def test_tasks_end_once_each_and_a_lost_worker_is_replaced(tmp_path, monkeypatch
         warn(f"a note of {number}")
         return shared, number, os.environ["PART"], os.getpid() != driver
 
-    driver, begun = os.getpid(), []
-    each = [(number,) for number in range(4)]
+    driver = os.getpid()
+    each = ((number,) for number in range(4))
     with joined("local", 2, [], tmp_path) as share:
         with pytest.warns(Note) as notes:
-            results = in_tasks(share, work, ("all",), each, begun.append)
+            results = in_tasks(share, work, ("all",), each)
         assert sorted(results) == [("all", number, "loaded", True) for number in range(4)]
         calls = [(tmp_path / f"{number}").read_text() for number in range(4)]
         assert calls == ["x", "xx", "x", "x"]
-        assert sorted(begun) == [0, 1, 1, 2, 3]
         words = sorted(str(note.message) for note in notes)
         assert words[-1].startswith("a worker of the cluster was lost (WorkerCrashedError); ")
         assert words[:-1] == [f"a note of {number}" for number in range(4)]
@@ -109,7 +109,7 @@ def test_tasks_end_once_each_and_a_lost_worker_is_replaced(tmp_path, monkeypatch
 
 
 def program(flags, out, plugin, *more: object) -> list[str]:
-    given = (*flags, "--methods", "gem", "--out", out, "--plugin", plugin, *more)
+    given = (*flags, "--methods", "crisalad+gem", "--out", out, "--plugin", plugin, *more)
     return [sys.executable, "-m", "crisalad_jax", *map(str, given)]
 
 
@@ -153,10 +153,11 @@ def holder_of(folder: pathlib.Path) -> int:
     return int(words[1]) if words else 0
 
 
-def start(command: list[str], out: pathlib.Path) -> tuple[subprocess.Popen[str], list[int]]:
+def start(command, out, environment=None) -> tuple[subprocess.Popen[str], list[int]]:
     """Start it; return it and the processes of its two runs, which both train."""
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    folders = [out / "gem" / f"seed-{seed}" for seed in (0, 1)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen(command, env=environment, **pipes)
+    folders = [out / "crisalad+gem" / f"seed-{seed}" for seed in (0, 1)]
     metrics = [folder / "run" / "metrics.jsonl" for folder in folders]
 
     def begun() -> bool:
@@ -223,3 +224,23 @@ def test_the_run_of_a_killed_worker_is_begun_again(long, tmp_path):
     results = json.loads((tmp_path / "out" / "results.json").read_text())
     (recalls,) = results["rows"][0]["recalls"].values()
     assert len(recalls["R@1"]["by_seed"]) == 2
+
+
+@pytest.mark.slow
+def test_the_run_of_a_lost_node_is_begun_again_on_another(flags, tmp_path, plugin, programs):
+    out = tmp_path / "out"
+    variables = {"JAX_COMPILATION_CACHE_DIR": str(programs)}
+    with ray_nodes() as nodes:
+        command = program(flags, out, plugin, "--cluster", nodes.address, "--epochs", 400)
+        process, workers = start(command, out, {**nodes.environment, **variables})
+        _, second = sessions = [node.pid for node in nodes.processes]
+        assert sorted(map(os.getsid, workers)) == sorted(sessions)
+        for pid in nodes.pids("raylet"):
+            if os.getsid(pid) == second:
+                os.kill(pid, signal.SIGKILL)
+        _, errors = process.communicate(timeout=900)
+    assert process.returncode == 0, errors
+    assert errors.count("a worker of the cluster was lost (") == 1
+    results = [json.loads(path.read_text()) for path in sorted(out.rglob("result.json"))]
+    assert [each["training"]["beside"] for each in results] == [False, False]
+    assert all(each["ranks"] for each in results)

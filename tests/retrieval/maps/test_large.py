@@ -15,6 +15,7 @@ from crisalad_jax.retrieval.maps.approximate import choose_search
 from crisalad_jax.retrieval.maps.build import Indexed, index
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import query
+from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import fit_pca, save_pca
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
@@ -116,13 +117,12 @@ def test_candidates_come_from_the_index(grown, monkeypatch):
         approximate = places._approximate
         assert approximate is not None
 
-        class Poor:
-            def search(self, queries, k, without):
-                numbers = np.full((len(queries), k), -1)
-                numbers[:, :2] = 7, 3
-                return type("Found", (), {"indices": numbers})
+        def poor(queries, k, removed):
+            numbers = np.full((len(queries), k), -1)
+            numbers[:, :2] = 7, 3
+            return Neighbours(numbers, np.zeros(numbers.shape, np.float32))
 
-        places._approximate = approximate._replace(index=Poor())
+        places._approximate = approximate._replace(ask=poor)
         found = places.search(QUERIES, 2)
         assert {tuple(sorted(row)) for row in found.indices.tolist()} == {(3, 7)}
         products = QUERIES.astype(np.float64) @ rows(0, 40)[[3, 7]].T.astype(np.float64)
@@ -191,13 +191,12 @@ def test_what_is_searched_how_is_chosen_by_size_and_memory(grown, monkeypatch):
         (215_518, "float16", "ivf-rabitq"),
         (10**8, "bits", "exact"),
     ):
-        assert choose_search(count, 512, dtype, "files")[0] == kind
-    assert choose_search(10**8, 512, "float32", "milvus:x.db")[0] == "exact"
+        assert choose_search(count, 512, dtype)[0] == kind
     said = "a graph in memory takes 2.32 GB, of 0.50 GB at most (2.0 GB available)"
-    assert choose_search(10**6, 512, "float16", "files") == ("ivf-rabitq", said)
+    assert choose_search(10**6, 512, "float16") == ("ivf-rabitq", said)
     free = 10**12
-    assert choose_search(462_819, 512, "float16", "files")[0] == "hnsw"  # 1 GiB / 2,320
-    assert choose_search(462_820, 512, "float16", "files")[0] == "ivf-rabitq"
+    assert choose_search(462_819, 512, "float16")[0] == "hnsw"  # 1 GiB / 2,320
+    assert choose_search(462_820, 512, "float16")[0] == "ivf-rabitq"
     with pytest.warns(Note, match="map: --search auto takes exact: a query reads 0.0 MB"):
         assert build(grown, "auto") is None
     free = 10**6
@@ -209,9 +208,8 @@ def test_what_is_searched_how_is_chosen_by_size_and_memory(grown, monkeypatch):
 def test_what_cannot_be_built(grown, shared, params, database, tmp_path):
     with pytest.raises(InputError, match="search: found 'tree'"):
         run(shared, params, database, tmp_path / "new", search="tree")
-    store = f"milvus:{tmp_path / 'new' / 'rows.db'}"
-    with pytest.raises(InputError, match="is searched by Milvus"):
-        run(shared, params, database, tmp_path / "new", search="hnsw", store=store)
+    with pytest.raises(InputError, match="found diskann for a map in files"):
+        run(shared, params, database, tmp_path / "new", search="diskann")
     assert not (tmp_path / "new").exists()
 
 

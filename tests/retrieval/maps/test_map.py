@@ -478,7 +478,7 @@ def test_a_map_that_fails_before_it_has_images_is_removed(tmp_path):
 
     def fail() -> None:
         with open_for_appending(tmp_path / "map", metadata("files")) as target:
-            target._segments.store.add(0, rows(0, 2))
+            target._segments.store.add(0, rows(0, 2), {"names": names(0, 2)})
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
