@@ -35,7 +35,6 @@ _SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",  # no telemetry
     "RAY_SCHEDULER_EVENTS": "0",  # nor the autoscaler's lines
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # nor a warning of it
-    "RAY_raylet_start_wait_time_s": "120",  # 30 are too few for a busy machine
 }
 CONNECT, ANSWER, START, RESULT = 60.0, 120.0, 300.0, 1800.0
 """Seconds to wait at most: for a cluster, for its nodes' answers, for the first worker, and for any
