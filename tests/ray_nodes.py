@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import psutil
 
-
 _TRIES = 3
 """Times that a node is started: Ray gives it 30 seconds."""
 
