@@ -55,8 +55,9 @@ class Index(ReadFlags, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     pca: pathlib.Path | None = None
     """Components of `crisalad pca`, for shorter descriptors; the map keeps a copy, which queries
     use."""
-    search: Literal["exact", "hnsw", "ivf-pq"] | None = None
-    """Build an approximate search, and print what it recalls; exact removes it (docs/large.md)."""
+    search: Literal["exact", "hnsw", "ivf-pq", "ivf-rabitq", "diskann", "auto"] | None = None
+    """Build an approximate search, and print what it recalls; exact removes it (docs/large.md). The
+    last three are Milvus', of which auto is the best for the size (docs/maps.md)."""
     again: bool = False
     """Add images that `crisalad map remove` removed, too."""
 

@@ -1,4 +1,4 @@
-"""Approximate search of a map: an index of FAISS beside its descriptors, made from them.
+"""Approximate search of a map: an index of FAISS made from its descriptors, or that of Milvus.
 
 The index's name holds a digest of the additions that it was built from. One of other additions is
 not used, so that a map that grew never answers from an old index.
@@ -15,7 +15,7 @@ import numpy as np
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import Queries, sample
-from crisalad_jax.retrieval.maps.milvus_store import MilvusStore
+from crisalad_jax.retrieval.maps.milvus_store import KINDS, MilvusStore
 from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.maps.store import Store
 from crisalad_jax.retrieval.neighbours import Neighbours, similarities_of
@@ -27,13 +27,14 @@ from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 if TYPE_CHECKING:
     from crisalad_jax.retrieval.faiss_index import Index
 
-SEARCHES: dict[str, None] = dict.fromkeys(("exact", "hnsw", "ivf-pq", "diskann"))
+SEARCHES: dict[str, None] = dict.fromkeys(("exact", "hnsw", "ivf-pq"))
 """How a map is searched: every descriptor is compared; by a graph over the descriptors, which are
 all in memory; or by codes of at most 128 bytes in memory, and the files rank the answers."""
 FOLDER = "approximate"
 NEIGHBOURS, SAMPLE = 10, 100
 """Recall is measured over the 10 nearest others of so many of the map's images."""
-_CANDIDATES = {"hnsw": (2, 16), "ivf-pq": (10, 100), "ivf-rabitq": (10, 100), "diskann": (2, 16)}
+_CANDIDATES = dict.fromkeys(("hnsw", "diskann"), (2, 16))
+_CANDIDATES |= dict.fromkeys(("ivf-pq", "ivf-rabitq"), (10, 100))
 """Of each kind: candidates for each neighbour, and at least so many; the best of them by exact
 similarity are the answer."""
 _SEED = 0
@@ -45,8 +46,8 @@ class Approximate(NamedTuple):
     """An approximate search of a map's descriptors."""
 
     kind: str
-    ask: Callable[[Queries, int, Removed], Neighbours]
-    """Finds candidates: so many of each query, whose numbers are -1 where there are fewer."""
+    ask: Callable[[Queries, int, int, Removed], Neighbours]
+    """Finds so many candidates among a count, whose numbers are -1 where there are fewer."""
     store: Store
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
@@ -62,7 +63,7 @@ class Approximate(NamedTuple):
         """
         each, least = _CANDIDATES[self.kind]
         candidates = min(count - len(removed.rows), max(least, each * k))
-        numbers = self.ask(queries, candidates, removed).indices
+        numbers = self.ask(queries, candidates, count, removed).indices
         query, found = np.nonzero(numbers >= 0)
         similarities = np.full(numbers.shape, -np.inf, np.float32)
         similarities[query, found] = similarities_of(
@@ -119,13 +120,11 @@ def check_search(kind: str, store: str, dtype: str) -> None:
     """Check that the descriptors in a store can be searched so.
 
     Raises:
-        InputError: an unknown kind, or an approximate search of bits or of descriptors in Milvus.
+        InputError: a kind that the store has not, or an approximate search of bits.
     """
-    choose("search", kind, SEARCHES)
+    choose("search", kind, SEARCHES if store == "files" else dict.fromkeys((*KINDS, "auto")))
     if kind != "exact" and dtype == "bits":
         raise InputError(f"search: found {kind} for a map of bits, expected exact")
-    if kind == "diskann" and store == "files":
-        raise InputError(f"search: found {kind} for a map in files, which is an index of Milvus")
 
 
 def build_approximate(
@@ -143,7 +142,7 @@ def build_approximate(
         InputError: too few descriptors; a full disk.
     """
     if isinstance(segments.store, MilvusStore):
-        segments.store.build(kind, quiet=quiet)
+        segments.store.build(kind, len(segments), quiet=quiet)
         built = _served(segments.store)
         return built and built._replace(recall=_recall(built, len(segments)))
     if kind == "exact":
@@ -174,8 +173,8 @@ def build_approximate(
     return built
 
 
-def _asking(index: "Index") -> Callable[[Queries, int, Removed], Neighbours]:
-    return lambda queries, k, removed: index.search(queries, k, without=removed.rows)
+def _asking(index: "Index") -> Callable[[Queries, int, int, Removed], Neighbours]:
+    return lambda queries, k, _, removed: index.search(queries, k, without=removed.rows)
 
 
 def _served(store: MilvusStore) -> Approximate | None:

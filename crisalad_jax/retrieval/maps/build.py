@@ -120,7 +120,7 @@ def index(
     store: str | None = None,
     dtype: Literal["float32", "float16", "bits"] | None = None,
     pca: Pca | str | os.PathLike[str] | None = None,
-    search: Literal["exact", "hnsw", "ivf-pq"] | None = None,
+    search: Literal["exact", "hnsw", "ivf-pq", "ivf-rabitq", "diskann", "auto"] | None = None,
     again: bool = False,
     reading: Reading = Reading(),
 ) -> Indexed:
@@ -154,7 +154,8 @@ def index(
         pca: components that shorten the descriptors, or a file of them, of which the map stores a
             copy. None is the map's, and of a new map none.
         search: the approximate search that is built from the map's descriptors; "exact" removes
-            one. None leaves what there is, which is of no use once the map has grown.
+            one. None leaves what there is; that of files is of no use once the map has grown.
+            Milvus has "ivf-rabitq", "diskann" and "auto" in place of "ivf-pq".
         again: whether to add images that were removed from the map, too (`remove_images`).
         reading: how images are read.
 

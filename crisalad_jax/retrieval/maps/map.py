@@ -355,7 +355,7 @@ class Map:
 
     @property
     def search_kind(self) -> str:
-        """How `search` searches: "exact", "hnsw" or "ivf-pq"."""
+        """How `search` searches: "exact", "hnsw", "ivf-pq", or one of `milvus_store.KINDS`."""
         return "exact" if self._approximate is None else self._approximate.kind
 
     @property
@@ -371,7 +371,8 @@ class Map:
         """Build the map's approximate search from its descriptors, where it is not there yet.
 
         Args:
-            kind: "hnsw" or "ivf-pq"; "exact" removes what there is.
+            kind: "hnsw" or "ivf-pq"; "exact" removes what there is. Of `milvus_store.KINDS` or
+                "auto" where the descriptors are in Milvus.
             quiet: whether to show no progress bar.
 
         Returns:
@@ -379,7 +380,7 @@ class Map:
             an exact search.
 
         Raises:
-            InputError: an unknown kind, too few images, or a map of bits or in Milvus.
+            InputError: an unknown kind, too few images, or a map of bits; Milvus fails.
         """
         check_search(kind, self.metadata.store, self.metadata.dtype)
         self._approximate = build_approximate(self.folder, kind, self._segments, quiet=quiet)

@@ -168,8 +168,9 @@ def test_what_cannot_be_built(grown, shared, params, database, tmp_path):
     with pytest.raises(InputError, match="search: found 'tree'"):
         run(shared, params, database, tmp_path / "new", search="tree")
     store = f"milvus:{tmp_path / 'new' / 'rows.db'}"
-    with pytest.raises(InputError, match="is searched by Milvus"):
-        run(shared, params, database, tmp_path / "new", search="hnsw", store=store)
+    for kind, where in (("ivf-pq", store), ("diskann", "files")):
+        with pytest.raises(InputError, match=f"search: found '{kind}', expected one of "):
+            run(shared, params, database, tmp_path / "new", search=kind, store=where)
     assert not (tmp_path / "new").exists()
 
 
