@@ -18,7 +18,7 @@ SOME = (
     # In a container root may not mount, and writes into any folder: three tries then.
     ("disks", 0, "convert", 3),
     ("inputs", 0, "a sample", 16),
-    ("interruptions", 0, "some", 18),
+    ("interruptions", 0, "some", 9),
 )
 ALL = (
     ("damage", 1, "", 4800),
