@@ -33,6 +33,7 @@ ALL = (
     ("kills", 1, "maps, extract .npy, extract .h5", 100),
     ("kills", 1, "map changes", 60),
     ("kills", 1, "compare", 6),
+    ("clusters", 1, "", 4),
     ("kills", 1, "compare on Ray", 20),
     ("memory", 1, "", 7),
     ("service", 1, "", 2000),
