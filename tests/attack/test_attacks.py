@@ -34,6 +34,7 @@ ALL = (
     ("kills", 1, "map changes", 60),
     ("kills", 1, "compare", 6),
     ("memory", 1, "", 7),
+    ("processes", 1, "", 13),
     ("service", 1, "", 2000),
     ("surroundings", 1, "20 columns, python -O, python -W error, C locale, no home", 40),
     ("surroundings", 1, "switches of JAX", 8),
