@@ -54,6 +54,7 @@ from .experiments.report import write_report as write_report
 from .experiments.train import train as train
 from .nn.adapters import Adapter as Adapter
 from .nn.adapters import BlockShape as BlockShape
+from .nn.adapters import TokenInfo as TokenInfo
 from .nn.adapters import register_adapter as register_adapter
 from .nn.aggregators import Aggregator as Aggregator
 from .nn.aggregators import TokenShape as TokenShape
@@ -97,12 +98,13 @@ from .retrieval.maps.corrections import merge_maps as merge_maps
 from .retrieval.maps.corrections import move_images as move_images
 from .retrieval.maps.corrections import remove_images as remove_images
 from .retrieval.maps.corrections import replace_images as replace_images
+from .retrieval.maps.images import MapImage as MapImage
 from .retrieval.maps.live import latency_words as latency_words
 from .retrieval.maps.live import query_live as query_live
 from .retrieval.maps.map import Map as Map
-from .retrieval.maps.map import MapImage as MapImage
 from .retrieval.maps.pairs import image_pairs as image_pairs
 from .retrieval.maps.query import query as query
+from .retrieval.maps.where import Where as Where
 from .retrieval.neighbours import Neighbours as Neighbours
 from .retrieval.pca import fit_pca as fit_pca
 from .retrieval.pca import load_pca as load_pca

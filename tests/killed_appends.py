@@ -20,22 +20,24 @@ import crisalad_jax.retrieval.maps.file_store
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.nn.config import ModelConfig
+from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.corrections import merge_maps, move_images, remove_images
-from crisalad_jax.retrieval.maps.map import Map, NewImages, open_for_appending
+from crisalad_jax.retrieval.maps.images import NewImages
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.metadata import MapMetadata, read_metadata
 from crisalad_jax.utils.errors import InputError
 
 LENGTH = 48
 
 
-def metadata(store: str) -> MapMetadata:
+def metadata(store: str, collection: str = "crisalad_map") -> MapMetadata:
     return MapMetadata(
         model="0" * 64,
         weights="w.safetensors",
         config=to_plain(ModelConfig()),
         descriptor_length=LENGTH,
         store=store,
-        collection="crisalad_map",
+        collection=collection,
     )
 
 
@@ -52,7 +54,8 @@ def names(first: int, count: int) -> list[str]:
 
 def append_until(folder: pathlib.Path, total: int, store: str = "files") -> None:
     """In segments of one to five."""
-    with open_for_appending(folder, metadata(store)) as target:
+    # One server has the collections of all maps.
+    with open_for_appending(folder, metadata(store, f"crisalad_map{folder.name}")) as target:
         while (first := len(target)) < total:
             count = min(1 + first % 5, total - first)
             new = names(first, count)

@@ -23,6 +23,7 @@ from crisalad_jax.retrieval.maps.live import latency_words, query_live
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, json_rows, query
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch
+from crisalad_jax.retrieval.maps.where import Where
 from crisalad_jax.retrieval.seqslam import SeqSlam
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.retrieval.verification.camera import Intrinsics
@@ -88,6 +89,9 @@ class Query(ReadFlags, FrameFlags, JsonFlag):
     say no times or positions, images of the map a frame."""
     sequence_length: int | None = None
     """Frames that seqslam's lines go through; by default 10."""
+    where: str | None = None
+    """Search only some of the map's images: 'folder=monday, added>=2026-05-01,
+    box=west,south,east,north', of which any may be left out; also time>= (docs/maps.md)."""
     exact: bool = False
     """Search exactly, although the map has an approximate search."""
     json: Annotated[pathlib.Path | None, Target((".json", ".jsonl"))] = None
@@ -135,7 +139,7 @@ def run(arguments: Query) -> None:
         return
     refuse_without("--camera", None, rate=arguments.rate)
     _check_files(arguments)
-    sequence = _sequence_of(arguments)
+    sequence, where = _sequence_of(arguments), _where_of(arguments)
     with _opened(arguments) as places:
         if arguments.out is not None:
             check_positions(arguments.out, places.axes, places.zone)
@@ -143,6 +147,7 @@ def run(arguments: Query) -> None:
             places,
             arguments.images,
             sequence=sequence,
+            where=where,
             verify=_verify_of(arguments),
             **pick(arguments, "k", "fps", "topic", "window", "exact", "min_similarity", "reading"),
         )
@@ -216,6 +221,13 @@ def _sequence_of(arguments: Query) -> SequenceSearch | None:
     if arguments.sequence is None:
         return None
     return BayesFilter() if reach is None else BayesFilter(reach=reach)
+
+
+def _where_of(arguments: Query) -> Where | None:
+    """Read the conditions on the map's images, before a model is loaded."""
+    if arguments.sequence is not None:
+        refuse_with("--sequence", where=arguments.where)
+    return None if arguments.where is None else Where.parse(arguments.where)
 
 
 def _verify_of(arguments: Query) -> Verify | None:
@@ -316,7 +328,7 @@ def _run_live(arguments: Query) -> None:
         "output as they come",
     )
     _check_files(arguments)
-    sequence = _sequence_of(arguments)
+    sequence, where = _sequence_of(arguments), _where_of(arguments)
     with contextlib.ExitStack() as stack:
         # First, for its errors: loading a model takes seconds.
         if arguments.watch is not None:
@@ -345,6 +357,7 @@ def _run_live(arguments: Query) -> None:
             places,
             source,
             sequence=sequence,
+            where=where,
             verify=_verify_of(arguments),
             ready=ready,
             check=state.check,

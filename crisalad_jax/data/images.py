@@ -27,7 +27,7 @@ from crisalad_jax.utils.files import read_bytes, real_path
 from crisalad_jax.utils.output import counted, warn
 from crisalad_jax.utils.shapes import UInt8
 
-_MAX_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS"
+MAX_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS"
 """Environment variable of the largest image in pixels, which OpenCV reads as it is imported and
 checks before it decodes. A small file can claim an image that fills the memory: this package sets
 2**28, which takes 0.8 GB, where the variable is not set."""
@@ -172,7 +172,7 @@ def decode_image(
     except cv2.error as error:
         found = " ".join(error.err.split())
         if "MAX_IMAGE_PIXELS" in found:
-            found = f"more than {os.environ.get(_MAX_PIXELS)} pixels (--max-pixels raises that)"
+            found = f"more than {os.environ.get(MAX_PIXELS)} pixels (--max-pixels raises that)"
     if image is None:
         raise InputError(f"{path}: found {found}, expected {_FORMATS}")
     return _turned(image, data) if data[4:12] in _AVIF else image

@@ -19,7 +19,7 @@ from crisalad_jax.data.frames import moment_of
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.positions import AXES
 from crisalad_jax.data.prepare import as_rgb
-from crisalad_jax.retrieval.maps.map import MapImage
+from crisalad_jax.retrieval.maps.images import MapImage
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.retrieval.verification.results import Verification
 from crisalad_jax.utils.errors import InputError, Interrupted

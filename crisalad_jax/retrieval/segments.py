@@ -8,10 +8,11 @@ A change commits any number of segments by one record of its own. The names of t
 which change they wait for.
 """
 
+import collections
 import hashlib
 import json
 import pathlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +26,10 @@ from crisalad_jax.utils.shapes import Int64
 
 SEGMENT = 256
 """Number of images appended together, and so described again at most after a kill."""
+
+
+Take = Callable[[Mapping[str, Any], pathlib.Path], None]
+"""Takes a record and its file."""
 
 
 class Segment(NamedTuple):
@@ -49,41 +54,58 @@ def write_record(path: pathlib.Path, value: Mapping[str, Any], indent: int | Non
 class Segments:
     """Rows in a store, and the records in a folder that say which of them count."""
 
-    def __init__(self, folder: pathlib.Path, store: Store, dtype: str) -> None:
+    def __init__(
+        self, folder: pathlib.Path, store: Store, dtype: str, take: Take | None = None
+    ) -> None:
         """Read all records, and check that the store has their rows.
+
+        Args:
+            folder: of the records.
+            store: of the rows.
+            dtype: of the rows.
+            take: is given each record and its file in order, now and when it is appended: of
+                segments with the `names` of their rows, and of changes with the number of `rows`
+                that are there after. By default the former go to `records`.
 
         Raises:
             InputError: a record or its rows are damaged or gone.
         """
         self.folder, self.store, self._dtype = folder, store, np.dtype(dtype)
         self.spans: list[Segment] = []
-        self.records: list[dict[str, Any]] = []
-        """The records in order; each has the `names` of its rows."""
+        self.records: list[Mapping[str, Any]] = []
+        self._give: Take = take or (lambda record, _: self.records.append(record))
         self.paths: list[pathlib.Path] = []
-        """The files of these records."""
-        self.changes: list[dict[str, Any]] = []
-        """The records of changes in order; each has the number of `rows` that are there after."""
+        """The files of the segments' records."""
+        self.changes = 0
+        """Number of changes."""
         # A writer adds records in order, so those that are listed now have all before them. It may
         # add more while they are read. Segments of a change are there before its record.
         later = set(folder.glob("change-*.json"))
-        while (path := self.change_path(len(self.changes))).exists():
-            self.changes.append(read_json(path, "a record of a change"))
+        changes: collections.deque[tuple[dict[str, Any], pathlib.Path]] = collections.deque()
+        while (path := self.change_path(self.changes)).exists():
+            changes.append((read_json(path, "a record of a change"), path))
             later.discard(path)
+            self.changes += 1
         _check_all_read(later, path)
         listed = {_first_of(each): each for each in folder.glob("[0-9]*.json")}
         for path in self.waiting():
             listed.pop(_first_of(path), None)
         while (path := listed.pop(len(self), self.path(len(self)))).exists():
-            self._take(read_json(path, "a record of images"), path)
-        if not self.change_path(len(self.changes)).exists():  # or it and others came meanwhile
+            record = read_json(path, "a record of images")
+            # A change of n rows came before the images of row n.
+            while changes and changes[0][0].get("rows") == len(self):
+                self._give(*changes.popleft())
+            self._take(record, path)
+            self._give(record, path)
+        if not self.change_path(self.changes).exists():  # or it and others came meanwhile
             _check_all_read(set(listed.values()), path)
-        for number, change in enumerate(self.changes):
-            rows = change.get("rows")
-            if not isinstance(rows, int) or not 0 <= rows <= len(self):
+        for change, path in changes:
+            if change.get("rows") != len(self):
                 raise InputError(
-                    f"{self.change_path(number)}: found a change of {rows} rows, expected at most "
+                    f"{path}: found a change of {change.get('rows')} rows, expected at most "
                     f"{len(self)}, of which there are records"
                 )
+            self._give(change, path)
         store.check([(span.first, span.count) for span in self.spans])
 
     def __len__(self) -> int:
@@ -101,13 +123,13 @@ class Segments:
     def waiting(self) -> list[pathlib.Path]:
         """List the records of segments whose change is not there, in order."""
         numbered = ((path, path.stem.partition(".")[2]) for path in self.folder.glob("[0-9]*.json"))
-        count = len(self.changes)
+        count = self.changes
         return sorted(path for path, of in numbered if of.isdecimal() and int(of) >= count)
 
     @property
     def has_more(self) -> bool:
         """Whether another process has added a segment or a change since these were read."""
-        paths = self.path(len(self)), self.change_path(len(self.changes))
+        paths = self.path(len(self)), self.change_path(self.changes)
         return any(path.exists() for path in paths)
 
     def _take(self, record: dict[str, Any], path: pathlib.Path) -> None:
@@ -115,7 +137,6 @@ class Segments:
         if not isinstance(names, list) or not names or not isinstance(digest, str):
             raise InputError(f"{path}: not a whole record of images: no names, or no sha256")
         self.spans.append(Segment(len(self), len(names), digest))
-        self.records.append(record)
         self.paths.append(path)
 
     def append(self, record: Mapping[str, Any], rows: Descriptors) -> None:
@@ -128,14 +149,17 @@ class Segments:
         Raises:
             InputError: the store or the folder cannot be written to.
         """
-        self._append(record, rows, self.path(len(self)))
+        self._give(*self._append(record, rows, self.path(len(self))))
 
-    def _append(self, record: Mapping[str, Any], rows: Descriptors, path: pathlib.Path) -> None:
+    def _append(
+        self, record: Mapping[str, Any], rows: Descriptors, path: pathlib.Path
+    ) -> tuple[Mapping[str, Any], pathlib.Path]:
         rows = np.ascontiguousarray(rows, self._dtype)
         whole = {**record, "sha256": _sha256(rows, self._dtype)}
-        self.store.add(len(self), rows)
+        self.store.add(len(self), rows, whole)
         write_record(path, whole)
         self._take(whole, path)
+        return whole, path
 
     def change(
         self, record: Mapping[str, Any], parts: Iterable[tuple[Mapping[str, Any], Descriptors]] = ()
@@ -149,19 +173,22 @@ class Segments:
         Raises:
             InputError: the store or the folder cannot be written to.
         """
-        first, number = len(self), len(self.changes)
+        first, number = len(self), self.changes
+        added = list[tuple[Mapping[str, Any], pathlib.Path]]()
         path = self.change_path(number)
         try:
             for addition, rows in parts:
                 waiting = self.path(len(self)).with_suffix(f".{number:010d}.json")
-                self._append(addition, rows, waiting)
+                added.append(self._append(addition, rows, waiting))
             whole = {**record, "rows": len(self)}
             write_record(path, whole)
         except BaseException:
             if not path.exists():
                 self._drop(first)
             raise
-        self.changes.append(whole)
+        self.changes += 1
+        for each in (*added, (whole, path)):
+            self._give(*each)
 
     def remove_waiting(self) -> int:
         """Remove the segments whose change is not there; return how many there were."""
@@ -175,8 +202,7 @@ class Segments:
         self.remove_waiting()
         self.store.drop(first)
         kept = sum(span.first < first for span in self.spans)
-        for each in (self.spans, self.records, self.paths):
-            del each[kept:]
+        del self.spans[kept:], self.paths[kept:]
 
     def blocks(self) -> Iterator[Descriptors]:
         """Yield the rows of each segment in order."""

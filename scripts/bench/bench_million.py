@@ -34,7 +34,8 @@ import faiss  # isort: skip
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.retrieval.faiss_index import recall_against_exact
-from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.appending import open_for_appending
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.metadata import MapMetadata
 from crisalad_jax.utils.progress import progress_bar
 

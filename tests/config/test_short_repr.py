@@ -16,7 +16,8 @@ from crisalad_jax.config.registry import REGISTRIES
 from crisalad_jax.config.short_repr import field_docs
 from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.nn.adapters.bottleneck import DepthwiseConfig
-from crisalad_jax.retrieval.maps.map import Answer, MapImage
+from crisalad_jax.retrieval.maps.images import MapImage
+from crisalad_jax.retrieval.maps.map import Answer
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.training.recipes import RECIPES
 from crisalad_jax.utils.pytree import summary

@@ -15,7 +15,7 @@ from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.rerun_log import record, record_results
 from crisalad_jax.nn.model import Model
-from crisalad_jax.retrieval.maps.map import MapImage
+from crisalad_jax.retrieval.maps.images import MapImage
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.verification.results import Verification

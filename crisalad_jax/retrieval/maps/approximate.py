@@ -1,65 +1,83 @@
 """Approximate search of a map: an index of FAISS beside its descriptors, made from them.
 
 The index's name holds a digest of the additions that it was built from. One of other additions is
-not used, so that a map that grew never answers from an old index.
+not used, so that a map that grew never answers from an old index. Building adds what is new to one
+of the first additions.
 """
 
 import hashlib
+import math
 import pathlib
 import shutil
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import Queries, sample
-from crisalad_jax.retrieval.maps.file_store import FileStore
+from crisalad_jax.retrieval.maps.milvus_store import MilvusStore
 from crisalad_jax.retrieval.maps.removed import NONE, Removed
+from crisalad_jax.retrieval.maps.store import Store
 from crisalad_jax.retrieval.neighbours import Neighbours, similarities_of
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
+from crisalad_jax.utils.host import available_memory
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 if TYPE_CHECKING:
     from crisalad_jax.retrieval.faiss_index import Index
 
-SEARCHES: dict[str, None] = dict.fromkeys(("exact", "hnsw", "ivf-pq"))
-"""How a map is searched: every descriptor is compared; by a graph over the descriptors, which are
-all in memory; or by codes of at most 128 bytes in memory, and the files rank the answers."""
+SEARCHES: dict[str, None] = dict.fromkeys(("auto", "exact", "hnsw", "ivf-rabitq", "diskann"))
+"""How a map is searched: as `choose_search` chooses; every descriptor is compared; by a graph over
+the descriptors, which are all in memory; or by their signs in memory, and the files rank the
+answers. Milvus has a graph on its disk, too."""
+_EXACT_BYTES = 2**26
+"""Largest size of descriptors that `choose_search` has searched exactly: all are read for a query,
+in less than a tenth of a second."""
+_GRAPH_BYTES = 2**30
+"""Largest size of a graph that `choose_search` takes: a larger one takes hours to build."""
+_LINK_BYTES = 272
+"""Size of the links of a descriptor in a graph."""
 FOLDER = "approximate"
 NEIGHBOURS, SAMPLE = 10, 100
 """Recall is measured over the 10 nearest others of so many of the map's images."""
-_CANDIDATES = {"hnsw": (2, 16), "ivf-pq": (10, 100)}
+_CANDIDATES = {"hnsw": (2, 16), "ivf-rabitq": (10, 100), "diskann": (2, 16)}
 """Of each kind: candidates for each neighbour, and at least so many; the best of them by exact
 similarity are the answer."""
+_SEARCHED = 10
+"""Of this many descriptors one is left at least where the index is searched."""
 _SEED = 0
 Additions = Sequence[tuple[int, int, str]]
 """First number, count and SHA-256 of each addition to a map."""
 
 
 class Approximate(NamedTuple):
-    """An approximate search of a map's descriptors, which are in files."""
+    """An approximate search of a map's descriptors."""
 
-    kind: Literal["hnsw", "ivf-pq"]
-    index: "Index"
-    store: FileStore
+    kind: str
+    ask: Callable[[Queries, int, Removed], Neighbours]
+    """Finds candidates: so many of each query, whose numbers are -1 where there are fewer."""
+    store: Store
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
 
     def search(self, queries: Queries, k: int, count: int, removed: Removed = NONE) -> Neighbours:
         """Find the k most similar of `count` descriptors: candidates, ranked exactly.
 
-        Queries with fewer than k candidates are searched exactly. What was removed is no candidate,
-        and its room in the search goes to others.
+        Queries with fewer than k candidates are searched exactly, and so are all where less than a
+        tenth is left. What was removed is no candidate; more are looked at in its place.
 
         Raises:
             InputError: the store is damaged or gone.
         """
         each, least = _CANDIDATES[self.kind]
-        candidates = min(count - len(removed.rows), max(least, each * k))
-        numbers = self.index.search(queries, candidates, without=removed.rows).indices
+        left = count - len(removed.rows)
+        if left < count // _SEARCHED:
+            return self.store.search(queries, k, count, removed)
+        candidates = min(left, max(least, each * k) * count // left)
+        numbers = self.ask(queries, candidates, removed).indices
         query, found = np.nonzero(numbers >= 0)
         similarities = np.full(numbers.shape, -np.inf, np.float32)
         similarities[query, found] = similarities_of(
@@ -83,6 +101,8 @@ def open_approximate(
     Raises:
         InputError: it is damaged, or changed where `verify` asks for that.
     """
+    if isinstance(segments.store, MilvusStore):
+        return _served(segments.store)
     path = _current(folder, segments.spans)
     if path is None:
         return None
@@ -90,7 +110,7 @@ def open_approximate(
 
     index = load_index(path, verify=verify)
     recall = float(_record(path)["recall"])
-    return Approximate(index.kind, index, cast(FileStore, segments.store), recall)
+    return Approximate(index.kind, _asking(index), segments.store, recall)
 
 
 def indexed_images(folder: pathlib.Path) -> list[tuple[pathlib.Path, int]]:
@@ -114,13 +134,35 @@ def check_search(kind: str, store: str, dtype: str) -> None:
     """Check that the descriptors in a store can be searched so.
 
     Raises:
-        InputError: an unknown kind, or an approximate search of bits or of descriptors in Milvus.
+        InputError: an unknown kind, an approximate search of bits, or one that files lack.
     """
     choose("search", kind, SEARCHES)
-    if kind != "exact" and dtype == "bits":
+    if kind not in ("auto", "exact") and dtype == "bits":
         raise InputError(f"search: found {kind} for a map of bits, expected exact")
-    if kind != "exact" and store != "files":
-        raise InputError(f"search: found {kind}, expected exact, as {store} is searched by Milvus")
+    if kind == "diskann" and store == "files":
+        raise InputError(f"search: found {kind} for a map in files, which is an index of Milvus")
+
+
+def choose_search(count: int, length: int, dtype: str) -> tuple[str, str]:
+    """Choose how descriptors in files are searched by their size and the memory available.
+
+    Args:
+        count: number of descriptors.
+        length: of each.
+        dtype: what they are stored as.
+
+    Returns:
+        One of `SEARCHES`, and why it was chosen.
+    """
+    if dtype == "bits":
+        return "exact", "no other search is built of bits"
+    size, graph = count * length * np.dtype(dtype).itemsize, count * (4 * length + _LINK_BYTES)
+    if size <= _EXACT_BYTES:
+        return "exact", f"a query reads {size / 1e6:.1f} MB, of {_EXACT_BYTES / 1e6:.0f} MB at most"
+    memory = available_memory()
+    most = min(_GRAPH_BYTES, memory // 4)
+    why = f"a graph in memory takes {graph / 1e9:.2f} GB, of {most / 1e9:.2f} GB at most"
+    return ("hnsw" if graph <= most else "ivf-rabitq"), f"{why} ({memory / 1e9:.1f} GB available)"
 
 
 def build_approximate(
@@ -137,32 +179,79 @@ def build_approximate(
     Raises:
         InputError: too few descriptors; a full disk.
     """
+    if isinstance(segments.store, MilvusStore):
+        segments.store.build(kind, quiet=quiet)
+        built = _served(segments.store)
+        return built and built._replace(recall=_recall(built, len(segments)))
     if kind == "exact":
         shutil.rmtree(folder / FOLDER, ignore_errors=True)
         return None
     path = folder / FOLDER / f"{kind}-{_digest(segments.spans)}.index"
     if path.exists():
         return open_approximate(folder, segments, verify=True)
-    from crisalad_jax.retrieval.faiss_index import build, recall_against_exact, save_index
+    from crisalad_jax.retrieval.faiss_index import build, save_index
 
-    count, store = len(segments), cast(FileStore, segments.store)
-    index = build(cast(Any, kind), segments.blocks, seed=_SEED, quiet=quiet)
-    built = Approximate(index.kind, index, store, 0.0)
-    places = sample(count, min(SAMPLE, count), _SEED)
-    k = min(NEIGHBOURS + 1, count)
-    queries = store.rows(places).astype(np.float32)
-    sides = (each.search(queries, k, count).indices for each in (built, store))
-    found, exact = (_others(places, side) for side in sides)
-    built = built._replace(recall=recall_against_exact(found, exact) if exact.size else 1.0)
+    count = len(segments)
+    index = _extended(folder, kind, segments, quiet=quiet)
+    if index is None:
+        index = build(cast(Any, kind), segments.blocks, seed=_SEED, quiet=quiet)
+    built = Approximate(index.kind, _asking(index), segments.store, 0.0)
+    built = built._replace(recall=_recall(built, count))
     with made_folder(path.parent):
         remove_temporaries(path.parent)
-        value = {"kind": kind, "images": count, "recall": built.recall, "queries": len(places)}
+        value = {
+            "kind": kind,
+            "images": count,
+            "recall": built.recall,
+            "queries": min(SAMPLE, count),
+        }
         write_json(path.with_suffix(".json"), value)
         save_index(path, index)
     for other in path.parent.iterdir():
         if other.stem != path.stem:
             other.unlink()
     return built
+
+
+def _extended(
+    folder: pathlib.Path, kind: str, segments: Segments, *, quiet: bool
+) -> "Index | None":
+    """Add what is new to the index of a map's first additions; None where it has no fitting one."""
+    for length, digest in enumerate(_digests(segments.spans), 1):
+        path = folder / FOLDER / f"{kind}-{digest}.index"
+        if path.exists():
+            from crisalad_jax.retrieval.faiss_index import load_index
+
+            index, more = load_index(path), segments.spans[length:]
+            if not index.has_room_for(len(segments)):
+                return None
+            new = (segments.store.read(each.first, each.count) for each in more)
+            index.add(new, len(segments) - index.size, quiet=quiet)
+            return index
+    return None
+
+
+def _asking(index: "Index") -> Callable[[Queries, int, Removed], Neighbours]:
+    return lambda queries, k, removed: index.search(queries, k, without=removed.rows)
+
+
+def _served(store: MilvusStore) -> Approximate | None:
+    """Return the approximate search that Milvus does of a map, whose recall is not known yet."""
+    if store.kind == "exact":
+        return None
+    return Approximate(store.kind, store.ask, store, math.nan)
+
+
+def _recall(built: Approximate, count: int) -> float:
+    """Measure the share of the exact nearest others of some images that a search finds."""
+    from crisalad_jax.retrieval.faiss_index import recall_against_exact
+
+    places = sample(count, min(SAMPLE, count), _SEED)
+    k = min(NEIGHBOURS + 1, count)
+    queries = built.store.rows(places).astype(np.float32)
+    sides = (each.search(queries, k, count).indices for each in (built, built.store))
+    found, exact = (_others(places, side) for side in sides)
+    return recall_against_exact(found, exact) if exact.size else 1.0
 
 
 def _others(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
@@ -172,9 +261,16 @@ def _others(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     return numbers[kept].reshape(len(numbers), -1)
 
 
+def _digests(additions: Additions) -> Iterator[str]:
+    """Yield a digest of the first addition, of the first two, and so on."""
+    digest = hashlib.sha256()
+    for first, count, rows in additions:
+        digest.update(f"{first} {count} {rows}\n".encode())
+        yield digest.hexdigest()[:16]
+
+
 def _digest(additions: Additions) -> str:
-    lines = (f"{first} {count} {digest}\n" for first, count, digest in additions)
-    return hashlib.sha256("".join(lines).encode()).hexdigest()[:16]
+    return ["none", *_digests(additions)][-1]
 
 
 def _indices(folder: pathlib.Path) -> list[pathlib.Path]:

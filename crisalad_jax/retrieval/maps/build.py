@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import pathlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from crisalad_jax.checkpoints.runtime import Runtime
@@ -14,11 +14,12 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.remote import for_each, size_of, whole_name
 from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.data.tracks import Track
-from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
+from crisalad_jax.retrieval.describe import check_readable, joined, shown
 from crisalad_jax.retrieval.describer import Describer, describer_of
+from crisalad_jax.retrieval.maps.appending import AppendableMap, open_for_appending
 from crisalad_jax.retrieval.maps.approximate import check_search
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
-from crisalad_jax.retrieval.maps.map import Map, MapImage, open_for_appending
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.metadata import (
     MapMetadata,
     check_model,
@@ -29,8 +30,10 @@ from crisalad_jax.retrieval.maps.metadata import (
 )
 from crisalad_jax.retrieval.maps.novelty import Novelty
 from crisalad_jax.retrieval.maps.store import check_store, store_name
+from crisalad_jax.retrieval.on_cluster import Describing
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.segments import SEGMENT
+from crisalad_jax.utils.cluster import check_cluster
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 
@@ -119,9 +122,10 @@ def index(
     store: str | None = None,
     dtype: Literal["float32", "float16", "bits"] | None = None,
     pca: Pca | str | os.PathLike[str] | None = None,
-    search: Literal["exact", "hnsw", "ivf-pq"] | None = None,
+    search: Literal["auto", "exact", "hnsw", "ivf-rabitq", "diskann"] | None = None,
     again: bool = False,
     reading: Reading = Reading(),
+    cluster: str | None = None,
 ) -> Indexed:
     """Make a map of a folder of images, or append to it those that it lacks.
 
@@ -152,10 +156,12 @@ def index(
             searched by the Hamming distance. None is the map's, and of a new map "float32".
         pca: components that shorten the descriptors, or a file of them, of which the map stores a
             copy. None is the map's, and of a new map none.
-        search: the approximate search that is built from the map's descriptors; "exact" removes
-            one. None leaves what there is, which is of no use once the map has grown.
+        search: the approximate search that is built from the map's descriptors, or extended by new
+            ones, see `Map.build_search`; "exact" removes one. None leaves what there is, which is
+            of no use once the map has grown.
         again: whether to add images that were removed from the map, too (`remove_images`).
         reading: how images are read.
+        cluster: the Ray cluster that describes them, as `extract` takes it; None describes here.
 
     Returns:
         What became of the images.
@@ -163,7 +169,8 @@ def index(
     Raises:
         InputError: parameters of another configuration; no image, or none that can be read;
             positions of none of them; a distance or similarity out of range; a map of another model
-            or of other settings; what `Map.append`, `new_metadata` and `open_for_appending` raise.
+            or of other settings; what `AppendableMap.append`, `new_metadata` and
+            `open_for_appending` raise.
 
     Example:
         >>> import jax
@@ -177,6 +184,7 @@ def index(
         4
     """
     describer = describer_of(model)
+    check_cluster(cluster)
     if novelty is not None:
         check_min_similarity(novelty, "novelty")
     out = pathlib.Path(out)
@@ -211,7 +219,8 @@ def index(
     if table is None and not known.of:
         known = None
     fitted = reading.fitted(len(source.paths))
-    work = _Indexing(describer, source, known, metadata, components, search, fitted, again, novelty)
+    how = {"cluster": cluster, "again": again, "novelty": novelty}
+    work = _Indexing(describer, source, known, metadata, components, search, fitted, **how)
     with open_for_appending(out, metadata, components) as target:
         result = work.into(target)
     if result.added == result.images and describer.config.cross_image.attends:
@@ -236,11 +245,12 @@ class _Indexing:
     components: Pca | None
     search: str | None
     reading: Reading
+    cluster: str | None = None
     again: bool = False
     novelty: float | None = None
     """Largest similarity to the last image that was taken; None is any."""
 
-    def into(self, target: Map) -> Indexed:
+    def into(self, target: AppendableMap) -> Indexed:
         """Append all images to a map that is open for appending.
 
         Raises:
@@ -248,11 +258,10 @@ class _Indexing:
         """
         known = len(target)
         unreadable = self._append(target)
-        removed = sum(map(target.was_removed, self.source.names))
-        result = self._counts(target.images[:known], target.images[known:], unreadable, removed)
+        result = self._counts(target, known, unreadable)
         return result._replace(recall=self._finish(target))
 
-    def _append(self, target: Map) -> list[str]:
+    def _append(self, target: AppendableMap) -> list[str]:
         """Describe images as the map's are, and append them, `SEGMENT` at a time.
 
         Images whose names the map has are left out, so that the same call resumes after a kill.
@@ -262,7 +271,7 @@ class _Indexing:
 
         Raises:
             InputError: an image cannot be read; a name in a map is of another image here; or what
-                `Map.append` raises.
+                `AppendableMap.append` raises.
         """
         root, total = whole_name(self.source.root), len(self.source.paths)
         choice = None if self.novelty is None else Novelty(target, self.source, root, self.novelty)
@@ -273,7 +282,8 @@ class _Indexing:
             positions = _by_exif(target, zip(names, new, strict=True))
         target.fitted(names, positions)  # checks them before any work
         unreadable: list[str] = []
-        stream = described(self.describer, new, self.reading, components=target.components)
+        how = Describing(self.describer, self.reading, target.components)
+        stream = how.stream(new, self.cluster)
         done, quiet = total - len(new), self.reading.quiet
         stream = shown(stream, "images", total, quiet=quiet, done=done)
         for part in joined(stream, SEGMENT):
@@ -292,26 +302,26 @@ class _Indexing:
                 choice.leave_out([names[i] for i in alike], [sizes[i] for i in alike])
         return unreadable
 
-    def _counts(
-        self,
-        there: Sequence[MapImage],
-        added: Sequence[MapImage],
-        unreadable: list[str],
-        removed: int,
-    ) -> Indexed:
-        """Count what became of the images, of a map that had some before."""
-        known, listed = {image.name for image in there}, set(self.source.names)
+    def _counts(self, target: Map, known: int, unreadable: list[str]) -> Indexed:
+        """Count what became of the images, of a map that had `known` ones before."""
+        added, listed = target.images[known:], set(self.source.names)
         given = () if self.positions is None else self.positions.of.keys()
-        there_now = len(listed & known)
+
+        def there(names: Iterable[str]) -> int:
+            numbers = map(target.images.find, names)
+            return sum(number is not None and number < known for number in numbers)
+
+        there_now = there(listed)
+        removed = sum(map(target.was_removed, self.source.names))
         rest = len(listed) - there_now - len(added) - len(unreadable) - removed
         return Indexed(
             added=len(added),
             there=there_now,
             positions=sum(image.position is not None for image in added),
-            stay=len(known.intersection(given)),
+            stay=there(given),
             unreadable=unreadable,
             unmatched=[name for name in given if name not in listed],
-            images=len(there) + len(added),
+            images=len(target),
             metadata=self.metadata,
             removed=removed,
             similar=0 if self.novelty is None else rest,

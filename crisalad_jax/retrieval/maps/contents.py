@@ -3,14 +3,18 @@
 import collections
 import datetime
 import itertools
+import operator
 import pathlib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from crisalad_jax.data.frames import Moment, moment_of, sequence_of
 
 if TYPE_CHECKING:
-    from crisalad_jax.retrieval.maps.map import Map, MapImage
+    from crisalad_jax.retrieval.maps.images import Images, MapImage
+    from crisalad_jax.retrieval.maps.map import Map
 
 
 class MapAddition(NamedTuple):
@@ -24,12 +28,15 @@ class MapAddition(NamedTuple):
     """Number of its images that were not removed."""
 
 
-def additions_of(parts: Sequence[tuple[str | None, str, int]]) -> list[MapAddition]:
-    """Join parts of a map, by time, root and number of images, to additions of a day and root."""
-    days = ((time and time[:10], root, images) for time, root, images in parts)
+def additions_of(images: "Images") -> list[MapAddition]:
+    """Join the parts of a map's images to additions of a day and root."""
+    counts = np.diff(images.starts).tolist()
+    days = ((part.added and part.added[:10], part.root) for part in images.parts)
     return [
-        MapAddition(*key, sum(images for _, _, images in some))
-        for key, some in itertools.groupby(days, key=lambda part: part[:2])
+        MapAddition(day, root, sum(count for _, count in some))
+        for (day, root), some in itertools.groupby(
+            zip(days, counts, strict=True), key=operator.itemgetter(0)
+        )
     ]
 
 

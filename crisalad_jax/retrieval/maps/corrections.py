@@ -26,8 +26,10 @@ from crisalad_jax.data.sources import open_sources
 from crisalad_jax.data.tracks import Track
 from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
 from crisalad_jax.retrieval.describer import describer_of
+from crisalad_jax.retrieval.maps.appending import AppendableMap, open_for_appending
 from crisalad_jax.retrieval.maps.build import check_settings
-from crisalad_jax.retrieval.maps.map import Map, NewImages, open_for_appending
+from crisalad_jax.retrieval.maps.images import NewImages
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.metadata import (
     MapMetadata,
     check_model,
@@ -69,7 +71,7 @@ class MapChange(NamedTuple):
 
 
 @contextlib.contextmanager
-def _open_existing(folder: str | os.PathLike[str]) -> Iterator[Map]:
+def _open_existing(folder: str | os.PathLike[str]) -> Iterator[AppendableMap]:
     with open_for_appending(folder, existing_metadata(folder)) as places:
         yield places
 
@@ -109,7 +111,7 @@ def find_images(
             continue
         matches = re.compile(fnmatch.translate(pattern)).match
         some = {number for name, number in numbers.items() if matches(name)}
-        gone = {name for name in places.removed_names if matches(name) or name == pattern}
+        gone = {name for name in places.images.removed_names if matches(name) or name == pattern}
         if not some and not gone:
             near = difflib.get_close_matches(pattern, list(numbers)[:_NEAR])
             words = f"did you mean {' or '.join(near)}?" if near else "see `crisalad map list`"
@@ -380,8 +382,9 @@ def _check_alike(other: Map, metadata: MapMetadata, folder: pathlib.Path) -> Non
             )
 
 
-def _merge(target: Map, others: Sequence[Map], *, quiet: bool) -> MapChange:
-    sources = {image.name: target for image in target.images}
+def _merge(target: AppendableMap, others: Sequence[Map], *, quiet: bool) -> MapChange:
+    sources = dict[str, Map]()
+    """Of the images that were merged, the maps that they come from."""
     merged, there, stay_out = list[str](), 0, 0
     total = sum(map(len, others))
     with progress_bar("merging", total, "images", quiet=quiet) as bar:
@@ -390,9 +393,11 @@ def _merge(target: Map, others: Sequence[Map], *, quiet: bool) -> MapChange:
             nonlocal there, stay_out
             for other in others:
                 for part in other.parts():
-                    known = [name in sources for name in part.names]
+                    known = [
+                        name in sources or target.image(name) is not None for name in part.names
+                    ]
                     gone = list(map(target.was_removed, part.names, part.sizes))
-                    _check_same(part.only(known), other, sources)
+                    _check_same(part.only(known), other, sources, target)
                     new = part.only([not any(pair) for pair in zip(known, gone, strict=True)])
                     there += sum(known)
                     stay_out += sum(gone)
@@ -409,11 +414,14 @@ def _merge(target: Map, others: Sequence[Map], *, quiet: bool) -> MapChange:
     return MapChange(merged, there, len(target), (), (), stay_out, target.stale_search)
 
 
-def _check_same(part: NewImages, other: Map, sources: dict[str, Map]) -> None:
-    """Check that names that another map has too are of the same image: its size and descriptor."""
+def _check_same(part: NewImages, other: Map, sources: dict[str, Map], target: Map) -> None:
+    """Check that names that another map has too are of the same image: its size and descriptor.
+
+    That is the one in `sources`, or else the target.
+    """
     by_source = collections.defaultdict[Map, list[int]](list)
     for number, name in enumerate(part.names):
-        by_source[sources[name]].append(number)
+        by_source[sources.get(name, target)].append(number)
     for source, numbers in by_source.items():
         names = [part.names[number] for number in numbers]
         theirs = source.descriptors_of(names)

@@ -24,6 +24,7 @@ from crisalad_jax.retrieval.maps.query import (
     verified,
 )
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch
+from crisalad_jax.retrieval.maps.where import Where
 from crisalad_jax.retrieval.verification.verify import Verifier, Verify
 from crisalad_jax.utils.output import counted
 
@@ -74,6 +75,7 @@ def query_live(
     window: int = 1,
     min_similarity: float | None = None,
     sequence: SequenceSearch | None = None,
+    where: Where | str | None = None,
     verify: Verify | None = None,
     ready: Callable[[], None] = lambda: None,
     check: Callable[[], None] = lambda: None,
@@ -93,6 +95,7 @@ def query_live(
             describes each alone, as a map's images are.
         min_similarity: see `query`.
         sequence: see `query`; frames that were passed over count for nothing.
+        where: see `query`.
         verify: see `query`.
         ready: called when the first frame can be answered.
         check: called several times a second; it may raise, to end this.
@@ -129,7 +132,7 @@ def query_live(
     describer = FrameDescriber(model_describer, window)
 
     def answers() -> Iterator[LiveAnswer]:
-        now, ask = places, asking(places, found_at_least(k, verifier), sequence)
+        now, ask = places, asking(places, found_at_least(k, verifier), sequence, where)
         blank = np.zeros((*(source.size or places.config.image_size), 3), np.uint8)
         places.search(places.shorten(describer(blank)), k)
         describer.forget()
@@ -137,7 +140,7 @@ def query_live(
         for frame in source.frames(check):
             asked = [pathlib.Path(frame.name)]
             if sequence is None and (then := now) is not (now := then.refreshed()):
-                ask = asking(now, found_at_least(k, verifier), None)
+                ask = asking(now, found_at_least(k, verifier), None, where)
             found = ask(now.shorten(describer(frame.image)), asked)
             answer = answers_of(now, asked, [found], thresholds)
             if verifier is not None:

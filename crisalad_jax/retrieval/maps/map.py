@@ -1,23 +1,13 @@
-"""Maps: a folder of descriptors with a description of itself, which grows by appending.
-
-Each addition is a segment: its descriptors go to the store, then the record of its images appears
-under its name. That single rename commits the addition. A change, which removes, moves and adds
-images, is a record too. A map whose writer is killed at any moment is as it was before the addition
-or change, or after it. docs/maps.md has the format.
-"""
+"""Maps: a folder of descriptors with a description of itself, opened to search it."""
 
 import bisect
-import collections
 import contextlib
-import dataclasses
-import datetime
 import functools
 import itertools
-import operator
 import os
 import pathlib
 import weakref
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, cast
 
 import numpy as np
@@ -30,7 +20,7 @@ from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import Zone
-from crisalad_jax.data.positions import AXES, Positions
+from crisalad_jax.data.positions import Positions
 from crisalad_jax.retrieval.bits import sign_vectors, to_bits
 from crisalad_jax.retrieval.chunks import Descriptors, Queries, as_unit_rows
 from crisalad_jax.retrieval.describer import Describer, describer_of
@@ -38,13 +28,14 @@ from crisalad_jax.retrieval.maps.approximate import (
     Approximate,
     build_approximate,
     check_search,
+    choose_search,
     open_approximate,
     stale_kind,
 )
 from crisalad_jax.retrieval.maps.calibration import Calibration, read_calibration
 from crisalad_jax.retrieval.maps.contents import MapAddition, additions_of, contents
+from crisalad_jax.retrieval.maps.images import Images, MapImage, NewImages
 from crisalad_jax.retrieval.maps.metadata import (
-    COMPONENTS,
     METADATA,
     SEGMENTS,
     MapMetadata,
@@ -53,64 +44,21 @@ from crisalad_jax.retrieval.maps.metadata import (
     has_images,
     model_config,
     read_components,
-    read_metadata,
     weights_of,
 )
-from crisalad_jax.retrieval.maps.recovery import remove_unrecorded
-from crisalad_jax.retrieval.maps.removed import NONE, Removed
-from crisalad_jax.retrieval.maps.store import open_store
+from crisalad_jax.retrieval.maps.removed import Removed
+from crisalad_jax.retrieval.maps.store import Store, open_store
+from crisalad_jax.retrieval.maps.where import Where
 from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.retrieval.pca import Pca, save_pca
-from crisalad_jax.retrieval.segments import Segments, write_record
+from crisalad_jax.retrieval.segments import Segments, Take
 from crisalad_jax.retrieval.verification.results import Verification
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.locks import lock
-from crisalad_jax.utils.output import counted, warn
+from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float32, Int64
-from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 if TYPE_CHECKING:  # a map is searched without JAX
     from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.model import Model
-
-
-@brief
-class MapImage(NamedTuple):
-    """An image of a map: everything but its descriptor."""
-
-    name: str
-    """Its posix path relative to `root`; no two images of a map share one."""
-    bytes: int
-    """Size of the described file in bytes; a file of another size is another picture."""
-    position: tuple[float, float] | None
-    root: str
-
-
-class NewImages(NamedTuple):
-    """Images to be appended, all from one folder; see `Map.append`."""
-
-    names: Sequence[str]
-    sizes: Sequence[int]
-    descriptors: Descriptors
-    root: str
-    positions: Positions | None = None
-    added: str | None = None
-    """The time when they were described; None is now."""
-    source: object = None
-    """What messages call them; None is their root."""
-
-    def only(self, chosen: Sequence[bool]) -> "NewImages":
-        """Return those of the images that are chosen."""
-        names, sizes = (
-            list(itertools.compress(column, chosen)) for column in (self.names, self.sizes)
-        )
-        return self._replace(
-            names=names, sizes=sizes, descriptors=self.descriptors[np.array(chosen)]
-        )
-
-
-MOST_CHANGED = 10**6
-"""Number of images that one change removes or moves at most, whose record JSON has room for."""
 
 
 @brief
@@ -156,15 +104,13 @@ class Map:
         '2.png'
     """
 
-    def __init__(self, folder: pathlib.Path, metadata: MapMetadata, segments: Segments) -> None:
-        """Read what the records say of the images."""
+    def __init__(self, folder: pathlib.Path, metadata: MapMetadata, store: Store) -> None:
+        """Read what the records say of the images, whose descriptors are in a store."""
         self.folder = folder
         self.metadata = metadata
         """The contents of map.json."""
-        self.images: list[MapImage] = []
-        """The images by number; those that were removed have none."""
-        self.removed = NONE
-        """What was removed, by the row of each in the store, which no change alters."""
+        self.images = Images()
+        """The images by number."""
         self.changed = ""
         """When images were last removed, replaced or merged into it; empty for never."""
         self.axes: tuple[str, str] | None = None
@@ -175,29 +121,20 @@ class Map:
         """What `calibrate` measured; None where it did not, or the map is open for appending."""
         self.components = read_components(folder, metadata)
         """The components that shorten descriptors, and those of queries; None is none."""
-        self._segments, self._numbers = segments, dict[str, int]()
-        self._stored: list[MapImage] = []
-        """The images by row, those that were removed included."""
-        self._gone = set[int]()
-        """Rows that were removed."""
-        self._parts: list[tuple[str | None, str, int]] = []
-        """Of each record of images the time, the root and the first row."""
         self._calibrated = False
-        self._opened_at = os.stat(segments.folder)
-        self._close = weakref.finalize(self, segments.store.close)
         self._approximate: Approximate | None = None
+        self._left_out = Where(), self.images, 0, Removed()
         self._describer: tuple[object, Describer] | None = None
         """A model that is known to be the one that made the map, and what describes with it."""
-        changes = [
-            (record["rows"], self._read_change, record, segments.change_path(number))
-            for number, record in enumerate(segments.changes)
-        ]
-        columns = zip(segments.spans, segments.records, segments.paths, strict=True)
-        parts = [(span.first, self._read_record, record, path) for span, record, path in columns]
-        # A change of n rows came before the images of row n.
-        for _, read, record, path in sorted(changes + parts, key=operator.itemgetter(0)):
-            read(record, path)
-        self._settle()
+        me = weakref.proxy(self)  # in a circle it would not close as soon as nothing refers to it
+        take: Take = lambda record, path: me._take(record, path)  # noqa: E731
+        self._segments = Segments(folder / SEGMENTS, store, metadata.row[1], take)
+        if (row := self.images.twice()) is not None:
+            firsts = [span.first for span in self._segments.spans]
+            path = self._segments.paths[bisect.bisect(firsts, row) - 1]
+            raise InputError(f"{path}: not a whole record of images: a name is there twice")
+        self._opened_at = os.stat(self._segments.folder)
+        self._close = weakref.finalize(self, store.close)
 
     @classmethod
     @takes(folder=PATH)
@@ -264,7 +201,7 @@ class Map:
             new=not has_images(folder),
         )
         try:
-            return cls(folder, metadata, Segments(folder / SEGMENTS, store, dtype))
+            return cls(folder, metadata, store)
         except BaseException:
             store.close()
             raise
@@ -317,101 +254,64 @@ class Map:
         return again
 
     @property
+    def removed(self) -> Removed:
+        """What was removed, by the row of each in the store, which no change alters."""
+        return self.images.removed
+
+    @property
     def additions(self) -> list[MapAddition]:
         """What was appended, in order: from which folder, on which day, and how many are left."""
-        ends = np.array([*(first for *_, first in self._parts), len(self._stored)], np.int64)
-        counts = np.diff(self.removed.numbers_of(ends)).tolist()
-        pairs = zip(self._parts, counts, strict=True)
-        return additions_of([(time, root, images) for (time, root, _), images in pairs])
+        return additions_of(self.images)
 
     def was_removed(self, name: str, size: int | None = None) -> bool:
         """Return whether an image of this name, and of this size if that is given, was removed."""
-        sizes = self.removed_names.get(name, ())
-        return name not in self._numbers and (bool(sizes) if size is None else size in sizes)
-
-    @functools.cached_property
-    def removed_names(self) -> dict[str, set[int]]:
-        """Names of the images that were removed or replaced, with the sizes of their files."""
-        sizes = collections.defaultdict[str, set[int]](set)
-        for row in self._gone:
-            sizes[self._stored[row].name].add(self._stored[row].bytes)
-        return sizes
+        sizes = self.images.removed_names.get(name, ())
+        is_one = bool(sizes) if size is None else size in sizes
+        return is_one and self.images.find(name) is None
 
     def image(self, name: str) -> MapImage | None:
         """Return what the map knows of the image of this name; None if it has none."""
-        number = self._numbers.get(name)
+        number = self.images.find(name)
         return None if number is None else self.images[number]
 
-    def _read_record(self, record: Mapping[str, Any], path: pathlib.Path) -> None:
-        """Take the images of a record.
+    def added(self, name: str) -> str | None:
+        """Return when the image of this name was described; None where its record does not say."""
+        return self.images.part_of(self._number(name)).added
+
+    def _number(self, name: str) -> int:
+        number = self.images.find(name)
+        if number is None:
+            raise KeyError(name)
+        return number
+
+    def _take(self, record: Mapping[str, Any], path: pathlib.Path) -> None:
+        """Take the images of a record, or what a record of a change says.
 
         Raises:
             InputError: a value is missing or of another type.
         """
+        is_change = "rows" in record
+        columns = ("removed", "moved") if is_change else ("root", "added", "names", "bytes")
         try:
-            root, added = record["root"], record["added"]
-            columns = (record["names"], record["bytes"], record["positions"])
-            images = [
-                MapImage(_inside(name), int(size), at and (float(at[0]), float(at[1])), root)
-                for name, size, at in zip(*columns, strict=True)
-            ]
-            axes, zone = _axes_in(record)
-            Positions(axes or AXES[2], {i.name: i.position for i in images if i.position}).check()
-            if not isinstance(root, str) or not isinstance(added, str | None):
-                raise TypeError(f"found root {root!r}, expected text, and added {added!r}, a time")
-        except (ValueError, LookupError, TypeError, OverflowError) as error:
-            raise InputError(f"{path}: not a whole record of images: {error!r}") from error
-        self._parts.append((added, root, len(self._stored)))
-        self._stored += images
-        self.axes, self.zone = self.axes or axes, self.zone or zone
-
-    def _read_change(self, record: Mapping[str, Any], path: pathlib.Path) -> None:
-        """Take what a record of a change says.
-
-        Raises:
-            InputError: a value is missing or of another type.
-        """
-        try:
-            rows = [*record["removed"], *record["moved"]]
-            if not all(isinstance(row, int) and 0 <= row < len(self._stored) for row in rows):
-                raise ValueError(f"found rows beyond {len(self._stored)} or no numbers")
-            pairs = zip(record["moved"], record["positions"], strict=True)
-            moved = {row: (float(at[0]), float(at[1])) for row, at in pairs}
-            self.axes, self.zone = _axes_in(record)
-            Positions(self.axes or AXES[2], {str(row): at for row, at in moved.items()}).check()
+            axes = record["axes"] and (record["axes"][0], record["axes"][1])
+            zone = record["zone"] and Zone(int(record["zone"][0]), bool(record["zone"][1]))
+            given: Any = [record[name] for name in columns]
+            if not is_change:
+                self.images.extend(*given, positions=record["positions"], axes=axes)
+                self.axes, self.zone = self.axes or axes, self.zone or zone
+                return
             if not isinstance(record["changed"], str):
                 raise TypeError("found no time")
+            self.images = self.images.changed(*given, positions=record["positions"], axes=axes)
+            self.axes, self.zone = axes, zone
+            self.changed = self.changed if record["verb"] == "move" else record["changed"]
         except (ValueError, LookupError, TypeError, OverflowError) as error:
-            raise InputError(f"{path}: not a whole record of a change: {error!r}") from error
-        for row, at in moved.items():
-            self._stored[row] = self._stored[row]._replace(position=at)
-        self._gone.update(record["removed"])
-        if record["verb"] != "move":
-            self.changed = record["changed"]
+            kind = "a change" if is_change else "images"
+            raise InputError(f"{path}: not a whole record of {kind}: {error!r}") from error
 
-    def _settle(self, first: int = 0) -> None:
-        """Number the images from a row on, of which those before it have their numbers.
-
-        Raises:
-            InputError: a name stands twice.
-        """
-        if not first:  # new ones, as answers hold the old
-            self.images, self._numbers = [], {}
-            self.removed = Removed(np.array(sorted(self._gone), np.int64))
-            self.__dict__.pop("removed_names", None)
-        rows = (row for row in range(first, len(self._stored)) if row not in self._gone)
-        images = [self._stored[row] for row in rows]
-        self._numbers |= {image.name: i for i, image in enumerate(images, len(self))}
-        self.images += images
-        if len(self._numbers) < len(self.images):
-            pairs = enumerate(self.images)
-            twice = next(image.name for i, image in pairs if self._numbers[image.name] != i)
-            row = self.removed.rows_of(np.array(self._numbers[twice]))
-            firsts = [span.first for span in self._segments.spans]
-            path = self._segments.paths[bisect.bisect(firsts, row) - 1]
-            raise InputError(f"{path}: not a whole record of images: a name stands twice")
-
-    def search(self, queries: Queries, k: int, *, exact: bool = False) -> Neighbours:
+    def search(
+        self, queries: Queries, k: int, *, exact: bool = False, where: Where | str | None = None
+    ) -> Neighbours:
         """Find the k most similar images of each query, best first; all where there are fewer.
 
         Search is exact, by inner product, or by equal bits in a map of these; of equal similarities
@@ -423,21 +323,40 @@ class Map:
                 bits takes those of any length, and packed bits.
             k: neighbours per query.
             exact: whether to search exactly although the map has an approximate search.
+            where: which images are searched, as `Where.parse` reads it; None is all.
 
         Raises:
             InputError: no queries, descriptors that are no unit vectors of the map's length, k
-                below 1; or the store is damaged or gone.
+                below 1; no image that `where` takes, or what `Where.parse` raises; or the store is
+                damaged or gone.
         """
         check_count("k", k)
         queries = self._rows("queries", queries)
-        k = min(k, len(self))
+        out, count = self.removed if where is None else self.left_out(where), self.images.rows
+        k = min(k, count - len(out.rows))
         if self._approximate is not None and not exact:
-            return self._approximate.search(queries, k, len(self._segments), self.removed)
-        return self._segments.store.search(queries, k, len(self._segments), self.removed)
+            found = self._approximate.search(queries, k, count, out)
+        else:
+            found = self._segments.store.search(queries, k, count, out)
+        if where is None:
+            return found
+        return found._replace(indices=self.removed.numbers_of(out.rows_of(found.indices)))
+
+    def left_out(self, where: Where | str) -> Removed:
+        """Return the rows that a search with conditions leaves out, those of the last one at once.
+
+        Raises:
+            InputError: no image is left; what `Where.parse` and `Where.left_out` raise.
+        """
+        conditions = Where.parse(where) if isinstance(where, str) else where
+        asked = conditions, self.images, self.images.rows
+        if self._left_out[:3] != asked:
+            self._left_out = *asked, conditions.left_out(self.images, self.axes)
+        return self._left_out[3]
 
     @property
     def search_kind(self) -> str:
-        """How `search` searches: "exact", "hnsw" or "ivf-pq"."""
+        """How `search` searches: "exact", "hnsw" or "ivf-rabitq"."""
         return "exact" if self._approximate is None else self._approximate.kind
 
     @property
@@ -453,7 +372,9 @@ class Map:
         """Build the map's approximate search from its descriptors, where it is not there yet.
 
         Args:
-            kind: "hnsw" or "ivf-pq"; "exact" removes what there is.
+            kind: "hnsw" or "ivf-rabitq", of Milvus also "diskann"; "exact" removes what there is;
+                "auto" chooses by the size of the descriptors and the memory available, or by what
+                Milvus' version has, and a note says why.
             quiet: whether to show no progress bar.
 
         Returns:
@@ -461,9 +382,14 @@ class Map:
             an exact search.
 
         Raises:
-            InputError: an unknown kind, too few images, or a map of bits or in Milvus.
+            InputError: an unknown kind, one that Milvus lacks, or a map of bits.
         """
-        check_search(kind, self.metadata.store, self.metadata.dtype)
+        metadata = self.metadata
+        check_search(kind, metadata.store, metadata.dtype)
+        if kind == "auto" and metadata.store == "files":
+            size = len(self._segments), metadata.descriptor_length
+            kind, why = choose_search(*size, metadata.dtype)
+            warn(f"{self.folder}: --search auto takes {kind}: {why}")
         self._approximate = build_approximate(self.folder, kind, self._segments, quiet=quiet)
         return None if self._approximate is None else self._approximate.recall
 
@@ -473,6 +399,7 @@ class Map:
         k: int = 5,
         *,
         model: "Model | Runtime | None" = None,
+        where: Where | str | None = None,
     ) -> list[Answer]:
         """Find the images of the map that are most similar to one image.
 
@@ -484,6 +411,7 @@ class Map:
                 width, 1), such as ROS's mono8; or its file.
             k: number of answers; all where the map has fewer.
             model: the model that made the map; None loads it from where it was.
+            where: which images are searched, as `search` takes it.
 
         Returns:
             The answers, best first. Positions are in `axes`.
@@ -511,7 +439,7 @@ class Map:
 
         pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
         descriptor = describe_images(self.describer(model), [pixels])
-        found = self.search(self.shorten(descriptor), k)
+        found = self.search(self.shorten(descriptor), k, where=where)
         return ranked(self.images, found.indices[0], found.similarities[0])
 
     def similarities(self, queries: Queries) -> Float32[np.ndarray, "q n"]:
@@ -533,184 +461,17 @@ class Map:
         convert = to_bits if self.metadata.is_bits else as_unit_rows
         return convert(rows, name, self.metadata.descriptor_length)
 
-    def fitted(self, names: Iterable[str], positions: Positions | None) -> Positions | None:
-        """Return the positions of new images in the map's axes; None where none of them has one.
-
-        Raises:
-            InputError: they have no place there, see `Positions.fitted`.
-        """
-        if positions is None:
-            return None
-        of = {name: positions.of[name] for name in names if name in positions.of}
-        return positions._replace(of=of).fitted(self.folder, self.axes, self.zone) if of else None
-
-    def append(
-        self,
-        names: Sequence[str],
-        sizes: Sequence[int],
-        descriptors: Descriptors,
-        *,
-        root: str,
-        positions: Positions | None = None,
-    ) -> None:
-        """Append images: all of them are there for good once this returns, and none before.
-
-        Args:
-            names: relative to `root`, none of which the map has.
-            sizes: of their files, in bytes.
-            descriptors: unit vectors, or what else `search` takes; stored as the map's type.
-            root: the folder of these images.
-            positions: where they were taken, as far as that is known; those of another zone of UTM
-                become the map's.
-
-        Raises:
-            InputError: a name that is there already or twice, descriptors that are no unit vectors,
-                positions that have no place among the map's, a store that cannot be written to, or
-                a map that is no longer where it was opened.
-        """
-        self._check_there()
-        first = len(self._segments)
-        part = NewImages(names, sizes, descriptors, root, self.fitted(names, positions))
-        self._segments.append(*self._addition(part, self._numbers.keys()))
-        self._read_record(self._segments.records[-1], self._segments.paths[-1])
-        self._settle(first)
-
-    def change(
-        self,
-        verb: Literal["remove", "replace", "move", "merge"],
-        *,
-        removed: Iterable[int] = (),
-        moved: Positions | None = None,
-        added: Iterable["NewImages"] = (),
-    ) -> None:
-        """Remove, move and append images: all of it counts once this returns, and none before.
-
-        The images that are left have other numbers then.
-
-        Args:
-            verb: why. "replace" also removes the images that have the names of those that are
-                added.
-            removed: numbers of images.
-            moved: new positions, by the names of images; in other axes than the map's only where no
-                other image has one.
-            added: new images.
-
-        Raises:
-            InputError: no image would be left, more than `MOST_CHANGED` of them, or what `append`
-                raises.
-        """
-        self._check_there()
-        gone = set(removed)
-        stay = [image for number, image in enumerate(self.images) if number not in gone]
-        axes, zone, new = self.axes, self.zone, {}
-        if moved is not None:
-            moved = self.fitted_anew(moved)
-            axes, zone, new = moved.axes, moved.zone, moved.of
-        record = {
-            "verb": verb,
-            "changed": _now(),
-            "removed": [],
-            "moved": self._rows_of(self._numbers[name] for name in new),
-            "positions": list(new.values()),
-            "axes": axes,
-            "zone": zone,
-        }
-
-        def parts() -> Iterator[tuple[Mapping[str, Any], Descriptors]]:
-            taken = {image.name for image in stay}
-            for part in added:
-                if verb == "replace":
-                    gone.update(self._numbers[name] for name in part.names)
-                    taken.difference_update(part.names)
-                if part.positions is not None:
-                    positions = part.positions.fitted(
-                        part.source or part.root, record["axes"], record["zone"]
-                    )
-                    part = part._replace(positions=positions)
-                    record["axes"] = positions.axes
-                    record["zone"] = positions.zone or record["zone"]
-                yield self._addition(part, taken)
-                taken.update(part.names)
-            if not taken:
-                raise InputError(
-                    f"{self.folder}: found all its {len(self)} images to be removed, expected at "
-                    "least one to stay: a map without images is none, so remove its folder instead"
-                )
-            if len(gone) + len(new) > MOST_CHANGED:
-                raise InputError(
-                    f"{self.folder}: found a change of {len(gone) + len(new)} images, expected at "
-                    f"most {MOST_CHANGED} at a time"
-                )
-            record["removed"] = self._rows_of(sorted(gone))
-
-        known = len(self._segments.spans)
-        self._segments.change(record, parts())
-        for each in range(known, len(self._segments.spans)):
-            self._read_record(self._segments.records[each], self._segments.paths[each])
-        number = len(self._segments.changes) - 1
-        self._read_change(self._segments.changes[number], self._segments.change_path(number))
-        self._settle()
-
-    def fitted_anew(self, positions: Positions) -> Positions:
-        """Return new positions of images in the map's axes and zone; in their own if no other has.
-
-        Raises:
-            InputError: they have no place there, see `Positions.fitted`.
-        """
-        axes, zone = self.axes, self.zone
-        if positions.axes != axes and not any(
-            image.position is not None and image.name not in positions.of for image in self.images
-        ):
-            axes = zone = None
-        found = positions.fitted(self.folder, axes, zone)
-        return found._replace(zone=found.zone or zone)
-
-    def _rows_of(self, numbers: Iterable[int]) -> list[int]:
-        return self.removed.rows_of(np.fromiter(numbers, np.int64)).tolist()
-
     def positions_of(self, names: Iterable[str]) -> Positions | None:
         """Return the positions of some images; None where none of them has one."""
-        pairs = ((name, self.images[self._numbers[name]].position) for name in names)
-        of = {name: at for name, at in pairs if at is not None}
+        images = map(self.image, names)
+        of = {image.name: image.position for image in images if image and image.position}
         return Positions(self.axes, of, self.zone) if self.axes and of else None
-
-    def added(self, name: str) -> str | None:
-        """Return when the image of this name was described; None where its record does not say."""
-        (row,) = self._rows_of([self._numbers[name]])
-        after = bisect.bisect(self._parts, row, key=operator.itemgetter(2))
-        return self._parts[after - 1][0]
 
     def descriptors_of(self, names: Iterable[str]) -> Queries:
         """Read the descriptors of some images; of bits, unit vectors of the signs."""
-        rows = self._rows_of(self._numbers[name] for name in names)
-        found = self._segments[np.array(rows, np.int64)]
+        numbers = np.fromiter(map(self._number, names), np.int64)
+        found = self._segments[self.removed.rows_of(numbers)]
         return sign_vectors(found) if self.metadata.is_bits else found.astype(np.float32)
-
-    def _check_there(self) -> None:
-        if not self.exists:
-            raise InputError(f"{self.folder}: found the opened map gone, expected it in this place")
-
-    def _addition(
-        self, part: "NewImages", taken: Collection[str]
-    ) -> tuple[dict[str, Any], Descriptors]:
-        """Return the record of new images, whose names are not `taken`, and their descriptors."""
-        descriptors = self._rows("descriptors", part.descriptors)
-        if twice := len(part.names) - len(set(part.names).difference(taken)):
-            raise InputError(
-                f"{self.folder}: found {twice} of {len(part.names)} names twice, or in the map "
-                "already, expected new ones"
-            )
-        axes, known, zone = part.positions or (None, {}, None)
-        record = {
-            "root": part.root,
-            "added": part.added or _now(),
-            "axes": axes,
-            "zone": zone,
-            "names": list(part.names),
-            "bytes": list(part.sizes),
-            "positions": [known.get(name) for name in part.names],
-        }
-        return record, descriptors
 
     @property
     def descriptors(self) -> Iterator[Descriptors]:
@@ -721,23 +482,19 @@ class Map:
             if len(rows):
                 yield sign_vectors(rows) if self.metadata.is_bits else rows
 
-    def parts(self) -> Iterator["NewImages"]:
+    def parts(self) -> Iterator[NewImages]:
         """Yield the images that are left of each addition, to append them to another map."""
-        counts = self.removed.numbers_of(np.array([first for *_, first in self._parts], np.int64))
-        starts = [*counts.tolist(), len(self)]
         blocks = self.descriptors
-        for (added, root, _), start, end in zip(self._parts, starts[:-1], starts[1:], strict=True):
-            if start == end:
-                continue
-            names = [image.name for image in self.images[start:end]]
-            sizes = [image.bytes for image in self.images[start:end]]
-            positions = self.positions_of(names)
-            yield NewImages(names, sizes, next(blocks), root, positions, added, self.folder)
-
-    def as_stored(self, descriptors: Descriptors) -> Float32[np.ndarray, "n d"]:
-        """Round descriptors as the map stores them; of bits, unit vectors of the signs."""
-        rows = self._rows("descriptors", descriptors).astype(self.metadata.row[1], copy=False)
-        return sign_vectors(rows) if self.metadata.is_bits else rows.astype(np.float32, copy=False)
+        spans = zip(self.images.parts, itertools.pairwise(self.images.starts), strict=True)
+        for part, (start, end) in spans:
+            if start < end:
+                images = self.images[start:end]
+                names, sizes = [each.name for each in images], [each.bytes for each in images]
+                of = {each.name: each.position for each in images if each.position}
+                positions = Positions(self.axes, of, self.zone) if self.axes and of else None
+                yield NewImages(
+                    names, sizes, next(blocks), part.root, positions, part.added, self.folder
+                )
 
     def verify(self) -> None:
         """Read all descriptors, and compare them with the digests in the records.
@@ -765,7 +522,7 @@ class Map:
         metadata = self.metadata
         return {
             "images": len(self),
-            "removed": len(self._gone),
+            "removed": len(self.removed.rows),
             "positions": sum(image.position is not None for image in self.images),
             "axes": self.axes,
             **contents(self),
@@ -865,70 +622,3 @@ class Map:
     def close(self) -> None:
         """Close the store; a map that nothing refers to any more closes itself."""
         self._close()
-
-
-@contextlib.contextmanager
-def open_for_appending(
-    folder: str | os.PathLike[str], metadata: MapMetadata, components: Pca | None = None
-) -> Iterator[Map]:
-    """Open the map with this metadata to append to it, or make it, with its components.
-
-    One process at a time may append; others may search meanwhile. A map that a kill left without
-    images is made anew; one that an exception leaves without images is removed. A note tells of
-    descriptors without a record, which are removed.
-
-    Raises:
-        InputError: another process appends, the map there is another one or has lost a record of
-            images, what `Map.open` raises, or the folder cannot be written to.
-    """
-    folder = pathlib.Path(folder)
-    read_metadata(folder)  # raises where something else is there, before anything is made
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(made_folder(folder / SEGMENTS))
-        stack.enter_context(lock(folder))
-        existing = read_metadata(folder)
-        if existing is not None and existing != metadata:
-            raise InputError(f"{folder}: found another map than was expected here")
-        for each in (folder, folder / SEGMENTS):
-            remove_temporaries(each)
-        if existing is None:
-            remove_unrecorded(folder, 0)
-        try:
-            if existing is None:
-                if components is not None:
-                    save_pca(folder / COMPONENTS, components)
-                write_record(folder / METADATA, dataclasses.asdict(metadata), indent=2)
-            opened = stack.enter_context(Map._opened(folder, existing or metadata))
-            if existing is not None:
-                remove_unrecorded(folder, len(opened._segments))
-                if waiting := opened._segments.remove_waiting():
-                    warn(
-                        f"{folder}: {counted(waiting, 'addition')} of an unfinished change removed"
-                    )
-            yield opened
-        except BaseException:
-            if not has_images(folder):
-                for name in (METADATA, COMPONENTS):
-                    (folder / name).unlink(missing_ok=True)
-                for path in (folder / SEGMENTS).glob("[0-9]*.npy"):
-                    path.unlink()
-            raise
-
-
-def _now() -> str:
-    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-
-
-def _axes_in(record: Mapping[str, Any]) -> tuple[tuple[str, str] | None, Zone | None]:
-    """Return the axes and the zone that a record states."""
-    axes = record["axes"] and (record["axes"][0], record["axes"][1])
-    return axes, record["zone"] and Zone(int(record["zone"][0]), bool(record["zone"][1]))
-
-
-def _inside(name: object) -> str:
-    """Return the name of an image, which is below its root; raise ValueError where it is not."""
-    name = str(name)
-    path = pathlib.PurePosixPath(name)
-    if path.is_absolute() or ".." in path.parts:
-        raise ValueError(f"found name {name!r}, expected one below the folder of images")
-    return name

@@ -1,21 +1,30 @@
-"""Descriptors in Milvus: a server, or milvus-lite in this process, by the same code."""
+"""Descriptors in Milvus: a server, or milvus-lite in this process, by the same code.
+
+Rows are upserted, so that a call whose acknowledgement was lost can be made again. Milvus has
+written an acknowledged row to its log; searches here are of what was acknowledged before.
+"""
 
 import contextlib
 import logging
 import os
 import pathlib
+import re
+import time
 import urllib.parse
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from crisalad_jax.retrieval.bits import Bits
-from crisalad_jax.retrieval.chunks import Descriptors, Queries
+from crisalad_jax.retrieval.chunks import Block, Descriptors, Queries
+from crisalad_jax.retrieval.maps.milvus_filter import among, columns_of, left_in
 from crisalad_jax.retrieval.maps.removed import NONE, Removed
-from crisalad_jax.retrieval.neighbours import Neighbours
+from crisalad_jax.retrieval.neighbours import Neighbours, nearest
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
+from crisalad_jax.utils.output import warn, warn_once
+from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Float, Int64
 
 TOKEN = "CRISALAD_MILVUS_TOKEN"
@@ -24,8 +33,55 @@ TOKEN = "CRISALAD_MILVUS_TOKEN"
 _MESSAGE_BYTES = 2**24
 _MOST = 16384
 """Largest number of neighbours, of queries at once, and of returned rows that Milvus allows."""
+_CONNECT = 10.0
+"""Seconds to wait for a connection."""
+_ANSWER = 120.0
+"""Seconds to wait for an answer, with a server that restarts in between."""
+_STALLED = 1800.0
+"""Seconds without progress after which an index is no longer waited for: a segment of a GB takes
+some minutes."""
+_PASSING = (2, 101, 103, 106, 503, 700)
+"""Milvus' codes, of those that it does not call retriable, of a server that is coming back: no
+connection; a collection that is not loaded, or whose index is being made; a channel."""
 # The last one logs a call that milvus-lite lacks, whose failure the client expects.
-_LOGS = ("pymilvus.decorators", "milvus_lite.server_manager", "grpc._server")
+_LOGS = ("pymilvus.decorators", "pymilvus.client", "milvus_lite.server_manager", "grpc._server")
+
+
+class _Kind(NamedTuple):
+    """An index of Milvus."""
+
+    name: str
+    since: tuple[int, ...]
+    """The first version that has it, of which milvus-lite's is (0,)."""
+    build: Mapping[str, Any] = {}
+    search: Callable[[int], Mapping[str, Any]] = lambda _: {}
+    """Returns parameters of a search for k neighbours."""
+
+
+KINDS = {
+    "exact": _Kind("FLAT", (0,)),
+    "hnsw": _Kind(
+        "HNSW", (0,), {"M": 32, "efConstruction": 128}, lambda k: {"ef": max(128, 2 * k)}
+    ),
+    "ivf-rabitq": _Kind(
+        "IVF_RABITQ",
+        (2, 6),
+        {"nlist": 1024, "refine": True, "refine_type": "SQ8"},
+        lambda _: {"nprobe": 64, "refine_k": 4},
+    ),
+    "diskann": _Kind("DISKANN", (2, 2), {}, lambda k: {"search_list": max(128, 2 * k)}),
+}
+"""How Milvus searches: comparing all, in memory; a graph, in memory; codes of a bit and a byte for
+each dimension, in memory; a graph on the disk. Of HNSW the numbers are those of maps in files."""
+_FEW, _GRAPH_BYTES = 50_000, 2**34
+"""Largest number of descriptors that are compared one by one, and size of those in a graph."""
+
+
+def choose_kind(count: int, length: int, version: tuple[int, ...]) -> str:
+    """Choose the index of `count` descriptors of this length, of those that Milvus' version has."""
+    kinds = [kind for kind in ("ivf-rabitq", "diskann") if KINDS[kind].since <= version]
+    small = "exact" if count <= _FEW else "hnsw"
+    return small if 4 * count * length <= _GRAPH_BYTES or not kinds else kinds[0]
 
 
 def check_address(address: str) -> bool:
@@ -49,23 +105,8 @@ def check_address(address: str) -> bool:
     return False
 
 
-@contextlib.contextmanager
-def _one_line(address: str) -> Iterator[None]:
-    """Turn Milvus' errors into one line."""
-    import grpc
-    import pymilvus
-
-    try:
-        yield
-    except (pymilvus.MilvusException, grpc.RpcError) as error:
-        words = getattr(error, "message", None) or str(error)
-        if "Open local milvus failed" in words:
-            words += " (damaged, or another process has it open)"
-        raise InputError(f"{address}: Milvus says: {' '.join(words.split())}") from error
-
-
 class MilvusStore:
-    """A `Store` in a collection of Milvus with the index FLAT, which is exact."""
+    """A `Store` in a collection of Milvus."""
 
     def __init__(self, address: str, collection: str, length: int, *, new: bool) -> None:
         """Connect to `address`, and make the collection if it is `new`."""
@@ -79,81 +120,203 @@ class MilvusStore:
             raise InputError(missing_extra(error, "store milvus")) from error
         for name in _LOGS:
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # its errors are raised
-        self._address, self._collection = address, collection
+        self._address, self._collection, self._length = address, collection, length
         self._rows = max(1, min(_MOST, _MESSAGE_BYTES // (4 * length)))
+        self.size = 0
+        """Number of descriptors that are searched: those that count."""
+        self._since: int | None = None
+        """Milvus' time after the last acknowledged addition; None is not known yet."""
+        self._loaded = False
         path = pathlib.Path(address)
         if self._is_file and new:
             path.parent.mkdir(parents=True, exist_ok=True)
         if self._is_file and not new and not path.exists():
             raise InputError(f"{address}: found nothing, expected the descriptors of this map")
-        with _one_line(address):
-            self._client = pymilvus.MilvusClient(address, token=os.environ.get(TOKEN, ""))
-            if new:
-                self._client.drop_collection(collection)
-                self._create(length)
-            elif not self._client.has_collection(collection):
-                raise InputError(
-                    f"{address}: found no collection {collection}, expected it with the "
-                    "descriptors of this map"
-                )
-            self._load()
+        with self._one_line("connecting"):
+            token = os.environ.get(TOKEN, "")
+            self._client: Any = pymilvus.MilvusClient(address, token=token, timeout=_CONNECT)
+            self._server: str = self._client.get_server_version(timeout=_CONNECT)
+        numbers = re.findall(r"\d+", self._server)[:3]
+        self._version = (0,) if self._is_file else tuple(map(int, numbers))
+        self.kind = "exact"
+        """Of `KINDS`."""
+        if new:
+            self._ask("removing what a kill left", "drop_collection")
+            self._create()
+        elif not self._ask("looking for the map", "has_collection"):
+            raise InputError(
+                f"{address}: found no collection {collection}, expected it with the "
+                "descriptors of this map"
+            )
+        elif found := self._ask("asking for its index", "describe_index", index_name="descriptor"):
+            names = {each.name: kind for kind, each in KINDS.items()}
+            self.kind = names[found["index_type"]]
+        else:  # killed while the index was changed
+            self._make_index()
 
-    def _create(self, length: int) -> None:
+    @contextlib.contextmanager
+    def _one_line(self, doing: str) -> Iterator[None]:
+        """Turn Milvus' errors into one line."""
+        import grpc
+        import pymilvus
+
+        try:
+            yield
+        except (pymilvus.MilvusException, grpc.RpcError) as error:
+            words = getattr(error, "message", None) or str(error)
+            if isinstance(error, grpc.RpcError):
+                words = f"no answer in time, {error.code().name}"  # pyright: ignore
+            if "Open local milvus failed" in words:
+                words += " (damaged, or another process has it open)"
+            words = " ".join(words.split())
+            raise InputError(f"{self._address}: Milvus says: {words} (while {doing})") from error
+
+    def _ask(self, doing: str, method: str, *, wait: float = 0, **options: Any) -> Any:
+        """Call a method of the client; again where a server is coming back.
+
+        Raises:
+            InputError: Milvus refuses, or does not come back in `_ANSWER` seconds.
+        """
+        import grpc
+        import pymilvus
+
+        end, wait = None, wait or _ANSWER
+        while True:
+            with self._one_line(doing):
+                try:
+                    call = getattr(self._client, method)
+                    return call(self._collection, timeout=wait, **options)
+                except pymilvus.MilvusException as error:
+                    end = end or time.monotonic() + _ANSWER
+                    # 2.3 has no code for parts of it that do not find each other yet.
+                    passes = error.retriable or "unrecoverable error" in error.message
+                    passes |= error.code in _PASSING
+                    if not passes or self._is_file or time.monotonic() > end:
+                        raise
+                    words = f"Milvus says {error.message}; waiting for up to {_ANSWER:g} s"
+                    warn_once(self._address, " ".join(words.split()))
+            time.sleep(0.5)
+            wait = max(1.0, end - time.monotonic())
+            if self._loaded:
+                with contextlib.suppress(pymilvus.MilvusException, grpc.RpcError):
+                    self._client.load_collection(self._collection, timeout=wait)
+
+    def _create(self) -> None:
         from pymilvus import DataType
 
         schema = self._client.create_schema(auto_id=False, enable_dynamic_field=False)
         schema.add_field("id", DataType.INT64, is_primary=True)
-        schema.add_field("descriptor", DataType.FLOAT_VECTOR, dim=length)
-        self._client.create_collection(
-            self._collection, schema=schema, index_params=self._flat(), consistency_level="Strong"
-        )
+        schema.add_field("name", DataType.VARCHAR, max_length=65535)
+        for name in ("added", "taken", "x", "y"):
+            schema.add_field(name, DataType.DOUBLE)
+        schema.add_field("descriptor", DataType.FLOAT_VECTOR, dim=self._length)
+        options = {"schema": schema, "consistency_level": "Strong"}
+        self._ask("making a collection", "create_collection", **options)
+        self._make_index()
 
-    def _flat(self) -> Any:
-        index = self._client.prepare_index_params()
-        index.add_index("descriptor", index_type="FLAT", metric_type="IP")
-        return index
+    def _make_index(self) -> None:
+        index, (name, _, build, _) = self._client.prepare_index_params(), KINDS[self.kind]
+        index.add_index("descriptor", index_type=name, metric_type="IP", params=dict(build))
+        self._ask("making an index", "create_index", index_params=index, sync=False)
+
+    def _drop_index(self) -> None:
+        self._loaded = False
+        self._ask("removing an index", "release_collection")
+        self._ask("removing an index", "drop_index", index_name="descriptor")
 
     def _load(self) -> None:
-        import pymilvus
-
+        if self._loaded:
+            return
         try:
-            self._client.load_collection(self._collection)
-        except pymilvus.MilvusException:
+            self._ask("loading descriptors", "load_collection", wait=_STALLED)
+        except InputError:
             if not self._is_file:
                 raise
             # milvus-lite writes an index in place: one that a kill cut short never loads again. It
             # can be rebuilt from the descriptors.
-            self._client.release_collection(self._collection)
-            self._client.drop_index(self._collection, "descriptor")
-            self._client.create_index(self._collection, self._flat())
-            self._client.load_collection(self._collection)
+            self._drop_index()
+            self._make_index()
+            self._ask("loading descriptors", "load_collection")
+        self._loaded = True
 
-    def add(self, first: int, descriptors: Descriptors) -> None:
+    def build(self, kind: str, *, quiet: bool = True) -> None:
+        """Make the index of all descriptors, and of those that are added later.
+
+        Searches, also of other processes, wait until it is there.
+
+        Args:
+            kind: of `KINDS`, or "auto", as `choose_kind` does.
+            quiet: no progress bar.
+
+        Raises:
+            InputError: this server does not have it, or fails.
+        """
+        if kind == "auto":
+            kind = choose_kind(self.size, self._length, self._version)
+            what = f"{self.size} descriptors of {self._length} numbers, Milvus {self._server}"
+            warn(f"{self._address}: --search auto takes {kind}: {what}")
+        known = [name for name, each in KINDS.items() if each.since <= self._version]
+        if kind not in known:
+            raise InputError(
+                f"search: found {kind}, expected {' or '.join(known)}, which {self._server} has"
+            )
+        self._ask("writing descriptors", "flush", wait=_STALLED)
+        if kind != self.kind:
+            self._drop_index()
+            self.kind = kind
+            self._make_index()
+        with progress_bar("indexed", self.size, "descriptors", quiet=quiet) as bar:
+            rows, last = 0, time.monotonic()
+            while True:
+                found = self._ask("indexing", "describe_index", index_name="descriptor")
+                if found["indexed_rows"] != rows:
+                    bar.advance(found["indexed_rows"] - rows)
+                    rows, last = found["indexed_rows"], time.monotonic()
+                if found["state"] == "Finished" and not found["pending_index_rows"]:
+                    break
+                if found["state"] == "Failed" or time.monotonic() - last > _STALLED:
+                    raise InputError(
+                        f"{self._address}: found the index of {self._collection} "
+                        f"{found['state']} at {rows} of {found['total_rows']} descriptors"
+                    )
+                time.sleep(0.2)
+        self._load()
+
+    def add(self, first: int, descriptors: Descriptors, record: Mapping[str, Any]) -> None:
         """Upsert descriptors by number; see `Store.add`."""
-        rows = np.ascontiguousarray(descriptors, np.float32)
-        with _one_line(self._address):
-            for start in range(0, len(rows), self._rows):
-                part = enumerate(rows[start : start + self._rows], first + start)
-                data = [{"id": number, "descriptor": row} for number, row in part]
-                self._client.upsert(self._collection, data)
-            self._client.flush(self._collection)
+        numbers = range(first, first + len(descriptors))
+        columns = {"id": numbers, "descriptor": np.asarray(descriptors, np.float32)}
+        columns |= columns_of(record)
+        for start in range(0, len(numbers), self._rows):
+            parts = (column[start : start + self._rows] for column in columns.values())
+            data = [dict(zip(columns, row, strict=True)) for row in zip(*parts, strict=True)]
+            self._ask(f"adding descriptors from {numbers[start]} on", "upsert", data=data)
+        if self._is_file:  # a server has written them to its log
+            self._ask("writing descriptors", "flush")
+        self.size, self._since = numbers.stop, None
 
     def check(self, segments: Sequence[tuple[int, int]]) -> None:
         """Count the stored descriptors; see `Store.check`."""
-        expected = sum(count for _, count in segments)
-        (answer,) = self._fetch(f"id < {expected}", "count(*)")
+        self.size = expected = sum(count for _, count in segments)
+        if not expected:  # a new map is loaded once it is searched
+            return
+        condition, fields = f"id < {expected}", ["count(*)"]
+        (answer,) = self._fetch("counting descriptors", "query", condition, output_fields=fields)
         if (stored := answer["count(*)"]) != expected:
             raise InputError(
                 f"{self._address}: found {stored} descriptors in {self._collection}, expected "
                 f"{expected}, as many as the map has images"
             )
 
-    def _fetch(self, condition: str, *fields: str) -> list[dict[str, Any]]:
-        with _one_line(self._address):
-            found = self._client.query(
-                self._collection, filter=condition, output_fields=list(fields)
-            )
-        return list(found)
+    def _fetch(self, doing: str, method: str, condition: str, **options: Any) -> Any:
+        """Query or search; all is seen that was acknowledged before the first call."""
+        self._load()
+        if self._since is None:
+            with self._one_line("asking for its time"):
+                self._since = self._client._get_connection().alloc_timestamp(timeout=_ANSWER)
+        # "Strong" would wait for Milvus' next tick each time, 0.2 s and more.
+        options |= {"consistency_level": "Customized", "guarantee_timestamp": self._since}
+        return self._ask(doing, method, filter=condition, **options)
 
     def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
         """Fetch the descriptors of one addition; see `Store.read`."""
@@ -161,52 +324,90 @@ class MilvusStore:
 
     def rows(self, numbers: Int64[np.ndarray, " n"]) -> Descriptors:
         """Fetch the descriptors of these numbers; see `Store.rows`."""
-        found: dict[int, Any] = {}
+        found = np.empty((len(numbers), self._length), np.float32)
+        order = np.argsort(numbers)
         for start in range(0, len(numbers), self._rows):
-            some = numbers[start : start + self._rows].tolist()
-            part = self._fetch(f"id in {some}", "id", "descriptor")
-            found |= {row["id"]: row["descriptor"] for row in part}
-        return np.array([found[number] for number in numbers.tolist()], np.float32)
+            places = order[start : start + self._rows]
+            some = numbers[places]
+            fields = {"output_fields": ["id", "descriptor"]}
+            part = self._fetch("reading descriptors", "query", among(some), **fields)
+            read = np.array([row["descriptor"] for row in part], np.float32)
+            ids = np.array([row["id"] for row in part])
+            if not np.isin(some, ids).all():
+                raise InputError(
+                    f"{self._address}: found {len(ids)} of {len(some)} descriptors in "
+                    f"{self._collection}, expected all of them"
+                )
+            by_id = np.argsort(ids)
+            found[places] = read[by_id[np.searchsorted(ids, some, sorter=by_id)]]
+        return found
 
     def drop(self, first: int) -> None:
-        """Do nothing, as the next addition overwrites them; see `Store.drop`."""
+        """Count no more than these, as the next addition overwrites others; see `Store.drop`."""
+        self.size = min(self.size, first)
 
     def search(
         self, queries: Queries | Bits, k: int, count: int, removed: Removed = NONE
     ) -> Neighbours:
-        """Find the k most similar descriptors of each query; see `Store.search`."""
-        condition, left = f"id < {count}", count - len(removed.rows)
-        if left < count:
-            condition += f" and id not in {removed.rows.tolist()}"
+        """Find the k most similar descriptors of each query; see `Store.search`.
+
+        Milvus does it with its index FLAT; with others all descriptors are read.
+        """
         if k > _MOST:
             raise InputError(f"k: found {k}, expected at most {_MOST}, of which Milvus gives")
-
-        def ask(queries: Queries, k: int) -> Neighbours:
-            # Answers are bounded too: 12 bytes for each neighbour, and 8 for its number again.
-            size = max(1, min(self._rows, _MESSAGE_BYTES // (20 * k)))
-            found: list[list[dict[str, Any]]] = []
-            with _one_line(self._address):
-                for start in range(0, len(queries), size):
-                    found += self._client.search(
-                        self._collection,
-                        data=list(queries[start : start + size]),
-                        limit=k,
-                        filter=condition,
-                        # milvus-lite reads an empty list as all fields, descriptors included.
-                        output_fields=["id"],
-                        search_params={"metric_type": "IP"},
-                    )
-            return Neighbours(
-                np.array([[hit["id"] for hit in hits] for hits in found], np.int64),
-                np.array([[hit["distance"] for hit in hits] for hits in found], np.float32),
-            )
-
-        found = break_ties(ask, queries, k, min(left, _MOST))
+        if self.kind != "exact":
+            return self._search_here(queries, k, count, removed)
+        left = min(count - len(removed.rows), _MOST)
+        found = break_ties(lambda some, k: self.ask(some, k, removed, count), queries, k, left)
         return found._replace(indices=removed.numbers_of(found.indices))
+
+    def _search_here(self, queries: Queries, k: int, count: int, removed: Removed) -> Neighbours:
+        def read(numbers: Int64[np.ndarray, " n"]) -> Descriptors:
+            return self.rows(removed.rows_of(numbers))
+
+        def stream() -> Generator[Block]:
+            left = np.arange(count - len(removed.rows))
+            for start in range(0, len(left), self._rows):
+                yield Block(start, read(left[start : start + self._rows]))
+
+        return nearest(stream, queries, k, read, self._rows)
+
+    def ask(
+        self, queries: Queries, k: int, removed: Removed, count: int | None = None
+    ) -> Neighbours:
+        """Search by Milvus' index; where it finds fewer than k, the last numbers are -1.
+
+        Args:
+            queries: unit descriptors.
+            k: neighbours of each.
+            removed: rows that are left out.
+            count: number of descriptors, those included; None is all that count.
+        """
+        k = min(k, _MOST)
+        condition = left_in(self.size if count is None else count, removed)
+        # Answers are bounded too: 12 bytes for each neighbour, and 8 for its number again.
+        size = max(1, min(self._rows, _MESSAGE_BYTES // (20 * k)))
+        indices = np.full((len(queries), k), -1, np.int64)
+        similarities = np.full((len(queries), k), -np.inf, np.float32)
+        for start in range(0, len(queries), size):
+            found = self._fetch(
+                "searching",
+                "search",
+                condition,
+                data=list(queries[start : start + size]),
+                limit=k,
+                # milvus-lite reads an empty list as all fields, descriptors included.
+                output_fields=["id"],
+                search_params={"metric_type": "IP", "params": dict(KINDS[self.kind].search(k))},
+            )
+            for row, hits in enumerate(found, start):
+                indices[row, : len(hits)] = [hit["id"] for hit in hits]
+                similarities[row, : len(hits)] = [hit["distance"] for hit in hits]
+        return Neighbours(indices, similarities)
 
     def close(self) -> None:
         """Disconnect; other processes may then open the file."""
-        with _one_line(self._address):
+        with self._one_line("disconnecting"):
             self._client.close()
         if self._is_file:
             from milvus_lite.server_manager import server_manager_instance

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from crisalad_jax.data.sources import ImageSource, sequence_of
-from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.appending import AppendableMap
 from crisalad_jax.retrieval.segments import write_record
 from crisalad_jax.utils.files import read_json
 from crisalad_jax.utils.shapes import Bool, Float32
@@ -22,7 +22,7 @@ SIMILAR = "similar"
 class Novelty:
     """Chooses which images of a source a map takes, in order, as they are described."""
 
-    def __init__(self, target: Map, source: ImageSource, root: str, most: float) -> None:
+    def __init__(self, target: AppendableMap, source: ImageSource, root: str, most: float) -> None:
         """Read what was left out before.
 
         Args:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
-from crisalad_jax.config.checks import check_count, takes
+from crisalad_jax.config.checks import check_count, require, takes
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.frames import frame_time
 from crisalad_jax.data.images import read_pixels
@@ -25,9 +25,11 @@ from crisalad_jax.retrieval.describe import (
     shown,
 )
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
-from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage, ranked
+from crisalad_jax.retrieval.maps.images import MapImage
+from crisalad_jax.retrieval.maps.map import Answer, Map, ranked
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch, SequenceTracker, TrackResult
 from crisalad_jax.retrieval.maps.verified import calibration_of, verify_answers
+from crisalad_jax.retrieval.maps.where import Where
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.verification.results import MapPose, Verification
 from crisalad_jax.retrieval.verification.verify import Verifier, Verify
@@ -134,6 +136,7 @@ def query(
     exact: bool = False,
     min_similarity: float | None = None,
     sequence: SequenceSearch | None = None,
+    where: Where | str | None = None,
     verify: Verify | None = None,
     reading: Reading = Reading(),
 ) -> Answers:
@@ -155,6 +158,8 @@ def query(
             `Answers.known`. None is what `calibrate` measured, and any where it did not; -1 is any.
         sequence: a filter over the map's images in their order, where queries are consecutive
             frames of one camera; None takes every query for itself.
+        where: which images of the map are searched, such as "folder=monday, added>=2026-05-01"
+            (`Where.parse`); None is all, as with `sequence`.
         verify: how the best answers are verified by local features, and put in order by their
             inliers (docs/verification.md); None leaves them by similarity.
         reading: how images are read.
@@ -187,7 +192,7 @@ def query(
     root, sources = _below_one_root(open_sources(images, **how, position_topic="none"))
     paths = list(itertools.chain(*sources))
     describer = places.describer(model, groupings=["single" if window == 1 else "window"])
-    ask = asking(places, found_at_least(k, verifier), sequence, exact=exact)
+    ask = asking(places, found_at_least(k, verifier), sequence, where, exact=exact)
     reading, components = reading.fitted(len(paths)), places.components
     stream = described_sources(describer, sources, reading, window=window, components=components)
     found: list[Sequence[np.ndarray]] = []
@@ -217,10 +222,26 @@ Ask = Callable[[Float32[np.ndarray, "query d"], Sequence[pathlib.Path]], Neighbo
 """Finds the answers to described images, given their names too."""
 
 
-def asking(places: Map, k: int, sequence: SequenceSearch | None, *, exact: bool = False) -> Ask:
-    """Return what asks a map for k answers: its search, or a filter over consecutive frames."""
+def asking(
+    places: Map,
+    k: int,
+    sequence: SequenceSearch | None,
+    where: Where | str | None,
+    *,
+    exact: bool = False,
+) -> Ask:
+    """Return what asks a map for k answers: its search, or a filter over consecutive frames.
+
+    Raises:
+        InputError: conditions that no image meets, or for such a filter, which is of all images.
+    """
+    if where is not None:
+        require(
+            sequence is None, f"where: found {where} with a sequence, expected only one of both"
+        )
+        places.left_out(where)
     if sequence is None:
-        return lambda descriptors, _: places.search(descriptors, k, exact=exact)
+        return lambda descriptors, _: places.search(descriptors, k, exact=exact, where=where)
     tracker = SequenceTracker(places, sequence)
     return lambda descriptors, frames: tracker.answer(descriptors, k, frames)
 

@@ -1,10 +1,13 @@
 """Rows of a store that were removed from its map, and the numbers of those that are left."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from crisalad_jax.utils.shapes import Int64
+
+if TYPE_CHECKING:
+    from crisalad_jax.retrieval.maps.where import Where
 
 
 class Removed(NamedTuple):
@@ -12,6 +15,14 @@ class Removed(NamedTuple):
 
     rows: Int64[np.ndarray, " removed"] = np.empty(0, np.int64)
     """In ascending order."""
+    asked: "tuple[Where, Int64[np.ndarray, ' removed']] | None" = None
+    """Conditions on images as they were added that leave the same in, where some rows are removed:
+    what a database is asked. None where there are none."""
+
+    def has(self, row: int) -> bool:
+        """Return whether a row was removed."""
+        place = int(np.searchsorted(self.rows, row))
+        return place < len(self.rows) and self.rows[place] == row
 
     def numbers_of(self, rows: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
         """Return the number of each row that is left."""

@@ -6,8 +6,8 @@ addition overwrites them.
 """
 
 import pathlib
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -29,8 +29,14 @@ _MILVUS = "milvus:"
 class Store(Protocol):
     """Descriptors by number. Each method raises InputError where the store is damaged or gone."""
 
-    def add(self, first: int, descriptors: Descriptors) -> None:
-        """Write descriptors as numbers `first` and on; they are durable once this returns."""
+    def add(self, first: int, descriptors: Descriptors, record: Mapping[str, Any]) -> None:
+        """Write descriptors as numbers `first` and on; they are durable once this returns.
+
+        Args:
+            first: number of the first.
+            descriptors: in order.
+            record: of their images, which conditions of a search are about.
+        """
 
     def check(self, segments: Sequence[tuple[int, int]]) -> None:
         """Check, without reading them, that all additions, as (first, count), are there."""

@@ -8,7 +8,8 @@ import numpy as np
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import AXES
 from crisalad_jax.retrieval.maps.calibration import VERIFIED, Calibration, read_calibration
-from crisalad_jax.retrieval.maps.map import Map, MapImage
+from crisalad_jax.retrieval.maps.images import MapImage
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.verification.results import MapPose, Verification
 from crisalad_jax.retrieval.verification.verify import Verifier, order_by_inliers
 from crisalad_jax.utils.output import warn

@@ -16,7 +16,7 @@ import re
 import secrets
 import sys
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any
 
@@ -38,9 +38,10 @@ from crisalad_jax.data.positions import AXES, MOST_METRES, Positions, exif_posit
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.data.tables import number_of
 from crisalad_jax.retrieval.describe import prepare_image
-from crisalad_jax.retrieval.maps.map import Answer, Map, MapImage
+from crisalad_jax.retrieval.maps.map import Answer, Map
 from crisalad_jax.retrieval.maps.query import answer_fields, asked_thresholds, position_fields
 from crisalad_jax.retrieval.maps.verified import verify_answers
+from crisalad_jax.retrieval.maps.where import Where
 from crisalad_jax.retrieval.serve.pictures import (
     check_new_name,
     check_picture,
@@ -165,7 +166,7 @@ class Health:
     model: str
     """Digest of the model that made the map."""
     search: str
-    """exact, hnsw or ivf-pq."""
+    """exact, hnsw or ivf-rabitq."""
     stale_search: str | None
     """An approximate search that lacks images and is not used; build it again. Else null."""
     uptime_s: float
@@ -205,6 +206,8 @@ class _Asked(pydantic.BaseModel, extra="forbid"):
     """Number of answers; by default the service's, see /map."""
     verify: int | None = pydantic.Field(None, ge=0, le=MOST_ANSWERS)
     """Number of best answers that are verified; by default the service's, of --rerank."""
+    where: str | None = None
+    """Conditions on the images that are searched, as of `crisalad query --where`."""
 
 
 def _plain(text: str) -> str:
@@ -362,17 +365,17 @@ def make_app(
     def describe_map(_: _Nothing) -> Places:
         """Tell how large the map is, and where its images were taken."""
         places = worker.places
-        known = [
-            (int(row), *image.position)
-            for row, image in zip(*_by_row(places), strict=True)
-            if image.position is not None
-        ]
+        positions, gone = places.images.positions, places.removed.rows  # by row
+        is_known = ~np.isnan(positions[:, 0])
+        is_known[gone] = False
+        known = np.flatnonzero(is_known)
+        shown = known[:: -(-len(known) // _DOTS) or 1]
         return Places(
             name=printable(places.folder.resolve().name),
             images=len(places),
             axes=places.axes,
             zone=None if places.zone is None else str(places.zone),
-            positions=known[:: -(-len(known) // _DOTS) or 1],
+            positions=[(row, *positions[row].tolist()) for row in shown.tolist()],
             positions_known=len(known),
             appends=appends,
             k=k,
@@ -408,7 +411,8 @@ def make_app(
                 count = asked.verify
                 if count and verifier is None:
                     raise InputError("verify: found in a service without --rerank, expected none")
-            question = Question(await prepare(data, name), max(answers, count))
+            where = None if asked.where is None else Where.parse(asked.where)
+            question = Question(await prepare(data, name), max(answers, count), where)
             places, found = await asyncio.wrap_future(worker.submit(question))
             best, checks = found[0][1], []
             if verifier is not None and count:
@@ -470,12 +474,6 @@ def make_app(
 
 def _row(places: Map, number: int) -> int:
     return int(places.removed.rows_of(np.array(number)))
-
-
-def _by_row(places: Map) -> tuple[Sequence[int], list[MapImage]]:
-    """List images, of which others may be appended meanwhile, and their rows."""
-    images = places.images[:]
-    return places.removed.rows_of(np.arange(len(images))).tolist(), images
 
 
 def _verified(

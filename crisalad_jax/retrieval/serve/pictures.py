@@ -17,7 +17,8 @@ from crisalad_jax.data.frames import frame_time
 from crisalad_jax.data.images import IMAGE_SUFFIXES, jpeg_scans, read_image
 from crisalad_jax.data.remote import size_of
 from crisalad_jax.data.resize import resize_image
-from crisalad_jax.retrieval.maps.map import Map, MapImage
+from crisalad_jax.retrieval.maps.images import MapImage
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.serve.worker import ADDED
 from crisalad_jax.utils.errors import InputError
 
@@ -133,7 +134,7 @@ def image_in(places: Map, row: int) -> MapImage:
     if not 0 <= number < len(places):
         last = places.removed.rows_of(np.array(len(places) - 1))
         raise InputError(f"number: found {row}, expected 0 to {last}")
-    if row in places.removed.rows:
+    if places.removed.has(row):
         raise InputError(f"number: found {row}, which was removed from the map")
     return places.images[number]
 

@@ -11,7 +11,7 @@ from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.experiments import report
 from crisalad_jax.experiments.report.gallery import _half_right
-from crisalad_jax.retrieval.maps.map import MapImage
+from crisalad_jax.retrieval.maps.images import MapImage
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError

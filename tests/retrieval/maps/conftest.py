@@ -10,6 +10,7 @@ from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, query
 from tests.conftest import MODEL, read_options
+from tests.retrieval.maps.milvus_server import Server
 
 
 @pytest.fixture(scope="session")
@@ -26,3 +27,10 @@ def ask(folder: pathlib.Path, params: Crisalad, images, **options) -> Answers:
     """Query a map, quietly, with its model."""
     with Map.open(folder) as places:
         return query(places, images, model=Model(params, places.config), **read_options(options))
+
+
+@pytest.fixture(scope="session")
+def milvus_server(tmp_path_factory):
+    server = Server(tmp_path_factory.mktemp("milvus"))
+    yield server
+    server.kill()

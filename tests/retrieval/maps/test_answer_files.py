@@ -15,7 +15,7 @@ import pytest
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import read_image_table
 from crisalad_jax.retrieval.maps.answer_files import write_answers
-from crisalad_jax.retrieval.maps.map import MapImage
+from crisalad_jax.retrieval.maps.images import MapImage
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.errors import InputError

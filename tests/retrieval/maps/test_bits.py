@@ -13,8 +13,9 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.calibrate import calibrate
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.build import index
-from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL, describe_single, random_params, read_options

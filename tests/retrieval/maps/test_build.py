@@ -15,9 +15,10 @@ from crisalad_jax.data.positions import Positions, utm_positions
 from crisalad_jax.data.sources import ImageSource
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.describer import describer_of
+from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.build import Indexed, _Indexing
 from crisalad_jax.retrieval.maps.build import index as index_source
-from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.metadata import new_metadata
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL, read_options

@@ -17,7 +17,8 @@ import pytest
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.nn.model import Model
-from crisalad_jax.retrieval.maps import map as maps
+from crisalad_jax.retrieval.maps import appending
+from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.corrections import (
     MapChange,
@@ -26,7 +27,8 @@ from crisalad_jax.retrieval.maps.corrections import (
     remove_images,
     replace_images,
 )
-from crisalad_jax.retrieval.maps.map import Map, NewImages, open_for_appending
+from crisalad_jax.retrieval.maps.images import NewImages
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.removed import Removed
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
@@ -200,7 +202,7 @@ def test_a_map_after_any_changes_is_that_of_the_images_that_are_left(tmp_path, s
 
 def test_images_are_removed_by_name_pattern_day_and_addition(tmp_path, monkeypatch):
     days = iter(["2026-05-01", "2026-05-02", "2026-05-02"])
-    monkeypatch.setattr(maps, "_now", lambda: f"{next(days)}T10:00:00+00:00")
+    monkeypatch.setattr(appending, "_now", lambda: f"{next(days)}T10:00:00+00:00")
     folder = tmp_path / "map"
     with open_for_appending(folder, metadata("files")) as target:
         for first, root in ((0, "/a"), (3, "/a"), (6, "/b")):
@@ -591,7 +593,7 @@ def test_one_other_byte_in_a_record_of_a_change_is_refused(changed, name):
         (lambda m: reseal(m / CHANGE, changed=1), f"{CHANGE}: not a whole record of a change: Typ"),
         (
             lambda m: reseal(m / "segments/0000000008.0000000002.json", names=["0.jpg"]),
-            "0000000008.0000000002.json: not a whole record of images: a name stands twice",
+            "0000000008.0000000002.json: not a whole record of images: a name is there twice",
         ),
     ],
 )
@@ -639,7 +641,7 @@ def test_a_change_that_fails_leaves_the_map_as_it_was(folder):
 
 
 def test_a_change_of_too_many_images_is_refused(folder, monkeypatch):
-    monkeypatch.setattr(maps, "MOST_CHANGED", 2)
+    monkeypatch.setattr(appending, "MOST_CHANGED", 2)
     before = files_in(folder)
     with pytest.raises(
         InputError, match="found a change of 3 images, expected at most 2 at a time"

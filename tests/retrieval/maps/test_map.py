@@ -16,12 +16,13 @@ import pymilvus
 import pyproj
 import pytest
 
-import crisalad_jax.retrieval.maps.map
+import crisalad_jax.retrieval.maps.appending
 from crisalad_jax.data.positions import Positions, utm_positions
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.describer import describer_of
+from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.corrections import merge_maps
-from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.metadata import check_model, new_metadata, read_metadata
 from crisalad_jax.retrieval.segments import write_record
 from crisalad_jax.utils.errors import InputError
@@ -97,7 +98,7 @@ def test_a_map_lists_its_folders_additions_and_extent(tmp_path, monkeypatch):
         def now(cls, tz=None):
             return cls.fromisoformat(f"{next(days)}T10:00:00+00:00")
 
-    monkeypatch.setattr(crisalad_jax.retrieval.maps.map.datetime, "datetime", Clock)
+    monkeypatch.setattr(crisalad_jax.retrieval.maps.appending.datetime, "datetime", Clock)
     # 2014-12-12 10:56:38 UTC, by `date -u -d @1418381798`.
     parts = [
         ("/days", ["monday/1418381798.png", "monday/1418381861.png"]),
@@ -477,7 +478,7 @@ def test_a_map_that_fails_before_it_has_images_is_removed(tmp_path):
 
     def fail() -> None:
         with open_for_appending(tmp_path / "map", metadata("files")) as target:
-            target._segments.store.add(0, rows(0, 2))
+            target._segments.store.add(0, rows(0, 2), {"names": names(0, 2)})
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):

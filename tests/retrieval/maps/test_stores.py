@@ -5,6 +5,7 @@ import os
 import pathlib
 import resource
 import sys
+from typing import Any
 
 import numpy as np
 import pymilvus
@@ -16,11 +17,13 @@ from crisalad_jax.retrieval.maps.store import Store, check_store, open_store, st
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.search import search
 from crisalad_jax.utils.errors import InputError
+from tests.retrieval.maps.milvus_server import ADDRESS
 
 LENGTH = 24
 # Sums of 24 products of float32 below one, in whatever order.
 ROUNDING = 2e-6
-STORES = ("files", "milvus:rows.db")
+SERVER = pytest.param(f"milvus:{ADDRESS}", marks=pytest.mark.slow)
+STORES = ("files", "milvus:rows.db", SERVER)
 
 
 def unit_rows(count: int, seed: int = 0, length: int = LENGTH) -> np.ndarray:
@@ -35,6 +38,8 @@ def opened(folder: pathlib.Path, name: str, **options) -> Store:
 
 @pytest.fixture(params=STORES)
 def store(request, tmp_path):
+    if "http" in request.param:
+        request.getfixturevalue("milvus_server")
     found = opened(tmp_path, request.param)
     yield found
     found.close()
@@ -45,10 +50,14 @@ def brute_force(rows: np.ndarray, queries: np.ndarray, k: int) -> np.ndarray:
     return np.argsort(-similarities, axis=1, kind="stable")[:, :k]
 
 
+def record(first: int, count: int) -> dict[str, Any]:
+    return {"names": [f"{number}.png" for number in range(first, first + count)]}
+
+
 def fill(store: Store, rows: np.ndarray, sizes: tuple[int, ...]) -> None:
     first = 0
     for size in sizes:
-        store.add(first, rows[first : first + size])
+        store.add(first, rows[first : first + size], record(first, size))
         first += size
     assert first == len(rows)
 
@@ -61,7 +70,7 @@ def test_an_addition_is_told_to_the_disk_before_it_counts(tmp_path, monkeypatch)
         synced.append(os.path.basename(os.readlink(f"/proc/self/fd/{descriptor}")))
 
     monkeypatch.setattr(os, "fsync", fsync)
-    opened(tmp_path, "files").add(0, unit_rows(3))
+    opened(tmp_path, "files").add(0, unit_rows(3), record(0, 3))
     assert len(synced) == 2  # the file under a temporary name, then the folder that has its name
     assert [name.endswith(".npy") for name in synced] == [True, False]
 
@@ -117,7 +126,7 @@ def test_what_a_killed_addition_left_is_not_found_and_is_overwritten(store):
     store.check([(0, 4)])
     found = store.search(rows[4:6], 4, 4)
     assert set(found.indices.ravel()) == {0, 1, 2, 3}
-    store.add(4, rows[5:8])
+    store.add(4, rows[5:8], record(4, 3))
     store.check([(0, 4), (4, 3)])
     np.testing.assert_array_equal(store.read(4, 3), rows[5:8])
     assert store.search(rows[5:8], 1, 7).indices.tolist() == [[4], [5], [6]]
@@ -266,9 +275,11 @@ def test_a_server_gets_the_token_of_the_environment(tmp_path, monkeypatch):
 
     monkeypatch.setattr(pymilvus, "MilvusClient", refuse)
     monkeypatch.setenv(milvus.TOKEN, "root:secret")
-    with pytest.raises(InputError, match=r"^https://a\.b:1: Milvus says: auth check failure$"):
+    with pytest.raises(
+        InputError, match=r"^https://a\.b:1: Milvus says: auth check failure \(while connecting\)$"
+    ):
         opened(tmp_path, "milvus:https://a.b:1")
-    assert given == [(("https://a.b:1",), {"token": "root:secret"})]
+    assert given == [(("https://a.b:1",), {"token": "root:secret", "timeout": 10.0})]
 
 
 def test_milvus_is_asked_for_when_it_is_not_installed(tmp_path, monkeypatch):

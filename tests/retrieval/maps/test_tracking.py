@@ -8,7 +8,8 @@ import pytest
 
 from crisalad_jax.data.frames import moment_of
 from crisalad_jax.data.positions import Positions, utm_positions
-from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.appending import open_for_appending
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.tracking import SequenceTracker
 from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.output import Note

@@ -14,8 +14,9 @@ import pytest
 
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.build import index
-from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.serve.app import make_app
 from crisalad_jax.retrieval.serve.server import Server, _bound
 from crisalad_jax.retrieval.serve.worker import MapWorker

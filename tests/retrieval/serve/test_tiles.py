@@ -15,7 +15,8 @@ import pytest
 
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import Positions
-from crisalad_jax.retrieval.maps.map import Map, open_for_appending
+from crisalad_jax.retrieval.maps.appending import open_for_appending
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.serve.app import headers
 from crisalad_jax.retrieval.serve.tiles import Tiles, open_tiles
 from crisalad_jax.utils.errors import InputError

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from crisalad_jax.data.metres import Zone
-from crisalad_jax.retrieval.maps.map import MapImage
+from crisalad_jax.retrieval.maps.images import MapImage
 from crisalad_jax.retrieval.maps.verified import verify_answers
 from crisalad_jax.retrieval.verification import verify
 from crisalad_jax.retrieval.verification.camera import Intrinsics

@@ -1,0 +1,265 @@
+"""Append to maps and change them: every addition counts as a whole, and so does every change.
+
+An addition is a segment: its descriptors go to the store, then the record of its images appears
+under its name. That single rename commits the addition. A change, which removes, moves and adds
+images, is a record too. A map whose writer is killed at any moment is as it was before the addition
+or change, or after it. docs/maps.md has the format.
+"""
+
+import contextlib
+import dataclasses
+import datetime
+import os
+import pathlib
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from crisalad_jax.data.positions import Positions
+from crisalad_jax.retrieval.bits import sign_vectors
+from crisalad_jax.retrieval.chunks import Descriptors
+from crisalad_jax.retrieval.maps.images import NewImages
+from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.metadata import (
+    COMPONENTS,
+    METADATA,
+    SEGMENTS,
+    MapMetadata,
+    has_images,
+    read_metadata,
+)
+from crisalad_jax.retrieval.maps.recovery import remove_unrecorded
+from crisalad_jax.retrieval.pca import Pca, save_pca
+from crisalad_jax.retrieval.segments import write_record
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.locks import lock
+from crisalad_jax.utils.output import counted, warn
+from crisalad_jax.utils.shapes import Float32
+from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
+
+MOST_CHANGED = 10**6
+"""Number of images that one change removes or moves at most, whose record JSON has room for."""
+
+
+class AppendableMap(Map):
+    """A map that this process alone may append to and change; see `open_for_appending`."""
+
+    def fitted(self, names: Iterable[str], positions: Positions | None) -> Positions | None:
+        """Return the positions of new images in the map's axes; None where none of them has one.
+
+        Raises:
+            InputError: they have no place there, see `Positions.fitted`.
+        """
+        if positions is None:
+            return None
+        of = {name: positions.of[name] for name in names if name in positions.of}
+        return positions._replace(of=of).fitted(self.folder, self.axes, self.zone) if of else None
+
+    def append(
+        self,
+        names: Sequence[str],
+        sizes: Sequence[int],
+        descriptors: Descriptors,
+        *,
+        root: str,
+        positions: Positions | None = None,
+    ) -> None:
+        """Append images: all of them are there for good once this returns, and none before.
+
+        Args:
+            names: relative to `root`, none of which the map has.
+            sizes: of their files, in bytes.
+            descriptors: unit vectors, or what else `search` takes; stored as the map's type.
+            root: the folder of these images.
+            positions: where they were taken, as far as that is known; those of another zone of UTM
+                become the map's.
+
+        Raises:
+            InputError: a name that is there already or twice, descriptors that are no unit vectors,
+                positions that have no place among the map's, a store that cannot be written to, or
+                a map that is no longer where it was opened.
+        """
+        self._check_there()
+        part = NewImages(names, sizes, descriptors, root, self.fitted(names, positions))
+        self._segments.append(*self._addition(part))
+
+    def change(
+        self,
+        verb: Literal["remove", "replace", "move", "merge"],
+        *,
+        removed: Iterable[int] = (),
+        moved: Positions | None = None,
+        added: Iterable[NewImages] = (),
+    ) -> None:
+        """Remove, move and append images: all of it counts once this returns, and none before.
+
+        The images that are left have other numbers then.
+
+        Args:
+            verb: why. "replace" also removes the images that have the names of those that are
+                added.
+            removed: numbers of images.
+            moved: new positions, by the names of images; in other axes than the map's only where no
+                other image has one.
+            added: new images.
+
+        Raises:
+            InputError: no image would be left, more than `MOST_CHANGED` of them, or what `append`
+                raises.
+        """
+        self._check_there()
+        gone = set(removed)
+        axes, zone, new = self.axes, self.zone, {}
+        if moved is not None:
+            moved = self.fitted_anew(moved)
+            axes, zone, new = moved.axes, moved.zone, moved.of
+        record = {
+            "verb": verb,
+            "changed": _now(),
+            "removed": [],
+            "moved": self._rows_of(map(self._number, new)),
+            "positions": list(new.values()),
+            "axes": axes,
+            "zone": zone,
+        }
+
+        def parts() -> Iterator[tuple[Mapping[str, Any], Descriptors]]:
+            taken = set[str]()
+            for part in added:
+                if verb == "replace":
+                    gone.update(map(self._number, part.names))
+                if part.positions is not None:
+                    positions = part.positions.fitted(
+                        part.source or part.root, record["axes"], record["zone"]
+                    )
+                    part = part._replace(positions=positions)
+                    record["axes"] = positions.axes
+                    record["zone"] = positions.zone or record["zone"]
+                yield self._addition(part, gone, taken)
+                taken.update(part.names)
+            if not taken and len(gone) == len(self):
+                raise InputError(
+                    f"{self.folder}: found all its {len(self)} images to be removed, expected at "
+                    "least one to stay: a map without images is none, so remove its folder instead"
+                )
+            if len(gone) + len(new) > MOST_CHANGED:
+                raise InputError(
+                    f"{self.folder}: found a change of {len(gone) + len(new)} images, expected at "
+                    f"most {MOST_CHANGED} at a time"
+                )
+            record["removed"] = self._rows_of(sorted(gone))
+
+        self._segments.change(record, parts())
+
+    def fitted_anew(self, positions: Positions) -> Positions:
+        """Return new positions of images in the map's axes and zone; in their own if no other has.
+
+        Raises:
+            InputError: they have no place there, see `Positions.fitted`.
+        """
+        axes, zone = self.axes, self.zone
+        if positions.axes != axes and not any(
+            image.position is not None and image.name not in positions.of for image in self.images
+        ):
+            axes = zone = None
+        found = positions.fitted(self.folder, axes, zone)
+        return found._replace(zone=found.zone or zone)
+
+    def _check_there(self) -> None:
+        if not self.exists:
+            raise InputError(f"{self.folder}: found the opened map gone, expected it in this place")
+
+    def _rows_of(self, numbers: Iterable[int]) -> list[int]:
+        return self.removed.rows_of(np.fromiter(numbers, np.int64)).tolist()
+
+    def _addition(
+        self, part: NewImages, gone: Collection[int] = (), taken: Collection[str] = ()
+    ) -> tuple[dict[str, Any], Descriptors]:
+        """Return the record of new images, and their descriptors.
+
+        Args:
+            part: the images.
+            gone: numbers of images that give their names away.
+            taken: other names that new ones may not be.
+
+        Raises:
+            InputError: a name is there twice; or what `_rows` raises.
+        """
+        descriptors = self._rows("descriptors", part.descriptors)
+        there = map(self.images.find, part.names)
+        pairs = zip(part.names, there, strict=True)
+        free = {name for name, number in pairs if number is None or number in gone}
+        if twice := len(part.names) - len(free.difference(taken)):
+            raise InputError(
+                f"{self.folder}: found {twice} of {len(part.names)} names twice, or in the map "
+                "already, expected new ones"
+            )
+        axes, known, zone = part.positions or (None, {}, None)
+        record = {
+            "root": part.root,
+            "added": part.added or _now(),
+            "axes": axes,
+            "zone": zone,
+            "names": list(part.names),
+            "bytes": list(part.sizes),
+            "positions": [known.get(name) for name in part.names],
+        }
+        return record, descriptors
+
+    def as_stored(self, descriptors: Descriptors) -> Float32[np.ndarray, "n d"]:
+        """Round descriptors as the map stores them; of bits, unit vectors of the signs."""
+        rows = self._rows("descriptors", descriptors).astype(self.metadata.row[1], copy=False)
+        return sign_vectors(rows) if self.metadata.is_bits else rows.astype(np.float32, copy=False)
+
+
+@contextlib.contextmanager
+def open_for_appending(
+    folder: str | os.PathLike[str], metadata: MapMetadata, components: Pca | None = None
+) -> Iterator[AppendableMap]:
+    """Open the map with this metadata to append to it, or make it, with its components.
+
+    One process at a time may append; others may search meanwhile. A map that a kill left without
+    images is made anew; one that an exception leaves without images is removed. A note tells of
+    descriptors without a record, which are removed.
+
+    Raises:
+        InputError: another process appends, the map there is another one or has lost a record of
+            images, what `Map.open` raises, or the folder cannot be written to.
+    """
+    folder = pathlib.Path(folder)
+    read_metadata(folder)  # raises where something else is there, before anything is made
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(made_folder(folder / SEGMENTS))
+        stack.enter_context(lock(folder))
+        existing = read_metadata(folder)
+        if existing is not None and existing != metadata:
+            raise InputError(f"{folder}: found another map than was expected here")
+        for each in (folder, folder / SEGMENTS):
+            remove_temporaries(each)
+        if existing is None:
+            remove_unrecorded(folder, 0)
+        try:
+            if existing is None:
+                if components is not None:
+                    save_pca(folder / COMPONENTS, components)
+                write_record(folder / METADATA, dataclasses.asdict(metadata), indent=2)
+            opened = stack.enter_context(AppendableMap._opened(folder, existing or metadata))
+            if existing is not None:
+                remove_unrecorded(folder, len(opened._segments))
+                if waiting := opened._segments.remove_waiting():
+                    warn(
+                        f"{folder}: {counted(waiting, 'addition')} of an unfinished change removed"
+                    )
+            yield opened
+        except BaseException:
+            if not has_images(folder):
+                for name in (METADATA, COMPONENTS):
+                    (folder / name).unlink(missing_ok=True)
+                for path in (folder / SEGMENTS).glob("[0-9]*.npy"):
+                    path.unlink()
+            raise
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
