@@ -54,6 +54,7 @@ from .experiments.report import write_report as write_report
 from .experiments.train import train as train
 from .nn.adapters import Adapter as Adapter
 from .nn.adapters import BlockShape as BlockShape
+from .nn.adapters import TokenInfo as TokenInfo
 from .nn.adapters import register_adapter as register_adapter
 from .nn.aggregators import Aggregator as Aggregator
 from .nn.aggregators import TokenShape as TokenShape

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -18,6 +19,7 @@ import parity.cases.case
 import parity.cases.parts
 import parity.cases.run
 from crisalad_jax.nn import layers
+from crisalad_jax.nn.adapters import TokenInfo
 from crisalad_jax.nn.backbones import vit
 from crisalad_jax.nn.layers import Linear, at_least_float32
 from parity.cases import checks
@@ -84,10 +86,10 @@ def _without_layer_scale(block: Any) -> Any:
 
 
 def _special_tokens_once(mlp_update: Any) -> Any:
-    def wrong(self: Any, params: Any, tokens: Any, grid: tuple[int, int], **more: Any) -> Any:
+    def wrong(self: Any, params: Any, tokens: Any, info: TokenInfo) -> Any:
         # Without bias, half of what counts twice is what counts once.
-        special = tokens.shape[-2] - grid[0] * grid[1]
-        adapted, updated = mlp_update(self, params, tokens, grid, **more)
+        special = tokens.shape[-2] - math.prod(info.grid)
+        adapted, updated = mlp_update(self, params, tokens, info)
         return adapted.at[..., :special, :].multiply(0.5), updated
 
     return wrong

@@ -19,6 +19,7 @@ import pytest
 from crisalad_jax.checkpoints.formats import to_params, to_state
 from crisalad_jax.checkpoints.formats.families import HEADS, TABLES
 from crisalad_jax.checkpoints.formats.rows import Form, Rows, expand
+from crisalad_jax.nn.adapters import TokenInfo
 from crisalad_jax.nn.adapters.bottleneck import MultiResolutionConfig
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.aggregators.base import to_descriptor
@@ -172,7 +173,7 @@ def test_multi_resolution_adapter() -> None:
     template = jax.eval_shape(lambda key: config.init(key, shape), jax.random.key(0))
 
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        return {"tokens": config.mlp_update(params, inputs["tokens"], (5, 5))[0]}
+        return {"tokens": config.mlp_update(params, inputs["tokens"], TokenInfo((5, 5)))[0]}
 
     names = part_names(TABLES["adapter"], template)
     check(function, golden, names, {"tokens": jnp.asarray(golden["in.tokens"])})

@@ -164,7 +164,7 @@ def scripts() -> Iterator[Callable[[str], ModuleType]]:
 @pytest.fixture(autouse=True)
 def _own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
     """No test fills the user's compile cache, nor changes for others how this process computes."""
-    monkeypatch.setattr(compiler, "configure", lambda: None)
+    monkeypatch.setattr(compiler, "configure", lambda devices=None: None)
     monkeypatch.delenv("CRISALAD_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
 

@@ -1,6 +1,8 @@
 """The examples: each runs, and what it computes is held against an independent source."""
 
 import ast
+import csv
+import json
 import pathlib
 import subprocess
 import sys
@@ -304,6 +306,34 @@ def test_the_search_says_what_it_needs(monkeypatch, capsys) -> None:
     monkeypatch.setitem(sys.modules, "optuna", None)
     assert example("prune").main() is None
     assert capsys.readouterr().out == "optuna is not installed: pip install optuna\n"
+
+
+def test_the_sweep_says_what_it_needs(monkeypatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert example("sweep").main() is None
+    assert capsys.readouterr().out == "Ray Tune is not installed: pip install 'ray[tune]'\n"
+
+
+@pytest.mark.slow
+def test_the_sweep_reports_the_recalls_of_its_runs(tmp_path) -> None:
+    """As a program, since Tune changes signals and folders; the runs' own tables have the same."""
+    code = f"""
+import json, sys
+sys.path.insert(0, {str(EXAMPLES)!r})
+import sweep
+results = sweep.main({str(tmp_path)!r})
+json.dump([[r.config["learning_rate"], r.metrics["trial_id"], r.metrics["epoch"],
+    r.metrics["recall"]] for r in results], open({str(tmp_path / "found.json")!r}, "w"))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert [rate for rate, *_ in found] == [1e-2, 1e-3, 1e-5]
+    for _, trial, epoch, recall in found:
+        with (tmp_path / "runs" / trial / "validations.csv").open() as file:
+            recalls = {row["epoch"]: row["R@1"] for row in csv.DictReader(file)}
+        assert float(recalls[str(epoch)]) == recall
+    assert max(epoch for _, _, epoch, _ in found) == 4
 
 
 @pytest.mark.slow

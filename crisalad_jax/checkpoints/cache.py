@@ -78,7 +78,7 @@ def _make(model: Published, *, quiet: bool) -> None:
         )
     if not published.is_file():
         _addresses(model)  # before a folder is made
-    with lock(_folder(model), wait=True):
+    with lock(_folder(model), wait=3600):
         if _is_ready(model):
             return
         address = None if published.is_file() else _download(model, quiet=quiet)

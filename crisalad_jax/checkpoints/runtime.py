@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import pathlib
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -72,6 +73,11 @@ class Runtime:
     _first: Program
     _second: Program | None
     row_dtype = "float32"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let pickle send it to another machine: by the bytes of its files."""
+        files = {path.name: path.read_bytes() for path in self.folder.iterdir() if path.is_file()}
+        return _opened, (files, self.engine, self.model)
 
     @functools.cached_property
     def config(self) -> "ModelConfig":
@@ -227,6 +233,14 @@ def open_runtime(
     )
 
 
+def _opened(files: Mapping[str, bytes], engine: EngineName, model: Mapping[str, Any]) -> Runtime:
+    """Open what the files of an exported folder hold."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name, data in files.items():
+            pathlib.Path(folder, name).write_bytes(data)
+        return open_runtime(folder, engine, model)
+
+
 def _preparation(
     folder: pathlib.Path, manifest: Mapping[str, Any], model: Mapping[str, Any]
 ) -> Preparation:
@@ -306,7 +320,7 @@ def _exported(
     folder = user_cache() / "exports" / key[:32]
     if not (folder / MANIFEST).is_file():
         _check_fixed(weights, model["preprocessing"]["size_rule"])
-        with lock(folder.parent, wait=True):
+        with lock(folder.parent, wait=3600):
             if not (folder / MANIFEST).is_file():
                 _export(weights, model, how, folder)
     return folder

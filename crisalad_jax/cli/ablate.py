@@ -8,8 +8,8 @@ import tyro
 from crisalad_jax.cli.compare import ComparisonFlags, names_of, run_comparison
 
 COMMON = (
-    "test out train rows row reference jobs backbone preset seeds epochs image-size grouping "
-    "batch-size page json latex on-bad-image quiet"
+    "test out train rows row reference jobs cluster backbone preset seeds epochs image-size "
+    "grouping batch-size page json latex on-bad-image quiet"
 )
 EXAMPLE = (
     "crisalad ablate --test pitts30k_test.mat --train gsv --backbone dinov2-vitb14 --out ablated"

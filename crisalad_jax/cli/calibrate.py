@@ -6,10 +6,10 @@ from typing import Any
 
 from crisalad_jax.cli.common import echo, find_given, open_set, refuse_without, show_tables
 from crisalad_jax.cli.flags import ReadFlags, SetFlags, TableFlags
-from crisalad_jax.cli.tables import points_table
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.evaluation.calibrate import calibrate, operating_point_of
 from crisalad_jax.evaluation.operating_point import caveats
+from crisalad_jax.experiments.result_tables import points_table
 from crisalad_jax.retrieval.maps.calibration import CALIBRATION, VERIFIED
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.verification.verify import Verify

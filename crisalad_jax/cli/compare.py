@@ -7,17 +7,17 @@ from typing import Annotated, Any, Literal
 import rich.console
 
 from crisalad_jax.cli.common import echo, find_given, pick, show_tables
-from crisalad_jax.cli.flags import FOLDER, ReadFlags, SizeFlags, TableFlags
+from crisalad_jax.cli.flags import FOLDER, ClusterFlag, ReadFlags, SizeFlags, TableFlags
 
 COMMON = (
     "test out train methods weights backbone preset seeds epochs image-size grouping batch-size "
-    "rerank reference jobs page json latex on-bad-image quiet"
+    "rerank reference jobs cluster page json on-bad-image quiet"
 )
 EXAMPLE = "crisalad compare --test pitts30k_test.mat --weights salad megaloc --out compared"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ComparisonFlags(ReadFlags, SizeFlags, TableFlags):
+class ComparisonFlags(ReadFlags, SizeFlags, TableFlags, ClusterFlag):
     """The flags of both commands."""
 
     test: tuple[pathlib.Path, ...]
@@ -42,9 +42,9 @@ class ComparisonFlags(ReadFlags, SizeFlags, TableFlags):
     reference: str | None = None
     """Which line differences, speeds and training times are relative to; by default crisalad, or
     the first where that is not compared."""
-    jobs: int = 1
-    """Runs at once, each in a process of its own: on a GPU of its own where there are as many, else
-    sharing one. Other hosts that run the same command on a shared folder take runs too."""
+    jobs: int | None = None
+    """Runs at once, each a task of Ray (extra ray) with its share of the devices; without --cluster
+    on this machine. By default 1; on a cluster one for each GPU, or for each node without any."""
     page: pathlib.Path | None = None
     """Also put the tables into this Markdown page, between its comments <!-- NAME --> and <!-- end
     of NAME -->, where NAME is the name of the folder --out."""
@@ -90,7 +90,7 @@ def run_comparison(
     summary = compare(
         config,
         flags.out,
-        **pick(flags, "page", "jobs", "quiet"),
+        **pick(flags, "page", "jobs", "cluster", "quiet"),
         say=lambda line: notes.print(line, soft_wrap=True, highlight=False),
     )
     show_tables(*tables_of(summary).values(), latex=flags.latex)

@@ -20,10 +20,10 @@ from crisalad_jax.cli.common import (
     show_tables,
 )
 from crisalad_jax.cli.flags import FOLDER, ModelFlags, ReadFlags, SetFlags, TableFlags, Target
-from crisalad_jax.cli.tables import grouping_table, leakage_table, points_table
 from crisalad_jax.evaluation.evaluate import check_evaluation, evaluate
 from crisalad_jax.evaluation.record import evaluation_record
 from crisalad_jax.evaluation.similarity import FirstSimilarities
+from crisalad_jax.experiments.result_tables import result_tables
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.grouping import DEFAULT_GROUPINGS
 from crisalad_jax.retrieval.pca import load_pca
@@ -113,11 +113,7 @@ def run(arguments: Evaluate) -> None:
         arguments, "batch_size", "seed", "seeds", "pca", "dtype", "rerank", "rerank_weights"
     )
     record = evaluation_record(results, benchmark, config, model_name=name, **asked)
-    tables = [grouping_table(results)]
-    if config.cross_image.attends:
-        tables.append(leakage_table(results))
-    if points := {each.label: each.operating_point for each in results if each.operating_point}:
-        tables.append(points_table(points))
+    tables = result_tables(results)
     show_tables(*tables)
     for note in record.notes:
         echo(note)

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from crisalad_jax.cli.common import echo, given_positions, open_flagged, pick
 from crisalad_jax.cli.flags import (
+    ClusterFlag,
     FrameFlags,
     JsonFlag,
     ModelFlags,
@@ -19,7 +20,7 @@ from crisalad_jax.utils.output import counted
 
 COMMON = (
     "weights images out image-size resize grouping batch-size runtime compute-dtype root pca "
-    "on-bad-image json quiet"
+    "on-bad-image cluster json quiet"
 )
 EXAMPLE = "crisalad extract --weights salad --images photos --out photos.npy"
 SEVERAL = "quote a pattern, or list the images in a .txt"
@@ -27,7 +28,7 @@ SEVERAL = "quote a pattern, or list the images in a .txt"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Extract(ReadFlags, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
+class Extract(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     """Write a descriptor of every image in a folder, in sorted path order."""
 
     images: pathlib.Path
@@ -49,10 +50,10 @@ class Extract(ReadFlags, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
 def run(arguments: Extract) -> dict[str, Any]:
     """Describe the images, and print what was written."""
     out, how = arguments.out, pick(arguments, "grouping", "seed")
-    check_extraction(out, **how)
+    check_extraction(out, cluster=arguments.cluster, **how)
     positions = given_positions(arguments)
     model, _, file = open_flagged(arguments, groupings=[arguments.grouping])
-    more = pick(arguments, "fps", "topic", "every_metres", "root", "pca", "reading")
+    more = pick(arguments, "fps", "topic", "every_metres", "root", "pca", "reading", "cluster")
     more |= {"weights": file, "positions": positions, "verify": arguments.checksums}
     result = extract(model, arguments.images, out, **how, **more)
     described = counted(len(result.names), "descriptor")

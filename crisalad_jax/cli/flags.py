@@ -87,6 +87,15 @@ class ReadFlags(DecodeFlags):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class ClusterFlag:
+    """Where the work is done."""
+
+    cluster: str | None = None
+    """Ray cluster that does the work: local, auto, ray://HOST[:PORT] or HOST:PORT
+    (docs/how-to/ray.md)."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class FrameFlags:
     """Which frames of videos and robot logs are taken."""
 

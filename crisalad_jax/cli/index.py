@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from crisalad_jax.cli.common import echo, given_positions, open_flagged, pick
 from crisalad_jax.cli.flags import (
     FOLDER,
+    ClusterFlag,
     FrameFlags,
     JsonFlag,
     ModelFlags,
@@ -21,7 +22,7 @@ from crisalad_jax.utils.output import counted
 
 COMMON = (
     "images out weights fps positions every-metres novelty store dtype pca search image-size "
-    "resize batch-size runtime compute-dtype on-bad-image json quiet"
+    "resize batch-size runtime compute-dtype on-bad-image cluster json quiet"
 )
 EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
 SEVERAL = "quote a pattern; other folders are added by the same command again"
@@ -29,7 +30,7 @@ SEVERAL = "quote a pattern; other folders are added by the same command again"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Index(ReadFlags, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
+class Index(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     """Make a map of a folder of images, or append to it those that it lacks.
 
     An existing map takes images by the model that made it, at its image size.
@@ -55,9 +56,9 @@ class Index(ReadFlags, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     pca: pathlib.Path | None = None
     """Components of `crisalad pca`, for shorter descriptors; the map keeps a copy, which queries
     use."""
-    search: Literal["exact", "hnsw", "ivf-pq", "ivf-rabitq", "diskann", "auto"] | None = None
-    """Build an approximate search, and print what it recalls; exact removes it (docs/large.md). The
-    last three are Milvus', of which auto is the best for the size (docs/maps.md)."""
+    search: Literal["auto", "exact", "hnsw", "ivf-rabitq", "diskann"] | None = None
+    """Build an approximate search, and print what it recalls; exact removes it, and auto chooses by
+    size and memory (docs/large.md)."""
     again: bool = False
     """Add images that `crisalad map remove` removed, too."""
 
@@ -73,7 +74,7 @@ def run(arguments: Index) -> dict[str, Any]:
     model, _, file = open_flagged(arguments, weights, like=like)
     config = model.config
     more = pick(arguments, "fps", "topic", "position_topic", "every_metres", "novelty", "reading")
-    more |= pick(arguments, "store", "dtype", "pca", "search", "again")
+    more |= pick(arguments, "store", "dtype", "pca", "search", "again", "cluster")
     result = index(model, arguments.images, out, weights=file, positions=positions, **more)
     echo(f"{out}: {'; '.join(_words(result, config))}")
     counts = {name: value for name, value in result._asdict().items() if name != "metadata"}

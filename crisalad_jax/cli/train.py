@@ -15,6 +15,7 @@ from crisalad_jax.cli.help import asked_for
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.flags import find_flag, flag_values, parse_settings, with_settings
 from crisalad_jax.config.io import read_config
+from crisalad_jax.data.file_cache import CACHE_GB
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.mixture import with_sets
 from crisalad_jax.training.recipes import recipe
@@ -35,10 +36,10 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
 
     data: tuple[pathlib.Path, ...]
     """Folder with one folder a place, a table name,place[,lat,lon[,heading]] (places.csv in the
-    folder, or the file), or Dataframes/ and Images/ of GSV-Cities; for netvlad, patch-netvlad and
-    selavpr, which mine tuples, a training set of queries in any layout that `evaluate` reads. Or
-    several sets of places, as NAME=DIR NAME=DIR: each step takes a sub-batch of each, as
-    --mixture.NAME.sampler, loss, share and weight say."""
+    folder, or the file), or Dataframes/ and Images/ of GSV-Cities, here or at an address as in
+    s3://bucket/places; for netvlad, patch-netvlad and selavpr, which mine tuples, a training set of
+    queries in any layout that `evaluate` reads. Or several sets of places, as NAME=DIR NAME=DIR:
+    each step takes a sub-batch of each, as --mixture.NAME.sampler, loss, share and weight say."""
     out: Annotated[pathlib.Path, FOLDER]
     """Folder of the run."""
     settings: Any
@@ -102,6 +103,9 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
     shard_state: bool = False
     """Keep what trains and its moments in shards, one a device, not whole on each: for --trainable
     all of a large model."""
+    cache_gb: float = CACHE_GB
+    """Most gigabytes of --data at an address (s3://...) that are cached on this host's disk, in
+    CRISALAD_CACHE; processes share it, and 0 caches nothing."""
     callback: tuple[str, ...] = ()
     """Also write the numbers of steps and validations elsewhere: csv (steps.csv and validations.csv
     in OUT), wandb, mlflow, or a registered callback's name."""
@@ -201,11 +205,13 @@ def run(arguments: Train) -> dict[str, Any] | None:
     """Train the model, and print how the run ended."""
     from crisalad_jax.experiments.train import train
     from crisalad_jax.training import distributed
+    from crisalad_jax.training.lost import filter_aborts
 
     address = arguments.coordinator_address
     which = pick(arguments, "num_processes", "process_id", "local_device_ids")
     refuse_without("--coordinator-address", address, **which)
     if address is not None:
+        filter_aborts()
         distributed.join_processes(address, *which.values())
     console.quiet = not distributed.is_primary()
     config: TrainConfig = arguments.settings
@@ -218,6 +224,7 @@ def run(arguments: Train) -> dict[str, Any] | None:
         validation_images=arguments.val_images,
         **pick(arguments, "place_radius", "place_frames", "positions", "fps", "topic"),
         **pick(arguments, "weights", "backbone", "on_bad_image", "num_threads", "shard_state"),
+        cache_gb=arguments.cache_gb,
         callbacks=arguments.callback,
         quiet=arguments.quiet,
         say=lambda line: console.print(line, soft_wrap=True),

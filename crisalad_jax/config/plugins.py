@@ -8,7 +8,7 @@ import os
 import pathlib
 import sys
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.machinery import ModuleSpec
 from typing import Any
 
@@ -76,8 +76,15 @@ def load_plugin(plugin: str) -> None:
 
 
 def loaded_plugins() -> list[str]:
-    """Return what `load_plugin` takes to load the same in another process."""
+    """Return what `load_plugins` takes to load the same in another process."""
     return list(_LOADED)
+
+
+def load_plugins(plugins: Iterable[str]) -> None:
+    """Load these plug-ins, and those of installed packages; raises as `load_plugin`."""
+    load_entry_points()
+    for plugin in plugins:
+        load_plugin(plugin)
 
 
 def _spec_of(plugin: str) -> ModuleSpec | None:

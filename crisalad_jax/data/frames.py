@@ -200,7 +200,7 @@ def moment_of(name: str | os.PathLike[str]) -> Moment | None:
         seconds = float(f"{timed[2]}.{timed[3] or 0}")
         is_unix = frame is not None and frame.topic is not None and seconds >= _UNIX
         return Moment("" if is_unix else timed[1], seconds)
-    found = _SINCE_1970.findall(pathlib.PurePath(name).stem)
+    found = _SINCE_1970.findall(os.path.splitext(os.path.basename(name))[0])
     if len(found) != 1:
         return None
     whole, decimals, digits = found[0]

@@ -9,7 +9,7 @@ import os
 import pathlib
 import re
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Literal
 
 import cv2
@@ -19,7 +19,7 @@ from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.config.preprocessing import BitDepth
 from crisalad_jax.data.frames import has_frames, parse_frame
 from crisalad_jax.data.prepare import as_rgb
-from crisalad_jax.data.remote import address_of, is_remote, read_remote
+from crisalad_jax.data.remote import address_of, is_remote, list_remote, read_remote
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.data.video import read_frame
 from crisalad_jax.utils.errors import InputError
@@ -27,7 +27,7 @@ from crisalad_jax.utils.files import read_bytes, real_path
 from crisalad_jax.utils.output import counted, warn
 from crisalad_jax.utils.shapes import UInt8
 
-_MAX_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS"
+MAX_PIXELS = "OPENCV_IO_MAX_IMAGE_PIXELS"
 """Environment variable of the largest image in pixels, which OpenCV reads as it is imported and
 checks before it decodes. A small file can claim an image that fills the memory: this package sets
 2**28, which takes 0.8 GB, where the variable is not set."""
@@ -119,12 +119,18 @@ def read_image(
 
 
 def read_pixels(
-    path: str | os.PathLike[str], *, enough: tuple[int, int] | None = None
+    path: str | os.PathLike[str],
+    *,
+    enough: tuple[int, int] | None = None,
+    read_far: Callable[[str | os.PathLike[str]], bytes] = read_remote,
 ) -> np.ndarray:
-    """Read an image file as `read_image` does, in the file's own depth; see `decode_image`."""
+    """Read an image file as `read_image` does, in the file's own depth; see `decode_image`.
+
+    `read_far` reads the bytes at an address.
+    """
     frame = parse_frame(path)
     if frame is None and is_remote(path):
-        return decode_image(read_remote(path), address_of(path), enough=enough)
+        return decode_image(read_far(path), address_of(path), enough=enough)
     if frame is None:
         return decode_image(read_bytes(path, "an image file"), path, enough=enough)
     if frame.topic is None:
@@ -166,7 +172,7 @@ def decode_image(
     except cv2.error as error:
         found = " ".join(error.err.split())
         if "MAX_IMAGE_PIXELS" in found:
-            found = f"more than {os.environ.get(_MAX_PIXELS)} pixels (--max-pixels raises that)"
+            found = f"more than {os.environ.get(MAX_PIXELS)} pixels (--max-pixels raises that)"
     if image is None:
         raise InputError(f"{path}: found {found}, expected {_FORMATS}")
     return _turned(image, data) if data[4:12] in _AVIF else image
@@ -293,6 +299,8 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
         InputError: the folder is missing, is a file, or holds no image.
     """
     folder = pathlib.Path(folder)
+    if is_remote(folder):
+        return images_below(folder, list_remote(folder), folder)
     check_folder(folder, "a folder of images")
     found = []
     # Real paths from the top to each folder: a link to one of them would make the walk endless.
@@ -307,9 +315,26 @@ def list_images(folder: str | os.PathLike[str]) -> list[pathlib.Path]:
                 above[here / name] = above[here] | {real}
                 inside.append(name)
         folders[:] = inside
-        found += [here / name for name in files if not name.startswith(".")]
-    images = only_images(found, folder)
-    return sorted(images, key=lambda image: image.relative_to(folder).as_posix())
+        found += [here / name for name in files]
+    return images_below(folder, found, folder)
+
+
+def images_below(
+    folder: pathlib.Path, files: Iterable[pathlib.Path], source: pathlib.Path
+) -> list[pathlib.Path]:
+    """Return the images among files below a folder, without hidden ones, in the order of paths.
+
+    Args:
+        folder: the folder, here or at an address.
+        files: what was found there.
+        source: what the message begins with.
+
+    Raises:
+        InputError: no image is among them.
+    """
+    named = {each.relative_to(folder).as_posix(): each for each in files}
+    shown = [named[name] for name in sorted(named) if "/." not in f"/{name}"]
+    return only_images(shown, address_of(source))
 
 
 def check_folder(folder: pathlib.Path, expected: str) -> None:

@@ -9,7 +9,7 @@ import os
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from crisalad_jax.config.short_repr import brief, with_field_docs
 from crisalad_jax.data.images import OnBadImage, read_pixels
 from crisalad_jax.data.places import JoinedPlaces, Places
 from crisalad_jax.data.prepare import Preparation
-from crisalad_jax.data.remote import AT_ONCE, is_remote
+from crisalad_jax.data.remote import AT_ONCE, is_remote, read_remote
 from crisalad_jax.data.resize import Pixels
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.host import usable_cores
@@ -88,9 +88,13 @@ class ImageCache:
     is spent it stores no more. A file that changes on disk is not read again.
     """
 
-    def __init__(self, budget_bytes: int = 2**30) -> None:
-        """Start empty, with room for `budget_bytes` of pixels."""
-        self._room = budget_bytes
+    def __init__(
+        self,
+        budget_bytes: int = 2**30,
+        read_far: Callable[[str | os.PathLike[str]], bytes] = read_remote,
+    ) -> None:
+        """Start empty, with room for `budget_bytes` of pixels; `read_far` reads at addresses."""
+        self._room, self._read_far = budget_bytes, read_far
         self._images: dict[tuple[str, Preparation, bool], Pixels] = {}
         self._lock = threading.Lock()
 
@@ -107,7 +111,8 @@ class ImageCache:
         key = (os.fspath(path), how, quickly)
         image = self._images.get(key)
         if image is None:
-            pixels = read_pixels(path, enough=how.image_size if quickly else None)
+            enough = how.image_size if quickly else None
+            pixels = read_pixels(path, enough=enough, read_far=self._read_far)
             image = how.prepare(pixels, os.fspath(path))
             image.setflags(write=False)
             with self._lock:
@@ -183,9 +188,8 @@ class Reading:
         def load(slot: int) -> Pixels:
             return cache.read(paths[slot], preparation)
 
-        far = self.threads and any(map(is_remote, paths))
-        reading = dataclasses.replace(self, threads=max(self.threads, AT_ONCE)) if far else self
-        return reading.read(load, slots, slots, slots, preparation, has_frames=_has_frames(paths))
+        where: Any = {"has_frames": _has_frames(paths), "far": any(map(is_remote, paths))}
+        return self.read(load, slots, slots, slots, preparation, **where)
 
     def read(
         self,
@@ -196,13 +200,16 @@ class Reading:
         preparation: Preparation,
         *,
         has_frames: bool,
+        far: bool,
     ) -> Iterator[ImageBatch]:
         """Yield batches of what `load` returns for each of `slots`, with its index and label.
 
         A batch holds the next `batch_size` of them, or fewer where the size changes. Of images with
         frames of videos one thread at most reads: more would read a video each, from its beginning.
+        Of images at addresses, `far` away, most threads wait, so that there are more.
         """
-        threads = min(self.threads, 1) if has_frames else self.threads
+        least = AT_ONCE if far and self.threads else 0
+        threads = min(self.threads, 1) if has_frames else max(self.threads, least)
 
         def load_or_skip(slot: int) -> Pixels | None:
             try:
@@ -398,9 +405,9 @@ def batches_of_groups(
         return augmented
 
     own = slots[start_step:, mine].reshape(-1)
-    return reading.read(
-        load, own, indices[own], labels.reshape(-1)[own], how, has_frames=has_frames
-    )
+    far = any(is_remote(files.path(image)) for image in indices[:1])
+    where: Any = {"has_frames": has_frames, "far": far}
+    return reading.read(load, own, indices[own], labels.reshape(-1)[own], how, **where)
 
 
 def read_ahead(

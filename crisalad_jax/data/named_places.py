@@ -9,6 +9,7 @@ place may be: places that are too near for that are listed as such, and do not m
 
 import collections
 import functools
+import itertools
 import math
 import operator
 import os
@@ -24,6 +25,7 @@ from crisalad_jax.data.frames import has_frames, sequence_of
 from crisalad_jax.data.images import OnBadImage, is_image, list_images
 from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.positions import AXES
+from crisalad_jax.data.remote import address_of, for_each, is_file, is_folder, is_remote, names_in
 from crisalad_jax.data.sources import ImageSource
 from crisalad_jax.data.tables import Disk, normal_name, read_table
 from crisalad_jax.utils.errors import InputError
@@ -71,7 +73,8 @@ def read_gsv_cities(
         InputError: a city that is unknown or named twice, a bad row, or a row without its image.
     """
     folder = root / "Dataframes"
-    tables = {path.stem: path for path in sorted(folder.glob("*.csv"))}
+    paths = (folder / name for name in sorted(names_in(folder)))
+    tables = {path.stem: path for path in paths if path.suffix == ".csv" and path.name[0] != "."}
     chosen = tuple(tables if cities is None else cities)
     if not chosen or len(set(chosen)) < len(chosen) or not tables.keys() >= set(chosen):
         raise InputError(
@@ -179,21 +182,22 @@ def read_named_places(
     Raises:
         InputError: it is none of these; what the table says does not fit; or an image is missing.
     """
-    if (root / TABLE).is_file():
+    if is_file(root / TABLE):
         root = root / TABLE
-    if root.is_file() and not has_frames(root):
+    is_table = root.suffix.lower() == ".csv" if is_remote(root) else root.is_file()
+    if is_table and not has_frames(root):
         return root.parent, *_read_table(root, on_bad_image)
     return root, (), _read_folders(root)
 
 
 def _read_folders(root: pathlib.Path) -> list[FoundPlace]:
     """Read a folder in which each folder that holds images is a place."""
-    inside = root.iterdir() if root.is_dir() else ()
-    flat = any(is_image(path) and path.is_file() and path.name[0] != "." for path in inside)
-    if flat or not root.is_dir() or has_sides(root) or has_split(root):
+    inside = (name for name in names_in(root) if is_image(name) and name[0] != ".")
+    flat = any(is_file(root / name) for name in inside)
+    if flat or not is_folder(root) or has_sides(root) or has_split(root):
         raise InputError(
-            f"{root}: found {listing(root)}, expected {_LAYOUTS}, without an image next to the "
-            f"folders; {_GROUPED}"
+            f"{address_of(root)}: found {listing(root)}, expected {_LAYOUTS}, without an image "
+            f"next to the folders; {_GROUPED}"
         )
     images: dict[str, dict[str, None]] = collections.defaultdict(dict)
     for path in list_images(root):
@@ -218,9 +222,10 @@ def _read_table(
     has_cities = "city" in table.columns
     places: dict[tuple[str, str], dict[str, View | None]] = collections.defaultdict(dict)
     missing = 0
-    for image, (name, row) in zip(paths, rows, strict=True):
+    found = for_each(is_file, paths) if on_bad_image == "skip" else itertools.repeat(True)
+    for image, is_there, (name, row) in zip(paths, found, rows):  # noqa: B905, for it repeats
         place = row.text("city") if has_cities else "", row.text("place")
-        if on_bad_image == "skip" and not image.is_file():
+        if not is_there:
             missing += 1
             continue
         inside = image.is_relative_to(root)

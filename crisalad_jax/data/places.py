@@ -24,6 +24,7 @@ from crisalad_jax.data.named_places import (
     read_msls_places,
     read_named_places,
 )
+from crisalad_jax.data.remote import address_of, check_address, is_file, is_folder
 from crisalad_jax.data.sources import check_frames, open_source
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
@@ -124,8 +125,9 @@ def read_places(
     second view.
 
     Args:
-        root: folder that holds `Dataframes/` and `Images/`, or a layout of your own; with
-            `place_radius` or `place_frames` a source of images (`open_source`).
+        root: folder that holds `Dataframes/` and `Images/`, or a layout of your own, here or at an
+            address such as s3://bucket/places (not MSLS); with `place_radius` or `place_frames` a
+            source of images (`open_source`).
         cities: names of CSV files without the suffix, or of MSLS's folders; None reads all, of MSLS
             those of its training set.
         min_images: places with fewer images are left out, and a note counts them.
@@ -154,8 +156,9 @@ def read_places(
         [3, 3, 3, 3, 3, 3, 3, 3]
     """
     root = pathlib.Path(root)
-    is_gsv = (root / "Dataframes").is_dir()
-    has_cities = is_gsv or (is_msls(root) and not (root / TABLE).is_file())
+    check_address(root)
+    is_gsv = is_folder(root / "Dataframes")
+    has_cities = is_gsv or (is_msls(root) and not is_file(root / TABLE))
     groupings = (place_radius is not None) + (place_frames is not None)
     if (
         groupings + has_cities > 1
@@ -164,9 +167,9 @@ def read_places(
         or (cities is not None and not has_cities)
     ):
         raise InputError(
-            f"{root}: found arguments that do not fit each other, expected --cities for the layout "
-            "of GSV-Cities or MSLS; for other images --place-radius, perhaps with --positions, or "
-            "--place-frames, and --fps or --topic with either"
+            f"{address_of(root)}: found arguments that do not fit each other, expected --cities "
+            "for the layout of GSV-Cities or MSLS; for other images --place-radius, perhaps with "
+            "--positions, or --place-frames, and --fps or --topic with either"
         )
     if place_radius is not None and not 0 < place_radius < math.inf:
         raise InputError(f"--place-radius: found {place_radius:g}, expected metres above 0")
@@ -198,13 +201,13 @@ def _places(
     if not large:
         most = max((len(place.images) for place in found), default=0)
         raise InputError(
-            f"{root}: found no place with at least {min_images} images; the largest has {most}, of "
-            f"{len(found)} places (--place-radius, --place-frames, --min-images)"
+            f"{address_of(root)}: found no place with at least {min_images} images; the largest "
+            f"has {most}, of {len(found)} places (--place-radius, --place-frames, --min-images)"
         )
     if len(large) < len(found):
         warn(
-            f"{root}: left out {len(found) - len(large)} of {len(found)} places, with fewer than "
-            f"{min_images} images"
+            f"{address_of(root)}: left out {len(found) - len(large)} of {len(found)} places, "
+            f"with fewer than {min_images} images"
         )
     images = [each for place in large.values() for each in place.images.items()]
     views = [view for _, view in images if view is not None]

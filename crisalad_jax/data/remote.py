@@ -132,6 +132,38 @@ def size_of(path: pathlib.Path) -> int | None:
     return stored_bytes(path)
 
 
+def is_file(path: pathlib.Path) -> bool:
+    """Return whether there is a file, here or at an address; raises as `size_of`."""
+    if not is_remote(path):
+        return path.is_file()
+    return bool(_if_there(path, lambda files, there: files.info(there)["type"] == "file"))
+
+
+def is_folder(path: pathlib.Path) -> bool:
+    """Return whether there is a folder, at an address one that holds something; as `size_of`."""
+    return bool(names_in(path)) if is_remote(path) else path.is_dir()
+
+
+def names_in(folder: pathlib.Path) -> list[str]:
+    """List the names in a folder, here or at an address; none where there is no such folder.
+
+    Raises:
+        InputError: an address that cannot be asked.
+    """
+    if not is_remote(folder):
+        try:
+            return os.listdir(folder)
+        except OSError:
+            return []
+
+    def names(files: Any, there: str) -> list[str]:
+        files.invalidate_cache(there)
+        inside = (each["name"].rstrip("/") for each in files.ls(there, detail=True))
+        return [each.rpartition("/")[2] for each in inside if each != there.rstrip("/")]
+
+    return _if_there(folder, names) or []
+
+
 def state_of(path: pathlib.Path) -> str | None:
     """Return a text that is another one when a file has changed; None where there is none.
 

@@ -22,7 +22,14 @@ from crisalad_jax.data.frames import (
     sequence_of,
     stored_bytes,
 )
-from crisalad_jax.data.images import OnBadImage, is_image, list_images, names_in, only_images
+from crisalad_jax.data.images import (
+    OnBadImage,
+    images_below,
+    is_image,
+    list_images,
+    names_in,
+    only_images,
+)
 from crisalad_jax.data.logs import list_log_frames, name_log_frame
 from crisalad_jax.data.metres import on_ellipsoid
 from crisalad_jax.data.positions import (
@@ -185,10 +192,7 @@ def _remote(path: pathlib.Path) -> ImageSource:
     if is_image(path) and not _PATTERN.search(str(path)):
         return _source(path.parent, [path], path)
     root, pattern = (_before_pattern(path), path) if _PATTERN.search(str(path)) else (path, None)
-    found = list_remote(root, pattern)
-    shown = [each for each in found if "/." not in f"/{each.relative_to(root).as_posix()}"]
-    images = only_images(shown, address_of(path))
-    return _source(root, sorted(images, key=lambda image: image.relative_to(root).as_posix()), path)
+    return _source(root, images_below(root, list_remote(root, pattern), path), path)
 
 
 def open_sources(

@@ -3,9 +3,10 @@
 Windows writes backslashes between folders, and macOS accents as letters of their own (NFD).
 """
 
+import collections
 import csv
+import io
 import math
-import os
 import pathlib
 import re
 import unicodedata
@@ -13,6 +14,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from crisalad_jax.data.frames import spelled
+from crisalad_jax.data.remote import is_remote, list_remote, names_in, read_remote
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
 
@@ -150,7 +152,8 @@ def read_table(path: pathlib.Path, *needed: str, any_spelling: bool = False) -> 
         InputError: the file cannot be read, lacks a column or has one twice, or a row has other
             than as many fields as the header.
     """
-    check_source(path, "a table of UTF-8 CSV", largest=LARGEST)
+    if not is_remote(path):
+        check_source(path, "a table of UTF-8 CSV", largest=LARGEST)
     lines = _lines(path)
     separator, columns = next(lines)
     if any_spelling:
@@ -176,7 +179,8 @@ def _plain(columns: Sequence[str]) -> list[str]:
 def _lines(path: pathlib.Path) -> Iterator[tuple[Any, list[str]]]:
     """Yield the separator and the columns, then the number and the fields of every row."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        opened = io.BytesIO(read_remote(path)) if is_remote(path) else path.open("rb")
+        with io.TextIOWrapper(opened, encoding="utf-8-sig", newline="") as file:
             first = file.readline(_LINE)
             file.seek(0)
             separator = ";" if first.count(";") > first.count(",") else ","
@@ -222,9 +226,20 @@ def matched(names: Iterable[str], there: Collection[str]) -> dict[str, str]:
 class Disk:
     """Finds files by names; each folder is listed once, as to stat each file is slow far away."""
 
-    def __init__(self) -> None:
-        """Begin without any listing."""
+    def __init__(self, root: pathlib.Path | None = None) -> None:
+        """Begin without any listing; or with all below a root, which is an address.
+
+        Raises:
+            InputError: the address cannot be listed.
+        """
         self._listings: dict[pathlib.Path, dict[str, str]] = {}
+        self._is_whole = root is not None and is_remote(root)
+        if root is not None and self._is_whole:
+            inside: dict[pathlib.Path, set[str]] = collections.defaultdict(set)
+            for path in list_remote(root):
+                for each in (path, *path.parents[: len(path.parts) - len(root.parts) - 1]):
+                    inside[each.parent].add(each.name)
+            self._listings = {folder: spellings(names) for folder, names in inside.items()}
 
     def find(self, root: pathlib.Path, name: str) -> pathlib.Path | None:
         """Return the path below `root` that a name means; None where there is none."""
@@ -242,9 +257,6 @@ class Disk:
     def names(self, folder: pathlib.Path) -> dict[str, str]:
         """Return the names in a folder, by themselves and by their `normal_name`."""
         if folder not in self._listings:
-            try:
-                names = os.listdir(folder)
-            except OSError:
-                names = []
+            names = () if self._is_whole else names_in(folder)
             self._listings[folder] = spellings(names)
         return self._listings[folder]

@@ -111,7 +111,7 @@ def calibrate(
         model=places.metadata.model,
         created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     )
-    with lock(places.folder, wait=True):  # an addition removes temporary files there
+    with lock(places.folder, wait=3600):  # an addition removes temporary files there
         write_calibration(places.folder, calibration)
     if verify is None:
         places.calibration = calibration

@@ -5,9 +5,11 @@ import pathlib
 from collections.abc import Callable, Mapping, Sequence
 
 from crisalad_jax.config.checks import PATH, takes
+from crisalad_jax.data.file_cache import CACHE_GB
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
+from crisalad_jax.data.remote import address_of
 from crisalad_jax.experiments.report import save_chart, training_curves
 from crisalad_jax.training.callbacks import Callback
 from crisalad_jax.training.config import TrainConfig
@@ -40,6 +42,7 @@ def train(
     on_bad_image: OnBadImage = "stop",
     num_threads: int | None = None,
     shard_state: bool = False,
+    cache_gb: float = CACHE_GB,
     callbacks: Sequence[Callback | str] = (),
     quiet: bool = False,
     say: Callable[[str], None] = lambda line: None,
@@ -48,9 +51,9 @@ def train(
 
     Args:
         config: how to train.
-        data: places, in a layout that `read_places` reads; the sets of `config.mixture` by name,
-            in such layouts; for a recipe that mines tuples, a set that `open_benchmark` reads, such
-            as pitts30k_train.mat.
+        data: places, in a layout that `read_places` reads, here or at an address; the sets of
+            `config.mixture` by name, in such layouts; for a recipe that mines tuples, a set that
+            `open_benchmark` reads, such as pitts30k_train.mat.
         place_radius: metres within which images of a source with positions are a place; see
             `read_places`, as for the four that follow.
         place_frames: number of consecutive images that are a place.
@@ -67,6 +70,7 @@ def train(
         on_bad_image: "stop", or "skip" to mask out unreadable images and count them.
         num_threads: number of threads that read the training images; None for one a usable core.
         shard_state: keep what trains and its moments in shards, one a device.
+        cache_gb: most gigabytes of images at addresses that are cached on this host's disk.
         callbacks: see `fit`.
         quiet: no progress bars.
         say: called with each line to print.
@@ -114,7 +118,8 @@ def train(
         groups = f"{len(each.names)} places" if isinstance(each, Places) else ""
         if isinstance(each, QuerySet):
             groups = f"{len(each.queries)} queries with positives"
-        say(f"{name}{': ' if name else ''}{roots[name]}: {groups}, {len(each.files)} images{on}")
+        root = f"{name}{': ' if name else ''}{address_of(roots[name])}"
+        say(f"{root}: {groups}, {len(each.files)} images{on}")
         on = ""
     result = fit(
         config,
@@ -125,6 +130,7 @@ def train(
         on_bad_image=on_bad_image,
         num_threads=num_threads,
         shard_state=shard_state,
+        cache_gb=cache_gb,
         callbacks=callbacks,
         quiet=quiet,
     )

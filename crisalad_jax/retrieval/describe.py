@@ -126,7 +126,7 @@ def describe_files(
     paths = [pathlib.Path(file) for file in _as_list("files", files)]
     stream = described(describer, paths, reading.fitted(len(paths)))
     stream = shown(stream, "images", len(paths), quiet=reading.quiet)
-    return _concatenated(list(stream)).descriptors
+    return concatenated(list(stream)).descriptors
 
 
 def describe_images(
@@ -287,13 +287,14 @@ def joined(stream: Iterator[Described], size: int) -> Iterator[Described]:
     for part in stream:
         waiting.append(part)
         if sum(len(each.indices) for each in waiting) >= size:
-            yield _concatenated(waiting)
+            yield concatenated(waiting)
             waiting.clear()
     if waiting:
-        yield _concatenated(waiting)
+        yield concatenated(waiting)
 
 
-def _concatenated(parts: Sequence[Described]) -> Described:
+def concatenated(parts: Sequence[Described]) -> Described:
+    """Join the descriptors of consecutive images."""
     return Described(*map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -310,7 +311,7 @@ class TokenSet:
         """Read the images, as `token_rows`."""
         stream = token_rows(describer, paths, reading)
         stream = shown(stream, label, len(paths), quiet=reading.quiet)
-        _, self.rows, self.unreadable = _concatenated(list(stream))
+        _, self.rows, self.unreadable = concatenated(list(stream))
         self._describer, self._reading, self._label = describer, reading, label
 
     def batches(self, grouping: str, batch_size: int | None, seed: int = 0) -> Batches:

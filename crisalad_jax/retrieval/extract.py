@@ -25,11 +25,9 @@ from crisalad_jax.data.tracks import Track
 from crisalad_jax.retrieval.chunks import Descriptors, check_rows
 from crisalad_jax.retrieval.describe import (
     check_readable,
-    described,
     grouped,
     joined,
     shown,
-    token_rows,
 )
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.descriptor_files import (
@@ -41,8 +39,10 @@ from crisalad_jax.retrieval.descriptor_files import (
 )
 from crisalad_jax.retrieval.grouping import GROUPINGS, batches_of
 from crisalad_jax.retrieval.maps.file_store import FileStore
+from crisalad_jax.retrieval.on_cluster import Describing
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash, shortened
 from crisalad_jax.retrieval.segments import SEGMENT, Segments, digest_of
+from crisalad_jax.utils.cluster import check_cluster
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import (
     check_no_links,
@@ -87,6 +87,7 @@ def extract(
     pca: StrPath | Pca | None = None,
     verify: bool = True,
     reading: Reading = Reading(),
+    cluster: str | None = None,
 ) -> Extracted:
     """Describe images, and write the descriptors where they are asked for.
 
@@ -112,13 +113,15 @@ def extract(
         pca: components that shorten the descriptors, or a file of them.
         verify: whether to check the bytes of `pca` against their checksum.
         reading: how images are read.
+        cluster: the Ray cluster that describes them (extra `ray`): "local", "auto",
+            "ray://HOST[:PORT]" or "HOST:PORT" (docs/how-to/ray.md). None describes them here.
 
     Returns:
         Names and descriptors of the images that could be read.
 
     Raises:
-        InputError: what `describer_of` and `check_extraction` raise; components of another
-            length; no image, an image that cannot be read, or none that can; a name that is
+        InputError: what `describer_of`, `check_extraction` and `connected` raise; components of
+            another length; no image, an image that cannot be read, or none that can; a name that is
             not a line of text or does not lie under `root`; or a file that cannot be read or
             written.
 
@@ -131,7 +134,7 @@ def extract(
         (4, 576)
     """
     describer = describer_of(model, [grouping])
-    check_extraction(out, grouping=grouping, seed=seed)
+    check_extraction(out, grouping=grouping, seed=seed, cluster=cluster)
     components = pca if pca is None or isinstance(pca, Pca) else load_pca(pca, verify=verify)
     made_by = "model" if weights is None else str(weights)
     length, is_unit = shortened(components, describer, made_by)
@@ -147,9 +150,8 @@ def extract(
     made = {} if out is None else _made(describer, components)
     reading = reading.fitted(len(paths))
     source = str(images) if isinstance(images, str | os.PathLike) else "images"
-    work = _Work(
-        describer, components, length, is_unit, grouping, seed, reading, source, paths, names
-    )
+    how = (describer, components, cluster, length, is_unit, grouping, seed, reading)
+    work = _Work(*how, source, paths, names)
     record = {
         "weights": None if weights is None else starter.named(weights),
         "images": source,
@@ -185,6 +187,7 @@ def check_extraction(
     *,
     grouping: str = "single",
     seed: int = 0,
+    cluster: str | None = None,
 ) -> None:
     """Check what can be checked of an extraction before a model is loaded.
 
@@ -192,6 +195,7 @@ def check_extraction(
         out: as `extract` takes it, and so are the others.
         grouping: which images attend to each other.
         seed: draws the order of the grouping "shuffled".
+        cluster: the address of a Ray cluster.
 
     Raises:
         InputError: an unknown suffix or grouping; a file that cannot be made; or a number out of
@@ -204,6 +208,7 @@ def check_extraction(
         check_target(target)
     choose("grouping", grouping, GROUPINGS)
     check_seed("seed", seed)
+    check_cluster(cluster)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,6 +220,7 @@ class _Work:
 
     describer: Describer
     components: Pca | None
+    cluster: str | None
     length: int
     """Number of dimensions of the descriptors that are written."""
     is_unit: bool
@@ -260,10 +266,8 @@ class _Work:
             read_pixels(self.paths[self.names.index(skipped[0])])  # raises what it was skipped for
         first = len(segments) + len(skipped)
         is_single, rest = self.grouping == "single", self.paths[first:]
-        if is_single:
-            new = described(self.describer, rest, self.reading, components=self.components)
-        else:
-            new = token_rows(self.describer, rest, self.reading)
+        how = Describing(self.describer, self.reading, self.components, tokens=not is_single)
+        new = how.stream(rest, self.cluster)
         new = shown(new, "images", len(self.paths), quiet=self.reading.quiet, done=first)
         for part in joined(new, SEGMENT):
             unreadable = [self.names[first + int(number)] for number in part.unreadable]

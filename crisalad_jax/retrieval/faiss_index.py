@@ -1,9 +1,10 @@
 """Approximate search by FAISS, for databases whose exact search takes too long.
 
-A graph (HNSW: Malkov and Yashunin, 2018) keeps the descriptors as they are and finds nearly all
-neighbours. IVF-PQ (Jegou, Douze and Schmid, 2011) keeps 128 bytes of each at most, and looks at a
-part of them. What either misses is measured against the exact search: `recall_against_exact`.
-Descriptors of thousands of numbers are reduced first (`pca`).
+A graph (HNSW: Malkov and Yashunin, 2018) stores the descriptors as they are and finds nearly all
+neighbours. IVF-RaBitQ (Gao and Long, 2024) stores a bit of each number, and compares the bits in
+the lists nearest to a query; exact similarities then rank what it finds. What either misses is
+measured against the exact search: `recall_against_exact`. Reduce descriptors of thousands of
+numbers first (`pca`).
 """
 
 import hashlib
@@ -11,7 +12,7 @@ import math
 import os
 import pathlib
 from collections.abc import Callable, Iterable
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import faiss as _faiss
 import numpy as np
@@ -27,10 +28,10 @@ from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Float, Int
 
 faiss: Any = _faiss  # its classes are made when it is loaded
-Kind = Literal["hnsw", "ivf-pq"]
-KINDS: dict[str, type] = {"hnsw": faiss.IndexHNSWFlat, "ivf-pq": faiss.IndexIVFPQ}
+Kind = Literal["hnsw", "ivf-rabitq"]
+KINDS: dict[str, None] = dict.fromkeys(get_args(Kind))
 """A graph over the descriptors as they are, nearly exact and as large as they are; or lists of
-codes of at most 128 bytes each, small and less exact."""
+their signs, a 27th of the size at 512 numbers, whose answers are to be ranked again."""
 _LINKS = 32
 """Number of links of a vector in each layer of the graph; twice as many in the lowest. Faiss
 recommends 4 to 64 and the paper 5 to 48, with more for longer vectors."""
@@ -38,13 +39,9 @@ _BUILD_EFFORT = 128
 """Number of candidates kept while a vector is inserted; the paper's examples keep 100."""
 _LEAST_EFFORT = 128
 """Number of candidates kept while a graph is searched, at least."""
-_CODE_BYTES = 128
-_CENTROIDS = 256
-"""Number of centroids of each part of a vector: a code of one byte."""
-_PER_CENTROID = 39
-"""Number of vectors to train a centroid from; with fewer, faiss warns of a poor clustering."""
-LEAST_ROWS = _PER_CENTROID * _CENTROIDS
-"""Smallest number of descriptors that an IVF-PQ index is trained from."""
+_PER_LIST = 39
+"""Number of vectors to train a list's centroid from; with fewer, faiss warns of a poor
+clustering."""
 _TRAINING_BYTES = 2**30
 """Largest size in bytes of the descriptors that an index is trained from."""
 _CHUNK_BYTES = 2**26
@@ -72,14 +69,14 @@ class Index(NamedTuple):
     ) -> Neighbours:
         """Find the most similar descriptors of each query, approximately.
 
-        Where fewer than k are found, the last indices are -1 and their similarities -inf. IVF-PQ's
-        similarities are products with the vectors that its codes approximate.
+        Where fewer than k are found, the last indices are -1 and their similarities -inf. Those of
+        IVF-RaBitQ are estimates.
 
         Args:
             queries: unit descriptors.
             k: neighbours per query; at most all.
             effort: how much is looked at, for more to be found in more time: of HNSW, candidates
-                kept while searching (by default 128, or 2 k); of IVF-PQ, lists looked into (by
+                kept while searching (by default 128, or 2 k); of IVF-RaBitQ, lists looked into (by
                 default a sixteenth of them).
             without: indices that are not to be found; None is none.
 
@@ -94,15 +91,41 @@ class Index(NamedTuple):
         if self.kind == "hnsw":
             chosen = faiss.SearchParametersHNSW(efSearch=effort or max(_LEAST_EFFORT, 2 * k))
         else:
-            lists = self.faiss_index.nlist
-            chosen = faiss.SearchParametersIVF(nprobe=min(effort or -(-lists // 16), lists))
+            lists = _lists(self.faiss_index).nlist
+            looked = min(effort or -(-lists // 16), lists)
+            chosen = faiss.SearchParametersIVF(nprobe=looked)
         if without is not None and len(without):
             left = np.ones(self.size, bool)
             left[without] = False
             packed = np.packbits(left, bitorder="little")  # must live as long as the search
             chosen.sel = faiss.IDSelectorBitmap(len(packed), faiss.swig_ptr(packed))
+        if self.kind != "hnsw":
+            chosen = faiss.SearchParametersPreTransform(index_params=chosen)
         similarities, indices = self.faiss_index.search(queries, k, params=chosen)
         return Neighbours(indices, np.where(indices < 0, -np.inf, similarities).astype(np.float32))
+
+    def add(
+        self, parts: Iterable[Float[np.ndarray, "rows d"]], count: int, *, quiet: bool = True
+    ) -> None:
+        """Append descriptors, some rows at a time.
+
+        Args:
+            parts: unit descriptors.
+            count: number of them all, for the progress bar.
+            quiet: no progress bar.
+
+        Raises:
+            InputError: rows that are not finite or not of unit length.
+        """
+        with progress_bar(self.kind, count, "rows", quiet=quiet) as bar:
+            for part in parts:
+                self.faiss_index.add(as_unit_rows(part, "database"))
+                bar.advance(len(part))
+
+    def has_room_for(self, count: int) -> bool:
+        """Return whether a new index of so many descriptors has at most twice as many lists."""
+        index = self.faiss_index
+        return self.kind == "hnsw" or 2 * _lists(index).nlist >= _list_count(count, index.d)
 
 
 Parts = Callable[[], Iterable[Float[np.ndarray, "rows d"]]]
@@ -112,13 +135,14 @@ Parts = Callable[[], Iterable[Float[np.ndarray, "rows d"]]]
 def build(kind: Kind, database: Descriptors | Parts, *, seed: int = 0, quiet: bool = True) -> Index:
     """Build an index of unit descriptors, which may be a memory map, reading some at a time.
 
-    IVF-PQ has 4 sqrt(n) lists (faiss's guidelines: 4 to 16 sqrt(n)), or fewer, so that each is
-    trained from 39 vectors. A vector is split into equal parts of 2 numbers or more, at most 128,
-    with a byte for each. The training sample is random, 1 GiB of descriptors at most.
+    IVF-RaBitQ rotates vectors at random, so that no number of theirs counts for more than others,
+    and has 4 sqrt(n) lists (faiss's guidelines: 4 to 16 sqrt(n)), or fewer, so that each is trained
+    from 39 vectors. The training sample is random, 1 GiB of descriptors at most. It takes an eighth
+    of a byte for each number, 8 bytes for two factors and 8 for the index of a descriptor.
 
     HNSW has 32 links for each vector. Its graph, and so the few neighbours that it misses, depend
     on the order in which threads insert vectors. With one thread (OMP_NUM_THREADS=1) the graph
-    depends on the seed alone, as IVF-PQ always does.
+    depends on the seed alone, as IVF-RaBitQ always does.
 
     Args:
         kind: of `KINDS`.
@@ -129,18 +153,16 @@ def build(kind: Kind, database: Descriptors | Parts, *, seed: int = 0, quiet: bo
 
     Raises:
         InputError: an unknown kind; an array that is empty or not a matrix; rows that are not
-            finite or not of unit length; too few to train from.
+            finite or not of unit length.
     """
     choose("kind", kind, KINDS)
     parts = database if callable(database) else _parts_of(as_rows(database, "database"))
     shapes = [part.shape for part in parts()]
     count, length = sum(rows for rows, _ in shapes), shapes[0][1]
-    index = _graph(length, seed) if kind == "hnsw" else _trained_lists(count, length, parts, seed)
-    with progress_bar(kind, count, "rows", quiet=quiet) as bar:
-        for part in parts():
-            index.add(as_unit_rows(part, "database"))
-            bar.advance(len(part))
-    return Index(kind, index)
+    made = _graph(length, seed) if kind == "hnsw" else _trained_lists(count, length, parts, seed)
+    index = Index(kind, made)
+    index.add(parts(), count, quiet=quiet)
+    return index
 
 
 def _parts_of(database: Descriptors) -> Parts:
@@ -155,29 +177,33 @@ def _graph(length: int, seed: int) -> Any:
     return index
 
 
+def _list_count(count: int, length: int) -> int:
+    most = min(count, _TRAINING_BYTES // (4 * length)) // _PER_LIST
+    return max(1, min(most, round(4 * math.sqrt(count))))
+
+
+def _lists(index: Any) -> Any:
+    """Return the lists behind the rotation."""
+    return faiss.downcast_index(index.index)
+
+
 def _trained_lists(count: int, length: int, database: Parts, seed: int) -> Any:
-    if count < LEAST_ROWS:
-        raise InputError(
-            f"database: found {count} descriptors, expected at least {LEAST_ROWS} to train an "
-            "IVF-PQ index from; search so few exactly, or by hnsw"
-        )
-    largest = max(LEAST_ROWS, _TRAINING_BYTES // (4 * length))
-    wanted = round(4 * math.sqrt(count))
-    trained_from = min(count, largest, max(LEAST_ROWS, 2 * _PER_CENTROID * wanted))
-    lists = min(wanted, trained_from // _PER_CENTROID)
-    parts = max(n for n in range(1, _CODE_BYTES + 1) if length % n == 0 and 2 * n <= max(2, length))
-    index = faiss.IndexIVFPQ(
-        faiss.IndexFlatIP(length), length, lists, parts, 8, faiss.METRIC_INNER_PRODUCT
+    number = _list_count(count, length)
+    rotation = faiss.RandomRotationMatrix(length, length)
+    rotation.init(seed)
+    lists = faiss.IndexIVFRaBitQ(
+        faiss.IndexFlatIP(length), length, number, faiss.METRIC_INNER_PRODUCT
     )
     # The centroids are unit vectors, for they are compared by inner products.
-    index.cp.spherical = True
-    index.cp.seed = index.pq.cp.seed = seed
-    places = sample(count, trained_from, seed)
+    lists.cp.spherical = True
+    lists.cp.seed = seed
+    places = sample(count, min(count, _PER_LIST * number), seed)
     start, chosen = 0, []
     for part in database():
         first, end = np.searchsorted(places, [start, start + len(part)])
         chosen.append(np.asarray(part[places[first:end] - start], WIDE))
         start += len(part)
+    index = faiss.IndexPreTransform(rotation, lists)
     index.train(np.concatenate(chosen))
     return index
 
@@ -218,10 +244,15 @@ def load_index(path: str | os.PathLike[str], *, verify: bool = True) -> Index:
         index = faiss.read_index(str(path))
     except (RuntimeError, MemoryError) as error:
         raise InputError(f"{path}: not a whole faiss index: {one_line(error)}") from error
-    kind: Any = next((name for name, each in KINDS.items() if type(index) is each), None)
+    inner = _lists(index) if type(index) is faiss.IndexPreTransform else index
+    kinds: dict[tuple[type, type], Kind] = {
+        (faiss.IndexHNSWFlat, faiss.IndexHNSWFlat): "hnsw",
+        (faiss.IndexPreTransform, faiss.IndexIVFRaBitQ): "ivf-rabitq",
+    }
+    kind = kinds.get((type(index), type(inner)))
     if kind is None or index.metric_type != faiss.METRIC_INNER_PRODUCT:
         raise InputError(
-            f"{path}: found a {type(index).__name__}, expected one of inner products, as `build` "
+            f"{path}: found a {type(inner).__name__}, expected one of inner products, as `build` "
             "makes it"
         )
     return Index(kind, index)

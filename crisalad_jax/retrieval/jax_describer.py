@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +42,14 @@ class JaxDescriber:
         self._placed: tuple[int, Devices, Crisalad] | None = None
         """A batch size, the devices that share such a batch, and the parameters on them."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let pickle send it to another process, whose CPU becomes as many devices as here.
+
+        A batch has other bits where more or fewer devices share it.
+        """
+        devices = jax.local_device_count() if jax.default_backend() == "cpu" else None
+        return _sent, (jax.tree.map(np.asarray, self._given), self.config, devices)
+
     @property
     def row_length(self) -> int:
         """Number of values in the row of an image's tokens."""
@@ -76,6 +85,11 @@ class JaxDescriber:
     ) -> Float[np.ndarray, "group image descriptor"]:
         """Make descriptors of the tokens of some groups of images; see `Describer.attend`."""
         return np.asarray(_attend(self._params, rows, mask, self.config))
+
+
+def _sent(params: Crisalad, config: ModelConfig, devices: int | None) -> JaxDescriber:
+    compiler.configure(devices)
+    return JaxDescriber(params, config)
 
 
 @over_images("images", 1)

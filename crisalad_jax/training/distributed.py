@@ -16,11 +16,11 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from crisalad_jax.config.checks import require
+from crisalad_jax.training.lost import HEARTBEAT
 from crisalad_jax.utils.errors import InputError, Interrupted
 
 _MESSAGE = 2**16
 """Number of bytes that `run_on_primary` broadcasts: fixed, because JAX compiles for each size."""
-ANOTHER_FAILED = "processes: another one failed; see what it says"
 _T = TypeVar("_T")
 
 
@@ -79,7 +79,7 @@ def join_processes(
     # JAX's own handler of SIGTERM would hide the signal from this program.
     jax.config.update("jax_enable_preemption_service", False)
     try:
-        jax.distributed.initialize(**given)
+        jax.distributed.initialize(**given, heartbeat_timeout_seconds=HEARTBEAT)
     except (ValueError, RuntimeError) as error:
         raise InputError(
             f"processes: cannot meet the others by --coordinator-address {coordinator}: {error} "
@@ -173,12 +173,14 @@ def check_same(numbers: Mapping[str, int]) -> None:
         InputError: they do not, in every process.
     """
     gathered = _gather(*numbers.values())
-    others = np.argwhere(gathered != gathered[0])
-    if len(others):
-        process, position = others[0]
+    is_other = gathered != gathered[0]
+    if is_other.any():
+        position = is_other.any(axis=0).argmax()
+        which = np.flatnonzero(is_other[:, position]).tolist()
+        where = f"process{'es' * (len(which) > 1)} {', '.join(map(str, which))}"
         raise InputError(
-            f"processes: found other {list(numbers)[position]} in process {process} than in 0, "
-            "expected the same"
+            f"processes: found other {list(numbers)[position]} in {where} than in 0, expected the "
+            "same"
         )
 
 
@@ -203,11 +205,16 @@ def raise_together(work: Callable[[], _T]) -> _T:
         error, code = raised, 1
         if isinstance(raised, Interrupted):
             code += raised.number
-    (failed,) = all_max(code)
+    failed, where = all_max(code, jax.process_index() if code else 0)
     if error is not None:
         raise error
     if failed > 1:
         raise Interrupted(failed - 1)
     if failed:
-        raise InputError(ANOTHER_FAILED)
+        raise failed_elsewhere(where)
     return value  # pyright: ignore[reportReturnType]
+
+
+def failed_elsewhere(process: int) -> InputError:
+    """Make the error of the processes other than the one that failed."""
+    return InputError(f"processes: process {process} failed; see what it says")

@@ -3,11 +3,10 @@
 import contextlib
 import dataclasses
 import functools
-import json
+import math
 import os
 import pathlib
 import time
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
@@ -15,19 +14,21 @@ import jax
 import numpy as np
 
 from crisalad_jax.config.checks import PATH, require, takes
-from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.plugins import sources_of
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.file_cache import CACHE_GB, FileCache
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.loader import THREADS, ImageCache
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
+from crisalad_jax.data.remote import is_remote, read_remote
 from crisalad_jax.nn.model import Crisalad, init_crisalad
 from crisalad_jax.training import distributed
 from crisalad_jax.training.batches import PlaceBatches, TrainingSet, sets_of
 from crisalad_jax.training.callbacks import Callback, Callbacks
 from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.lost import ends_with_the_others
 from crisalad_jax.training.mining import Miner
 from crisalad_jax.training.mixture import check_names
 from crisalad_jax.training.run_files import (
@@ -36,11 +37,14 @@ from crisalad_jax.training.run_files import (
     RunState,
     checksum,
     checksum_of_benchmark,
+    checksum_of_config,
     checksum_of_places,
+    checksum_of_sizes,
 )
 from crisalad_jax.training.trainer import LossNotFiniteError, Trainer, run_keys
 from crisalad_jax.training.validation import Validator
-from crisalad_jax.utils.errors import InputError, Interrupted
+from crisalad_jax.utils.errors import Interrupted
+from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.signals import SignalState, defer_signals
 
@@ -64,6 +68,7 @@ class FitResult(NamedTuple):
     """Number of unreadable images that were masked out, counted each time they came up."""
 
 
+@ends_with_the_others
 @takes(config=TrainConfig, places=(Places, QuerySet, Mapping), out=PATH)
 def fit(
     config: TrainConfig,
@@ -75,6 +80,7 @@ def fit(
     on_bad_image: OnBadImage = "stop",
     num_threads: int | None = None,
     shard_state: bool = False,
+    cache_gb: float = CACHE_GB,
     callbacks: Sequence[Callback | str] = (),
     quiet: bool = False,
 ) -> FitResult:
@@ -103,6 +109,8 @@ def fit(
             leave them out.
         num_threads: number of those threads; None is one for each core that this process may use.
         shard_state: keep what trains and its moments in shards, one a device, not whole on each.
+        cache_gb: most gigabytes (1e9 bytes) of images at addresses that are cached on this host's
+            disk, in the folder `images` of this package's cache; 0 caches none.
         callbacks: called with the numbers of each step and validation, in the primary process; or
             names of registered ones. `StopTraining` of one ends the run, and the same call resumes
             it.
@@ -116,6 +124,7 @@ def fit(
             ground truth; `out` holds something else, or a run of another configuration or start; an
             image cannot be read; there are too few places, classes or images; the loss is no longer
             finite (the state before that step is saved); or a file cannot be written.
+        LostProcessError: another process of this run has ended without a word.
         Interrupted: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
 
     Example:
@@ -135,6 +144,7 @@ def fit(
         )
     threads = THREADS if num_threads is None else num_threads
     require(threads >= 0, f"num_threads: found {threads}, expected at least 0")
+    require(0 <= cache_gb < math.inf, f"--cache-gb: found {cache_gb:g}, expected at least 0")
     called = Callbacks(callbacks)
     if initial is None:
         initial = init_crisalad(run_keys(config.seed)[0], config.model)
@@ -144,12 +154,17 @@ def fit(
         "weights": checksum(jax.tree.leaves(initial)),
     }
     # What does not fit raises in all processes, before the first file is written.
-    configuration = zlib.crc32(json.dumps(to_plain(config)).encode())
-    distributed.check_same(
-        {"configuration": configuration, "--shard-state": shard_state, **checksums}
-    )
-    cache = ImageCache()
     part = jax.process_index(), jax.process_count()
+    distributed.check_same(
+        {
+            "configuration": checksum_of_config(config),
+            "--shard-state": shard_state,
+            **checksums,
+            "sizes of images": checksum_of_sizes(places) if part[1] > 1 else 0,
+        }
+    )
+    far = distributed.raise_together(lambda: _reader(places, cache_gb))
+    cache = ImageCache(read_far=far)
     make: Any = Miner if config.mines else PlaceBatches
     data: PlaceBatches | Miner = make(
         config, places, part=part, on_bad_image=on_bad_image, threads=threads, cache=cache
@@ -179,6 +194,13 @@ def fit(
     result = FitResult(trainer.params(), record.step, best, stopped, record.skipped_images)
     called.call("on_end", result)
     return result
+
+
+def _reader(places: TrainingSet, cache_gb: float) -> Callable[[Any], bytes]:
+    """Return what reads images at addresses, from this host's disk where it has them."""
+    if cache_gb == 0 or not any(is_remote(each.root) for each in sets_of(places)):
+        return read_remote
+    return FileCache(user_cache() / "images", cache_gb * 1e9).read
 
 
 @dataclasses.dataclass(frozen=True)
@@ -266,12 +288,13 @@ class _Loop:
     def _exchange_status(self, error: Exception | None) -> None:
         """Act on what any process knows: raise an error or a signal, or save."""
         own = 0 if error is None else 1 if isinstance(error, LossNotFiniteError) else 2
-        failed, number, save_is_due, stopped = distributed.all_max(
-            own, self.signals.number, self.files.save_is_due(), self.callbacks.stopped
+        where = jax.process_index() if own else 0
+        failed, number, save_is_due, stopped, where = distributed.all_max(
+            own, self.signals.number, self.files.save_is_due(), self.callbacks.stopped, where
         )
         if failed:
             # Where all have found that the loss is not finite, all raise that, and save together.
-            another = InputError(distributed.ANOTHER_FAILED)
+            another = distributed.failed_elsewhere(where)
             raise error if error is not None and own == failed else another
         self.callbacks.stopped = bool(stopped)
         if number or save_is_due or stopped:

@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import dataclasses
+import json
 import pathlib
 import time
 import zlib
@@ -19,7 +20,9 @@ from crisalad_jax.config.checks import require
 from crisalad_jax.config.io import differences, read_config, to_plain
 from crisalad_jax.config.plugins import changed_sources
 from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.frames import file_of
 from crisalad_jax.data.query_set import QuerySet
+from crisalad_jax.data.remote import for_each, size_of
 from crisalad_jax.nn.model import Crisalad, Model
 from crisalad_jax.training import distributed
 from crisalad_jax.training.batches import Drawn, TrainingSet, sets_of
@@ -296,13 +299,29 @@ def write_data(
 
 
 def checksum_of_places(places: TrainingSet) -> int:
-    """Compute the CRC of all images' names, and of their places or of the queries' positives."""
+    """Compute the CRC of the names of all images and places, or of the queries' positives."""
     if isinstance(places, Mapping):
         return checksum(map(checksum_of_places, sets_of(places)))
     if isinstance(places, QuerySet):
         names = (pathlib.Path(file).name for file in places.files)
         return checksum([_text(names), places.queries, *places.positives, *places.near])
-    return checksum([_text(places.files), places.place_start])
+    return checksum([_text(places.files), places.place_start, _text(places.names)])
+
+
+def checksum_of_sizes(places: TrainingSet) -> int:
+    """Compute the CRC of the sizes of all images' files.
+
+    Raises:
+        InputError: an address that cannot be asked.
+    """
+    paths = (each.path(image) for each in sets_of(places) for image in range(len(each.files)))
+    files = list(dict.fromkeys(map(file_of, paths)))
+    return checksum([[-1 if size is None else size for size in for_each(size_of, files)]])
+
+
+def checksum_of_config(config: TrainConfig) -> int:
+    """Compute the CRC of a configuration."""
+    return checksum([_text([json.dumps(to_plain(config))])])
 
 
 def checksum_of_benchmark(benchmark: Benchmark) -> int:

@@ -19,8 +19,9 @@ from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.training import distributed
 from crisalad_jax.training.batches import TrainingSet, sets_of
 from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.lost import ends_with_the_others
 from crisalad_jax.training.mixture import check_names
-from crisalad_jax.training.run_files import check_run
+from crisalad_jax.training.run_files import check_run, checksum_of_config
 from crisalad_jax.training.trainable import count_trainable
 from crisalad_jax.training.vocabulary import with_vocabulary
 from crisalad_jax.utils.output import warn
@@ -32,6 +33,7 @@ RunInputs = tuple[TrainingSet, Benchmark | None, Crisalad | None]
 """The training set, the validation set, and the parameters to start from, as `fit` takes them."""
 
 
+@ends_with_the_others
 def read_inputs(
     config: TrainConfig,
     data: Path | Mapping[str, Path],
@@ -83,9 +85,13 @@ def read_inputs(
         how: Any = {"images": validation_images, "on_bad_image": on_bad_image}
         return places, open_benchmark(validation, **how), initial
 
-    count_trainable(config.model, config.trainable)  # refuses a wrong name before anything is read
+    # This refuses a wrong name before anything is read.
+    distributed.raise_together(lambda: count_trainable(config.model, config.trainable))
     distributed.run_on_primary(lambda: check_run(pathlib.Path(out), config))
     places, benchmark, initial = distributed.raise_together(read)
+    # Others would not meet in what follows.
+    given = {"configuration": checksum_of_config(config), "--weights": weights is not None}
+    distributed.check_same(given)
     if weights is None and config.model.aggregator.trainable:
         how: Any = {"on_bad_image": on_bad_image, "quiet": quiet}
         initial = with_vocabulary_of(initial, config, places, **how)

@@ -172,12 +172,16 @@ def set_up() -> Session:
     return Session(devices[0].platform, len(devices), cache)
 
 
-def configure() -> None:
-    """Configure devices and the compile cache of `set_up`, and start no device."""
+def configure(devices: int | None = None) -> None:
+    """Configure devices and the compile cache of `set_up`, and start no device.
+
+    Args:
+        devices: number of devices that the CPU becomes; None is one for each core.
+    """
     is_set = "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
     if not is_set and jax.config.jax_num_cpu_devices < 1:  # pyright: ignore
         with contextlib.suppress(RuntimeError):  # JAX has been used already
-            jax.config.update("jax_num_cpu_devices", usable_cores())
+            jax.config.update("jax_num_cpu_devices", devices or usable_cores())
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore
         with contextlib.suppress(OSError, RuntimeError):  # no permission, or no home folder
             cache = user_cache() / "xla"

@@ -13,6 +13,7 @@ EXTRAS: Mapping[str, tuple[str, ...]] = {
     "openvino": ("openvino", "onnx", *_CLI),
     "serve": ("fastapi", "uvicorn", "python_multipart", *_CLI),
     "data": ("huggingface_hub", "kagglehub", *_CLI),
+    "ray": ("ray", "grpc", *_CLI),
     "milvus": ("pymilvus", "milvus_lite"),
     "convert": ("torch", *_CLI),
 }
@@ -29,7 +30,7 @@ def missing_extra(error: ModuleNotFoundError, what: str) -> str:
     extra = next((extra for extra, modules in EXTRAS.items() if name in modules), None)
     if extra is None:
         raise error
-    others = "" if extra in ("milvus", "convert") else " (or [all])"
+    others = "" if extra in ("milvus", "ray", "convert") else " (or [all])"
     return (
         f"{what}: found no module {name}, expected it with the extra {extra}: "
         f"pip install 'crisalad-jax[{extra}]'{others}"

@@ -1,6 +1,9 @@
 """The share of the machine that this process may use."""
 
+import contextlib
 import os
+import pathlib
+import re
 import resource
 
 
@@ -9,6 +12,17 @@ def usable_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def available_memory() -> int:
+    """Return how many bytes of memory programs may still take, or may at most, by what is known."""
+    found = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    with contextlib.suppress(OSError):
+        lines = pathlib.Path("/proc/meminfo").read_text(encoding="utf-8")
+        found += [1024 * int(size) for size in re.findall(r"MemAvailable:\s*(\d+) kB", lines)]
+    with contextlib.suppress(OSError, ValueError):  # a container's limit, or "max"
+        found.append(int(pathlib.Path("/sys/fs/cgroup/memory.max").read_text(encoding="utf-8")))
+    return min(found)
 
 
 def most_files() -> int:

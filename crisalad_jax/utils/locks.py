@@ -22,15 +22,12 @@ from crisalad_jax.utils.temporaries import (
     temporary_beside,
 )
 
-
-class BusyFolderError(InputError):
-    """Another process writes into a folder."""
+_POLL = 0.2
+"""Seconds between two looks at a lock that another process holds."""
 
 
 @contextlib.contextmanager
-def lock(
-    folder: str | os.PathLike[str], *, wait: bool = False, quiet: bool = False
-) -> Iterator[None]:
+def lock(folder: str | os.PathLike[str], *, wait: float = 0.0) -> Iterator[None]:
     """Hold the lock of a folder, which is made if needed, while the block writes into it.
 
     The kernel releases the lock at the end of the process at the latest, so a killed process never
@@ -38,30 +35,26 @@ def lock(
 
     Args:
         folder: the folder.
-        wait: whether to wait for another process that holds it, with a note.
-        quiet: whether to wait without a note.
+        wait: seconds to wait for another process that holds it, with a note.
 
     Raises:
-        BusyFolderError: another process holds it; the message says which, on which host.
-        InputError: the folder cannot be made or written to.
+        InputError: another process holds it, and the message says which, on which host; or the
+            folder cannot be made or written to.
     """
     folder = pathlib.Path(folder)
+    end, told = time.monotonic() + wait, False
     while (held := _acquire(folder)) is None:
-        if not wait:
-            raise BusyFolderError(
+        if time.monotonic() >= end:
+            raise InputError(
                 f"{folder}: found another process that writes here{_holder(folder)}, expected to "
                 "be the only one"
             )
-        if not quiet:
+        if not told:
             warn(f"{folder}: waiting for another process{_holder(folder)}")
-            quiet = True
-        time.sleep(POLL)
+            told = True
+        time.sleep(_POLL)
     with held:
         yield
-
-
-POLL = 0.2
-"""Seconds between two looks at a lock that another process holds."""
 
 
 def _acquire(folder: pathlib.Path) -> contextlib.ExitStack | None:

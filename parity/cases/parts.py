@@ -11,6 +11,7 @@ import jax
 import torch
 from torch import Tensor
 
+from crisalad_jax.nn.adapters import TokenInfo
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.attention import attention
 from crisalad_jax.nn.backbones import Features
@@ -126,7 +127,7 @@ FEED_FORWARD = Part(
 
 
 def _our_block(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
-    return {"tokens": block(_last_block(params), x["tokens"], GRID, _vit(config))[0]}
+    return {"tokens": block(_last_block(params), x["tokens"], TokenInfo(GRID), _vit(config))[0]}
 
 
 BLOCK = Part(

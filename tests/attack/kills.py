@@ -8,6 +8,7 @@ while they import. Moments are of two kinds: at any time of a whole run, and soo
 work has begun, so that saves and commits, which are short, are met too.
 """
 
+import contextlib
 import dataclasses
 import functools
 import importlib
@@ -42,6 +43,7 @@ from tests.attack.world import (
     forked,
     has_temporaries,
     part_of,
+    with_flag,
     without_times,
 )
 
@@ -739,6 +741,63 @@ def attack_compare(bench: Bench, scale: float) -> list[Row]:
     return [row]
 
 
+def attack_compare_on_ray(bench: Bench, scale: float) -> list[Row]:
+    """Kill workers of a comparison of two runs at once on Ray, and the command itself."""
+    folder = bench.folder / "comparing on ray"
+    ends = "the comparison ends as a whole one, and finished runs are left as they are"
+    rows = {name: Row(f"kills of compare on Ray: {name}", ends) for name in ("worker", "command")}
+
+    def start(out: pathlib.Path) -> subprocess.Popen[bytes]:
+        given = arguments("compare", bench.world, out)
+        given = with_flag(with_flag(given, "--seeds", "3"), "--epochs", "20")
+        return bench.program(with_flag(given, "--jobs", "2"))
+
+    def ended(program: subprocess.Popen[bytes]) -> str:
+        """Wait for its end; return what is wrong with that."""
+        _, err = program.communicate(timeout=900)
+        return err.decode()[-300:] if program.returncode else ""
+
+    def workers(out: pathlib.Path) -> list[int]:
+        """The processes that write into runs."""
+        texts = (path.read_text().split() for path in out.glob("*/*/*/.crisalad-lock"))
+        return sorted({int(words[1]) for words in texts if words})
+
+    def finished(out: pathlib.Path) -> dict[pathlib.Path, int]:
+        """When each finished run got its result."""
+        paths = out.glob("*/*/*/result.json")
+        return {p: p.stat().st_mtime_ns for p in paths if json.loads(p.read_text())["ranks"]}
+
+    begun = time.monotonic()
+    assert not ended(start(folder / "whole"))
+    seconds, expected = time.monotonic() - begun, contents(folder / "whole")
+    kills, chain = dict.fromkeys(rows, part_of(10, scale)), 0
+    while left := [name for name, count in kills.items() if count]:
+        out, wrong, before, met = folder / f"chain{chain}", [], {}, []
+        while (name := bench.random.choice(left)) and kills[name]:
+            program = start(out)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                program.wait(bench.random.uniform(0.2, 1) * seconds)
+            before |= finished(out)
+            victims = workers(out) if name == "worker" else [program.pid]
+            if program.poll() is None and victims:
+                os.kill(bench.random.choice(victims), signal.SIGKILL)
+                kills[name] -= 1
+                met.append(name)
+            said = ended(program)
+            if program.returncode == 0:
+                break
+            if program.returncode != -signal.SIGKILL or name == "worker":
+                wrong.append(said)
+        wrong += filter(None, [ended(start(out))])
+        wrong += differences(contents(out), expected)
+        wrong += [str(path) for path, when in before.items() if finished(out).get(path) != when]
+        for name in met:
+            rows[name].note(not wrong, f"seed {bench.seed}, chain {chain}, {met}: {wrong}")
+        chain += 1
+        bench.say(f"kills of compare on Ray: {kills} are left")
+    return [*rows.values()]
+
+
 ATTACKS: Mapping[str, Attack] = {
     "training": attack_training,
     "maps": attack_maps,
@@ -746,6 +805,7 @@ ATTACKS: Mapping[str, Attack] = {
     "extract .npy": functools.partial(attack_extract, ".npy"),
     "extract .h5": functools.partial(attack_extract, ".h5"),
     "compare": attack_compare,
+    "compare on Ray": attack_compare_on_ray,
 }
 
 

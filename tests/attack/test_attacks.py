@@ -33,6 +33,7 @@ ALL = (
     ("kills", 1, "maps, extract .npy, extract .h5", 100),
     ("kills", 1, "map changes", 60),
     ("kills", 1, "compare", 6),
+    ("kills", 1, "compare on Ray", 20),
     ("memory", 1, "", 7),
     ("service", 1, "", 2000),
     ("surroundings", 1, "20 columns, python -O, python -W error, C locale, no home", 40),

@@ -18,23 +18,31 @@ def test_the_page_holds_the_numbers_of_the_json(shared, tmp_path, capfd, weights
     page_text = (tmp_path / "page" / "index.html").read_text(encoding="utf-8")
     page = Page(page_text)
     results = json.loads((tmp_path / "found.json").read_text())["results"]
-    assert [e["text"] for e in page.all("th", scope="row")] == ["single", "sequential"]
+    assert [e["text"] for e in page.all("th", scope="row")] == 3 * ["single", "sequential"]
     cells = iter(e["text"] for e in page.all("td"))
     for result in results:
         for value in result["recalls"].values():
             assert next(cells).startswith(f"{100 * value:.1f}")
-        for share in (*result["same_place"].values(), result["mirrored"]):
-            assert next(cells) == ("\N{EN DASH}" if share is None else f"{100 * share:.1f}")
-        gain = result["over_single"]
-        points = [100 * number for number in (gain["R@1"], *gain["interval"])] if gain else []
-        assert next(cells) == (
-            "{:+.1f}{:+.1f} to {:+.1f}".format(*points) if gain else "\N{EN DASH}"
-        )
         for name in ("average_precision", "recall_at_full_precision"):
             assert next(cells) == f"{100 * result[name]:.1f}"
+    for result in results:
+        assert next(cells) == f"{100 * result['recalls']['R@1']:.1f}"
+        gain = result["over_single"]
+        points = [100 * number for number in (gain["R@1"], *gain["interval"])] if gain else []
+        assert next(cells) == ("{:+.1f}{:+.1f} to {:+.1f}".format(*points) if gain else "-")
+        shares = [
+            "-" if share is None else f"{100 * share:.1f}"
+            for share in (*result["same_place"].values(), result["mirrored"])
+        ]
+        assert next(cells) == " / ".join(shares[:2])
+        assert next(cells) == shares[2]
+    for result in results:
         point = result["operating_point"]
-        similarity = f"similarity from {point['min_similarity']:.9g}"
-        assert next(cells) == f"{100 * point['right'] / 5:.1f}{similarity}"
+        assert next(cells) == f"{point['min_similarity']:.9g}"
+        assert next(cells).startswith(f"{100 * point['precision']:.1f}")
+        assert next(cells).startswith(f"{100 * point['right'] / 5:.1f}")
+        assert next(cells) == f"{point['right']} of {point['answered']}"
+        next(cells)
         # Five queries are few, as the terminal and the page say.
         words = f"{result['grouping']}: rests on few queries: {point['right']} of "
         assert words in said

@@ -245,7 +245,7 @@ def test_an_abandoned_iterator_stops_reading(places, monkeypatch):
     reads = []
     go_on = threading.Event()
 
-    def slow_read(path, *, enough):
+    def slow_read(path, *, enough, read_far):
         reads.append(path)
         if len(reads) > 16:
             assert go_on.wait(timeout=30)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from crisalad_jax.cli.tables import grouping_table, leakage_table
 from crisalad_jax.evaluation.difference import paired_difference
 from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
 from crisalad_jax.evaluation.results import ANY, GroupingResult, over_single, summarise, to_json
+from crisalad_jax.experiments.result_tables import grouping_table, leakage_table
 from crisalad_jax.retrieval.neighbours import Neighbours
 
 KS = (1, 2)

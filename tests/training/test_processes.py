@@ -244,12 +244,17 @@ def test_processes_that_differ_end_before_the_run(shared, tmp_path, more, what):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("more", "words"),
-    [(("--data", "none"), "crisalad: none"), (("--weights", "no.safetensors"), "no.safetensors")],
+    [
+        (("--data", "none"), "crisalad: none"),
+        (("--weights", "no.safetensors"), "no.safetensors"),
+        # Without credentials, which the tests' environment has not.
+        (("--data", "s3://none/places"), "crisalad: s3://none/places"),
+    ],
 )
 def test_what_fails_in_one_process_before_training_ends_both(shared, tmp_path, more, words):
     found = ends(start(shared, tmp_path / "run", *more))
     assert [code for code, _ in found] == [2, 2], found
-    assert "crisalad: processes: another one failed; see what it says" in found[0][1]
+    assert "crisalad: processes: process 1 failed; see what it says" in found[0][1]
     assert words in found[1][1]
 
 
@@ -263,7 +268,7 @@ def test_an_image_that_one_process_cannot_read_ends_both(shared, tmp_path):
     assert [code for code, _ in found] == [2, 2], found
     words = sorted(words.splitlines()[-1] for _, words in found)
     assert any(words[0].startswith(f"crisalad: {path}: found 10 bytes") for path in broken)
-    assert words[1] == "crisalad: processes: another one failed; see what it says"
+    assert re.fullmatch("crisalad: processes: process [01] failed; see what it says", words[1])
 
 
 def wait_for_steps(programs: list[subprocess.Popen[str]], out: pathlib.Path) -> None:
@@ -282,9 +287,12 @@ def test_where_one_process_is_killed_the_other_ends_and_both_go_on(
     programs = start(shared, out)
     wait_for_steps(programs, out)
     programs[killed].kill()
-    codes = [code for code, _ in ends(programs)]
-    assert codes[killed] == -signal.SIGKILL
-    assert codes[1 - killed] != 0
+    found = ends(programs)
+    assert found[killed][0] == -signal.SIGKILL
+    code, words = found[1 - killed]
+    assert code != 0
+    assert re.search("^crisalad: processes: lost (process [01]|another one)", words, re.MULTILINE)
+    assert "Check failure stack trace" not in words
     assert [code for code, _ in ends(start(shared, out))] == [0, 0]
     assert_same_run(out, by_devices / "1")
 
@@ -385,6 +393,22 @@ def test_each_process_of_a_host_has_its_own_gpu(
     assert asked.get("local_device_ids") == expected
     if coordinator != "auto":
         assert (asked["num_processes"], asked["process_id"]) == (4, 3)
+
+
+def test_processes_that_gave_other_numbers_are_named(monkeypatch):
+    given = np.array([[1, 7], [1, 7], [1, 8], [1, 9]])
+    monkeypatch.setattr(processes, "_gather", lambda *numbers: given)
+    words = "^processes: found other places in processes 2, 3 than in 0, expected the same$"
+    with pytest.raises(InputError, match=words):
+        processes.check_same({"configuration": 1, "places": 7})
+    given[2:] = given[0]
+    processes.check_same({"configuration": 1, "places": 7})
+
+
+def test_the_process_that_failed_is_named(monkeypatch):
+    monkeypatch.setattr(processes, "all_max", lambda *numbers: (1, 2))
+    with pytest.raises(InputError, match=r"^processes: process 2 failed; see what it says$"):
+        processes.raise_together(lambda: None)
 
 
 @pytest.mark.parametrize("given", [(), (0, -1)])

@@ -240,7 +240,7 @@ def test_the_next_writer_waits_and_tells_of_the_first(tmp_path):
         # Ends the holder while this process waits.
         threading.Timer(0.3, process.stdin.close).start()
         words = rf"out: waiting for another process \(process {process.pid} on "
-        second = lock(folder, wait=True)
+        second = lock(folder, wait=60)
         with pytest.warns(Note, match=words):
             second.__enter__()
         assert process.wait(10) == 0

@@ -17,6 +17,7 @@ from crisalad_jax.data.benchmarks.benchmark import DEFAULT_RADIUS, Benchmark, wi
 from crisalad_jax.data.benchmarks.on_disk import find_images, listing, shown
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.metres import on_ellipsoid
+from crisalad_jax.data.remote import is_folder
 from crisalad_jax.data.tables import read_table
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
@@ -158,7 +159,7 @@ def heading_difference(
 
 def is_msls(root: pathlib.Path) -> bool:
     """Return whether a folder is raw MSLS: it holds train_val/ or is itself train_val/."""
-    return (root / "train_val").is_dir() or real_path(root).name == "train_val"
+    return is_folder(root / "train_val") or real_path(root).name == "train_val"
 
 
 def read_side(

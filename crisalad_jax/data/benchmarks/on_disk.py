@@ -5,6 +5,7 @@ import pathlib
 from collections.abc import Iterable, Sequence
 
 from crisalad_jax.data.images import OnBadImage, list_images
+from crisalad_jax.data.remote import is_file, is_folder, names_in
 from crisalad_jax.data.tables import Disk
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
@@ -16,12 +17,12 @@ def find_database(folder: pathlib.Path) -> pathlib.Path:
     """Return the folder `database/`, or `gallery/` (SVOX) where there is none."""
     gallery = folder / "gallery"
     database = folder / "database"
-    return gallery if gallery.is_dir() and not database.is_dir() else database
+    return gallery if is_folder(gallery) and not is_folder(database) else database
 
 
 def has_sides(folder: pathlib.Path) -> bool:
     """Return whether a folder itself holds a database and queries."""
-    return find_database(folder).is_dir() and (folder / "queries").is_dir()
+    return is_folder(find_database(folder)) and is_folder(folder / "queries")
 
 
 def list_part(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
@@ -38,9 +39,9 @@ def list_part(folder: pathlib.Path) -> tuple[pathlib.Path, ...]:
 
 def listing(folder: pathlib.Path) -> str:
     """Describe in a message what a folder holds."""
-    if not folder.is_dir():
-        return "a file" if folder.exists() else "no such folder"
-    return shown(path.name + "/" * path.is_dir() for path in folder.iterdir())
+    if not is_folder(folder):
+        return "a file" if is_file(folder) else "no such folder"
+    return shown(name + "/" * is_folder(folder / name) for name in names_in(folder))
 
 
 def shown(names: Iterable[str]) -> str:
@@ -52,7 +53,7 @@ def shown(names: Iterable[str]) -> str:
 
 def has_split(root: pathlib.Path) -> bool:
     """Return whether any of `images/{test,val,train}` is there."""
-    return any((root / "images" / split).is_dir() for split in SPLITS)
+    return any(is_folder(root / "images" / split) for split in SPLITS)
 
 
 def find_split(root: pathlib.Path, split: str | None) -> tuple[pathlib.Path, str]:
@@ -103,8 +104,8 @@ def find_images(
     near = (named_by.parent, named_by.parent.absolute().parent)
     tops = near if images is None else (pathlib.Path(images),)
     roots = [top / folder for top in tops for folder in folders]
-    disk = Disk()
-    there = [root for root in roots if root.is_dir()]
+    disk = Disk(roots[0])
+    there = [root for root in roots if is_folder(root)]
     found = (root for root in there if any(disk.find(root, name) is not None for name in names))
     root = next(found, roots[0])
     paths = [disk.find(root, name) for name in names]

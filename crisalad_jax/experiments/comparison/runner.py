@@ -12,9 +12,7 @@ import functools
 import os
 import pathlib
 import statistics
-import time
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from crisalad_jax.checkpoints.public import with_backbone_of
@@ -31,7 +29,6 @@ from crisalad_jax.experiments.comparison.costs import (
     race,
 )
 from crisalad_jax.experiments.comparison.plan import ComparisonConfig, Prepared, prepare
-from crisalad_jax.experiments.comparison.processes import run_jobs
 from crisalad_jax.experiments.comparison.results import (
     Run,
     Summary,
@@ -40,6 +37,7 @@ from crisalad_jax.experiments.comparison.results import (
     summarise,
 )
 from crisalad_jax.experiments.comparison.tables import markdown, put_in_page, write_tables
+from crisalad_jax.experiments.comparison.tasks import in_tasks, in_turn, joined
 from crisalad_jax.experiments.report.gallery import first_right_ranks
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.retrieval.describe import describe_prepared, prepare_image
@@ -52,12 +50,13 @@ from crisalad_jax.training.start import with_vocabulary_of
 from crisalad_jax.training.trainer import run_keys
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_no_links, real_path, split_markers, write_json
-from crisalad_jax.utils.locks import POLL, BusyFolderError, lock
-from crisalad_jax.utils.output import Note
+from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.target import target
 from crisalad_jax.utils.temporaries import holds_other_files, remove_temporaries
 
 Say = Callable[[str], None]
+_PATIENCE = 60.0
+"""Seconds to wait for the end of a worker that still writes into a run's folder."""
 
 
 @takes(config=ComparisonConfig, out=PATH)
@@ -66,7 +65,8 @@ def compare(
     out: str | os.PathLike[str],
     *,
     page: str | os.PathLike[str] | None = None,
-    jobs: int = 1,
+    jobs: int | None = None,
+    cluster: str | None = None,
     say: Say = lambda line: None,
     quiet: bool = False,
 ) -> Summary:
@@ -74,8 +74,7 @@ def compare(
 
     Everything is checked before any work, as far as it can be. The same call resumes after a kill.
     It also goes on with a folder that holds a part of the comparison, or more: methods, rows, seeds
-    and sets may be added. Several hosts that share the folder may make the same call, and share
-    the runs.
+    and sets may be added.
 
     Args:
         config: what to compare.
@@ -83,8 +82,10 @@ def compare(
             index.html.
         page: a Markdown page that gets the tables too, between its comments <!-- NAME --> and
             <!-- end of NAME -->, where NAME is the name of the folder.
-        jobs: number of runs at once, each in a process with its share of this host's devices. A
-            program needs `if __name__ == "__main__"` for more than one.
+        jobs: number of runs at once, as tasks of Ray, each with its share of the devices. By
+            default 1; on a cluster one for each GPU, or for each node without any.
+        cluster: Ray's cluster: "local", "auto" or an address, as `cluster.connected` takes it. All
+            its nodes read the files of `config`, and write into `out`. None is this machine.
         say: is given a line at the start and before each run.
         quiet: whether to show no progress bars.
 
@@ -93,24 +94,50 @@ def compare(
 
     Raises:
         InputError: what `prepare`, `fit`, `evaluate` and `summarise` raise; the folder holds
-            other files, or a run of the same name with other settings; or the page has no place
-            for the tables.
+            other files, or a run of the same name with other settings; another process writes into
+            it; the page has no place for the tables; or there is no such cluster, or a node that
+            cannot take part.
         Interrupted: a signal asked for the end; the same call resumes.
     """
     out = pathlib.Path(out)
     name = real_path(out).name
     if page is not None:
         split_markers(pathlib.Path(page), name)
-    check_count("--jobs", jobs)
-    jobs = min(jobs, len(config.lines) * config.seeds)
-    work = functools.partial(carry_out, config, out)
-    with warnings.catch_warnings():
-        if jobs > 1:
-            run_jobs(functools.partial(work, quiet=True), jobs, say)
-            warnings.simplefilter("ignore", Note)  # the processes have told them
-        prepared, runs = work(say=say, quiet=quiet)
-    with lock(out, wait=True):
-        speed = _speed(prepared, runs, out, say, quiet)
+    if jobs is not None:
+        check_count("--jobs", jobs)
+        jobs = min(jobs, len(config.lines) * config.seeds)
+    path = out / "config.json"
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(lock(out))
+        if not path.exists() and holds_other_files(out):
+            raise InputError(
+                f"{out}: found files but no comparison, expected one or a new or empty folder"
+            )
+        do, beside = in_turn, False
+        if cluster is not None or (jobs or 1) > 1:
+            read = [*config.test, config.train, config.backbone]
+            share = stack.enter_context(joined(cluster or "local", jobs, read, out))
+            do, beside, quiet = functools.partial(in_tasks, share), share.beside, True
+        (prepared,) = do(functools.partial(prepare, quiet=quiet), (config,))
+        check_no_links(out)
+        write_json(path, to_plain(config))
+        runs = runs_of(prepared, out)
+        start = config.backbone or "nothing"
+        say(f"{len(runs)} runs to compare; what is trained starts from {start}")
+
+        def left() -> Iterator[tuple[int]]:
+            for number, run in enumerate(runs):
+                if not run.is_done:
+                    done = sum(each.is_done for each in runs)
+                    say(f"{run.variant.run}, seed {run.seed}: {done} of {len(runs)} runs done")
+                    yield (number,)
+
+        do(_complete, (prepared, runs, quiet, beside), left())
+        speed = _measured(prepared, runs, out / "speed.json")
+        if speed is None:
+            say("images described a second, all models in turns")
+            (speed,) = do(_speed, (prepared, runs, quiet))
+            write_json(out / "speed.json", speed)
         summary = summarise(prepared, runs, speed)
         write_tables(summary, out)
     if page is not None:
@@ -118,75 +145,34 @@ def compare(
     return summary
 
 
-def carry_out(
-    config: ComparisonConfig, out: pathlib.Path, *, say: Say, quiet: bool, beside: bool = False
-) -> tuple[Prepared, list[Run]]:
-    """Prepare a comparison, make `out` its folder, and take all runs that nobody is at.
-
-    Args:
-        config: what to compare.
-        out: the folder.
-        say: is given a line at the start and before each run.
-        quiet: no progress bars.
-        beside: whether they share this process's device.
-
-    Raises:
-        InputError: what `compare` raises.
-        Interrupted: a signal asked for the end.
-    """
-    prepared = prepare(config, quiet=quiet)
-    path = out / "config.json"
-    if not path.exists() and out.exists() and holds_other_files(out):
-        raise InputError(
-            f"{out}: found files but no comparison, expected one or a new or empty folder"
-        )
-    with lock(out, wait=True, quiet=quiet):
-        check_no_links(out)
-        write_json(path, to_plain(config))
-    runs = runs_of(prepared, out)
-    start = config.backbone or "nothing"
-    say(f"{len(runs)} runs to compare; what is trained starts from {start}")
-    waits = False
-    while left := [run for run in runs if not run.is_done]:
-        began = False
-        for run in left:
-            with contextlib.suppress(BusyFolderError), lock(run.folder):
-                if not run.is_done:  # by another, a moment ago
-                    done = sum(each.is_done for each in runs)
-                    say(f"{run.variant.run}, seed {run.seed}: {done} of {len(runs)} runs done")
-                    _complete(prepared, run, quiet, beside)
-                    began = True
-        if not began:
-            if not waits:
-                say("waiting for the runs of other processes")
-            waits = True
-            time.sleep(POLL)
-    return prepared, runs
-
-
-def _complete(prepared: Prepared, run: Run, quiet: bool, beside: bool) -> None:
+def _complete(
+    prepared: Prepared, runs: Sequence[Run], quiet: bool, beside: bool, number: int
+) -> None:
     """Train a run's model and evaluate its variants, as far as results are missing."""
-    remove_temporaries(run.folder)
-    params, config = _model(prepared, run, quiet, beside), prepared.config
-    result = run.read()
-    for key, variant, benchmark in run.evaluations:
-        if key in result.ranks:
-            continue
-        results = evaluate(
-            Model(params, variant.model),
-            benchmark,
-            groupings=config.grouping.split(","),
-            seed=run.seed,
-            seeds=1,
-            rerank=None if variant.rerank is None else parse_reranking(variant.rerank),
-            reading=Reading(batch_size=config.batch_size, quiet=True),
-        )
-        # Of a grouping with and without a second stage, the last is the one with it.
-        result.ranks[key] = {
-            each.grouping: first_right_ranks(each.neighbours, benchmark.ground_truth()).tolist()
-            for each in results
-        }
-        result.write(run.folder)
+    run, config = runs[number], prepared.config
+    # After a kill of the command, its workers may end some seconds later.
+    with lock(run.folder, wait=_PATIENCE):
+        remove_temporaries(run.folder)
+        params, result = _model(prepared, run, quiet, beside), run.read()
+        for key, variant, benchmark in run.evaluations:
+            if key in result.ranks:
+                continue
+            results = evaluate(
+                Model(params, variant.model),
+                benchmark,
+                groupings=config.grouping.split(","),
+                seed=run.seed,
+                seeds=1,
+                rerank=None if variant.rerank is None else parse_reranking(variant.rerank),
+                reading=Reading(batch_size=config.batch_size, quiet=True),
+            )
+            truth = benchmark.ground_truth()
+            # Of a grouping with and without a second stage, the last is the one with it.
+            result.ranks[key] = {
+                each.grouping: first_right_ranks(each.neighbours, truth).tolist()
+                for each in results
+            }
+            result.write(run.folder)
 
 
 def _model(prepared: Prepared, run: Run, quiet: bool, beside: bool = False) -> Crisalad:
@@ -232,19 +218,21 @@ def _start(prepared: Prepared, run: Run, training: TrainConfig, quiet: bool) -> 
     return start
 
 
-def _speed(
-    prepared: Prepared, runs: Sequence[Run], out: pathlib.Path, say: Say, quiet: bool
-) -> dict[str, Any]:
-    """Time a batch of every model in turns, unless that was done; variants of a run count once."""
-    path, size = out / "speed.json", prepared.config.batch_size
-    models = {run.variant.run: run for run in runs if run.seed == 0}
+def _measured(prepared: Prepared, runs: Sequence[Run], path: pathlib.Path) -> Any:
+    """Read the times of all models and adapters; None where any of them is missing."""
+    if not path.exists():
+        return None
+    record, config = read_result(path), prepared.config
+    models = {run.variant.run for run in runs}
+    adapters = adapter_calls() if config.is_papers else {}
+    is_whole = models <= record["rounds"].keys() and adapters.keys() <= record["adapters"].keys()
+    return record if is_whole and record["batch_size"] == config.batch_size else None
+
+
+def _speed(prepared: Prepared, runs: Sequence[Run], quiet: bool) -> dict[str, Any]:
+    """Time a batch of every model in turns; variants of a run count once."""
+    size = prepared.config.batch_size
     adapters = adapter_calls() if prepared.config.is_papers else {}
-    if path.exists():
-        record = read_result(path)
-        is_timed = models.keys() <= record["rounds"].keys() and record["batch_size"] == size
-        if is_timed and adapters.keys() <= record["adapters"].keys():
-            return record
-    say("images described a second, all models in turns")
 
     def ready(run: Run) -> Callable[[], Any]:
         params, model = _model(prepared, run, quiet=True), run.variant.model
@@ -253,8 +241,8 @@ def _speed(
         describer = describer_of(Model(params, model))
         return functools.partial(describe_prepared, describer, [image] * size, size)
 
-    calls = {name: functools.partial(ready, run) for name, run in models.items()}
-    record = {
+    calls = {run.variant.run: functools.partial(ready, run) for run in runs if run.seed == 0}
+    return {
         "device": machine(),
         # A CPU's times depend on other load.
         "absolute": target().platform != "cpu",
@@ -263,5 +251,3 @@ def _speed(
         "adapters": race(adapters),
         "adapter_memory": adapter_memory(adapters),
     }
-    write_json(path, record)
-    return record

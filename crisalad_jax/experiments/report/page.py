@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.images import read_image
-from crisalad_jax.evaluation.operating_point import OperatingPoint
 from crisalad_jax.evaluation.record import table_notes
 from crisalad_jax.evaluation.results import GroupingResult, percent
 from crisalad_jax.experiments.report.charts import (
@@ -29,19 +28,14 @@ from crisalad_jax.experiments.report.charts import (
 from crisalad_jax.experiments.report.gallery import evenly, first_right_ranks, thumbnail
 from crisalad_jax.experiments.report.style import Drawing, chart, illustration, photograph
 from crisalad_jax.experiments.report.transport import Transported, draw_transport, transport_of
-from crisalad_jax.experiments.tables import (
-    Cell,
-    Table,
-    write_csv,
-    write_text,
-)
+from crisalad_jax.experiments.result_tables import result_tables
+from crisalad_jax.experiments.tables import write_csv, write_text
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.utils.locks import staged_folder
 from crisalad_jax.utils.output import printable
 
 PAGE = "index.html"
-_DASH = "\N{EN DASH}"
 _RETRIEVALS = 4
 """Number of retrievals shown for each query."""
 _SHOWN = 6
@@ -108,7 +102,7 @@ def write_report(
             "subject": subject,
             "config": model.config,
             "main": main,
-            "table": _table(groupings),
+            "tables": result_tables(groupings),
             "notes": table_notes(groupings, settings),
             "curves": _curves(folder, groupings),
             "galleries": {
@@ -187,59 +181,6 @@ class Subject(NamedTuple):
             "wrong": wrong[:most].tolist(),
             "no positive": unmatched[:most].tolist(),
         }
-
-
-def _table(groupings: Sequence[GroupingResult]) -> Table:
-    """Make a row for each grouping, without columns that all lack."""
-
-    def cell(value: float | None) -> Cell:
-        return Cell(_DASH if value is None else percent(value))
-
-    ks = sorted({k for grouping in groupings for k in grouping.recalls})
-    asked = next((g.operating_point.asked for g in groupings if g.operating_point), 0.0)
-    columns = {
-        "grouping": [Cell(g.label) for g in groupings],
-        **{f"R@{k}": [_recall(g, k) for g in groupings] for k in ks},
-        "same place, queries": [cell(g.query_share) for g in groupings],
-        "same place, database": [cell(g.database_share) for g in groupings],
-        "mirrored": [cell(g.mirrored_share) for g in groupings],
-        "R@1 over single": [_gain(g) for g in groupings],
-        "AP": [cell(g.average_precision) for g in groupings],
-        "recall at 100 % precision": [cell(g.recall_at_full_precision) for g in groupings],
-        f"answered right at {100 * asked:g} %": [_point(g.operating_point) for g in groupings],
-    }
-    columns = {
-        header: cells
-        for header, cells in columns.items()
-        if any(each != Cell(_DASH) for each in cells)
-    }
-    return Table(list(columns), list(zip(*columns.values(), strict=True)))
-
-
-def _recall(grouping: GroupingResult, k: int) -> Cell:
-    if k not in grouping.recalls:
-        return Cell(_DASH)
-    notes = []
-    if grouping.spread is not None:
-        notes.append(f"± {percent(grouping.spread.recalls[k])}")
-    if k in grouping.intervals:
-        notes.append(_DASH.join(map(percent, grouping.intervals[k])))
-    return Cell(percent(grouping.recalls[k]), "\n".join(notes))
-
-
-def _gain(grouping: GroupingResult) -> Cell:
-    if grouping.over_single is None:
-        return Cell(_DASH)
-    mean, interval, _ = grouping.over_single
-    return Cell(f"{100 * mean:+.1f}", " to ".join(f"{100 * end:+.1f}" for end in interval))
-
-
-def _point(point: OperatingPoint | None) -> Cell:
-    if point is None:
-        return Cell(_DASH)
-    if not point.reached:
-        return Cell(_DASH, f"highest precision {percent(point.precision)}")
-    return Cell(percent(point.recall), f"similarity from {point.min_similarity:.9g}")
 
 
 def _curves(folder: pathlib.Path, groupings: Sequence[GroupingResult]) -> list[Drawing]:

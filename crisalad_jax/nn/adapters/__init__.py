@@ -6,6 +6,7 @@ import pkgutil
 from crisalad_jax.nn.adapters.base import ADAPTERS as ADAPTERS
 from crisalad_jax.nn.adapters.base import Adapter as Adapter
 from crisalad_jax.nn.adapters.base import BlockShape as BlockShape
+from crisalad_jax.nn.adapters.base import TokenInfo as TokenInfo
 
 register_adapter = ADAPTERS.register
 

@@ -27,6 +27,18 @@ class BlockShape(NamedTuple):
     fc1 and fc2 of the MLP (or w12 and w3 of SwiGLU)."""
 
 
+class TokenInfo(NamedTuple):
+    """What a hook is told of the tokens."""
+
+    grid: Grid
+    """Rows and columns of patches, the last `grid[0] * grid[1]` tokens."""
+    length: int | None = None
+    """Number of first tokens that are not padding; None is all."""
+    valid: Valid = None
+    """Images of a training batch, whose statistics batch norms normalise by
+    (`layers.train_batch_norm`); None takes the stored ones."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Adapter(Part, abc.ABC):
     """Small layers that are added to every block: a frozen dataclass whose fields are its settings.
@@ -46,7 +58,7 @@ class Adapter(Part, abc.ABC):
         ...     def init(self, key, shape):
         ...         return {"shift": jnp.zeros(shape.dim)}
         ...
-        ...     def mlp_update(self, params, tokens, grid, *, length=None, valid=None):
+        ...     def mlp_update(self, params, tokens, info):
         ...         return params["shift"].astype(tokens.dtype), params
         >>> jax.eval_shape(ViTConfig(adapter="shift").init, jax.random.key(0)).blocks.adapter
         {'shift': ShapeDtypeStruct(shape=(12, 768), dtype=float32)}
@@ -101,63 +113,44 @@ class Adapter(Part, abc.ABC):
         raise NotImplementedError
 
     def attention_update(
-        self, params: Any, attended: AnyTokens, grid: Grid, *, length: int | None = None
+        self, params: Any, attended: AnyTokens, info: TokenInfo
     ) -> AnyTokens | None:
         """Return what is added to the attention's output, before LayerScale and the residual.
 
         Args:
             params: of `init`.
             attended: the output of the attention.
-            grid: rows and columns of patches, the last `grid[0] * grid[1]` tokens.
-            length: number of first tokens that are not padding; None is all.
+            info: of these tokens.
         """
         return None
 
     def mlp_update(
-        self,
-        params: Any,
-        tokens: AnyTokens,
-        grid: Grid,
-        *,
-        length: int | None = None,
-        valid: Valid = None,
+        self, params: Any, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens | None, Any]:
         """Return what is added to the MLP's output, before LayerScale, and the parameters.
 
         Args:
             params: of `init`.
             tokens: the MLP's input, normalised.
-            grid: see `attention_update`.
-            length: see `attention_update`.
-            valid: images of a training batch, whose statistics batch norms normalise by
-                (`layers.train_batch_norm`); None takes the stored ones.
+            info: of these tokens.
 
         Returns:
             (update, updated): the parameters with updated running statistics, if there are any.
         """
         return None, params
 
-    def output_update(
-        self, params: Any, tokens: AnyTokens, *, length: int | None = None
-    ) -> AnyTokens | None:
+    def output_update(self, params: Any, tokens: AnyTokens, info: TokenInfo) -> AnyTokens | None:
         """Return what is added to the block's output.
 
         Args:
             params: of `init`.
             tokens: the output.
-            length: see `attention_update`.
+            info: of these tokens.
         """
         return None
 
     def side_path(
-        self,
-        params: Any,
-        side: AnyTokens,
-        tokens: AnyTokens,
-        grid: Grid,
-        *,
-        length: int | None = None,
-        valid: Valid = None,
+        self, params: Any, side: AnyTokens, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, Any]:
         """Return the tokens of a path beside the blocks, whose last ones are the backbone's.
 
@@ -167,9 +160,7 @@ class Adapter(Part, abc.ABC):
             params: of `init`, those of the path.
             side: the path's tokens.
             tokens: the output of the block.
-            grid: see `attention_update`.
-            length: see `attention_update`.
-            valid: see `mlp_update`.
+            info: of these tokens.
 
         Returns:
             (side, updated): as `mlp_update` returns them.

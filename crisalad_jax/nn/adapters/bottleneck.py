@@ -6,6 +6,7 @@ so that an untrained adapter adds nothing.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar, Literal
 
@@ -16,12 +17,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import PositiveFloat, PositiveInt, require_field
 from crisalad_jax.nn import random_init
-from crisalad_jax.nn.adapters.base import ADAPTERS, Adapter, AnyTokens, BlockShape
+from crisalad_jax.nn.adapters.base import ADAPTERS, Adapter, AnyTokens, BlockShape, TokenInfo
 from crisalad_jax.nn.convolutions import ConvNorm, Map, conv_norm
 from crisalad_jax.nn.layers import (
     Conv,
     DepthwiseConv,
-    Grid,
     Linear,
     Valid,
     at_least_float32,
@@ -140,17 +140,11 @@ class DepthwiseConfig(BottleneckAdapter):
         )
 
     def mlp_update(
-        self,
-        params: DepthwiseAdapter,
-        tokens: AnyTokens,
-        grid: Grid,
-        *,
-        length: int | None = None,
-        valid: Valid = None,
+        self, params: DepthwiseAdapter, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, DepthwiseAdapter]:
         """Project down, ReLU, convolve the patches, add the skip, project up (paper Eq. 2)."""
         hidden = _project_down(params.down, tokens)
-        mixed, _ = _on_patches(lambda x: (_separable(params, x), None), hidden, grid, length)
+        mixed, _ = _on_patches(lambda x: (_separable(params, x), None), hidden, info)
         return self.alpha * linear(params.up, mixed + hidden), params
 
 
@@ -166,16 +160,10 @@ class MultiResolutionConfig(BottleneckAdapter):
         return _init_multi_resolution(key, shape.dim, self.width(shape.dim))
 
     def mlp_update(
-        self,
-        params: MultiResolutionAdapter,
-        tokens: AnyTokens,
-        grid: Grid,
-        *,
-        length: int | None = None,
-        valid: Valid = None,
+        self, params: MultiResolutionAdapter, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, MultiResolutionAdapter]:
         """Project down, ReLU, convolve the patches, add the skip, project up."""
-        update, updated = _multi_resolution(params, tokens, grid, length, valid)
+        update, updated = _multi_resolution(params, tokens, info)
         return self.alpha * update, updated
 
 
@@ -189,13 +177,7 @@ class MlpConfig(BottleneckAdapter):
         return _init_mlp(key, shape.dim, self.width(shape.dim))
 
     def mlp_update(
-        self,
-        params: MlpAdapter,
-        tokens: AnyTokens,
-        grid: Grid,
-        *,
-        length: int | None = None,
-        valid: Valid = None,
+        self, params: MlpAdapter, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, MlpAdapter]:
         """Return the MLP's output, of every token by itself."""
         return self.alpha * _mlp(params, tokens), params
@@ -212,24 +194,13 @@ class SerialParallelConfig(BottleneckAdapter):
         return SerialParallelAdapter(*(_init_mlp(k, dim, width) for k in random_init.split(key)))
 
     def attention_update(
-        self,
-        params: SerialParallelAdapter,
-        attended: AnyTokens,
-        grid: Grid,
-        *,
-        length: int | None = None,
+        self, params: SerialParallelAdapter, attended: AnyTokens, info: TokenInfo
     ) -> AnyTokens:
         """Return the serial MLP's output; the addition is its skip."""
         return _mlp(params.serial, attended)
 
     def mlp_update(
-        self,
-        params: SerialParallelAdapter,
-        tokens: AnyTokens,
-        grid: Grid,
-        *,
-        length: int | None = None,
-        valid: Valid = None,
+        self, params: SerialParallelAdapter, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, SerialParallelAdapter]:
         """Return the parallel MLP's output."""
         return self.alpha * _mlp(params.parallel, tokens), params
@@ -249,14 +220,7 @@ class SideConfig(BottleneckAdapter):
         return _init_mlp(key, shape.dim, self.width(shape.dim))
 
     def side_path(
-        self,
-        params: MlpAdapter,
-        side: AnyTokens,
-        tokens: AnyTokens,
-        grid: Grid,
-        *,
-        length: int | None = None,
-        valid: Valid = None,
+        self, params: MlpAdapter, side: AnyTokens, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, MlpAdapter]:
         """Add the MLP's output."""
         total = tokens + side
@@ -286,17 +250,10 @@ class SideMultiResolutionConfig(BottleneckAdapter):
         return one if self.paths == 1 else (one,) * self.paths
 
     def side_path(
-        self,
-        params: MultiResolutionAdapter,
-        side: AnyTokens,
-        tokens: AnyTokens,
-        grid: Grid,
-        *,
-        length: int | None = None,
-        valid: Valid = None,
+        self, params: MultiResolutionAdapter, side: AnyTokens, tokens: AnyTokens, info: TokenInfo
     ) -> tuple[AnyTokens, MultiResolutionAdapter]:
         """Add the convolutions of the sum with the block's output."""
-        update, updated = _multi_resolution(params, tokens + side, grid, length, valid)
+        update, updated = _multi_resolution(params, tokens + side, info)
         return _sum(side, self.alpha, update), updated
 
 
@@ -342,7 +299,7 @@ def _mlp(
 
 
 def _on_patches(
-    mix: Callable[[Map], tuple[Map, Any]], hidden: AnyTokens, grid: Grid, length: int | None
+    mix: Callable[[Map], tuple[Map, Any]], hidden: AnyTokens, info: TokenInfo
 ) -> tuple[AnyTokens, Any]:
     """Apply a convolution to the patches; return the tokens and what else it returned.
 
@@ -350,11 +307,11 @@ def _on_patches(
     the skip that follows, these tokens therefore count twice, as in CricaVPR.
     """
     *batch, count, width = hidden.shape
-    last = count if length is None else length
-    special = last - grid[0] * grid[1]
-    patches = hidden[..., special:last, :].reshape(-1, *grid, width)
+    last = count if info.length is None else info.length
+    special = last - math.prod(info.grid)
+    patches = hidden[..., special:last, :].reshape(-1, *info.grid, width)
     mixed, more = mix(patches)
-    mixed = mixed.reshape(*batch, grid[0] * grid[1], width)
+    mixed = mixed.reshape(*batch, last - special, width)
     parts = [hidden[..., :special, :], mixed]
     if last < count:
         parts.append(hidden[..., last:, :])
@@ -368,16 +325,12 @@ def _separable(params: DepthwiseAdapter, x: Map) -> Map:
 
 
 def _multi_resolution(
-    params: MultiResolutionAdapter,
-    tokens: AnyTokens,
-    grid: Grid,
-    length: int | None,
-    valid: Valid,
+    params: MultiResolutionAdapter, tokens: AnyTokens, info: TokenInfo
 ) -> tuple[AnyTokens, MultiResolutionAdapter]:
     """Project down, ReLU, convolve the patches, add the skip, project up."""
     hidden = _project_down(params.down, tokens)
-    mix = functools.partial(_branches, params, valid=valid)
-    mixed, updated = _on_patches(mix, hidden, grid, length)
+    mix = functools.partial(_branches, params, valid=info.valid)
+    mixed, updated = _on_patches(mix, hidden, info)
     return linear(params.up, mixed + hidden), updated
 
 

@@ -8,7 +8,7 @@ import dataclasses
 from jaxtyping import PRNGKeyArray
 
 from crisalad_jax.config.checks import PositiveInt
-from crisalad_jax.nn.adapters.base import ADAPTERS, Adapter, AnyTokens, BlockShape
+from crisalad_jax.nn.adapters.base import ADAPTERS, Adapter, AnyTokens, BlockShape, TokenInfo
 from crisalad_jax.nn.layers import TwoLayer, init_two_layer, powers
 
 
@@ -30,9 +30,7 @@ class DynamicPowerConfig(Adapter):
         """Draw the network as torch's linear layers."""
         return init_two_layer(key, shape.dim, self.hidden, 1)
 
-    def output_update(
-        self, params: TwoLayer, tokens: AnyTokens, *, length: int | None = None
-    ) -> AnyTokens:
+    def output_update(self, params: TwoLayer, tokens: AnyTokens, info: TokenInfo) -> AnyTokens:
         """Return the powers."""
-        mean = tokens[..., :length, :].mean(axis=-2, keepdims=True)
+        mean = tokens[..., : info.length, :].mean(axis=-2, keepdims=True)
         return powers(params, tokens, mean)

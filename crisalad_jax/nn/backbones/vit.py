@@ -28,7 +28,7 @@ from crisalad_jax.config.checks import (
 from crisalad_jax.config.part import OrName, non_semantic_field
 from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.nn import random_init
-from crisalad_jax.nn.adapters import ADAPTERS, Adapter, BlockShape
+from crisalad_jax.nn.adapters import ADAPTERS, Adapter, BlockShape, TokenInfo
 from crisalad_jax.nn.adapters.base import HOOKS
 from crisalad_jax.nn.adapters.bottleneck import NoAdapter
 from crisalad_jax.nn.attention import (
@@ -623,21 +623,19 @@ def run_blocks(
     tokens = jnp.pad(tokens, ((0, 0), (front, 0), (0, 0))) if front else tokens
     real = tokens.shape[1]
     padding = padded_length(real, tokens.dtype, config.dim, config.heads) - real
-    length = real if padding else None
+    info = TokenInfo(grid, real if padding else None, valid)
     tokens = jnp.pad(tokens, ((0, 0), (0, padding), (0, 0))) if padding else tokens
 
     def body(carry: tuple[Array, Array | None], layer: Block) -> tuple[Any, Block]:
         tokens, side = carry
         if front:
             tokens = _with_prompts(tokens, layer, config)
-        tokens, statistics = block(layer, tokens, grid, config, length=length, valid=valid)
+        tokens, statistics = block(layer, tokens, info, config)
         if side is not None:
             layer = merge_statistics(statistics, layer)
             own = layer.adapter if config.adapter.paths == 1 else layer.adapter[path]
             with jax.named_scope("adapter"):
-                after, updated = config.adapter.side_path(
-                    own, side, tokens, grid, length=length, valid=valid
-                )
+                after, updated = config.adapter.side_path(own, side, tokens, info)
             expect_like(f"adapter {config.adapter.part_name}", after, side)
             if config.adapter.paths > 1:
                 updated = (*layer.adapter[:path], updated, *layer.adapter[path + 1 :])
@@ -672,7 +670,7 @@ def run_blocks(
                     )
                 if start == first:
                     statistics.append(measured)
-    return (tokens if side is None else side)[:, front:length], statistics
+    return (tokens if side is None else side)[:, front : info.length], statistics
 
 
 def _with_prompts(tokens: TokenBatch, layer: Block, config: VisionTransformer) -> TokenBatch:
@@ -694,50 +692,40 @@ def _layer_at(stack: Block, number: Int[Array, ""]) -> Block:
 
 
 def block(
-    params: Block,
-    tokens: TokenBatch,
-    grid: Grid,
-    config: VisionTransformer,
-    *,
-    length: int | None = None,
-    valid: Valid = None,
+    params: Block, tokens: TokenBatch, info: TokenInfo, config: VisionTransformer
 ) -> tuple[TokenBatch, Block]:
     """Run one block (paper Eq. 2), with LayerScale on MLP plus adapter, as in CricaVPR.
 
     Args:
         params: the block.
         tokens: of a batch of images.
-        grid: rows and columns of patches.
+        info: of these tokens.
         config: the backbone's.
-        length: number of first tokens that are not padding; None is all.
-        valid: images that the batch norms' statistics are taken of; None takes the stored ones.
 
     Returns:
         (tokens, statistics): the second has the running statistics, and None for all else.
     """
     adapter = _adapter_of(params, config)
     normed = layer_norm(params.norm1, tokens, epsilon=config.norm_epsilon)
-    attn, rotation = config.attention_of(params), config.rotation(grid)
+    attn, rotation = config.attention_of(params), config.rotation(info.grid)
     linear_update = _update_of(params, config)
     attended = attention(
-        attn, normed, config.heads, length=length, rotation=rotation, update=linear_update
+        attn, normed, config.heads, length=info.length, rotation=rotation, update=linear_update
     )
     with jax.named_scope("adapter"):
-        extra = adapter.attention_update(params.adapter, attended, grid, length=length)
+        extra = adapter.attention_update(params.adapter, attended, info)
         attended = _added(attended, extra, config)
     tokens = checkpoint_name(_residual(tokens, params.ls1, attended), "attended")
     normed = layer_norm(params.norm2, tokens, epsilon=config.norm_epsilon)
     update = feed_forward(params.mlp, normed, linear_update)
     with jax.named_scope("adapter"):
-        extra, updated = adapter.mlp_update(
-            params.adapter, normed, grid, length=length, valid=valid
-        )
+        extra, updated = adapter.mlp_update(params.adapter, normed, info)
         update = _added(update, extra, config)
     if updated is not params.adapter:
         params = dataclasses.replace(params, adapter=updated)
     tokens = _residual(tokens, params.ls2, update)
     with jax.named_scope("adapter"):
-        extra = adapter.output_update(params.adapter, tokens, length=length)
+        extra = adapter.output_update(params.adapter, tokens, info)
         tokens = _added(tokens, extra, config)
     return tokens, split_statistics(params)[0]
 

@@ -1,42 +1,53 @@
 """Approximate search of a map: an index of FAISS made from its descriptors, or that of Milvus.
 
 The index's name holds a digest of the additions that it was built from. One of other additions is
-not used, so that a map that grew never answers from an old index.
+not used, so that a map that grew never answers from an old index. Building adds what is new to one
+of the first additions.
 """
 
 import hashlib
 import math
 import pathlib
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import Queries, sample
-from crisalad_jax.retrieval.maps.milvus_store import KINDS, MilvusStore
+from crisalad_jax.retrieval.maps.milvus_store import MilvusStore
 from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.maps.store import Store
 from crisalad_jax.retrieval.neighbours import Neighbours, similarities_of
 from crisalad_jax.retrieval.segments import Segments
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
+from crisalad_jax.utils.host import available_memory
 from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 
 if TYPE_CHECKING:
     from crisalad_jax.retrieval.faiss_index import Index
 
-SEARCHES: dict[str, None] = dict.fromkeys(("exact", "hnsw", "ivf-pq"))
-"""How a map is searched: every descriptor is compared; by a graph over the descriptors, which are
-all in memory; or by codes of at most 128 bytes in memory, and the files rank the answers."""
+SEARCHES: dict[str, None] = dict.fromkeys(("auto", "exact", "hnsw", "ivf-rabitq", "diskann"))
+"""How a map is searched: as `choose_search` chooses; every descriptor is compared; by a graph over
+the descriptors, which are all in memory; or by their signs in memory, and the files rank the
+answers. Milvus has a graph on its disk, too."""
+_EXACT_BYTES = 2**26
+"""Largest size of descriptors that `choose_search` has searched exactly: all are read for a query,
+in less than a tenth of a second."""
+_GRAPH_BYTES = 2**30
+"""Largest size of a graph that `choose_search` takes: a larger one takes hours to build."""
+_LINK_BYTES = 272
+"""Size of the links of a descriptor in a graph."""
 FOLDER = "approximate"
 NEIGHBOURS, SAMPLE = 10, 100
 """Recall is measured over the 10 nearest others of so many of the map's images."""
-_CANDIDATES = dict.fromkeys(("hnsw", "diskann"), (2, 16))
-_CANDIDATES |= dict.fromkeys(("ivf-pq", "ivf-rabitq"), (10, 100))
+_CANDIDATES = {"hnsw": (2, 16), "ivf-rabitq": (10, 100), "diskann": (2, 16)}
 """Of each kind: candidates for each neighbour, and at least so many; the best of them by exact
 similarity are the answer."""
+_SEARCHED = 10
+"""Of this many descriptors one is left at least where the index is searched."""
 _SEED = 0
 Additions = Sequence[tuple[int, int, str]]
 """First number, count and SHA-256 of each addition to a map."""
@@ -51,19 +62,25 @@ class Approximate(NamedTuple):
     store: Store
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
+    is_served: bool = False
+    """Whether a server looks for candidates among what is left, however little that is."""
 
     def search(self, queries: Queries, k: int, count: int, removed: Removed = NONE) -> Neighbours:
         """Find the k most similar of `count` descriptors: candidates, ranked exactly.
 
-        Queries with fewer than k candidates are searched exactly. What was removed is no candidate,
-        and its room in the search goes to others.
+        Queries with fewer than k candidates are searched exactly, and so are files where less than
+        a tenth is left. What was removed is no candidate; more are looked at in its place.
 
         Raises:
             InputError: the store is damaged or gone.
         """
         each, least = _CANDIDATES[self.kind]
-        candidates = min(count - len(removed.rows), max(least, each * k))
-        numbers = self.ask(queries, candidates, count, removed).indices
+        left, candidates = count - len(removed.rows), max(least, each * k)
+        if not self.is_served:
+            if left < count // _SEARCHED:
+                return self.store.search(queries, k, count, removed)
+            candidates = candidates * count // left
+        numbers = self.ask(queries, min(left, candidates), count, removed).indices
         query, found = np.nonzero(numbers >= 0)
         similarities = np.full(numbers.shape, -np.inf, np.float32)
         similarities[query, found] = similarities_of(
@@ -120,11 +137,35 @@ def check_search(kind: str, store: str, dtype: str) -> None:
     """Check that the descriptors in a store can be searched so.
 
     Raises:
-        InputError: a kind that the store has not, or an approximate search of bits.
+        InputError: an unknown kind, an approximate search of bits, or one that files lack.
     """
-    choose("search", kind, SEARCHES if store == "files" else dict.fromkeys((*KINDS, "auto")))
-    if kind != "exact" and dtype == "bits":
+    choose("search", kind, SEARCHES)
+    if kind not in ("auto", "exact") and dtype == "bits":
         raise InputError(f"search: found {kind} for a map of bits, expected exact")
+    if kind == "diskann" and store == "files":
+        raise InputError(f"search: found {kind} for a map in files, which is an index of Milvus")
+
+
+def choose_search(count: int, length: int, dtype: str) -> tuple[str, str]:
+    """Choose how descriptors in files are searched by their size and the memory available.
+
+    Args:
+        count: number of descriptors.
+        length: of each.
+        dtype: what they are stored as.
+
+    Returns:
+        One of `SEARCHES`, and why it was chosen.
+    """
+    if dtype == "bits":
+        return "exact", "no other search is built of bits"
+    size, graph = count * length * np.dtype(dtype).itemsize, count * (4 * length + _LINK_BYTES)
+    if size <= _EXACT_BYTES:
+        return "exact", f"a query reads {size / 1e6:.1f} MB, of {_EXACT_BYTES / 1e6:.0f} MB at most"
+    memory = available_memory()
+    most = min(_GRAPH_BYTES, memory // 4)
+    why = f"a graph in memory takes {graph / 1e9:.2f} GB, of {most / 1e9:.2f} GB at most"
+    return ("hnsw" if graph <= most else "ivf-rabitq"), f"{why} ({memory / 1e9:.1f} GB available)"
 
 
 def build_approximate(
@@ -154,7 +195,9 @@ def build_approximate(
     from crisalad_jax.retrieval.faiss_index import build, save_index
 
     count = len(segments)
-    index = build(cast(Any, kind), segments.blocks, seed=_SEED, quiet=quiet)
+    index = _extended(folder, kind, segments, quiet=quiet)
+    if index is None:
+        index = build(cast(Any, kind), segments.blocks, seed=_SEED, quiet=quiet)
     built = Approximate(index.kind, _asking(index), segments.store, 0.0)
     built = built._replace(recall=_recall(built, count))
     with made_folder(path.parent):
@@ -173,6 +216,24 @@ def build_approximate(
     return built
 
 
+def _extended(
+    folder: pathlib.Path, kind: str, segments: Segments, *, quiet: bool
+) -> "Index | None":
+    """Add what is new to the index of a map's first additions; None where it has no fitting one."""
+    for length, digest in enumerate(_digests(segments.spans), 1):
+        path = folder / FOLDER / f"{kind}-{digest}.index"
+        if path.exists():
+            from crisalad_jax.retrieval.faiss_index import load_index
+
+            index, more = load_index(path), segments.spans[length:]
+            if not index.has_room_for(len(segments)):
+                return None
+            new = (segments.store.read(each.first, each.count) for each in more)
+            index.add(new, len(segments) - index.size, quiet=quiet)
+            return index
+    return None
+
+
 def _asking(index: "Index") -> Callable[[Queries, int, int, Removed], Neighbours]:
     return lambda queries, k, _, removed: index.search(queries, k, without=removed.rows)
 
@@ -181,7 +242,7 @@ def _served(store: MilvusStore) -> Approximate | None:
     """Return the approximate search that Milvus does of a map, whose recall is not known yet."""
     if store.kind == "exact":
         return None
-    return Approximate(store.kind, store.ask, store, math.nan)
+    return Approximate(store.kind, store.ask, store, math.nan, is_served=True)
 
 
 def _recall(built: Approximate, count: int) -> float:
@@ -203,9 +264,16 @@ def _others(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     return numbers[kept].reshape(len(numbers), -1)
 
 
+def _digests(additions: Additions) -> Iterator[str]:
+    """Yield a digest of the first addition, of the first two, and so on."""
+    digest = hashlib.sha256()
+    for first, count, rows in additions:
+        digest.update(f"{first} {count} {rows}\n".encode())
+        yield digest.hexdigest()[:16]
+
+
 def _digest(additions: Additions) -> str:
-    lines = (f"{first} {count} {digest}\n" for first, count, digest in additions)
-    return hashlib.sha256("".join(lines).encode()).hexdigest()[:16]
+    return ["none", *_digests(additions)][-1]
 
 
 def _indices(folder: pathlib.Path) -> list[pathlib.Path]:

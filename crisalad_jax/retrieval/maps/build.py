@@ -14,7 +14,7 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.remote import for_each, size_of, whole_name
 from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.data.tracks import Track
-from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
+from crisalad_jax.retrieval.describe import check_readable, joined, shown
 from crisalad_jax.retrieval.describer import Describer, describer_of
 from crisalad_jax.retrieval.maps.appending import AppendableMap, open_for_appending
 from crisalad_jax.retrieval.maps.approximate import check_search
@@ -30,8 +30,10 @@ from crisalad_jax.retrieval.maps.metadata import (
 )
 from crisalad_jax.retrieval.maps.novelty import Novelty
 from crisalad_jax.retrieval.maps.store import check_store, store_name
+from crisalad_jax.retrieval.on_cluster import Describing
 from crisalad_jax.retrieval.pca import Pca, load_pca, pca_hash
 from crisalad_jax.retrieval.segments import SEGMENT
+from crisalad_jax.utils.cluster import check_cluster
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 
@@ -120,9 +122,10 @@ def index(
     store: str | None = None,
     dtype: Literal["float32", "float16", "bits"] | None = None,
     pca: Pca | str | os.PathLike[str] | None = None,
-    search: Literal["exact", "hnsw", "ivf-pq", "ivf-rabitq", "diskann", "auto"] | None = None,
+    search: Literal["auto", "exact", "hnsw", "ivf-rabitq", "diskann"] | None = None,
     again: bool = False,
     reading: Reading = Reading(),
+    cluster: str | None = None,
 ) -> Indexed:
     """Make a map of a folder of images, or append to it those that it lacks.
 
@@ -153,11 +156,12 @@ def index(
             searched by the Hamming distance. None is the map's, and of a new map "float32".
         pca: components that shorten the descriptors, or a file of them, of which the map stores a
             copy. None is the map's, and of a new map none.
-        search: the approximate search that is built from the map's descriptors; "exact" removes
-            one. None leaves what there is; that of files is of no use once the map has grown.
-            Milvus has "ivf-rabitq", "diskann" and "auto" in place of "ivf-pq".
+        search: the approximate search that is built from the map's descriptors, or extended by new
+            ones, see `Map.build_search`; "exact" removes one. None leaves what there is, which is
+            of no use once the map has grown.
         again: whether to add images that were removed from the map, too (`remove_images`).
         reading: how images are read.
+        cluster: the Ray cluster that describes them, as `extract` takes it; None describes here.
 
     Returns:
         What became of the images.
@@ -180,6 +184,7 @@ def index(
         4
     """
     describer = describer_of(model)
+    check_cluster(cluster)
     if novelty is not None:
         check_min_similarity(novelty, "novelty")
     out = pathlib.Path(out)
@@ -214,7 +219,8 @@ def index(
     if table is None and not known.of:
         known = None
     fitted = reading.fitted(len(source.paths))
-    work = _Indexing(describer, source, known, metadata, components, search, fitted, again, novelty)
+    how = {"cluster": cluster, "again": again, "novelty": novelty}
+    work = _Indexing(describer, source, known, metadata, components, search, fitted, **how)
     with open_for_appending(out, metadata, components) as target:
         result = work.into(target)
     if result.added == result.images and describer.config.cross_image.attends:
@@ -239,6 +245,7 @@ class _Indexing:
     components: Pca | None
     search: str | None
     reading: Reading
+    cluster: str | None = None
     again: bool = False
     novelty: float | None = None
     """Largest similarity to the last image that was taken; None is any."""
@@ -275,7 +282,8 @@ class _Indexing:
             positions = _by_exif(target, zip(names, new, strict=True))
         target.fitted(names, positions)  # checks them before any work
         unreadable: list[str] = []
-        stream = described(self.describer, new, self.reading, components=target.components)
+        how = Describing(self.describer, self.reading, target.components)
+        stream = how.stream(new, self.cluster)
         done, quiet = total - len(new), self.reading.quiet
         stream = shown(stream, "images", total, quiet=quiet, done=done)
         for part in joined(stream, SEGMENT):

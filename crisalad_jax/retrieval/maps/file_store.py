@@ -36,7 +36,7 @@ class FileStore:
     """A `Store` in a folder of files, each named by the number of its first descriptor.
 
     Files are memory-mapped one after the other. A search has a few blocks of rows in memory,
-    whatever the size of the map.
+    whatever the size of the map. All rows of a small map, one block, stay in memory.
     """
 
     def __init__(self, folder: pathlib.Path, length: int, dtype: str) -> None:
@@ -44,6 +44,8 @@ class FileStore:
         self._folder, self._length, self._dtype = folder, length, np.dtype(dtype)
         self._counts: dict[int, int] = {}
         """Number of descriptors in each file, by the number of its first, in ascending order."""
+        self._held: tuple[int, Removed, Block] | None = None
+        """Of the last search that was of one block: the arguments that it was of, and the block."""
         self._mapped = functools.lru_cache(min(_MAPPED, most_files() // 16))(self._open)
 
     def _path(self, first: int) -> pathlib.Path:
@@ -55,7 +57,7 @@ class FileStore:
         path = self._path(first)
         with atomic_path(path, durable=True) as temporary:
             write_npy(temporary, descriptors.astype(self._dtype))
-        self._counts[first] = len(descriptors)
+        self._counts[first], self._held = len(descriptors), None
 
     def check(self, segments: Sequence[tuple[int, int]]) -> None:
         """Open the file of each addition; see `Store.check`."""
@@ -96,23 +98,42 @@ class FileStore:
     ) -> Neighbours:
         """Find the k most similar descriptors of each query; see `Store.search`."""
         if self._dtype == BITS:
-            left = ((n, removed.left(n, rows)) for n, rows in self._counts.items() if n < count)
-            parts = (self._open(n) if some is None else self._open(n)[some] for n, some in left)
+            parts = (
+                self._open(first) if places is None else self._open(first)[places]
+                for first, places in self._left(count, removed)
+            )
             return nearest_bits(parts, queries, k)
         size = max(1, _BLOCK // max(self._length, min(len(queries), QUERY_CHUNK)))
 
         def files() -> Iterator[Block]:
-            for first in [first for first in self._counts if first < count]:
+            for first, places in self._left(count, removed):
                 rows = self._open(first)
                 # A block of small files would keep a descriptor open for each of its parts.
                 rows = np.array(rows) if len(rows) < size // 8 else rows
-                places = removed.left(first, len(rows))
                 yield from blocks(rows, str(self._path(first)), size, places=places)
+
+        if (left := count - len(removed.rows)) <= size:  # a block, which stays for the next search
+            if self._held is None or self._held[0] != count or self._held[1] is not removed:
+                (block,) = joined(files(), left)
+                self._held = count, removed, block
+            block = self._held[2]
+            return nearest(
+                lambda: (each for each in [block]), queries, k, block.rows.__getitem__, size
+            )
 
         def read_rows(numbers: Int64[np.ndarray, " n"]) -> Descriptors:
             return self.rows(removed.rows_of(numbers), release=True)
 
         return nearest(lambda: joined(files(), size), queries, k, read_rows, 2 * size)
+
+    def _left(
+        self, count: int, removed: Removed
+    ) -> Iterator[tuple[int, Int64[np.ndarray, " left"] | None]]:
+        """Yield the files of which rows are left, with the places of these; None is all."""
+        for first, rows in list(self._counts.items()):
+            places = removed.left(first, rows)
+            if first < count and (places is None or len(places)):
+                yield first, places
 
     def rows(self, numbers: Int64[np.ndarray, " n"], *, release: bool = False) -> Descriptors:
         """Read the descriptors of these numbers; their files stay mapped into memory.

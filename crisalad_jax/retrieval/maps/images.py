@@ -153,15 +153,14 @@ class Images(Sequence[MapImage]):
     def in_rows(self, rows: Int64[np.ndarray, " n"]) -> list[MapImage]:
         """Return the images in some rows, also those that were removed."""
         places = np.searchsorted(self._firsts.values, rows, side="right") - 1
-        columns = (self._sizes.values[rows], self._positions.values[rows], places)
-        each = zip(self._named(rows), *(column.tolist() for column in columns), strict=True)
-        return [
-            MapImage(name, size, None if at[0] != at[0] else (at[0], at[1]), self.parts[place].root)
-            for name, size, at, place in each
-        ]
+        at = self._positions.values[rows].tolist()
+        spots = [None if first != first else (first, second) for first, second in at]  # of NaN
+        roots = [self.parts[place].root for place in places.tolist()]
+        sizes = self._sizes.values[rows].tolist()
+        return list(map(MapImage, self._named(rows), sizes, spots, roots))
 
     def _named(self, rows: Int64[np.ndarray, " n"]) -> list[str]:
-        data, ends = memoryview(self._names.values), self._ends.values
+        data, ends = self._names.values.data, self._ends.values
         spans = zip(ends[rows].tolist(), ends[rows + 1].tolist(), strict=True)
         return [str(data[start:end], *_NAMES) for start, end in spans]
 
@@ -243,7 +242,7 @@ class Images(Sequence[MapImage]):
         for column, new in columns:
             column.extend(new)
         self._recent.update(zip(names, range(first, self.rows), strict=True))
-        if len(self._recent) > _RECENT + len(self._order) // 4:
+        if len(self._recent) > _RECENT + len(self._order) // 2:
             self._sort()
 
     def _sort(self) -> None:

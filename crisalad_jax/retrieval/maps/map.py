@@ -28,6 +28,7 @@ from crisalad_jax.retrieval.maps.approximate import (
     Approximate,
     build_approximate,
     check_search,
+    choose_search,
     open_approximate,
     stale_kind,
 )
@@ -355,7 +356,7 @@ class Map:
 
     @property
     def search_kind(self) -> str:
-        """How `search` searches: "exact", "hnsw", "ivf-pq", or one of `milvus_store.KINDS`."""
+        """How `search` searches: "exact", "hnsw" or "ivf-rabitq"."""
         return "exact" if self._approximate is None else self._approximate.kind
 
     @property
@@ -371,8 +372,9 @@ class Map:
         """Build the map's approximate search from its descriptors, where it is not there yet.
 
         Args:
-            kind: "hnsw" or "ivf-pq"; "exact" removes what there is. Of `milvus_store.KINDS` or
-                "auto" where the descriptors are in Milvus.
+            kind: "hnsw" or "ivf-rabitq", of Milvus also "diskann"; "exact" removes what there is;
+                "auto" chooses by the size of the descriptors and the memory available, or by what
+                Milvus' version has, and a note says why.
             quiet: whether to show no progress bar.
 
         Returns:
@@ -380,9 +382,14 @@ class Map:
             an exact search.
 
         Raises:
-            InputError: an unknown kind, too few images, or a map of bits; Milvus fails.
+            InputError: an unknown kind, one that Milvus lacks, or a map of bits.
         """
-        check_search(kind, self.metadata.store, self.metadata.dtype)
+        metadata = self.metadata
+        check_search(kind, metadata.store, metadata.dtype)
+        if kind == "auto" and metadata.store == "files":
+            size = len(self._segments), metadata.descriptor_length
+            kind, why = choose_search(*size, metadata.dtype)
+            warn(f"{self.folder}: --search auto takes {kind}: {why}")
         self._approximate = build_approximate(self.folder, kind, self._segments, quiet=quiet)
         return None if self._approximate is None else self._approximate.recall
 

@@ -24,7 +24,7 @@ from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.neighbours import Neighbours, nearest
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
-from crisalad_jax.utils.output import warn_once
+from crisalad_jax.utils.output import warn, warn_once
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Float, Int64
 
@@ -259,6 +259,8 @@ class MilvusStore:
         """
         if kind == "auto":
             kind = choose_kind(count, self._length, self._version)
+            what = f"{count} descriptors of {self._length} numbers, Milvus {self._server}"
+            warn(f"{self._address}: --search auto takes {kind}: {what}")
         known = [name for name, each in KINDS.items() if each.since <= self._version]
         choose(f"search in Milvus {self._server}", kind, dict.fromkeys(known))
         self._ask("writing descriptors", "flush", wait=_STALLED)

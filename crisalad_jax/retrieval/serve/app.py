@@ -41,6 +41,7 @@ from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.maps.map import Answer, Map
 from crisalad_jax.retrieval.maps.query import answer_fields, asked_thresholds, position_fields
 from crisalad_jax.retrieval.maps.verified import verify_answers
+from crisalad_jax.retrieval.maps.where import Where
 from crisalad_jax.retrieval.serve.pictures import (
     check_new_name,
     check_picture,
@@ -165,7 +166,7 @@ class Health:
     model: str
     """Digest of the model that made the map."""
     search: str
-    """exact, hnsw or ivf-pq."""
+    """exact, hnsw or ivf-rabitq."""
     stale_search: str | None
     """An approximate search that lacks images and is not used; build it again. Else null."""
     uptime_s: float
@@ -205,6 +206,8 @@ class _Asked(pydantic.BaseModel, extra="forbid"):
     """Number of answers; by default the service's, see /map."""
     verify: int | None = pydantic.Field(None, ge=0, le=MOST_ANSWERS)
     """Number of best answers that are verified; by default the service's, of --rerank."""
+    where: str | None = None
+    """Conditions on the images that are searched, as of `crisalad query --where`."""
 
 
 def _plain(text: str) -> str:
@@ -408,7 +411,8 @@ def make_app(
                 count = asked.verify
                 if count and verifier is None:
                     raise InputError("verify: found in a service without --rerank, expected none")
-            question = Question(await prepare(data, name), max(answers, count))
+            where = None if asked.where is None else Where.parse(asked.where)
+            question = Question(await prepare(data, name), max(answers, count), where)
             places, found = await asyncio.wrap_future(worker.submit(question))
             best, checks = found[0][1], []
             if verifier is not None and count:

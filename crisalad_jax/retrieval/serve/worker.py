@@ -20,6 +20,7 @@ from crisalad_jax.retrieval.describe import describe_prepared, prepare_image
 from crisalad_jax.retrieval.describer import Describer
 from crisalad_jax.retrieval.maps.appending import AppendableMap
 from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.where import Where
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, real_path
 from crisalad_jax.utils.progress import progress_bar
@@ -45,6 +46,8 @@ class Question(NamedTuple):
     pixels: Pixels
     """As `prepare_image` returns them."""
     k: int
+    where: Where | None = None
+    """Which images of the map are searched; None is all."""
 
 
 class Addition(NamedTuple):
@@ -98,8 +101,9 @@ class MapWorker:
 
         Returns:
             Of a question, the map that was searched, and (number, similarity) of its k most similar
-            images; of an addition, its number. It raises `InputError` for an addition that the map
-            does not take, `NameTakenError` among them, and `MapFailedError` for all else.
+            images; of an addition, its number. It raises `InputError` for conditions that no image
+            meets and for an addition that the map does not take, `NameTakenError` among them, and
+            `MapFailedError` for all else.
         """
         result: Future[Any] = Future()
         self._waiting.append((work, result))
@@ -192,15 +196,21 @@ class MapWorker:
             raise NameTakenError(f"name: found {name!r}, {expected}")
 
     def _search(self, jobs: "Sequence[_Job]") -> None:
-        """Search for all questions at once."""
-        if not jobs:
-            return
-        rows = np.stack([job.descriptor for job in jobs])
-        found = self.places.search(rows, max(job.work.k for job in jobs))
-        for job, numbers, similarities in zip(jobs, *found, strict=True):
-            k = job.work.k
-            best = zip(numbers[:k].tolist(), similarities[:k].tolist(), strict=True)
-            job.result.set_result((self.places, list(best)))
+        """Search for all questions with the same conditions at once."""
+        for where in {job.work.where for job in jobs}:
+            some = [job for job in jobs if job.work.where == where]
+            try:
+                _ = where and self.places.left_out(where)
+            except InputError as error:  # no image is left
+                for job in some:
+                    job.result.set_exception(error)
+                continue
+            rows = np.stack([job.descriptor for job in some])
+            found = self.places.search(rows, max(job.work.k for job in some), where=where)
+            for job, numbers, similarities in zip(some, *found, strict=True):
+                k = job.work.k
+                best = zip(numbers[:k].tolist(), similarities[:k].tolist(), strict=True)
+                job.result.set_result((self.places, list(best)))
 
 
 class _Job(NamedTuple):

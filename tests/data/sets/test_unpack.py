@@ -1,5 +1,6 @@
 """Archives of others: what is in them, and nothing outside of the folder."""
 
+import contextlib
 import io
 import pathlib
 import shutil
@@ -48,11 +49,13 @@ def test_files_and_folders_are_unpacked(tmp_path, name):
 
 @pytest.mark.parametrize("name", WRITERS)
 @pytest.mark.parametrize("inside", ["../out.txt", "/out.txt", "a/../../out.txt", "..\\out", "C:/o"])
-def test_a_name_that_leads_out_is_refused(tmp_path, name, inside):
+def test_no_name_leads_out(tmp_path, name, inside):
     archive = WRITERS[name](tmp_path / name, {inside: b"x"})
-    with pytest.raises(InputError, match="found a name that leads out of the folder, expected"):
-        unpack(archive, tmp_path / "deep" / "to", quiet=True)
-    assert set(written(tmp_path)) == {name}
+    folder = tmp_path / "deep" / "to"
+    with contextlib.suppress(InputError):
+        unpack(archive, folder, quiet=True)
+    others = {path for path in tmp_path.rglob("*") if path.is_file() and folder not in path.parents}
+    assert others == {archive}
 
 
 def tar_of(path: pathlib.Path, kind: bytes) -> pathlib.Path:
@@ -64,16 +67,20 @@ def tar_of(path: pathlib.Path, kind: bytes) -> pathlib.Path:
 
 
 @pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE])
-def test_links_and_devices_are_refused(tmp_path, kind):
-    with pytest.raises(InputError, match=r"a.tar: link: found a link or a device, expected files"):
+def test_links_out_and_devices_are_refused(tmp_path, kind):
+    with pytest.raises(InputError, match=r"a\.tar: cannot be unpacked: "):
         unpack(tar_of(tmp_path / "a.tar", kind), tmp_path / "to", quiet=True)
+    assert list((tmp_path / "to").iterdir()) == []
+
+
+def test_a_link_in_a_zip_is_no_link(tmp_path):
     info = zipfile.ZipInfo("link")
     info.external_attr = (stat.S_IFLNK | 0o777) << 16
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         archive.writestr(info, "/etc/passwd")
-    with pytest.raises(InputError, match=r"a.zip: link: found a link or a device"):
-        unpack(tmp_path / "a.zip", tmp_path / "to", quiet=True)
-    assert written(tmp_path / "to") == {}
+    unpack(tmp_path / "a.zip", tmp_path / "to", quiet=True)
+    assert (tmp_path / "to" / "link").read_text() == "/etc/passwd"
+    assert not (tmp_path / "to" / "link").is_symlink()
 
 
 @pytest.mark.parametrize("name", WRITERS)

@@ -3,9 +3,11 @@
 import contextlib
 import dataclasses
 import json
+import os
 import shutil
 import socket
 import statistics
+import threading
 import types
 
 import jax
@@ -33,6 +35,7 @@ from crisalad_jax.training import start
 from crisalad_jax.utils import locks, temporaries
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_json, write_json
+from crisalad_jax.utils.output import Note
 from tests.cli.test_cli import fails, succeeds
 from tests.conftest import BATCH, STEPS, assert_equal
 
@@ -348,32 +351,31 @@ def test_it_grows_by_a_set_and_a_seed_and_nothing_is_repeated(
     assert len(first["R@1"]["by_seed"]) == 3
 
 
-def test_runs_are_shared_with_another_process(finished, config, monkeypatch):
-    """It holds seed 0, and ends it while this one waits; seed 1 is done here, and only that."""
-    prepared = comparison.prepare(config)
-    runs = runs_of(prepared, finished)
-    for each in runs:
-        (each.folder / "result.json").rename(finished / f"{each.seed}.json")
-    one, lines = [], []
+def test_a_second_process_is_refused(finished, config):
+    with locks.lock(finished):
+        words = rf"^{finished}: found another process that writes here \(process {os.getpid()} on"
+        with pytest.raises(InputError, match=words):
+            run(config, finished)
 
-    def done(each):
-        (finished / f"{each.seed}.json").rename(each.folder / "result.json")
 
-    monkeypatch.setattr(runner, "_complete", lambda p, r, *_: one.append(r.seed) or done(r))
-    with contextlib.ExitStack() as other:
-        other.enter_context(locks.lock(runs[0].folder))
+def test_a_run_waits_for_a_worker_of_a_killed_command(finished, config, monkeypatch):
+    """It writes the result, some moments before it ends."""
+    folder, other = finished / "crisalad" / "seed-0", contextlib.ExitStack()
+    result = folder / "result.json"
+    result.rename(finished / "result.json")
+    for name in ("fit", "evaluate"):
+        monkeypatch.delattr(runner, name)
 
-        def ended(seconds):
-            done(runs[0])
-            other.close()
+    def ended():
+        (finished / "result.json").rename(result)
+        other.close()
 
-        monkeypatch.setattr(runner.time, "sleep", ended)
-        runner.carry_out(config, finished, say=lines.append, quiet=True)
-    assert one == [1]
-    assert lines[1:] == [
-        "crisalad, seed 1: 0 of 2 runs done",
-        "waiting for the runs of other processes",
-    ]
+    other.enter_context(locks.lock(folder))
+    timer = threading.Timer(0.3, ended)
+    timer.start()
+    with pytest.warns(Note, match=rf"^{folder}: waiting for another process"):
+        run(config, finished)
+    timer.join()
 
 
 def test_the_run_of_a_killed_process_is_free(finished, config, monkeypatch):
@@ -382,7 +384,7 @@ def test_the_run_of_a_killed_process_is_free(finished, config, monkeypatch):
     (folder / temporaries.LOCK).write_text(f"process 1 on {socket.gethostname()}\n")
     change(folder, ranks={})
     monkeypatch.delattr(runner, "fit")
-    runner.carry_out(config, finished, say=print, quiet=True)
+    run(config, finished)
     assert not (folder / temporaries.LOCK).exists()
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import crisalad_jax as cj
+from crisalad_jax.nn.adapters import TokenInfo
 from crisalad_jax.nn.adapters.lora import LoraConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig, block
 from tests.conftest import MODEL
@@ -31,10 +32,10 @@ def own(own_parts: Any) -> type:
         def linear_update(self, params: Any, name: str, x: Any) -> Any:
             return jnp.full((*x.shape[:-1], 16 + self.extra), 0.5) if name == "proj" else None
 
-        def attention_update(self, params: Any, attended: Any, grid: Any, **more: Any) -> Any:
+        def attention_update(self, params: Any, attended: Any, info: Any) -> Any:
             return params + attended
 
-        def mlp_update(self, params: Any, tokens: Any, grid: Any, **more: Any) -> Any:
+        def mlp_update(self, params: Any, tokens: Any, info: Any) -> Any:
             return jnp.full_like(tokens, 3.0), params
 
     return Own
@@ -51,7 +52,9 @@ def test_hooks_add_where_they_say(own: type) -> None:
     ones = jnp.ones(16)
     params = dataclasses.replace(silent, attn=attn, ls1=ones, ls2=ones, adapter=jnp.arange(16.0))
     tokens = jnp.ones((1, 7, 16))
-    found = jax.jit(lambda params, x: block(params, x, (2, 3), config)[0])(params, tokens)
+    found = jax.jit(lambda params, x: block(params, x, TokenInfo((2, 3)), config)[0])(
+        params, tokens
+    )
     expected = 1 + 2 * 0.75 + np.arange(16) + 3
     np.testing.assert_array_equal(found, np.broadcast_to(expected, (1, 7, 16)))
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from crisalad_jax.nn.adapters import ADAPTERS
+from crisalad_jax.nn.adapters import ADAPTERS, TokenInfo
 from crisalad_jax.nn.adapters.bottleneck import DepthwiseConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.utils.pytree import named_leaves
@@ -45,7 +45,9 @@ def test_equals_torch(special: int, kernel_size: int, bias: Literal["convolution
     bias = 0 if t.up.bias is None else t.up.bias
     expected = 0.5 * ((branch + hidden) @ t.up.weight + bias)
     # Chains of at most 25 products of order 1, then 8 of order 10.
-    np.testing.assert_allclose(config.mlp_update(params, tokens, GRID)[0], expected, atol=2e-5)
+    np.testing.assert_allclose(
+        config.mlp_update(params, tokens, TokenInfo(GRID))[0], expected, atol=2e-5
+    )
 
 
 @pytest.mark.parametrize("bias", ["convolutions", "up"])
@@ -75,10 +77,12 @@ def test_an_untrained_adapter_adds_nothing(name: str) -> None:
     config = ADAPTERS.make(name)
     params = config.init(jax.random.key(0), SMALL)
     tokens = jax.random.normal(jax.random.key(2), (16, 32))
-    np.testing.assert_array_equal(config.mlp_update(params, tokens, GRID)[0], jnp.zeros((16, 32)))
+    np.testing.assert_array_equal(
+        config.mlp_update(params, tokens, TokenInfo(GRID))[0], jnp.zeros((16, 32))
+    )
     if name == "serial-parallel":
         assert (params.serial.down.weight != params.parallel.down.weight).any()
-        serial = config.attention_update(params, tokens, GRID)
+        serial = config.attention_update(params, tokens, TokenInfo(GRID))
         np.testing.assert_array_equal(serial, jnp.zeros((16, 32)))
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import crisalad_jax as cj
+from crisalad_jax.nn.adapters import TokenInfo
 from crisalad_jax.nn.adapters.bottleneck import SideConfig
 from crisalad_jax.nn.adapters.dynamic_power import DynamicPowerConfig
 from crisalad_jax.nn.adapters.lora import LoraConfig
@@ -158,7 +159,7 @@ def test_dynamic_power_equals_torchs() -> None:
     p = torch.sigmoid(hidden @ t.fc2.weight + t.fc2.bias)
     expected = tokens.sign() * (tokens.abs() + 1e-6).pow(p)
     # The seventh token is padding, which no mean has. Ten roundings of numbers up to 3.
-    found = config.output_update(params, x, length=6)
+    found = config.output_update(params, x, TokenInfo((2, 2), length=6))
     np.testing.assert_allclose(found, expected.numpy(), rtol=2e-6, atol=2e-6)
     assert found[0, 0, 0] == 0
     assert float(p.std()) > 0.2 or len(np.unique(p.numpy())) == 3  # an exponent an image

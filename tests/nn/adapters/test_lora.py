@@ -12,6 +12,7 @@ import torch
 from torch.nn import functional as F
 
 import crisalad_jax as cj
+from crisalad_jax.nn.adapters import TokenInfo
 from crisalad_jax.nn.adapters.lora import LoraConfig
 from crisalad_jax.nn.backbones.base import FeatureSpec
 from crisalad_jax.nn.backbones.dinov3 import DinoV3Config
@@ -57,7 +58,9 @@ def test_a_block_and_its_gradients_equal_torchs() -> None:
     tokens, weights = random_like((jnp.zeros((2, 7, 16)),) * 2, 2)
 
     def loss(adapter: Any, tokens: jax.Array) -> tuple[jax.Array, jax.Array]:
-        y, _ = block(dataclasses.replace(params, adapter=adapter), tokens, (2, 3), config)
+        y, _ = block(
+            dataclasses.replace(params, adapter=adapter), tokens, TokenInfo((2, 3)), config
+        )
         return (y * weights).sum(), y
 
     grads, found = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))(params.adapter, tokens)
@@ -152,7 +155,9 @@ def test_no_gradient_has_the_size_of_a_weight() -> None:
     one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), params.blocks)
 
     def loss(adapter: Any, frozen: Any, tokens: jax.Array) -> jax.Array:
-        return block(dataclasses.replace(frozen, adapter=adapter), tokens, (2, 3), config)[0].sum()
+        return block(
+            dataclasses.replace(frozen, adapter=adapter), tokens, TokenInfo((2, 3)), config
+        )[0].sum()
 
     tokens = jax.ShapeDtypeStruct((5, 7, 64), jnp.float32)
     program = jax.make_jaxpr(jax.grad(loss))(one.adapter, one, tokens)

@@ -11,6 +11,7 @@ import torch
 from torch.nn import functional
 
 import crisalad_jax as cj
+from crisalad_jax.nn.adapters import TokenInfo
 from crisalad_jax.nn.adapters.bottleneck import SideMultiResolutionConfig
 from crisalad_jax.nn.backbones.base import FeatureSpec
 from crisalad_jax.nn.backbones.vit import ViTConfig, block, run_blocks
@@ -67,7 +68,7 @@ def test_two_paths_equal_torchs(trains: bool) -> None:
         layer = jax.tree.map(lambda leaf, i=i: leaf[i], bare)
         if i == DEPTH - LAST:
             sides = [trunk, trunk]
-        trunk, _ = block(layer, trunk, GRID, BARE)
+        trunk, _ = block(layer, trunk, TokenInfo(GRID), BARE)
         if i < DEPTH - LAST:
             continue
         for number in range(2):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from crisalad_jax.nn.adapters import TokenInfo
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.backbones.vit import NORM_EPSILON, ViTConfig, block, embed
 from crisalad_jax.nn.config import ModelConfig
@@ -35,7 +36,7 @@ def test_the_tokens_run_through_the_last_blocks_by_hand() -> None:
         if i == 1:
             tokens = jnp.concatenate([params.aggregator.tokens[None], tokens], axis=1)
         layer = jax.tree.map(lambda leaf, i=i: leaf[i], params.backbone.blocks)
-        tokens, _ = block(layer, tokens, (2, 3), backbone)
+        tokens, _ = block(layer, tokens, TokenInfo((2, 3)), backbone)
     normed = layer_norm(params.backbone.norm, tokens[:, :3], epsilon=NORM_EPSILON)
     found = describe(params, image[None], CONFIG)
     # The same sums, compiled twice.

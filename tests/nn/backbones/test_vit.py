@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from crisalad_jax.nn.adapters import TokenInfo
 from crisalad_jax.nn.adapters.bottleneck import MlpAdapter, SideConfig
 from crisalad_jax.nn.attention import attention
 from crisalad_jax.nn.backbones.base import FeatureSpec
@@ -58,7 +59,9 @@ def test_serial_and_parallel_adapters_by_hand() -> None:
     middle = tokens + 0.5 * (a + mlp(adapters.serial, a))
     y = normed(layer.norm2, middle)
     expected = middle + 0.5 * (feed_forward(layer.mlp, y) + 0.2 * mlp(adapters.parallel, y))
-    found, _ = block(dataclasses.replace(layer, adapter=adapters), tokens, (2, 3), config)
+    found, _ = block(
+        dataclasses.replace(layer, adapter=adapters), tokens, TokenInfo((2, 3)), config
+    )
     # Sums of at most 16 products of order 10.
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
 
@@ -78,7 +81,7 @@ def test_side_adapters_take_the_sum_of_both_paths() -> None:
     trunk, beside = tokens, tokens
     for i in range(CONFIG.depth):
         layer = jax.tree.map(lambda leaf, i=i: leaf[i], params.blocks)
-        trunk, _ = block(dataclasses.replace(layer, adapter=None), trunk, (2, 3), BARE)
+        trunk, _ = block(dataclasses.replace(layer, adapter=None), trunk, TokenInfo((2, 3)), BARE)
         t = jax.tree.map(lambda leaf: torch.tensor(np.asarray(leaf)), layer.adapter)
         z = torch.tensor(np.asarray(trunk + beside))
         hidden = torch.nn.functional.gelu(z @ t.down.weight + t.down.bias)

@@ -81,9 +81,9 @@ def form(data: bytes, field: str = "image") -> tuple[bytes, dict[str, str]]:
 def test_many_clients_get_the_answers_of_query(service, pictures, expected, monkeypatch):
     search, threads = Map.search, set()
 
-    def recorded(*arguments):
+    def recorded(*arguments, **options):
         threads.add(threading.get_ident())
-        return search(*arguments)
+        return search(*arguments, **options)
 
     monkeypatch.setattr(Map, "search", recorded)
 
@@ -185,9 +185,30 @@ def test_a_form_is_as_good_as_a_body(service, pictures, expected):
     assert len(service.ask("POST", "/locate?k=99", data, **headers).json["neighbours"]) == 7
 
 
+def test_a_request_may_be_of_some_images(service, pictures):
+    """Two at once with other conditions: each has the whole map's answers, without others."""
+    data = pictures[0].read_bytes()
+    whole = service.ask("POST", "/locate?k=99", data).json["neighbours"]
+    east = {each["number"]: each["position"]["east"] for each in whole if each["position"]}
+    ends = (max(east.values()), min(east.values()))
+
+    def ask(west):
+        path = f"/locate?k=99&where=box={west},-9e9,9e9,9e9"
+        return [each["number"] for each in service.ask("POST", path, data).json["neighbours"]]
+
+    with concurrent.futures.ThreadPoolExecutor(2) as threads:
+        for west, found in zip(ends, threads.map(ask, ends), strict=True):
+            assert found == [number for number, at in east.items() if at >= west]
+            assert found
+    reply = service.ask("POST", "/locate?where=folder=nowhere", data)
+    assert reply.status == 400
+    assert reply.json["error"].startswith("where: found none of 7 images (0 by folder)")
+
+
 @pytest.mark.parametrize(
     ("method", "path", "body", "status", "words"),
     [
+        ("POST", "/locate?where=colour", b"", 400, "where: found 'colour', expected folder="),
         ("POST", "/locate", b"", 400, "image: found an empty file, expected an image (.jpg"),
         ("POST", "/locate", b"hello", 400, "image: found 5 bytes that do not decode"),
         ("POST", "/locate", b"\xff\xd8\xff\xe0 cut", 400, "image: found 8 bytes that do"),

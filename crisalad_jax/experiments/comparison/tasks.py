@@ -1,0 +1,215 @@
+"""The work of a comparison as tasks of Ray, each with its share of the cluster's devices."""
+
+import contextlib
+import math
+import os
+import pathlib
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+
+from crisalad_jax.config.checks import require
+from crisalad_jax.config.plugins import load_plugins, loaded_plugins
+from crisalad_jax.data.images import MAX_PIXELS
+from crisalad_jax.utils.cluster import START, check_nodes, connected
+from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.output import Note, counted, warn
+from crisalad_jax.utils.signals import defer_signals
+
+_MEMORY = 0.9
+"""Fraction of a GPU's memory that all tasks on it may use together."""
+_TRIES = 10
+"""Number of times that a task may lose its worker."""
+_PATIENCE = 300.0
+"""Seconds that the tasks have to save their work at an interruption; compiling may take minutes."""
+_JAX = (
+    *("jax_platforms", "jax_num_cpu_devices", "jax_compilation_cache_dir"),
+    "jax_persistent_cache_min_compile_time_secs",
+)
+"""Settings of JAX that a worker takes from this process, as variables: a run has the same bits."""
+
+
+class Share(NamedTuple):
+    """What each task gets of a cluster."""
+
+    device: str
+    """What it reserves: "GPU", or "CPU" for cores."""
+    size: float
+    """How many of these; a fraction where tasks share one."""
+    at_once: int
+    """Number of tasks at once."""
+    beside: bool
+    """Whether tasks share a device; without GPUs, whether a node may have two of them."""
+
+
+def share_of(nodes: Sequence[Mapping[str, float]], jobs: int | None) -> Share:
+    """Share the devices of a cluster between tasks.
+
+    GPUs are dealt out, one or more to a task; where there are too few, tasks share them, and their
+    memory. Without GPUs a task reserves cores, but JAX computes on all cores of its node.
+
+    Args:
+        nodes: the resources of each node, by Ray's names.
+        jobs: number of tasks at once. None is one for each GPU, or one for each node without any.
+
+    Returns:
+        The share of each task.
+
+    Raises:
+        InputError: no node has any.
+
+    Example:
+        >>> share_of([{"CPU": 16, "GPU": 2}], 4)
+        Share(device='GPU', size=0.5, at_once=4, beside=True)
+    """
+    device = "GPU" if any(node.get("GPU") for node in nodes) else "CPU"
+    counts = [int(node[device]) for node in nodes if node.get(device)]
+    require(bool(counts), "--cluster: found no node with a GPU or a CPU, expected one")
+
+    def fits(size: int) -> int:
+        return sum(count // size for count in counts)
+
+    if jobs is None:
+        size = 1 if device == "GPU" else min(counts)
+        jobs = fits(size)
+    elif jobs <= sum(counts):
+        size = max(size for size in range(1, max(counts) + 1) if fits(size) >= jobs)
+    else:  # in the ten thousandths that Ray counts in
+        size = math.floor(1e4 / math.ceil(jobs / sum(counts))) / 1e4
+    beside = size < 1 if device == "GPU" else 2 * size <= max(counts)
+    return Share(device, size, jobs, beside)
+
+
+@contextlib.contextmanager
+def joined(
+    address: str, jobs: int | None, read: Iterable[str | None], write: pathlib.Path
+) -> Iterator[Share]:
+    """Join a cluster while the block runs, and yield the share of each task there.
+
+    Args:
+        address: as `cluster.connected` takes it.
+        jobs: as `share_of` takes it.
+        read: files and folders that every node has to read.
+        write: a folder that every node has to write into.
+
+    Raises:
+        InputError: what `connected` and `check_nodes` raise.
+    """
+    paths = [*filter(None, read), *(name for name in loaded_plugins() if name.endswith(".py"))]
+    with connected(address) as ray:
+        absolute = [path if "://" in path else os.path.abspath(path) for path in paths]
+        check_nodes(ray, read=absolute, write=write.absolute())
+        share = share_of([node["Resources"] for node in ray.nodes() if node["Alive"]], jobs)
+        first = ray.remote(_nothing).options(**_options(share)).remote()
+        if not ray.wait([first], timeout=START)[0]:
+            raise InputError(
+                f"--cluster {address}: found no {share.size:g} free {share.device} within "
+                f"{START:.0f} s, expected that of a node for each run"
+            )
+        yield share
+
+
+def in_turn(
+    work: Callable[..., Any], shared: tuple[Any, ...], each: Iterable[tuple[Any, ...]] = ((),)
+) -> list[Any]:
+    """Call a function for each of some arguments, after those that all calls share."""
+    return [work(*shared, *given) for given in each]
+
+
+def in_tasks(
+    share: Share,
+    work: Callable[..., Any],
+    shared: tuple[Any, ...],
+    each: Iterable[tuple[Any, ...]] = ((),),
+) -> list[Any]:
+    """Do the same by tasks of the cluster; return the results in the order in which they end.
+
+    Arguments are taken from `each` as tasks begin. A task whose worker is lost is begun again. At a
+    signal the tasks get Ctrl-C, and time to save their work; a second signal does not wait for it.
+    An error of one ends the others likewise.
+
+    Raises:
+        InputError: what a call raises as one; or one has lost too many workers.
+        Interrupted: a signal asked for the end.
+    """
+    import ray
+    from ray.exceptions import RayError, RayTaskError, UnserializableException
+
+    task = ray.remote(_carry_out).options(**_options(share))
+    here = os.getcwd(), loaded_plugins()
+    reference = [ray.put((work, shared))]  # in a list: a task reads it after its plug-ins
+    waiting, again, lost = iter(each), [], Counter()
+    running, results = {}, []
+    with defer_signals() as stop:
+        stop.has_work = True
+        try:
+            while True:
+                stop.check()
+                while len(running) < share.at_once:
+                    given = again.pop() if again else next(waiting, None)
+                    if given is None:
+                        break
+                    running[task.remote(*here, reference, given)] = given
+                if not running:
+                    return results
+                for ended in ray.wait([*running], timeout=0.2)[0]:
+                    given = running.pop(ended)
+                    try:
+                        result, notes = ray.get(ended)
+                    except (RayTaskError, UnserializableException) as error:
+                        raise getattr(error, "cause", error) from error
+                    except RayError as error:
+                        lost[given] += 1
+                        words = f"a worker of the cluster was lost ({type(error).__name__})"
+                        if lost[given] == _TRIES:
+                            raise InputError(f"{words}, {_TRIES} times in the same work") from None
+                        warn(f"{words}; its work is begun again where it was saved")
+                        again.append(given)
+                    else:
+                        results.append(result)
+                        for note in notes:
+                            warn(note)
+        finally:
+            if running:
+                tasks = counted(len(running), "task")
+                warn(f"waiting for {tasks} to save the work, at most {_PATIENCE:.0f} s")
+            for ended in running:
+                ray.cancel(ended)
+            ray.wait([*running], num_returns=len(running), timeout=_PATIENCE)
+
+
+def _options(share: Share) -> dict[str, Any]:
+    """Return Ray's options of a task: what it reserves, and the variables of its process."""
+    values = {name.upper(): getattr(jax.config, name) for name in _JAX}
+    values[MAX_PIXELS] = os.environ[MAX_PIXELS]
+    if share.device == "GPU" and share.size < 1:
+        values["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{_MEMORY * share.size:.3f}"
+    given = {name: str(value) for name, value in values.items() if value is not None}
+    return {
+        **{"num_cpus": 0, f"num_{share.device.lower()}s": share.size},
+        **{"max_retries": 0, "scheduling_strategy": "SPREAD", "runtime_env": {"env_vars": given}},
+    }
+
+
+def _nothing() -> None:
+    """Start a worker."""
+
+
+def _carry_out(
+    folder: str, plugins: Sequence[str], reference: list[Any], given: tuple[Any, ...]
+) -> tuple[Any, list[str]]:
+    """Carry out a call in a worker; return its result, and its notes."""
+    import ray
+
+    with contextlib.suppress(OSError):  # a node without this folder is given whole paths
+        os.chdir(folder)
+    load_plugins(plugins)
+    work, shared = ray.get(reference[0])
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always", Note)
+        result = work(*shared, *given)
+    notes = [str(each.message) for each in found if issubclass(each.category, Note)]
+    return result, [*dict.fromkeys(notes)]

@@ -1,0 +1,102 @@
+"""End a process of a run in one line where another one is lost: killed, or with its host.
+
+JAX ends the others in one of two ways. An exchange raises an error, where the kernel of the lost
+one's host closes its connections; or JAX's service misses its heartbeats, and aborts each process
+in C++, with a page of its own, wherever that is.
+"""
+
+import atexit
+import functools
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import jax
+
+from crisalad_jax.utils.errors import InputError
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+HEARTBEAT = 60
+"""Seconds without a heartbeat after which a process counts as lost."""
+_OF_EXCHANGES = re.compile(r"gloo|nccl|coordination service|connection (reset|closed)", re.I)
+"""What JAX's error says where another process has left an exchange."""
+_NEXT = "the same command resumes from the last saved state, with as many processes or others"
+_FILTER = """
+import re, sys
+aborted, of_jax, page = False, False, b""
+for line in sys.stdin.buffer:
+    if re.match(rb"[IWEF]\\d{4} \\d\\d:|crisalad:", line):
+        of_jax = b"coordination_service" in line or b"JAX distributed service" in line
+        aborted = aborted or (of_jax and line[:1] == b"F")
+    if of_jax:
+        page += line
+    elif not line.startswith(b"[Gloo] Rank "):
+        sys.stderr.buffer.write(line)
+        sys.stderr.buffer.flush()
+if aborted:
+    found = re.search(rb"[Tt]ask (\\d+) heartbeat|heartbeats\\):\\s+(\\d+)", page)
+    lost = next(filter(None, found.groups())).decode() if found else "0"
+    print(f"crisalad: processes: lost process {lost}; " + sys.argv[1], file=sys.stderr)
+"""
+_filters: list[subprocess.Popen[bytes]] = []
+
+
+class LostProcessError(InputError):
+    """Another process of the run has ended without a word."""
+
+
+def filter_aborts() -> None:
+    """Let a small program write to standard error what C++ writes, and a line for JAX's page.
+
+    What Python writes goes where it went before.
+    """
+    program = subprocess.Popen(
+        [sys.executable, "-ISc", _FILTER, _NEXT], stdin=subprocess.PIPE, start_new_session=True
+    )
+    assert program.stdin is not None
+    for number, stream in ((1, sys.stdout), (2, sys.stderr)):
+        stream.flush()
+        # The stream stays the same object, which others hold. Without a buffer, it is the file.
+        file = getattr(stream.buffer, "raw", stream.buffer)
+        file.__init__(os.dup(number), "w", closefd=False)
+        os.dup2(program.stdin.fileno(), number)
+    program.stdin.close()
+    _filters.append(program)
+
+
+def ends_with_the_others(function: Callable[_P, _T]) -> Callable[_P, _T]:
+    """Wrap a function that processes call together: where one is lost the others raise.
+
+    What the function holds is closed first, so that a state that is being written is whole. This
+    process then ends without JAX's farewell to the others, which would wait for the lost one.
+
+    Raises:
+        LostProcessError: JAX's error is of an exchange with another process.
+    """
+
+    @functools.wraps(function)
+    def call(*args: _P.args, **options: _P.kwargs) -> _T:
+        try:
+            return function(*args, **options)
+        except (RuntimeError, ValueError) as error:
+            text = " ".join(str(error).split())
+            is_lost = jax.process_count() > 1 and _OF_EXCHANGES.search(text)
+            if isinstance(error, InputError) or not is_lost:
+                raise
+            for program in _filters:  # the line is said here
+                program.kill()
+            atexit.register(_leave)
+            raise LostProcessError(
+                f"processes: lost another one ({text[:120]}); {_NEXT}"
+            ) from error
+
+    return call
+
+
+def _leave() -> None:
+    sys.stdout.flush()
+    os._exit(2)
