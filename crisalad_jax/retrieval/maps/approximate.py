@@ -16,7 +16,7 @@ import numpy as np
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import Queries, sample
-from crisalad_jax.retrieval.maps.milvus_store import KINDS, MilvusStore
+from crisalad_jax.retrieval.maps.milvus_store import MilvusStore
 from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.maps.store import Store
 from crisalad_jax.retrieval.neighbours import Neighbours, similarities_of
@@ -62,22 +62,25 @@ class Approximate(NamedTuple):
     store: Store
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
+    is_served: bool = False
+    """Whether a server looks for candidates among what is left, however little that is."""
 
     def search(self, queries: Queries, k: int, count: int, removed: Removed = NONE) -> Neighbours:
         """Find the k most similar of `count` descriptors: candidates, ranked exactly.
 
-        Queries with fewer than k candidates are searched exactly, and so are all where less than a
-        tenth is left. What was removed is no candidate; more are looked at in its place.
+        Queries with fewer than k candidates are searched exactly, and so are files where less than
+        a tenth is left. What was removed is no candidate; more are looked at in its place.
 
         Raises:
             InputError: the store is damaged or gone.
         """
         each, least = _CANDIDATES[self.kind]
-        left = count - len(removed.rows)
-        if left < count // _SEARCHED:
-            return self.store.search(queries, k, count, removed)
-        candidates = min(left, max(least, each * k) * count // left)
-        numbers = self.ask(queries, candidates, count, removed).indices
+        left, candidates = count - len(removed.rows), max(least, each * k)
+        if not self.is_served:
+            if left < count // _SEARCHED:
+                return self.store.search(queries, k, count, removed)
+            candidates = candidates * count // left
+        numbers = self.ask(queries, min(left, candidates), count, removed).indices
         query, found = np.nonzero(numbers >= 0)
         similarities = np.full(numbers.shape, -np.inf, np.float32)
         similarities[query, found] = similarities_of(
@@ -237,7 +240,7 @@ def _served(store: MilvusStore) -> Approximate | None:
     """Return the approximate search that Milvus does of a map, whose recall is not known yet."""
     if store.kind == "exact":
         return None
-    return Approximate(store.kind, store.ask, store, math.nan)
+    return Approximate(store.kind, store.ask, store, math.nan, is_served=True)
 
 
 def _recall(built: Approximate, count: int) -> float:

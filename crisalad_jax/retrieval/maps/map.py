@@ -356,7 +356,7 @@ class Map:
 
     @property
     def search_kind(self) -> str:
-        """How `search` searches: "exact", "hnsw", "ivf-rabitq", or one of `milvus_store.KINDS`."""
+        """How `search` searches: "exact", "hnsw" or "ivf-rabitq"."""
         return "exact" if self._approximate is None else self._approximate.kind
 
     @property

@@ -36,6 +36,8 @@ _MOST = 16384
 """Largest number of neighbours, of queries at once, and of returned rows that Milvus allows."""
 _CONNECT = 10.0
 """Seconds to wait for a connection."""
+_GRPC = {"grpc.max_reconnect_backoff_ms": 1000}
+"""Without this a server that is back again is asked after up to two minutes."""
 _ANSWER = 120.0
 """Seconds to wait for an answer, with a server that restarts in between."""
 _STALLED = 1800.0
@@ -132,8 +134,9 @@ class MilvusStore:
         if self._is_file and not new and not path.exists():
             raise InputError(f"{address}: found nothing, expected the descriptors of this map")
         with self._one_line("connecting"):
+            options = {"timeout": _CONNECT, "grpc_options": _GRPC}
             token = os.environ.get(TOKEN, "")
-            self._client: Any = pymilvus.MilvusClient(address, token=token, timeout=_CONNECT)
+            self._client: Any = pymilvus.MilvusClient(address, token=token, **options)
             self._server: str = self._client.get_server_version(timeout=_CONNECT)
         numbers = re.findall(r"\d+", self._server)[:3]
         self._version = (0,) if self._is_file else tuple(map(int, numbers))

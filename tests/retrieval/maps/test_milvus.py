@@ -230,7 +230,8 @@ def faked(monkeypatch, client: Fake) -> MilvusStore:
 def test_a_server_of_2_6_has_codes_of_bits(monkeypatch):
     client = Fake()
     store = faked(monkeypatch, client)
-    store.build("auto", 10**8)
+    with pytest.warns(Note, match="--search auto takes ivf-rabitq: 100000000 descriptors of 512"):
+        store.build("auto", 10**8)
     (index,) = client.last("create_index")["index_params"]
     assert index.get_index_configs() == {
         "index_type": "IVF_RABITQ",
