@@ -16,7 +16,7 @@ import numpy as np
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import Queries, sample
-from crisalad_jax.retrieval.maps.milvus_store import MilvusStore
+from crisalad_jax.retrieval.maps.milvus_store import KINDS, MilvusStore
 from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.maps.store import Store
 from crisalad_jax.retrieval.neighbours import Neighbours, similarities_of
