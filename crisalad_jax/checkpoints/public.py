@@ -43,7 +43,6 @@ from crisalad_jax.checkpoints.weights import (
     check_sizes,
     read_weights,
     save_weights,
-    with_metadata,
 )
 from crisalad_jax.config.checks import PATH, choose, takes
 from crisalad_jax.config.io import differences, from_plain, to_plain
@@ -69,8 +68,8 @@ class _Declared:
 
     format: str
     config: ModelConfig
-    aggregator: dict
-    """What the aggregator keeps besides arrays."""
+    aggregator: dict = dataclasses.field(default_factory=dict)
+    """Of earlier files, and not read."""
 
 
 def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Checkpoint:
@@ -102,19 +101,18 @@ def read_checkpoint(path: str | os.PathLike[str], *, verify: bool = True) -> Che
     source = str(path)
     if content.declared is None:
         name, config, state = identify(content.state, source=source)
-        own: Mapping[str, Any] = {}
     else:
         value = parse_json(content.declared, f"{source} ({DECLARED})", "a configuration")
         check_sizes(value, content.state.values(), source)
         declared = from_plain(_Declared, value, source=f"{source} ({DECLARED})")
-        name, config, own = declared.format, declared.config, declared.aggregator
+        name, config = declared.format, declared.config
         state = renamed_to(content.state, public_shapes(config, name).keys())
     if content.mean is not None:
         chain = dataclasses.replace(config.preprocessing, mean=content.mean)
         config = dataclasses.replace(config, preprocessing=chain)
     state = {key: _float32(key, array, source) for key, array in state.items()}
     params, extras = to_params(state, config, name, source=source)
-    params = with_metadata(jax.tree.map(jnp.asarray, params), config, own, source)
+    params = jax.tree.map(jnp.asarray, params)
     if restriction := restriction_of(name):
         warn_once(source, restriction)
     return Checkpoint(params, config, extras, name, restriction=restriction)
@@ -159,9 +157,7 @@ def read_vocabulary(
         found = f"found a tensor of shape {words.shape}"
         raise InputError(f"{path}: {found}, expected (words, {width}), for the backbone's width")
     config = vocabulary_model(len(words), base.config, fields or {})
-    aggregator = AnyLoc(jnp.asarray(words))
-    aggregator = config.aggregator.attach_backbone_hash(aggregator, base.params.backbone)
-    params = Crisalad(base.params.backbone, aggregator, None)
+    params = Crisalad(base.params.backbone, AnyLoc(jnp.asarray(words)), None)
     return Checkpoint(params, config, base.extras, VOCABULARY)
 
 
@@ -209,11 +205,7 @@ def write_checkpoint(
         raise InputError(f"{path}: found suffix {path.suffix!r}, expected {' or '.join(wanted)}")
     shown = check_holds(config, format)
     is_shown = format != REFERENCE and with_non_semantic_fields_of(config, shown) == shown
-    declared = {
-        "format": format,
-        "config": to_plain(config),
-        "aggregator": config.aggregator.metadata(params.aggregator),
-    }
+    declared = {"format": format, "config": to_plain(config)}
     text = None if is_shown else json.dumps(declared)
     state = to_state(params, config, format, extras)
     if form.stored == "safetensors":

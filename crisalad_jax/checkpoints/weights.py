@@ -44,10 +44,10 @@ class Header:
     """Version of this package that wrote it."""
     parts: dict
     """Name and source's digest of every part."""
-    aggregator: dict
-    """What the aggregator keeps besides arrays."""
     model_sha256: str
     """The `model_hash` of the parameters."""
+    aggregator: dict = dataclasses.field(default_factory=dict)
+    """Of earlier files, and not read."""
     loss: dict = dataclasses.field(default_factory=dict)
     """The run's loss, a `LossConfig` as JSON values, where the file has its parameters."""
     restriction: str = ""
@@ -101,7 +101,7 @@ def save_weights(
 
     Raises:
         InputError: parameters that `load_weights` would refuse; the folder cannot be made, or the
-            file not be written; or AnyLoc's vocabulary is of another backbone.
+            file not be written.
 
     Example:
         >>> import jax, tempfile
@@ -120,7 +120,6 @@ def save_weights(
         stored = jax.tree.map(_halved, params)
         params = jax.tree.map(lambda leaf, half: half.astype(leaf.dtype), params, stored)
     check_params(params, config, stored=True)
-    config.aggregator.check_backbone(params.aggregator, params.backbone, str(path))
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(stored).items()}
     arrays |= {EXTRA + name: array for name, array in (extras or {}).items()}
     learnt = {} if loss is None else named_leaves(loss[1])
@@ -129,7 +128,6 @@ def save_weights(
         "config": to_plain(config),
         "version": VERSION,
         "parts": sources_of(config),
-        "aggregator": config.aggregator.metadata(params.aggregator),
         "model_sha256": model_hash(params, config),
         **({} if loss is None else {"loss": to_plain(loss[0])}),
         **({"restriction": restriction} if restriction else {}),
@@ -166,7 +164,7 @@ def load_weights(
         InputError: the file is missing, changed, cut short or no such file; it needs a part that is
             not registered; its parameters do not fit its configuration or are not finite (the first
             that are missing, unknown or wrong are listed); its configuration is not `expected` (all
-            fields that differ are listed); or AnyLoc's vocabulary is of another backbone.
+            fields that differ are listed).
 
     Example:
         >>> load_weights("none.safetensors")
@@ -208,7 +206,6 @@ def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkp
         if array.dtype == np.float16:
             arrays[name] = array.astype(np.float32)
     params = params_of(arrays, config, source=str(path))
-    params = with_metadata(params, config, header.aggregator, str(path))
     changed = changed_sources(config, header.parts)
     if changed:
         warn(
@@ -220,19 +217,6 @@ def read_weights(path: str | os.PathLike[str], *, verify: bool = True) -> Checkp
     if restriction:
         warn_once(str(path), restriction)
     return Checkpoint(params, config, extras, None, header.model_sha256, loss, restriction)
-
-
-def with_metadata(
-    params: Crisalad, config: ModelConfig, metadata: Mapping[str, Any], source: str
-) -> Crisalad:
-    """Return parameters with what an aggregator keeps besides arrays.
-
-    Raises:
-        InputError: it is a vocabulary of another backbone.
-    """
-    own = config.aggregator.with_metadata(params.aggregator, metadata)
-    config.aggregator.check_backbone(own, params.backbone, source)
-    return dataclasses.replace(params, aggregator=own)
 
 
 def check_sizes(plain: Any, arrays: Collection[np.ndarray], source: str) -> None:

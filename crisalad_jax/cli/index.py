@@ -58,7 +58,7 @@ class Index(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag
     use."""
     search: Literal["auto", "exact", "hnsw", "ivf-rabitq", "diskann"] | None = None
     """Build an approximate search, and print what it recalls; exact removes it, and auto chooses by
-    size and memory (docs/large.md)."""
+    size and memory (docs/large.md). Milvus alone has diskann."""
     again: bool = False
     """Add images that `crisalad map remove` removed, too."""
 

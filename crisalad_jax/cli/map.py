@@ -68,6 +68,8 @@ class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):
     of one folder on one day."""
     day: str | None = None
     """With list and remove: only images that were added on this day, as YYYY-MM-DD (UTC)."""
+    store: str | None = None
+    """With merge: where a new map's descriptors are, files or milvus:URI as of `crisalad index`."""
     images: pathlib.Path | None = None
     """With replace: where the changed images are, by the same names, as `crisalad index` takes
     it."""
@@ -79,6 +81,7 @@ _OF = {
     "names": ("list",),
     "addition": ("list", "remove"),
     "day": ("list", "remove"),
+    "store": ("merge",),
     "images": ("replace",),
     "fps": ("replace",),
     "weights": ("replace",),
@@ -165,7 +168,7 @@ _CHANGES = {
     ),
     "replace": _replace,
     "move": _move,
-    "merge": lambda given: merge_maps(given.map, *given.what, quiet=given.quiet),
+    "merge": lambda given: merge_maps(given.map, *given.what, store=given.store, quiet=given.quiet),
 }
 _DONE = {"remove": "removed", "replace": "replaced", "move": "moved", "merge": "added"}
 _THERE = {

@@ -39,6 +39,8 @@ _BUILD_EFFORT = 128
 """Number of candidates kept while a vector is inserted; the paper's examples keep 100."""
 _LEAST_EFFORT = 128
 """Number of candidates kept while a graph is searched, at least."""
+_LEAST_LISTS = 256
+"""Number of lists that a query looks into, at least."""
 _PER_LIST = 39
 """Number of vectors to train a list's centroid from; with fewer, faiss warns of a poor
 clustering."""
@@ -77,7 +79,7 @@ class Index(NamedTuple):
             k: neighbours per query; at most all.
             effort: how much is looked at, for more to be found in more time: of HNSW, candidates
                 kept while searching (by default 128, or 2 k); of IVF-RaBitQ, lists looked into (by
-                default a sixteenth of them).
+                default a sixteenth of them, or 256).
             without: indices that are not to be found; None is none.
 
         Raises:
@@ -92,7 +94,7 @@ class Index(NamedTuple):
             chosen = faiss.SearchParametersHNSW(efSearch=effort or max(_LEAST_EFFORT, 2 * k))
         else:
             lists = _lists(self.faiss_index).nlist
-            looked = min(effort or -(-lists // 16), lists)
+            looked = min(effort or max(_LEAST_LISTS, lists // 16), lists)
             chosen = faiss.SearchParametersIVF(nprobe=looked)
         if without is not None and len(without):
             left = np.ones(self.size, bool)

@@ -123,8 +123,8 @@ def fit(
         InputError: nothing of the model trains; an argument is out of range; the validation has no
             ground truth; `out` holds something else, or a run of another configuration or start; an
             image cannot be read; there are too few places, classes or images; the loss is no longer
-            finite (the state before that step is saved); or a file cannot be written.
-        LostProcessError: another process of this run has ended without a word.
+            finite (the state before that step is saved); a file cannot be written; or another
+            process of the run is lost (then this one ends without a wait at its end).
         Interrupted: SIGTERM or Ctrl-C came (in the main thread); the state is saved.
 
     Example:

@@ -12,7 +12,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 
@@ -61,7 +61,7 @@ def filter_aborts() -> None:
     for number, stream in ((1, sys.stdout), (2, sys.stderr)):
         stream.flush()
         # The stream stays the same object, which others hold. Without a buffer, it is the file.
-        file = getattr(stream.buffer, "raw", stream.buffer)
+        file: Any = getattr(stream.buffer, "raw", stream.buffer)
         file.__init__(os.dup(number), "w", closefd=False)
         os.dup2(program.stdin.fileno(), number)
     program.stdin.close()

@@ -111,7 +111,6 @@ def with_vocabulary(
             means = _k_means(reduced, clusters, seed, spherical=aggregator.spherical_centroids)
         learnt = aggregator.from_centroids(jnp.asarray(means), there)
         learnt = aggregator.with_frequencies(learnt, by_image)
-    learnt = aggregator.attach_backbone_hash(learnt, params.backbone)
     return dataclasses.replace(params, aggregator=learnt)
 
 

@@ -13,12 +13,7 @@ from crisalad_jax.utils.errors import InputError
 _T = TypeVar("_T")
 
 
-def static_field(**options: Any) -> Any:
-    """Return a dataclass field that is part of the pytree's structure, and no leaf."""
-    return dataclasses.field(metadata={"static": True}, **options)
-
-
-@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, static_field))
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 def pytree_dataclass(cls: type[_T]) -> type[_T]:
     """Make a class a frozen dataclass and register it as a pytree whose children are its fields.
 
@@ -50,19 +45,17 @@ def pytree_dataclass(cls: type[_T]) -> type[_T]:
     if not own:
         cls.__repr__ = summary  # pyright: ignore[reportAttributeAccessIssue]
     fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
-    names = tuple(field.name for field in fields if not field.metadata.get("static"))
-    statics = tuple(field.name for field in fields if field.metadata.get("static"))
+    names = tuple(field.name for field in fields)
 
-    def flatten_with_keys(tree: _T) -> tuple[tuple[tuple[Any, Any], ...], tuple[Any, ...]]:
-        children = tuple((jax.tree_util.GetAttrKey(n), getattr(tree, n)) for n in names)
-        return children, tuple(getattr(tree, n) for n in statics)
+    def flatten_with_keys(tree: _T) -> tuple[tuple[tuple[Any, Any], ...], None]:
+        return tuple((jax.tree_util.GetAttrKey(n), getattr(tree, n)) for n in names), None
 
-    def flatten(tree: _T) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        return tuple(getattr(tree, n) for n in names), tuple(getattr(tree, n) for n in statics)
+    def flatten(tree: _T) -> tuple[tuple[Any, ...], None]:
+        return tuple(getattr(tree, n) for n in names), None
 
-    def unflatten(values: tuple[Any, ...], children: Any) -> _T:
+    def unflatten(_: None, children: Any) -> _T:
         tree = object.__new__(cls)
-        vars(tree).update(zip((*names, *statics), (*children, *values), strict=True))
+        vars(tree).update(zip(names, children, strict=True))
         return tree
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)

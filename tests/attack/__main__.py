@@ -18,7 +18,7 @@ from tests.attack.world import ROOT
 
 SCRIPTS = (
     *("kills", "interruptions", "memory", "disks", "damage", "inputs"),
-    *("service", "hostile", "surroundings", "clusters"),
+    *("service", "hostile", "surroundings", "clusters", "processes"),
 )
 PAGE = ROOT / "docs" / "reliability.md"
 

@@ -349,7 +349,7 @@ VALUES: Mapping[str, tuple[str, ...]] = {
     "evaluate --compute-dtype": ("float8",),
     "train --epochs": ("0", "-1", HUGE, "1e9", "x"),
     "train --places-per-batch|--images-per-place|--min-images": ("0", "-1", HUGE),
-    "train --patience|--num-threads": ("-1", "x"),
+    "train --patience|--num-threads|--cache-gb": ("-1", "x"),
     "train --save-top-k": ("-1",),
     "train --optimiser.learning-rate": ("-1", "nan", "inf", "x"),
     "train --model.aggregator|--augmentation": ("x",),

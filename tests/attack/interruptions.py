@@ -393,7 +393,7 @@ QUICK = [name for name in VERBS if name not in ("compare", "demo")]
 ATTACKS: Mapping[str, Attack] = {
     # Two quick verbs, which need none of the products.
     "some": lambda bench, _: attack_forks(
-        "extract .npy, convert", ["extract .npy", "convert"], 6, bench
+        "extract .npy, convert", ["extract .npy", "convert"], 3, bench
     ),
     "forks": lambda bench, scale: attack_forks(
         "all verbs but the long ones", QUICK, part_of(64, scale), bench

@@ -18,7 +18,7 @@ SOME = (
     # In a container root may not mount, and writes into any folder: three tries then.
     ("disks", 0, "convert", 3),
     ("inputs", 0, "a sample", 16),
-    ("interruptions", 0, "some", 18),
+    ("interruptions", 0, "some", 9),
 )
 ALL = (
     ("damage", 1, "", 4800),
@@ -36,6 +36,7 @@ ALL = (
     ("clusters", 1, "", 4),
     ("kills", 1, "compare on Ray", 20),
     ("memory", 1, "", 7),
+    ("processes", 1, "", 13),
     ("service", 1, "", 2000),
     ("surroundings", 1, "20 columns, python -O, python -W error, C locale, no home", 40),
     ("surroundings", 1, "switches of JAX", 8),

@@ -27,7 +27,6 @@ from crisalad_jax.checkpoints.public import (
 )
 from crisalad_jax.checkpoints.safetensors_io import write_safetensors
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
-from crisalad_jax.nn.aggregators.vlad import AnyLocConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Model, describe, init_crisalad, self_mask
 from crisalad_jax.utils.errors import InputError
@@ -207,20 +206,6 @@ def test_what_no_description_depends_on_comes_back(tmp_path: pathlib.Path, layou
         assert all(content[name].tobytes() == array.tobytes() for name, array in whole.items())
     else:
         assert same_bits(torch.load(back), torch.load(source))
-
-
-def test_a_vocabulary_comes_back_with_its_backbones_digest(tmp_path: pathlib.Path) -> None:
-    config = dataclasses.replace(MODEL, aggregator=AnyLocConfig(layer=0), cross_image="none")
-    params = random_params(config)
-    bound = config.aggregator.attach_backbone_hash(params.aggregator, params.backbone)
-    params = dataclasses.replace(params, aggregator=bound)
-    write_checkpoint(tmp_path / "back.pth", params, config, "reference", {})
-    again = read_checkpoint(tmp_path / "back.pth")
-    assert again.params.aggregator.backbone == bound.backbone is not None
-    content = torch.load(tmp_path / "back.pth")
-    content["state_dict"]["backbone.norm.bias"] += 1
-    with pytest.raises(InputError, match="found a vocabulary of another backbone"):
-        read_checkpoint(save(tmp_path / "other.pth", content))
 
 
 def test_the_source_is_never_written_over(tmp_path: pathlib.Path) -> None:

@@ -266,8 +266,19 @@ def inferred(name: str) -> tuple[str, ModelConfig]:
     return infer(state | {"rope_embed.periods": periods.astype(np.float32)}, source=name)
 
 
+FIRST = {published_model(name).format: name for name in reversed(PUBLISHED)}
+"""The first model of each format; the others take minutes in all."""
+
+
 # DINOv3's are checked beside transformers, in parity/test_dinov3.py.
-@pytest.mark.parametrize("name", [name for name in PUBLISHED if not name.startswith("dinov3-")])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in FIRST.values() else pytest.mark.slow)
+        for name in PUBLISHED
+        if not name.startswith("dinov3-")
+    ],
+)
 def test_a_models_facts_are_those_of_its_file(name):
     model, (layout, config) = published_model(name), inferred(name)
     found = (model.format, model.descriptor, model.parameters)

@@ -58,7 +58,7 @@ def test_the_file_is_plain_safetensors_with_dotted_names(shared, params):
     metadata = header.pop("__metadata__")
     assert metadata.keys() == {"crisalad-jax 4"}
     told = json.loads(metadata["crisalad-jax 4"])
-    assert list(told) == [*("checksum", "config", "version", "parts", "aggregator", "model_sha256")]
+    assert list(told) == [*("checksum", "config", "version", "parts", "model_sha256")]
     assert told["config"] == to_plain(MODEL)
     assert {field: name for field, (name, _) in told["parts"].items()} == {
         "backbone": "vit",

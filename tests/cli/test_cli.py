@@ -232,7 +232,9 @@ def test_the_console_script_and_the_module_are_the_same_thing(tmp_path):
     assert files_in(tmp_path) == {"photos/a.jpg", "w.safetensors"}
 
 
-@pytest.mark.parametrize("more", [("--help",), ("--preset", "tiny")])
+@pytest.mark.parametrize(
+    "more", [("--help",), pytest.param(("--preset", "tiny"), marks=pytest.mark.slow)]
+)
 def test_a_reader_that_goes_away_is_no_error(more):
     """As `crisalad info --help | head -1`: the work goes on, and its files are written."""
     reading, writing = os.pipe()
@@ -244,7 +246,9 @@ def test_a_reader_that_goes_away_is_no_error(more):
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device of Linux alone")
-@pytest.mark.parametrize("more", [("--help",), ("--help-all",), ("--json", "-")])
+@pytest.mark.parametrize(
+    "more", [("--help",), pytest.param(("--json", "-"), marks=pytest.mark.slow)]
+)
 def test_a_full_disk_at_standard_output_is_one_line(more):
     """Of output met by the last flush, by a print on the way, and by JSON."""
     with open("/dev/full", "w") as full:

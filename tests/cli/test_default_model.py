@@ -42,7 +42,7 @@ def test_extract_takes_it(shared, tmp_path, capfd):
 
 
 @pytest.mark.usefixtures("symbolic_shapes")
-@pytest.mark.parametrize("runtime", ["jax", "onnxruntime"])
+@pytest.mark.parametrize("runtime", ["jax", pytest.param("onnxruntime", marks=pytest.mark.slow)])
 def test_a_map_is_made_asked_and_grown_without_weights(runtime, shared, tmp_path, capfd):
     images, out = shared / "town" / "images" / "test" / "database", tmp_path / "map"
     flags = ("--out", out, "--runtime", runtime, "--quiet")

@@ -92,6 +92,29 @@ def test_answers_are_a_table_json_or_a_gallery(folder, queries, tmp_path, capfd)
     assert cv2.imread(str(picture)).shape[1] > 6 * 204
 
 
+def test_answers_are_of_the_images_that_conditions_take(folder, queries, capfd):
+    """The whole map's answers without the others; what cannot be meant is one line."""
+    one = list_images(queries)[0]
+
+    def answers(*more):
+        printed, _ = runs(capfd, *query(folder, one, "--k", 9, "--json", "-", *more))
+        found = json.loads(printed)["neighbours"]
+        return [(answer["name"], answer["similarity"]) for answer in found]
+
+    whole = answers()
+    east = sorted(float(name.split("@")[1]) for name, _ in whole)[3]
+    some = answers("--where", f"added>=2020-01-01, box={east},0,9e9,9e9")
+    assert some == [pair for pair in whole if float(pair[0].split("@")[1]) >= east]
+    assert 0 < len(some) < len(whole)
+    for text, words in (
+        ("colour=red", "where: found 'colour=red', expected folder="),
+        ("folder=nowhere", "where: found none of 7 images (0 by folder), expected at least one"),
+    ):
+        fails(capfd, *query(folder, one, "--where", text), words=(words,))
+    both = query(folder, one, "--where", "folder=a", "--sequence", "bayes")
+    fails(capfd, *both, words=("--where: found with --sequence",))
+
+
 def test_answers_are_positions_of_a_new_map(shared, folder, queries, tmp_path, capfd):
     """What `query --out` writes, `index --positions` reads; GeoJSON has the same in degrees."""
     table, layer = tmp_path / "a.csv", tmp_path / "a.geojson"

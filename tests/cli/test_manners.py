@@ -39,7 +39,7 @@ def module_of(command):
 # Platforms
 
 
-@pytest.mark.parametrize("platforms", ["gpuu", "rocm"])
+@pytest.mark.parametrize("platforms", ["gpuu", pytest.param("rocm", marks=pytest.mark.slow)])
 def test_platforms_that_jax_lacks_are_one_line(tmp_path, platforms, database, weights):
     """JAX raises a RuntimeError of the first, and an AssertionError without words of the second."""
     given = ("index", "--images", database, "--weights", weights, "--out", "m")
@@ -60,6 +60,7 @@ def test_platforms_that_jax_lacks_are_one_line(tmp_path, platforms, database, we
 # The cache
 
 
+@pytest.mark.slow
 def test_all_that_is_cached_is_in_one_folder(tmp_path, shared, weights):
     """A process of its own, as of a user: the tests' set-up keeps no programs."""
     environment = {k: v for k, v in os.environ.items() if k not in OWN_CACHES}
@@ -86,7 +87,7 @@ def files(folder):
 # Help
 
 
-@pytest.mark.parametrize("columns", [10, 20, 40, 50])
+@pytest.mark.parametrize("columns", [10, 50])
 def test_help_in_a_narrow_terminal_is_that_of_60_columns(capfd, monkeypatch, columns):
     monkeypatch.setenv("COLUMNS", "60")
     expected = {command: runs(capfd, command, "--help")[0] for command in COMMANDS}

@@ -24,6 +24,7 @@ from tests.conftest import MODEL
 pytestmark = pytest.mark.usefixtures("symbolic_shapes")
 
 ENGINES = ("onnxruntime", "openvino")
+SLOW = pytest.mark.slow
 # As of exports: the same operations, rounded in another order.
 TOLERANCE = 2e-6
 
@@ -41,7 +42,7 @@ def succeeds(capfd: Capture, *arguments: object) -> str:
     ("engine", "grouping", "source"),
     [
         ("onnxruntime", "sequential", "weights"),
-        ("openvino", "window", "weights"),
+        pytest.param("openvino", "window", "weights", marks=SLOW),
         ("openvino", "single", "exported"),
     ],
 )
@@ -59,7 +60,7 @@ def test_extract_gives_the_descriptors_of_jax(
     np.testing.assert_allclose(*found, rtol=0, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", ["onnxruntime", pytest.param("openvino", marks=SLOW)])
 def test_evaluate_recalls_as_jax_does(engine, shared, tmp_path, capfd, weights):
     command = (
         *("evaluate", "--data", shared / "town", "--weights", weights),
@@ -118,7 +119,7 @@ def exported(params: Crisalad, tmp_path: pathlib.Path) -> pathlib.Path:
     return tmp_path / "onnx"
 
 
-@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize("told", [True, pytest.param(False, marks=SLOW)])
 def test_a_query_by_an_exported_folder_starts_without_jax(exported, shared, tmp_path, capfd, told):
     places, asked = tmp_path / "map", town(shared) / "queries"
     by = ("--weights", exported, "--runtime", "onnxruntime")

@@ -2,18 +2,22 @@
 
 import logging
 import pathlib
+from typing import Any
 
 import fsspec
 import numpy as np
 import pytest
 
+from crisalad_jax.data.file_cache import FileCache
 from crisalad_jax.data.images import read_image
+from crisalad_jax.data.loader import ImageCache, training_batches
+from crisalad_jax.data.places import Places, read_places
 from crisalad_jax.data.positions import Positions, exif_position
 from crisalad_jax.data.reading import image_batches
 from crisalad_jax.data.remote import address_of, is_remote, size_of, state_of
 from crisalad_jax.data.sources import open_source, open_sources
 from crisalad_jax.utils.errors import InputError
-from tests.conftest import write_picture
+from tests.conftest import write_city, write_picture
 from tests.data.benchmarks.trees import refused
 from tests.data.test_sources import write_jpeg
 from tests.file_server import file_server
@@ -177,6 +181,69 @@ def test_files_and_addresses_do_not_mix(memory, tmp_path):
     assert (root, paths) == (pathlib.Path("memory:/run"), list(map(pathlib.Path, given)))
 
 
+def write_layouts(folder: pathlib.Path) -> None:
+    """Places in the layout of GSV-Cities, as folders, and in a table."""
+    write_city(folder / "city")
+    for number in range(6):
+        write_picture(folder / "folders" / f"p{number % 3}" / f"{number}.png", number)
+        write_picture(folder / "table" / "all" / f"{number}.png", number)
+    rows = [f"all/{number}.png,{'ab'[number % 2]},1.5,{number}" for number in range(6)]
+    (folder / "table" / "places.csv").write_text("\n".join(["name,place,lat,lon", *rows]))
+
+
+@pytest.fixture
+def layouts(tmp_path):
+    write_layouts(tmp_path)
+    files = fsspec.filesystem("memory")
+    files.put(str(tmp_path), "/run", recursive=True)
+    yield files
+    files.rm("/run", recursive=True)
+
+
+def same_places(found: Places, expected: Places) -> bool:
+    for name in ("place_start", "place_city", "views"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    return (found.files, found.names, found.cities) == (
+        expected.files,
+        expected.names,
+        expected.cities,
+    )
+
+
+@pytest.mark.parametrize("name", ["city", "folders", "table", "table/places.csv"])
+def test_places_at_addresses(layouts, tmp_path, name):
+    given: Any = {"min_images": 2}
+    found, expected = (read_places(f"{at}/{name}", **given) for at in ("memory://run", tmp_path))
+    assert same_places(found, expected)
+    assert found.path(0) == pathlib.Path("memory:/run", name.partition("/")[0], found.files[0])
+    cache = ImageCache(0, read_far=FileCache(tmp_path / "cache", 2**30).read)
+    drawn: Any = {
+        **{"image_size": (14, 14), "places_per_batch": 2, "images_per_place": 2, "seed": 3},
+        **{"epoch": 0, "sampler": "shuffled", "augmentation": "light", "threads": 2},
+    }
+    batches = training_batches(found, cache=cache, **drawn)
+    for batch, other in zip(batches, training_batches(expected, **drawn), strict=True):
+        for ours, theirs in zip(batch, other, strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+    assert any((tmp_path / "cache").rglob("*"))
+
+
+@pytest.mark.filterwarnings("ignore:.*left out")
+def test_places_at_addresses_that_cannot_be_read_are_a_line(layouts):
+    layouts.rm("/run/table/all/0.png")
+    with refused("^memory:/run/table/places.csv: found 1 of 6 images missing.*is all/0.png"):
+        read_places("memory://run/table", min_images=2)
+    found = read_places("memory://run/table", min_images=2, on_bad_image="skip")
+    assert found.image_counts.tolist() == [3, 2]  # the first is of b
+    layouts.pipe("/run/folders/a.png", b"x")
+    with refused("^memory://run/folders: found a.png, p0/, p1/, p2/, expected the layout"):
+        read_places("memory://run/folders", min_images=2)
+    with refused("^memory://run/none: found no such folder, expected the layout"):
+        read_places("memory://run/none")
+    with refused("^http://h/a: found a user or a query"):
+        read_places("http://h/a?key=1")
+
+
 @pytest.mark.slow
 def test_s3_in_a_server_of_moto(pictures, tmp_path, monkeypatch):
     from moto.server import ThreadedMotoServer
@@ -203,6 +270,16 @@ def test_s3_in_a_server_of_moto(pictures, tmp_path, monkeypatch):
         assert sum(int(batch.valid.sum()) for batch in batches) == len(NAMES)
         with refused("^s3://frames-of-a-robot/gone.png: cannot be read: found no such file"):
             read_image("s3://frames-of-a-robot/gone.png")
+        write_layouts(tmp_path / "layouts")
+        files.put(str(tmp_path / "layouts"), "frames-of-a-robot/layouts", recursive=True)
+        for name in ("city", "folders", "table"):
+            ours, theirs = (
+                read_places(f"{at}/{name}", min_images=2)
+                for at in ("s3://frames-of-a-robot/layouts", tmp_path / "layouts")
+            )
+            assert same_places(ours, theirs)
+            data = FileCache(tmp_path / "cache", 2**30).read(ours.path(0))
+            assert data == theirs.path(0).read_bytes()
         with refused("^s3://another-bucket-of-a-robot/run: found no folder"):
             open_source("s3://another-bucket-of-a-robot/run")
     finally:

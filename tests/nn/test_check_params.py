@@ -17,8 +17,7 @@ from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.nn.aggregators.vlad import AnyLoc
-from crisalad_jax.nn.config import ModelConfig, with_aggregator
+from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import (
     Crisalad,
     Model,
@@ -28,7 +27,6 @@ from crisalad_jax.nn.model import (
     describe,
     extract_features,
     extract_tokens,
-    init_crisalad,
     transport_masses,
     unit_features,
 )
@@ -192,15 +190,6 @@ def test_trees_of_another_model_are_not_merged() -> None:
     other = dataclasses.replace(MODEL, cross_image=dataclasses.replace(MODEL.cross_image, layers=1))
     with pytest.raises(InputError, match=r"params: not of this configuration: cross_image\."):
         merge_params(chosen, frozen, other)
-
-
-def test_a_vocabularys_backbone_makes_no_misfit() -> None:
-    alone = "none"
-    config = with_aggregator(MODEL, "anyloc", "tiny", cross_image=alone)
-    params = init_crisalad(jax.random.key(0), config)
-    check_params(
-        dataclasses.replace(params, aggregator=AnyLoc(params.aggregator.words, "a")), config
-    )
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from crisalad_jax.checkpoints.safetensors_io import read_sealed, write_sealed
-from crisalad_jax.checkpoints.weights import FORMAT, load_weights, save_weights
+from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.resize import resize_image
@@ -29,7 +28,7 @@ from crisalad_jax.training.vocabulary import build_vocabulary, with_vocabulary
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.output import Note
-from tests.cli.test_cli import extract, fails
+from tests.cli.test_cli import fails
 from tests.conftest import BATCH, MODEL, RECIPE, assert_equal, random_params
 
 ANYLOC = dataclasses.replace(
@@ -167,37 +166,6 @@ def test_features_that_are_not_finite_are_refused(fresh, paths) -> None:
     model = Model(broken, dataclasses.replace(ANYLOC, aggregator=token))
     with pytest.raises(InputError, match=r"^images: found .* without NaN or infinity"):
         with_vocabulary(model, paths[:BATCH], batch_size=BATCH)
-
-
-# Whose it is
-
-
-def other(backbone):
-    return dataclasses.replace(backbone, cls_token=backbone.cls_token + 1)
-
-
-def test_a_vocabulary_of_another_backbone_is_refused(capfd, built, shared, tmp_path) -> None:
-    path = tmp_path / "w.safetensors"
-    mixed = dataclasses.replace(built, backbone=other(built.backbone))
-    with pytest.raises(InputError, match=f"{path}: found a vocabulary of another backbone"):
-        save_weights(path, Model(mixed, ANYLOC))
-    assert not path.exists()
-
-    save_weights(path, Model(built, ANYLOC))
-    found, _ = load_weights(path)
-    assert_equal(found, built)
-    value, arrays = read_sealed(path, FORMAT, "weights")
-    arrays["backbone.cls_token"] = arrays["backbone.cls_token"] + 1
-    write_sealed(path, arrays, FORMAT, value)
-    start = extract(shared, shared / "town", tmp_path / "d.npy")
-    start = tuple(path if part == shared / "weights.safetensors" else part for part in start)
-    fails(capfd, *start, words=(f"{path}: found a vocabulary of another backbone, expected one",))
-
-
-def test_words_that_nobody_built_go_with_any_backbone(fresh, tmp_path) -> None:
-    mixed = dataclasses.replace(fresh, backbone=other(fresh.backbone))
-    save_weights(tmp_path / "w.safetensors", Model(mixed, ANYLOC))
-    assert_equal(load_weights(tmp_path / "w.safetensors")[0], mixed)
 
 
 # In training

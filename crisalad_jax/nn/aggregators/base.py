@@ -168,21 +168,6 @@ class Aggregator(Part, abc.ABC):
         """Whether it has a `plan`."""
         return type(self).plan is not Aggregator.plan
 
-    def attach_backbone_hash(self, params: Any, backbone: Any) -> Any:
-        """Return parameters with the backbone's digest, if they fit only this backbone."""
-        return params
-
-    def check_backbone(self, params: Any, backbone: Any, source: str) -> None:
-        """Raise InputError, beginning with `source`, where parameters are of another backbone."""
-
-    def metadata(self, params: Any) -> dict[str, str]:
-        """Return the parameters' metadata that a file of weights stores with their arrays."""
-        return {}
-
-    def with_metadata(self, params: Any, metadata: Mapping[str, str]) -> Any:
-        """Return parameters with the metadata that a file stores with their arrays."""
-        return params
-
     def plan(self, params: Any, features: Features) -> Float[Array, "*batch patch column"]:
         """Return the mass that a transport sends from each patch to each cluster.
 

@@ -5,14 +5,11 @@ All compute in float32 at least, at the highest precision.
 
 import abc
 import dataclasses
-import hashlib
 import math
-from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import (
@@ -34,7 +31,7 @@ from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid
 from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.pytree import named_leaves, pytree_dataclass, static_field
+from crisalad_jax.utils.pytree import pytree_dataclass
 
 RATIO = 100
 """Initial ratio of a patch's largest share to its second largest, as in public implementations."""
@@ -229,12 +226,10 @@ class VladBuffConfig(VladConfig):
 
 @pytree_dataclass
 class AnyLoc:
-    """The visual words, and the backbone that they belong to."""
+    """The visual words."""
 
     words: Centroids
     """k-means centroids of unit features."""
-    backbone: str | None = static_field(default=None)
-    """Digest of the words' backbone; None before a vocabulary is built."""
 
 
 @AGGREGATORS.register("anyloc", tiny={"clusters": 16, "layer": -1})
@@ -275,26 +270,6 @@ class AnyLocConfig(VladConfig):
     def from_centroids(self, centroids: Centroids, features: FeatureRows) -> AnyLoc:
         """Use the centroids as words."""
         return AnyLoc(centroids)
-
-    def attach_backbone_hash(self, params: AnyLoc, backbone: Any) -> AnyLoc:
-        """Return the vocabulary with its backbone's digest."""
-        return AnyLoc(params.words, _digest(backbone))
-
-    def check_backbone(self, params: AnyLoc, backbone: Any, source: str) -> None:
-        """Raise InputError where a vocabulary, if one was built, is of another backbone."""
-        require(
-            params.backbone is None or params.backbone == _digest(backbone),
-            f"{source}: found a vocabulary of another backbone, expected one of these weights' "
-            "(`crisalad vocabulary` builds it)",
-        )
-
-    def metadata(self, params: AnyLoc) -> dict[str, str]:
-        """Return the backbone's digest, where a vocabulary was built."""
-        return {} if params.backbone is None else {"backbone": params.backbone}
-
-    def with_metadata(self, params: AnyLoc, metadata: Mapping[str, str]) -> AnyLoc:
-        """Return the words with the backbone's digest."""
-        return AnyLoc(params.words, metadata.get("backbone"))
 
     def sums(self, params: AnyLoc, patches: Patches) -> Float[Array, "*batch cluster dim"]:
         """Compute VLAD (Jegou et al. 2010): residuals from the nearest word, intra-normalised.
@@ -390,14 +365,6 @@ def burst_weights(burst: Float[Array, "3"], patches: Patches) -> Float[Array, "*
     cosines = jnp.einsum("...id,...jd->...ij", patches, patches, precision="highest")
     alike = jax.nn.sigmoid(slope * (2 * cosines - 2) + offset)
     return alike.sum(axis=-1) ** power
-
-
-def _digest(backbone: Any) -> str:
-    digest = hashlib.sha256()
-    for name, leaf in named_leaves(backbone).items():
-        digest.update(name.encode())
-        digest.update(np.ascontiguousarray(leaf).data)
-    return digest.hexdigest()
 
 
 def nearest_words(

@@ -1,4 +1,4 @@
-"""Approximate search of a map: an index of FAISS beside its descriptors, made from them.
+"""Approximate search of a map: an index of FAISS made from its descriptors, or that of Milvus.
 
 The index's name holds a digest of the additions that it was built from. One of other additions is
 not used, so that a map that grew never answers from an old index. Building adds what is new to one
@@ -16,7 +16,7 @@ import numpy as np
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.chunks import Queries, sample
-from crisalad_jax.retrieval.maps.milvus_store import MilvusStore
+from crisalad_jax.retrieval.maps.milvus_store import KINDS, MilvusStore
 from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.maps.store import Store
 from crisalad_jax.retrieval.neighbours import Neighbours, similarities_of
@@ -29,10 +29,10 @@ from crisalad_jax.utils.temporaries import made_folder, remove_temporaries
 if TYPE_CHECKING:
     from crisalad_jax.retrieval.faiss_index import Index
 
-SEARCHES: dict[str, None] = dict.fromkeys(("auto", "exact", "hnsw", "ivf-rabitq", "diskann"))
-"""How a map is searched: as `choose_search` chooses; every descriptor is compared; by a graph over
-the descriptors, which are all in memory; or by their signs in memory, and the files rank the
-answers. Milvus has a graph on its disk, too."""
+SEARCHES: dict[str, None] = dict.fromkeys(("auto", "exact", "hnsw", "ivf-rabitq"))
+"""How a map in files is searched: as `choose_search` chooses; every descriptor is compared; by a
+graph over the descriptors, which are all in memory; or by their signs in memory, and the files rank
+the answers."""
 _EXACT_BYTES = 2**26
 """Largest size of descriptors that `choose_search` has searched exactly: all are read for a query,
 in less than a tenth of a second."""
@@ -57,27 +57,30 @@ class Approximate(NamedTuple):
     """An approximate search of a map's descriptors."""
 
     kind: str
-    ask: Callable[[Queries, int, Removed], Neighbours]
-    """Finds candidates: so many of each query, whose numbers are -1 where there are fewer."""
+    ask: Callable[[Queries, int, int, Removed], Neighbours]
+    """Finds so many candidates among a count, whose numbers are -1 where there are fewer."""
     store: Store
     recall: float
     """Share of the exact neighbours that it found when it was built (`NEIGHBOURS`, `SAMPLE`)."""
+    is_served: bool = False
+    """Whether a server looks for candidates among what is left, however little that is."""
 
     def search(self, queries: Queries, k: int, count: int, removed: Removed = NONE) -> Neighbours:
         """Find the k most similar of `count` descriptors: candidates, ranked exactly.
 
-        Queries with fewer than k candidates are searched exactly, and so are all where less than a
-        tenth is left. What was removed is no candidate; more are looked at in its place.
+        Queries with fewer than k candidates are searched exactly, and so are files where less than
+        a tenth is left. What was removed is no candidate; more are looked at in its place.
 
         Raises:
             InputError: the store is damaged or gone.
         """
         each, least = _CANDIDATES[self.kind]
-        left = count - len(removed.rows)
-        if left < count // _SEARCHED:
-            return self.store.search(queries, k, count, removed)
-        candidates = min(left, max(least, each * k) * count // left)
-        numbers = self.ask(queries, candidates, removed).indices
+        left, candidates = count - len(removed.rows), max(least, each * k)
+        if not self.is_served:
+            if left < count // _SEARCHED:
+                return self.store.search(queries, k, count, removed)
+            candidates = candidates * count // left
+        numbers = self.ask(queries, min(left, candidates), count, removed).indices
         query, found = np.nonzero(numbers >= 0)
         similarities = np.full(numbers.shape, -np.inf, np.float32)
         similarities[query, found] = similarities_of(
@@ -134,13 +137,11 @@ def check_search(kind: str, store: str, dtype: str) -> None:
     """Check that the descriptors in a store can be searched so.
 
     Raises:
-        InputError: an unknown kind, an approximate search of bits, or one that files lack.
+        InputError: a kind that the store has not, or an approximate search of bits.
     """
-    choose("search", kind, SEARCHES)
+    choose("search", kind, SEARCHES if store == "files" else dict.fromkeys((*KINDS, "auto")))
     if kind not in ("auto", "exact") and dtype == "bits":
         raise InputError(f"search: found {kind} for a map of bits, expected exact")
-    if kind == "diskann" and store == "files":
-        raise InputError(f"search: found {kind} for a map in files, which is an index of Milvus")
 
 
 def choose_search(count: int, length: int, dtype: str) -> tuple[str, str]:
@@ -180,7 +181,7 @@ def build_approximate(
         InputError: too few descriptors; a full disk.
     """
     if isinstance(segments.store, MilvusStore):
-        segments.store.build(kind, quiet=quiet)
+        segments.store.build(kind, len(segments), quiet=quiet)
         built = _served(segments.store)
         return built and built._replace(recall=_recall(built, len(segments)))
     if kind == "exact":
@@ -231,15 +232,15 @@ def _extended(
     return None
 
 
-def _asking(index: "Index") -> Callable[[Queries, int, Removed], Neighbours]:
-    return lambda queries, k, removed: index.search(queries, k, without=removed.rows)
+def _asking(index: "Index") -> Callable[[Queries, int, int, Removed], Neighbours]:
+    return lambda queries, k, _, removed: index.search(queries, k, without=removed.rows)
 
 
 def _served(store: MilvusStore) -> Approximate | None:
     """Return the approximate search that Milvus does of a map, whose recall is not known yet."""
     if store.kind == "exact":
         return None
-    return Approximate(store.kind, store.ask, store, math.nan)
+    return Approximate(store.kind, store.ask, store, math.nan, is_served=True)
 
 
 def _recall(built: Approximate, count: int) -> float:

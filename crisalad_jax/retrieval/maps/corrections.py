@@ -36,6 +36,7 @@ from crisalad_jax.retrieval.maps.metadata import (
     existing_metadata,
     read_metadata,
 )
+from crisalad_jax.retrieval.maps.store import store_name
 from crisalad_jax.retrieval.segments import SEGMENT
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_folder, real_path
@@ -308,16 +309,21 @@ def move_images(
 
 
 def merge_maps(
-    folder: str | os.PathLike[str], *others: str | os.PathLike[str], quiet: bool = True
+    folder: str | os.PathLike[str],
+    *others: str | os.PathLike[str],
+    store: str | None = None,
+    quiet: bool = True,
 ) -> MapChange:
     """Append the images of other maps, of the same model and settings, to a map, or make it.
 
-    A new map has what is left of the others' images, and none of what was removed; its descriptors
-    are in files. Images keep their folders and days.
+    A new map has what is left of the others' images, and none of what was removed. Images keep
+    their folders and days.
 
     Args:
         folder: the map's.
         others: the others'.
+        store: "files", or "milvus:URI", which has float32 of maps in float16, too. None is the
+            map's, and of a new map "files".
         quiet: no progress bar.
 
     Returns:
@@ -325,7 +331,8 @@ def merge_maps(
 
     Raises:
         InputError: maps of several models or settings; a name of two images; positions that have no
-            place in the map; or what `Map.open` and `open_for_appending` raise.
+            place in the map; another store than the map's; or what `Map.open` and
+            `open_for_appending` raise.
 
     Example:
         >>> import jax
@@ -349,11 +356,16 @@ def merge_maps(
         metadata = read_metadata(folder)
         exists = metadata is not None
         if metadata is not None:
+            if store is not None and store_name(store, folder) != metadata.store:
+                raise InputError(f"{folder}: found store {store}, expected {metadata.store}")
             target = stack.enter_context(open_for_appending(folder, metadata))
         else:
+            first = opened[0].metadata
+            is_wider = store not in (None, "files") and first.dtype == "float16"
             metadata = dataclasses.replace(
-                opened[0].metadata,
-                store="files",
+                first,
+                store=store_name(store or "files", folder),
+                dtype="float32" if is_wider else first.dtype,
                 collection=f"crisalad_{uuid.uuid4().hex}",
                 created=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             )
@@ -368,7 +380,7 @@ def merge_maps(
 def _check_alike(other: Map, metadata: MapMetadata, folder: pathlib.Path) -> None:
     for name in ("model", "config", "dtype", "pca"):
         found, expected = (getattr(each, name) for each in (other.metadata, metadata))
-        if found != expected:
+        if found != expected and not (metadata.store != "files" and found == "float16"):
             words = name
             if name == "config":
                 words = next(key for key in expected if found.get(key) != expected[key])

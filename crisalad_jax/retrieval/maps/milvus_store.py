@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from crisalad_jax.config.checks import choose
 from crisalad_jax.retrieval.bits import Bits
 from crisalad_jax.retrieval.chunks import Block, Descriptors, Queries
 from crisalad_jax.retrieval.maps.milvus_filter import among, columns_of, left_in
@@ -35,6 +36,8 @@ _MOST = 16384
 """Largest number of neighbours, of queries at once, and of returned rows that Milvus allows."""
 _CONNECT = 10.0
 """Seconds to wait for a connection."""
+_GRPC = {"grpc.max_reconnect_backoff_ms": 1000}
+"""Without this a server that is back again is asked after up to two minutes."""
 _ANSWER = 120.0
 """Seconds to wait for an answer, with a server that restarts in between."""
 _STALLED = 1800.0
@@ -122,8 +125,6 @@ class MilvusStore:
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)  # its errors are raised
         self._address, self._collection, self._length = address, collection, length
         self._rows = max(1, min(_MOST, _MESSAGE_BYTES // (4 * length)))
-        self.size = 0
-        """Number of descriptors that are searched: those that count."""
         self._since: int | None = None
         """Milvus' time after the last acknowledged addition; None is not known yet."""
         self._loaded = False
@@ -133,8 +134,9 @@ class MilvusStore:
         if self._is_file and not new and not path.exists():
             raise InputError(f"{address}: found nothing, expected the descriptors of this map")
         with self._one_line("connecting"):
+            options = {"timeout": _CONNECT, "grpc_options": _GRPC}
             token = os.environ.get(TOKEN, "")
-            self._client: Any = pymilvus.MilvusClient(address, token=token, timeout=_CONNECT)
+            self._client: Any = pymilvus.MilvusClient(address, token=token, **options)
             self._server: str = self._client.get_server_version(timeout=_CONNECT)
         numbers = re.findall(r"\d+", self._server)[:3]
         self._version = (0,) if self._is_file else tuple(map(int, numbers))
@@ -148,7 +150,7 @@ class MilvusStore:
                 f"{address}: found no collection {collection}, expected it with the "
                 "descriptors of this map"
             )
-        elif found := self._ask("asking for its index", "describe_index", index_name="descriptor"):
+        elif found := self._index():
             names = {each.name: kind for kind, each in KINDS.items()}
             self.kind = names[found["index_type"]]
         else:  # killed while the index was changed
@@ -214,6 +216,9 @@ class MilvusStore:
         self._ask("making a collection", "create_collection", **options)
         self._make_index()
 
+    def _index(self) -> Any:
+        return self._ask("asking for the index", "describe_index", index_name="descriptor")
+
     def _make_index(self) -> None:
         index, (name, _, build, _) = self._client.prepare_index_params(), KINDS[self.kind]
         index.add_index("descriptor", index_type=name, metric_type="IP", params=dict(build))
@@ -239,45 +244,40 @@ class MilvusStore:
             self._ask("loading descriptors", "load_collection")
         self._loaded = True
 
-    def build(self, kind: str, *, quiet: bool = True) -> None:
+    def build(self, kind: str, count: int, *, quiet: bool = True) -> None:
         """Make the index of all descriptors, and of those that are added later.
 
         Searches, also of other processes, wait until it is there.
 
         Args:
             kind: of `KINDS`, or "auto", as `choose_kind` does.
+            count: number of descriptors.
             quiet: no progress bar.
 
         Raises:
             InputError: this server does not have it, or fails.
         """
         if kind == "auto":
-            kind = choose_kind(self.size, self._length, self._version)
-            what = f"{self.size} descriptors of {self._length} numbers, Milvus {self._server}"
+            kind = choose_kind(count, self._length, self._version)
+            what = f"{count} descriptors of {self._length} numbers, Milvus {self._server}"
             warn(f"{self._address}: --search auto takes {kind}: {what}")
         known = [name for name, each in KINDS.items() if each.since <= self._version]
-        if kind not in known:
-            raise InputError(
-                f"search: found {kind}, expected {' or '.join(known)}, which {self._server} has"
-            )
+        choose(f"search in Milvus {self._server}", kind, dict.fromkeys(known))
         self._ask("writing descriptors", "flush", wait=_STALLED)
         if kind != self.kind:
             self._drop_index()
             self.kind = kind
             self._make_index()
-        with progress_bar("indexed", self.size, "descriptors", quiet=quiet) as bar:
-            rows, last = 0, time.monotonic()
-            while True:
-                found = self._ask("indexing", "describe_index", index_name="descriptor")
-                if found["indexed_rows"] != rows:
+        rows, last = 0, time.monotonic()
+        with progress_bar("indexed", count, "descriptors", quiet=quiet) as bar:
+            while (found := self._index())["state"] != "Finished":
+                if found["indexed_rows"] > rows:
                     bar.advance(found["indexed_rows"] - rows)
                     rows, last = found["indexed_rows"], time.monotonic()
-                if found["state"] == "Finished" and not found["pending_index_rows"]:
-                    break
                 if found["state"] == "Failed" or time.monotonic() - last > _STALLED:
                     raise InputError(
                         f"{self._address}: found the index of {self._collection} "
-                        f"{found['state']} at {rows} of {found['total_rows']} descriptors"
+                        f"{found['state']} at {rows} of {count} descriptors"
                     )
                 time.sleep(0.2)
         self._load()
@@ -293,13 +293,13 @@ class MilvusStore:
             self._ask(f"adding descriptors from {numbers[start]} on", "upsert", data=data)
         if self._is_file:  # a server has written them to its log
             self._ask("writing descriptors", "flush")
-        self.size, self._since = numbers.stop, None
+        self._since = None
 
     def check(self, segments: Sequence[tuple[int, int]]) -> None:
         """Count the stored descriptors; see `Store.check`."""
-        self.size = expected = sum(count for _, count in segments)
-        if not expected:  # a new map is loaded once it is searched
+        if not segments:  # a new map is loaded once it is searched
             return
+        expected = sum(count for _, count in segments)
         condition, fields = f"id < {expected}", ["count(*)"]
         (answer,) = self._fetch("counting descriptors", "query", condition, output_fields=fields)
         if (stored := answer["count(*)"]) != expected:
@@ -324,27 +324,21 @@ class MilvusStore:
 
     def rows(self, numbers: Int64[np.ndarray, " n"]) -> Descriptors:
         """Fetch the descriptors of these numbers; see `Store.rows`."""
-        found = np.empty((len(numbers), self._length), np.float32)
-        order = np.argsort(numbers)
-        for start in range(0, len(numbers), self._rows):
-            places = order[start : start + self._rows]
-            some = numbers[places]
+        found, ordered = dict[int, Any](), np.sort(numbers)
+        for start in range(0, len(ordered), self._rows):
+            condition = among(ordered[start : start + self._rows])
             fields = {"output_fields": ["id", "descriptor"]}
-            part = self._fetch("reading descriptors", "query", among(some), **fields)
-            read = np.array([row["descriptor"] for row in part], np.float32)
-            ids = np.array([row["id"] for row in part])
-            if not np.isin(some, ids).all():
-                raise InputError(
-                    f"{self._address}: found {len(ids)} of {len(some)} descriptors in "
-                    f"{self._collection}, expected all of them"
-                )
-            by_id = np.argsort(ids)
-            found[places] = read[by_id[np.searchsorted(ids, some, sorter=by_id)]]
-        return found
+            for row in self._fetch("reading descriptors", "query", condition, **fields):
+                found[row["id"]] = np.asarray(row["descriptor"], np.float32)
+        if missing := set(numbers.tolist()) - found.keys():
+            raise InputError(
+                f"{self._address}: found no descriptor {min(missing)} in {self._collection}, "
+                "expected all of the map's images"
+            )
+        return np.array([found[number] for number in numbers.tolist()])
 
     def drop(self, first: int) -> None:
-        """Count no more than these, as the next addition overwrites others; see `Store.drop`."""
-        self.size = min(self.size, first)
+        """Do nothing, as the next addition overwrites them; see `Store.drop`."""
 
     def search(
         self, queries: Queries | Bits, k: int, count: int, removed: Removed = NONE
@@ -358,7 +352,7 @@ class MilvusStore:
         if self.kind != "exact":
             return self._search_here(queries, k, count, removed)
         left = min(count - len(removed.rows), _MOST)
-        found = break_ties(lambda some, k: self.ask(some, k, removed, count), queries, k, left)
+        found = break_ties(lambda some, k: self.ask(some, k, count, removed), queries, k, left)
         return found._replace(indices=removed.numbers_of(found.indices))
 
     def _search_here(self, queries: Queries, k: int, count: int, removed: Removed) -> Neighbours:
@@ -372,19 +366,9 @@ class MilvusStore:
 
         return nearest(stream, queries, k, read, self._rows)
 
-    def ask(
-        self, queries: Queries, k: int, removed: Removed, count: int | None = None
-    ) -> Neighbours:
-        """Search by Milvus' index; where it finds fewer than k, the last numbers are -1.
-
-        Args:
-            queries: unit descriptors.
-            k: neighbours of each.
-            removed: rows that are left out.
-            count: number of descriptors, those included; None is all that count.
-        """
-        k = min(k, _MOST)
-        condition = left_in(self.size if count is None else count, removed)
+    def ask(self, queries: Queries, k: int, count: int, removed: Removed) -> Neighbours:
+        """Search by Milvus' index; where it finds fewer than k, the last numbers are -1."""
+        k, condition = min(k, _MOST), left_in(count, removed)
         # Answers are bounded too: 12 bytes for each neighbour, and 8 for its number again.
         size = max(1, min(self._rows, _MESSAGE_BYTES // (20 * k)))
         indices = np.full((len(queries), k), -1, np.int64)

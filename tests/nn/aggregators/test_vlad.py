@@ -1,6 +1,5 @@
 """Hard VLAD by loops, the starts from centroids, bursts, and whose vocabulary it is."""
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -29,7 +28,6 @@ from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import Linear, init_linear, l2_normalise
 from crisalad_jax.utils.errors import InputError
-from tests.conftest import random_params
 
 PATCHES = np.random.default_rng(0).normal(size=(2, 9, 6)).astype(np.float32)
 CENTROIDS = np.random.default_rng(1).normal(size=(4, 6)).astype(np.float32)
@@ -184,28 +182,6 @@ def test_without_features_centroids_are_random_and_unit() -> None:
         centroids = params.centroids if isinstance(params, NetVlad) else params.words
         assert centroids.shape == (3, 32)
         np.testing.assert_allclose(np.linalg.norm(centroids, axis=1), 1, rtol=1e-6)
-
-
-def test_a_vocabulary_knows_its_backbone() -> None:
-    config = AnyLocConfig(clusters=2, layer=1)
-    backbone = random_params(MODEL).backbone
-    words = config.from_centroids(jnp.ones((2, 32)), jnp.ones((3, 32)))
-    assert words.backbone is None
-    config.check_backbone(words, backbone, "some.safetensors")  # it may be of any
-    digests = {None}
-    others = (
-        {"cls_token": backbone.cls_token.at[0].add(1e-6)},
-        {"pos_embed_cls": backbone.cls_token, "cls_token": backbone.pos_embed_cls},
-    )
-    for each in (backbone, *(dataclasses.replace(backbone, **change) for change in others)):
-        bound = config.attach_backbone_hash(words, each)
-        np.testing.assert_array_equal(bound.words, words.words)
-        config.check_backbone(bound, each, "some.safetensors")
-        config.check_backbone(bound, jax.tree.map(np.asarray, each), "some.safetensors")
-        digests.add(bound.backbone)
-    assert len(digests) == 4
-    with pytest.raises(InputError, match=r"^some.safetensors: found a vocabulary of another back"):
-        config.check_backbone(bound, backbone, "some.safetensors")
 
 
 def test_patches_that_are_alike_share_their_weight() -> None:

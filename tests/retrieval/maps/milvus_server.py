@@ -29,7 +29,7 @@ class Server:
 
     def start(self) -> None:
         with (self._folder / "log").open("a") as log:
-            program = [PROGRAM, "--data", self._folder / "data"]
+            program = [PROGRAM, "--data", self._folder / "data", "--proxy-port", "19530"]
             self._process = subprocess.Popen(
                 program, stdout=log, stderr=log, start_new_session=True
             )

@@ -34,6 +34,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import Note
 from tests.conftest import MODEL, describe_single, read_options, write_picture
 from tests.killed_appends import append_until, metadata, names, rows
+from tests.retrieval.maps.milvus_server import ADDRESS
 from tests.retrieval.maps.test_map import files_in, reseal
 from tests.retrieval.maps.test_stores import ROUNDING, brute_force
 from tests.utils.test_checksums import flips
@@ -170,9 +171,14 @@ def change_at_random(folder: pathlib.Path, expected: Expected, draw: random.Rand
         ("files", "float32", range(4)),
         ("files", "bits", range(4, 6)),
         ("milvus:rows.db", "float32", [6]),
+        pytest.param(f"milvus:{ADDRESS}", "float32", [7, 8], marks=pytest.mark.slow),
     ],
 )
-def test_a_map_after_any_changes_is_that_of_the_images_that_are_left(tmp_path, store, dtype, seeds):
+def test_a_map_after_any_changes_is_that_of_the_images_that_are_left(
+    tmp_path, store, dtype, seeds, request
+):
+    if ADDRESS in store:
+        request.getfixturevalue("milvus_server")
     seen = set()
     for seed in seeds:
         draw, free = random.Random(seed), iter(range(100, 10_000))
@@ -398,6 +404,27 @@ def test_a_new_map_of_nothing_good_is_not_made(tmp_path, folder):
         with pytest.raises(InputError):
             merge_maps(tmp_path / "new", *others)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["clash", "map"]
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float16"])
+def test_maps_in_files_are_imported_into_milvus(tmp_path, dtype):
+    others = [tmp_path / "map0", tmp_path / "map1"]
+    for number, each in enumerate(others):
+        known = dataclasses.replace(metadata("files"), dtype=dtype)
+        with open_for_appending(each, known) as target:
+            new = [f"{number}/{name}" for name in names(0, 40)]
+            target.append(new, [7] * 40, rows(40 * number, 40), root="/images")
+    remove_images(others[0], ["0/3.jpg"])
+    store = f"milvus:{tmp_path / 'both' / 'rows.db'}"
+    assert merge_maps(tmp_path / "both", *others, store=store).images == 79
+    with Map.open(tmp_path / "both") as places:
+        assert (places.metadata.store, places.metadata.dtype) == ("milvus:rows.db", "float32")
+        found = places.search(rows(0, 80), 1)
+        named = [places.images[i].name for i in found.indices[:, 0]]
+    expected = [f"{number}/{name}" for number in range(2) for name in names(0, 40)]
+    assert (named[:3], named[4:]) == (expected[:3], expected[4:])
+    with pytest.raises(InputError, match=r"both: found store files, expected milvus:rows\.db$"):
+        merge_maps(tmp_path / "both", others[0], store="files")
 
 
 def in_x(names_: list[str]) -> Positions:

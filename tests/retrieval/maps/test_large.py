@@ -117,7 +117,7 @@ def test_candidates_come_from_the_index(grown, monkeypatch):
         approximate = places._approximate
         assert approximate is not None
 
-        def poor(queries, k, removed):
+        def poor(queries, k, count, removed):
             numbers = np.full((len(queries), k), -1)
             numbers[:, :2] = 7, 3
             return Neighbours(numbers, np.zeros(numbers.shape, np.float32))
@@ -208,8 +208,10 @@ def test_what_is_searched_how_is_chosen_by_size_and_memory(grown, monkeypatch):
 def test_what_cannot_be_built(grown, shared, params, database, tmp_path):
     with pytest.raises(InputError, match="search: found 'tree'"):
         run(shared, params, database, tmp_path / "new", search="tree")
-    with pytest.raises(InputError, match="found diskann for a map in files"):
-        run(shared, params, database, tmp_path / "new", search="diskann")
+    store = f"milvus:{tmp_path / 'new' / 'rows.db'}"
+    for kind, where in (("ivf-pq", store), ("diskann", "files")):
+        with pytest.raises(InputError, match=f"search: found '{kind}', expected one of "):
+            run(shared, params, database, tmp_path / "new", search=kind, store=where)
     assert not (tmp_path / "new").exists()
 
 

@@ -178,8 +178,8 @@ def test_an_index_serves_what_is_added_later(store, tmp_path, request):
             np.testing.assert_allclose(answers.similarities, similarities, atol=2e-6, rtol=0)
         assert len(places.search(queries, 95).indices[0]) == 95
     with open_for_appending(tmp_path, made) as target:
-        with pytest.raises(InputError, match=r"search: found ivf-rabitq, expected exact or hnsw"):
-            target._segments.store.build("ivf-rabitq")
+        with pytest.raises(InputError, match=r"found 'ivf-rabitq', expected one of"):
+            target._segments.store.build("ivf-rabitq", 100)
         assert target.build_search("exact") is None
     with Map.open(tmp_path) as places:
         assert places.search_kind == "exact"
@@ -230,15 +230,15 @@ def faked(monkeypatch, client: Fake) -> MilvusStore:
 def test_a_server_of_2_6_has_codes_of_bits(monkeypatch):
     client = Fake()
     store = faked(monkeypatch, client)
-    store.size = 10**8
-    store.build("auto")
+    with pytest.warns(Note, match="--search auto takes ivf-rabitq: 100000000 descriptors of 512"):
+        store.build("auto", 10**8)
     (index,) = client.last("create_index")["index_params"]
     assert index.get_index_configs() == {
         "index_type": "IVF_RABITQ",
         "metric_type": "IP",
         **{"nlist": 1024, "refine": True, "refine_type": "SQ8"},
     }
-    store.ask(np.ones((1, 512), np.float32), 3, NONE, 5)
+    store.ask(np.ones((1, 512), np.float32), 3, 5, NONE)
     asked = client.last("search")
     assert asked["search_params"]["params"] == {"nprobe": 64, "refine_k": 4}
     assert (asked["limit"], asked["guarantee_timestamp"]) == (3, 17)

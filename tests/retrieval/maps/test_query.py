@@ -22,6 +22,7 @@ from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.live import query_live
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, json_lines, query
+from crisalad_jax.retrieval.sequence import BayesFilter
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL, random_params, read_options
 from tests.retrieval.maps.conftest import ask
@@ -226,6 +227,32 @@ def test_a_map_of_thermal_images_reads_queries_as_it_was_made(tmp_path, shared, 
     other = MODEL.resized(None, ["high-byte"])
     with pytest.raises(InputError, match=r"expected .*contrast-stretch as in the map"):
         index(Model(params, other), tmp_path / "thermal", out, **options)
+
+
+def test_one_picture_and_what_comes_live_are_asked_of_some_images(town_map, answers):
+    """As a search of the whole map has them, without the others."""
+    places = Map.open(town_map)
+    east = sorted(image.position[0] for image in places.images if image.position)[3]
+    whole = places.locate(answers.queries[0], k=9)
+    expected = [each.image for each in whole if each.image.position[0] >= east]
+    assert 0 < len(expected) < len(whole)
+    where = f"box={east},0,9e9,9e9"
+    assert [each.image for each in places.locate(answers.queries[0], 9, where=where)] == expected
+
+    class Node:
+        size = None
+
+        def frames(self, check=None):
+            yield Frame("camera", 1.5, read_image(answers.queries[0]), 0.0)
+
+    (live,) = query_live(places, Node(), k=9, where=where)
+    assert [answer.image for answer in live.ranked] == expected
+    for options, words in (
+        ({"where": "folder=nowhere"}, "where: found none of 7 images"),
+        ({"where": where, "sequence": BayesFilter()}, "with a sequence, expected only one"),
+    ):
+        with pytest.raises(InputError, match=words):
+            query(places, answers.queries, **options)
 
 
 def test_what_locate_refuses(town_map, params, answers):
