@@ -115,7 +115,8 @@ def compare(
             )
         do, beside = in_turn, False
         if cluster is not None or (jobs or 1) > 1:
-            read = [*config.test, config.train, config.backbone]
+            weights = (text.partition("=")[2] for text in config.weights)
+            read = (*config.test, config.train, config.backbone, *weights)
             share = stack.enter_context(joined(cluster or "local", jobs, read, out))
             do, beside, quiet = functools.partial(in_tasks, share), share.beside, True
         (prepared,) = do(functools.partial(prepare, quiet=quiet), (config,))

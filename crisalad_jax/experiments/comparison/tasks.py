@@ -92,16 +92,16 @@ def joined(
     Args:
         address: as `cluster.connected` takes it.
         jobs: as `share_of` takes it.
-        read: files and folders that every node has to read.
+        read: files and folders; those that are here every node has to read.
         write: a folder that every node has to write into.
 
     Raises:
         InputError: what `connected` and `check_nodes` raise.
     """
-    paths = [*filter(None, read), *(name for name in loaded_plugins() if name.endswith(".py"))]
+    names = filter(None, (*read, *loaded_plugins()))
+    paths = [os.path.abspath(name) for name in names if os.path.exists(name)]
     with connected(address) as ray:
-        absolute = [path if "://" in path else os.path.abspath(path) for path in paths]
-        check_nodes(ray, read=absolute, write=write.absolute())
+        check_nodes(ray, read=paths, write=write.absolute())
         share = share_of([node["Resources"] for node in ray.nodes() if node["Alive"]], jobs)
         first = ray.remote(_nothing).options(**_options(share)).remote()
         if not ray.wait([first], timeout=START)[0]:
