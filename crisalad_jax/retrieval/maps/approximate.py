@@ -37,7 +37,7 @@ _EXACT_BYTES = 2**26
 """Largest size of descriptors that `choose_search` has searched exactly: all are read for a query,
 in less than a tenth of a second."""
 _GRAPH_BYTES = 2**30
-"""Largest size of a graph that `choose_search` takes: a larger one takes hours to build."""
+"""Largest size of a graph that `choose_search` takes; a larger one takes long to build."""
 _LINK_BYTES = 272
 """Size of the links of a descriptor in a graph."""
 FOLDER = "approximate"
@@ -169,7 +169,7 @@ def choose_search(count: int, length: int, dtype: str) -> tuple[str, str]:
 def build_approximate(
     folder: pathlib.Path, kind: str, segments: Segments, *, quiet: bool = True
 ) -> Approximate | None:
-    """Build the approximate search of a map, unless it is there; "exact" removes any.
+    """Build or extend the approximate search of a map; "exact" removes any.
 
     Args:
         folder: the map's, whose lock is held.
@@ -178,7 +178,7 @@ def build_approximate(
         quiet: no progress bar.
 
     Raises:
-        InputError: too few descriptors; a full disk.
+        InputError: an index of fewer images is damaged; a full disk.
     """
     if isinstance(segments.store, MilvusStore):
         segments.store.build(kind, len(segments), quiet=quiet)
