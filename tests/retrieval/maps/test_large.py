@@ -117,7 +117,7 @@ def test_candidates_come_from_the_index(grown, monkeypatch):
         approximate = places._approximate
         assert approximate is not None
 
-        def poor(queries, k, removed):
+        def poor(queries, k, count, removed):
             numbers = np.full((len(queries), k), -1)
             numbers[:, :2] = 7, 3
             return Neighbours(numbers, np.zeros(numbers.shape, np.float32))
