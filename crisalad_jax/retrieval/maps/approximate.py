@@ -180,10 +180,13 @@ def build_approximate(
     Raises:
         InputError: an index of fewer images is damaged; a full disk.
     """
-    if isinstance(segments.store, MilvusStore):
-        segments.store.build(kind, len(segments), quiet=quiet)
-        built = _served(segments.store)
-        return built and built._replace(recall=_recall(built, len(segments)))
+    count, store = len(segments), segments.store
+    if isinstance(store, MilvusStore):
+        # Before the index is another, as FLAT compares all on the server.
+        measure = None if kind == "exact" else _measuring(store, count)
+        store.build(kind, count, quiet=quiet)
+        built = _served(store)
+        return built and built._replace(recall=measure(built) if measure else math.nan)
     if kind == "exact":
         shutil.rmtree(folder / FOLDER, ignore_errors=True)
         return None
@@ -192,12 +195,11 @@ def build_approximate(
         return open_approximate(folder, segments, verify=True)
     from crisalad_jax.retrieval.faiss_index import build, save_index
 
-    count = len(segments)
     index = _extended(folder, kind, segments, quiet=quiet)
     if index is None:
         index = build(cast(Any, kind), segments.blocks, seed=_SEED, quiet=quiet)
-    built = Approximate(index.kind, _asking(index), segments.store, 0.0)
-    built = built._replace(recall=_recall(built, count))
+    built = Approximate(index.kind, _asking(index), store, 0.0)
+    built = built._replace(recall=_measuring(store, count)(built))
     with made_folder(path.parent):
         remove_temporaries(path.parent)
         value = {
@@ -243,16 +245,20 @@ def _served(store: MilvusStore) -> Approximate | None:
     return Approximate(store.kind, store.ask, store, math.nan, is_served=True)
 
 
-def _recall(built: Approximate, count: int) -> float:
-    """Measure the share of the exact nearest others of some images that a search finds."""
+def _measuring(store: Store, count: int) -> Callable[[Approximate], float]:
+    """Find the exact nearest others of some images; return what measures a search against them."""
     from crisalad_jax.retrieval.faiss_index import recall_against_exact
 
     places = sample(count, min(SAMPLE, count), _SEED)
     k = min(NEIGHBOURS + 1, count)
-    queries = built.store.rows(places).astype(np.float32)
-    sides = (each.search(queries, k, count).indices for each in (built, built.store))
-    found, exact = (_others(places, side) for side in sides)
-    return recall_against_exact(found, exact) if exact.size else 1.0
+    queries = store.rows(places).astype(np.float32)
+    exact = _others(places, store.search(queries, k, count).indices)
+
+    def recall(built: Approximate) -> float:
+        found = _others(places, built.search(queries, k, count).indices)
+        return recall_against_exact(found, exact) if exact.size else 1.0
+
+    return recall
 
 
 def _others(places: np.ndarray, numbers: np.ndarray) -> np.ndarray:
