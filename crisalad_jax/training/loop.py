@@ -155,16 +155,16 @@ def fit(
     }
     # What does not fit raises in all processes, before the first file is written.
     part = jax.process_index(), jax.process_count()
+    configuration = checksum_of_config(config)
     distributed.check_same(
-        {
-            "configuration": checksum_of_config(config),
-            "--shard-state": shard_state,
-            **checksums,
-            "sizes of images": checksum_of_sizes(places) if part[1] > 1 else 0,
-        }
+        {"configuration": configuration, "--shard-state": shard_state, **checksums}
     )
-    far = distributed.raise_together(lambda: _reader(places, cache_gb))
-    cache = ImageCache(read_far=far)
+    # Each may fail in one process alone: at an address, or at its host's disk.
+    if part[1] > 1:
+        sizes = distributed.raise_together(lambda: checksum_of_sizes(places))
+        distributed.check_same({"sizes of images": sizes})
+    read_far = distributed.raise_together(lambda: _reader(places, cache_gb))
+    cache = ImageCache(read_far=read_far)
     make: Any = Miner if config.mines else PlaceBatches
     data: PlaceBatches | Miner = make(
         config, places, part=part, on_bad_image=on_bad_image, threads=threads, cache=cache

@@ -27,26 +27,21 @@ _OF_EXCHANGES = re.compile(r"gloo|nccl|coordination service|connection (reset|cl
 _NEXT = "the same command resumes from the last saved state, with as many processes or others"
 _FILTER = """
 import re, sys
-aborted, of_jax, page = False, False, b""
+of_jax, page = False, b""
 for line in sys.stdin.buffer:
     if re.match(rb"[IWEF]\\d{4} \\d\\d:|crisalad:", line):
         of_jax = b"coordination_service" in line or b"JAX distributed service" in line
-        aborted = aborted or (of_jax and line[:1] == b"F")
     if of_jax:
         page += line
     elif not line.startswith(b"[Gloo] Rank "):
         sys.stderr.buffer.write(line)
         sys.stderr.buffer.flush()
-if aborted:
+if b"Terminating process" in page:
     found = re.search(rb"[Tt]ask (\\d+) heartbeat|heartbeats\\):\\s+(\\d+)", page)
     lost = next(filter(None, found.groups())).decode() if found else "0"
     print(f"crisalad: processes: lost process {lost}; " + sys.argv[1], file=sys.stderr)
 """
 _filters: list[subprocess.Popen[bytes]] = []
-
-
-class LostProcessError(InputError):
-    """Another process of the run has ended without a word."""
 
 
 def filter_aborts() -> None:
@@ -75,7 +70,7 @@ def ends_with_the_others(function: Callable[_P, _T]) -> Callable[_P, _T]:
     process then ends without JAX's farewell to the others, which would wait for the lost one.
 
     Raises:
-        LostProcessError: JAX's error is of an exchange with another process.
+        InputError: in place of JAX's error of an exchange with another process.
     """
 
     @functools.wraps(function)
@@ -90,9 +85,7 @@ def ends_with_the_others(function: Callable[_P, _T]) -> Callable[_P, _T]:
             for program in _filters:  # the line is said here
                 program.kill()
             atexit.register(_leave)
-            raise LostProcessError(
-                f"processes: lost another one ({text[:120]}); {_NEXT}"
-            ) from error
+            raise InputError(f"processes: lost another one ({text[:120]}); {_NEXT}") from error
 
     return call
 

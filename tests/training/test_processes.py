@@ -18,7 +18,9 @@ from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
+from crisalad_jax.data.remote import read_remote
 from crisalad_jax.training import distributed as processes
+from crisalad_jax.training import loop, run_files
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
 from crisalad_jax.utils.errors import InputError
@@ -226,6 +228,7 @@ def test_two_processes_do_not_change_a_run(shared, by_devices, tmp_path):
     ("more", "what"),
     [
         (("--data", "{smaller}"), "places"),
+        (("--data", "{longer}"), "sizes of images"),
         (("--epochs", "9"), "configuration"),
         (("--shard-state",), "--shard-state"),
     ],
@@ -234,7 +237,10 @@ def test_two_processes_do_not_change_a_run(shared, by_devices, tmp_path):
 def test_processes_that_differ_end_before_the_run(shared, tmp_path, more, what):
     smaller, out = shutil.copytree(shared / "city", tmp_path / "smaller"), tmp_path / "run"
     (smaller / "Dataframes" / "Brill.csv").unlink()
-    more = [flag.format(smaller=smaller) for flag in more]
+    longer = shutil.copytree(shared / "city", tmp_path / "longer")
+    with next(longer.rglob("*.jpg")).open("ab") as picture:
+        picture.write(b"x")
+    more = [flag.format(smaller=smaller, longer=longer) for flag in more]
     for code, words in ends(start(shared, out, *more)):
         assert code == 2, words
         assert f"processes: found other {what} in process 1 than in 0, expected the same" in words
@@ -403,6 +409,29 @@ def test_processes_that_gave_other_numbers_are_named(monkeypatch):
         processes.check_same({"configuration": 1, "places": 7})
     given[2:] = given[0]
     processes.check_same({"configuration": 1, "places": 7})
+
+
+def test_sums_of_data_tell_names_places_and_sizes(shared, tmp_path):
+    city = shutil.copytree(shared / "city", tmp_path / "city")
+    first, second = (read_places(each, min_images=2) for each in (shared / "city", city))
+    sums = run_files.checksum_of_places, run_files.checksum_of_sizes
+    assert [of(first) for of in sums] == [of(second) for of in sums]
+    with second.path(3).open("ab") as picture:
+        picture.write(b"x")
+    other = dataclasses.replace(second, names=("another", *second.names[1:]))
+    assert [of(first) == of(other) for of in sums] == [False, False]
+    assert sums[0](first) == sums[0](second)
+
+
+def test_images_at_addresses_are_read_by_the_cache(shared, tmp_path, monkeypatch):
+    monkeypatch.setenv("CRISALAD_CACHE", str(tmp_path))
+    places = read_places(shared / "city", min_images=2)
+    far = dataclasses.replace(places, root=pathlib.Path("s3://bucket/places"))
+    assert loop._reader(places, 1.0) is loop._reader(far, 0.0) is read_remote
+    cache = loop._reader(far, 2.0).__self__  # pyright: ignore
+    assert (cache._folder, cache._share * 256) == (tmp_path / "images", 2e9)
+    with pytest.raises(InputError, match=r"^--cache-gb: found -1, expected at least 0"):
+        fit(CONFIG, places, tmp_path / "run", cache_gb=-1.0)
 
 
 def test_the_process_that_failed_is_named(monkeypatch):
