@@ -4,6 +4,7 @@ import dataclasses
 import datetime
 import pathlib
 import uuid
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.retrieval.maps import appending
 from crisalad_jax.retrieval.maps.appending import open_for_appending
+from crisalad_jax.retrieval.maps.approximate import Approximate
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.metadata import MapMetadata
 from crisalad_jax.retrieval.maps.where import Where
@@ -139,6 +141,19 @@ def test_a_search_is_of_the_images_that_meet_the_conditions(made):
                 np.testing.assert_allclose(found.similarities[query], similarities, 0, rounding)
             first = places.search(queries, 2, where=Where.parse(text))
             np.testing.assert_array_equal(first.indices, found.indices[:, :2])
+
+
+def test_an_index_is_not_asked_for_a_twentieth_of_a_map(tmp_path):
+    """A graph would pass by the few that count; there is none here to be asked."""
+    with open_for_appending(tmp_path / "map", metadata("files")) as target:
+        names = [f"{'few' if number < 3 else 'many'}/{number}.jpg" for number in range(60)]
+        target.append(names, [7] * 60, rows(0, 60), root="/images")
+        expected = target.search(rows(100, 2), 9, where="folder=few")
+        nobody: Any = None
+        target._approximate = Approximate("hnsw", nobody, target._segments.store, 1.0)
+        found = target.search(rows(100, 2), 9, where="folder=few")
+        np.testing.assert_array_equal(found.indices, expected.indices)
+        assert sorted(found.indices[0].tolist()) == [0, 1, 2]
 
 
 @pytest.mark.parametrize("store", STORES)
