@@ -111,6 +111,7 @@ def found(where: str, **options: Any) -> list[int]:
         ("time<2023-11-14", []),
         ("time<2030-01-01", [4]),
         ("box=0,-3,2,4", [1, 2, 3]),
+        ("box=1.5,-2.25,1.5,-2.25", [2]),  # its ends count
         ("box=1,-3,2,4, folder=monday", [2]),
     ],
 )
