@@ -1,4 +1,4 @@
-"""The attacks: a handful of tries of three kinds, and all of them (slow).
+"""The attacks: a handful of tries of two kinds, and all of them (slow).
 
 Of kills, tests/training/test_interruption.py has some of training, and tests/retrieval/serve of the
 service.
@@ -18,7 +18,6 @@ SOME = (
     # In a container root may not mount, and writes into any folder: three tries then.
     ("disks", 0, "convert", 3),
     ("inputs", 0, "a sample", 16),
-    ("interruptions", 0, "some", 9),
 )
 ALL = (
     ("damage", 1, "", 4800),
@@ -26,6 +25,7 @@ ALL = (
     ("disks", 0.6, "train limited, evaluate limited, extract .h5 limited, index limited", 24),
     ("hostile", 1, "", 400),
     ("inputs", 1, "", 1600),
+    ("interruptions", 0, "some", 9),
     ("interruptions", 1, "forks", 192),
     ("interruptions", 1, "programs, training, busy, closed output", 88),
     ("interruptions", 1, "long", 24),
