@@ -10,7 +10,6 @@ from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import Answers, query
 from tests.conftest import MODEL, read_options
-from tests.retrieval.maps.milvus_server import Server
 
 
 @pytest.fixture(scope="session")
@@ -31,6 +30,9 @@ def ask(folder: pathlib.Path, params: Crisalad, images, **options) -> Answers:
 
 @pytest.fixture(scope="session")
 def milvus_server(tmp_path_factory):
+    # pymilvus ends other handlers of logs: pytest's capture with absl's, as pytest reads this file.
+    from tests.retrieval.maps.milvus_server import Server
+
     server = Server(tmp_path_factory.mktemp("milvus"))
     yield server
     server.kill()
