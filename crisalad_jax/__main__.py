@@ -41,7 +41,7 @@ def keep_on_without_reader() -> None:
                 io.BufferedWriter(_Output(stream.fileno(), "w", closefd=False)),
                 encoding=stream.encoding,
                 errors="backslashreplace",
-                line_buffering=stream.line_buffering,
+                line_buffering=stream.line_buffering or stream.write_through,  # python -u
             )
         setattr(sys, name, stream)
 

@@ -10,6 +10,7 @@ import pathlib
 import re
 import subprocess
 import sys
+import threading
 
 import jax
 import numpy as np
@@ -668,3 +669,25 @@ def test_info_gives_the_papers_numbers(capfd, tmp_path):
 
 def test_the_version_is_that_of_the_package(capfd):
     assert runs(capfd, "--version") == (f"crisalad-jax {crisalad_jax.__version__}\n", "")
+
+
+def test_a_line_comes_as_it_is_written_without_buffers():
+    """PYTHONUNBUFFERED makes Python's own streams write through, and no line buffers."""
+    code = (
+        "from crisalad_jax.__main__ import keep_on_without_reader as keep\n"
+        "keep(); print('a note'); input()"
+    )
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(
+        [sys.executable, "-c", code],
+        **{"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": environment},
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        ends = threading.Timer(60, process.stdin.close)  # else a buffered line never comes
+        ends.start()
+        assert process.stdout.readline() == "a note\n"
+        assert process.poll() is None
+        assert not ends.finished.is_set()
+        ends.cancel()
+        process.stdin.close()

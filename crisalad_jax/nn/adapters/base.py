@@ -27,6 +27,7 @@ class BlockShape(NamedTuple):
     fc1 and fc2 of the MLP (or w12 and w3 of SwiGLU)."""
 
 
+@brief
 class TokenInfo(NamedTuple):
     """What a hook is told of the tokens."""
 
