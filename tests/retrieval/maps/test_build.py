@@ -67,7 +67,7 @@ def test_appended_in_portions_or_at_once_the_bits_are_the_same(
     assert len(list((tmp_path / "whole" / "segments").glob("*.npy"))) == segments
     with Map.open(tmp_path / "whole") as one, Map.open(tmp_path / "parts") as other:
         np.testing.assert_array_equal(descriptors_of(one), descriptors_of(other))
-        assert one.images == other.images
+        assert list(one.images) == list(other.images)
         assert [image.name for image in one.images] == [path.name for path in paths]
         assert [image.position for image in one.images[:2]] == [(0.0, 5e6), (40.0, 5e6)]
 

@@ -13,6 +13,7 @@ import crisalad_jax.retrieval.maps.novelty
 from crisalad_jax.data.positions import Positions
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
+from crisalad_jax.retrieval.maps.appending import AppendableMap
 from crisalad_jax.retrieval.maps.build import Indexed, index
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.novelty import SIMILAR
@@ -174,7 +175,7 @@ def test_after_a_kill_the_same_call_makes_the_same_map(images, tmp_path, monkeyp
 
     with monkeypatch.context() as patch:
         for where, name in (
-            (Map, "append"),
+            (AppendableMap, "append"),
             (crisalad_jax.retrieval.maps.novelty.Novelty, "leave_out"),
         ):
             patch.setattr(where, name, cut(getattr(where, name)))
