@@ -276,7 +276,7 @@ def test_positions_of_images_that_are_there_are_said_to_stay(
     images.mkdir()
     (images / "new.png").write_bytes(known[0].read_bytes())
     table.write_text("name,lat,lon\nnew.png,1,2\n")
-    monkeypatch.setattr("crisalad_jax.retrieval.maps.build.described", None)
+    monkeypatch.setattr("crisalad_jax.retrieval.on_cluster.described", None)
     words = ("degrees of longitude from the middle of zone 10 south, whose metres",)
     fails(capfd, *index(shared, images, folder, "--positions", table), words=words)
 

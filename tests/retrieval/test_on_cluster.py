@@ -81,6 +81,7 @@ def test_a_describer_of_jax_by_pickle(images, model):
     assert sent.digest == describer_of(model).digest
 
 
+@pytest.mark.usefixtures("symbolic_shapes")
 def test_a_runtime_by_pickle(images, model, tmp_path):
     pytest.importorskip("onnxruntime")
     write_export(tmp_path / "onnx", model, ExportConfig(format="onnx"))

@@ -17,6 +17,7 @@ import pytest
 from crisalad_jax.data.images import list_images
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval import extract as extract_module
+from crisalad_jax.retrieval import on_cluster
 from crisalad_jax.retrieval.descriptor_files import read_descriptors, write_descriptors
 from crisalad_jax.retrieval.extract import Extracted, extract
 from crisalad_jax.retrieval.segments import Segments
@@ -107,7 +108,7 @@ def described(monkeypatch) -> list[str]:
 
     monkeypatch.setattr(extract_module, "SEGMENT", 1)
     for name in ("described", "token_rows"):
-        monkeypatch.setattr(extract_module, name, spied(getattr(extract_module, name)))
+        monkeypatch.setattr(on_cluster, name, spied(getattr(on_cluster, name)))
     return names
 
 

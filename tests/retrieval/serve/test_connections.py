@@ -77,9 +77,9 @@ def test_an_answer_takes_as_long_as_it_does(service, pictures, monkeypatch):
     monkeypatch.setattr(server, "_EXCHANGE", 0.2)
     search = service.worker.places.search
 
-    def slow(*given):
+    def slow(*given, **options):
         time.sleep(1)
-        return search(*given)
+        return search(*given, **options)
 
     monkeypatch.setattr(service.worker.places, "search", slow)
     assert service.ask("POST", "/locate", pictures[0].read_bytes()).status == 200

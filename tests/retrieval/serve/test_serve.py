@@ -155,8 +155,8 @@ def test_answers_are_verified(own_map, params, pictures):
 def test_files_that_are_gone_are_the_service_s_fault(own_map, params, pictures, tmp_path):
     """A client does not learn the names of folders."""
     with serving(own_map, params, rerank=Verify(answers=1)) as service:
-        images = service.worker.places.images
-        images[:] = [image._replace(root=str(tmp_path)) for image in images]
+        parts = service.worker.places.images.parts
+        parts[:] = [part._replace(root=str(tmp_path)) for part in parts]
         reply = service.ask("POST", "/locate", pictures[0].read_bytes())
         assert reply.status == 500
         assert str(tmp_path) not in reply.json["error"]
@@ -458,9 +458,8 @@ def test_pictures_of_the_map(service, sides, own_map, params):
         (moved / path.name).write_bytes(data + b"more" if number == 3 else data)
     with serving(own_map, params, map_images=moved) as own:
         assert own.ask("GET", "/images/2").status == 200
-        own.worker.places.images[:] = [
-            image._replace(root="/nowhere") for image in own.worker.places.images
-        ]
+        parts = own.worker.places.images.parts
+        parts[:] = [part._replace(root="/nowhere") for part in parts]
         assert own.ask("GET", "/images/3").status == 404
         assert own.ask("GET", "/images/4").status == 200
 
@@ -740,7 +739,7 @@ def test_too_many_are_told_to_come_again(folder, params, pictures):
 def test_a_map_that_fails_tells_the_client_nothing_of_the_machine(
     folder, params, pictures, capfd, monkeypatch
 ):
-    def fail(*_):
+    def fail(*_, **__):
         raise InputError(f"{folder}: damaged")
 
     with serving(folder, params) as own:
@@ -758,10 +757,10 @@ def test_requests_in_flight_are_answered_at_the_end(folder, params, pictures, mo
     with serving(folder, params) as own:
         search = own.worker.places.search
 
-        def slow(*arguments):
+        def slow(*arguments, **options):
             inside.set()
             assert go_on.wait(60)
-            return search(*arguments)
+            return search(*arguments, **options)
 
         monkeypatch.setattr(own.worker.places, "search", slow)
         with concurrent.futures.ThreadPoolExecutor(1) as pool:
