@@ -275,11 +275,16 @@ class _Worker:
 
     def call(self, item: Any) -> tuple[Any, list[str]]:
         """Return the function's result, and its notes."""
-        with warnings.catch_warnings(record=True) as notes:
-            warnings.simplefilter("always", Note)
-            with locate_errors(f"node {socket.gethostname()}: "):
-                result = self._work(item)
-        return result, [str(each.message) for each in notes if issubclass(each.category, Note)]
+        with locate_errors(f"node {socket.gethostname()}: "):
+            return with_notes(self._work, item)
+
+
+def with_notes(work: Callable[..., _Result], *given: Any) -> tuple[_Result, list[str]]:
+    """Return a function's result, and the notes that it gives, for another process to give."""
+    with warnings.catch_warnings(record=True) as notes:
+        warnings.simplefilter("always", Note)
+        result = work(*given)
+    return result, [str(each.message) for each in notes if issubclass(each.category, Note)]
 
 
 def map_in_order(

@@ -4,7 +4,6 @@ import contextlib
 import math
 import os
 import pathlib
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -14,9 +13,9 @@ import jax
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.plugins import load_plugins, loaded_plugins
 from crisalad_jax.data.images import MAX_PIXELS
-from crisalad_jax.utils.cluster import START, check_nodes, connected
+from crisalad_jax.utils.cluster import START, check_nodes, connected, with_notes
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.output import Note, counted, warn
+from crisalad_jax.utils.output import counted, warn
 from crisalad_jax.utils.signals import defer_signals
 
 _MEMORY = 0.9
@@ -208,8 +207,5 @@ def _carry_out(
         os.chdir(folder)
     load_plugins(plugins)
     work, shared = ray.get(reference[0])
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always", Note)
-        result = work(*shared, *given)
-    notes = [str(each.message) for each in found if issubclass(each.category, Note)]
+    result, notes = with_notes(work, *shared, *given)
     return result, [*dict.fromkeys(notes)]

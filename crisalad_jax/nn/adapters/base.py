@@ -29,7 +29,7 @@ class BlockShape(NamedTuple):
 
 @brief
 class TokenInfo(NamedTuple):
-    """What a hook is told of the tokens."""
+    """What a hook knows of the tokens."""
 
     grid: Grid
     """Rows and columns of patches, the last `grid[0] * grid[1]` tokens."""

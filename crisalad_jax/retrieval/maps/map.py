@@ -356,7 +356,7 @@ class Map:
 
     @property
     def search_kind(self) -> str:
-        """How `search` searches: "exact", "hnsw" or "ivf-rabitq"."""
+        """How `search` searches: "exact", "hnsw", "ivf-rabitq", or in Milvus "diskann"."""
         return "exact" if self._approximate is None else self._approximate.kind
 
     @property
