@@ -25,7 +25,7 @@ from crisalad_jax.data.frames import has_frames, sequence_of
 from crisalad_jax.data.images import OnBadImage, is_image, list_images
 from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.positions import AXES
-from crisalad_jax.data.remote import address_of, for_each, is_file, is_folder, is_remote, names_in
+from crisalad_jax.data.remote import address_of, for_each, is_file, is_folder, is_remote, list_names
 from crisalad_jax.data.sources import ImageSource
 from crisalad_jax.data.tables import Disk, normal_name, read_table
 from crisalad_jax.utils.errors import InputError
@@ -73,7 +73,7 @@ def read_gsv_cities(
         InputError: a city that is unknown or named twice, a bad row, or a row without its image.
     """
     folder = root / "Dataframes"
-    paths = (folder / name for name in sorted(names_in(folder)))
+    paths = (folder / name for name in sorted(list_names(folder)))
     tables = {path.stem: path for path in paths if path.suffix == ".csv" and path.name[0] != "."}
     chosen = tuple(tables if cities is None else cities)
     if not chosen or len(set(chosen)) < len(chosen) or not tables.keys() >= set(chosen):
@@ -192,7 +192,7 @@ def read_named_places(
 
 def _read_folders(root: pathlib.Path) -> list[FoundPlace]:
     """Read a folder in which each folder that holds images is a place."""
-    inside = (name for name in names_in(root) if is_image(name) and name[0] != ".")
+    inside = (name for name in list_names(root) if is_image(name) and name[0] != ".")
     flat = any(is_file(root / name) for name in inside)
     if flat or not is_folder(root) or has_sides(root) or has_split(root):
         raise InputError(

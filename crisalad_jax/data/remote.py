@@ -141,11 +141,11 @@ def is_file(path: pathlib.Path) -> bool:
 
 def is_folder(path: pathlib.Path) -> bool:
     """Return whether there is a folder, at an address one that holds something; as `size_of`."""
-    return bool(names_in(path)) if is_remote(path) else path.is_dir()
+    return bool(list_names(path)) if is_remote(path) else path.is_dir()
 
 
-def names_in(folder: pathlib.Path) -> list[str]:
-    """List the names in a folder, here or at an address; none where there is no such folder.
+def list_names(folder: pathlib.Path) -> list[str]:
+    """List the names in a folder, here or at an address; an empty list if there is no folder.
 
     Raises:
         InputError: an address that cannot be asked.

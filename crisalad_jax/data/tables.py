@@ -14,7 +14,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from crisalad_jax.data.frames import spelled
-from crisalad_jax.data.remote import is_remote, list_remote, names_in, read_remote
+from crisalad_jax.data.remote import is_remote, list_names, list_remote, read_remote
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import LARGEST, check_source
 
@@ -257,6 +257,6 @@ class Disk:
     def names(self, folder: pathlib.Path) -> dict[str, str]:
         """Return the names in a folder, by themselves and by their `normal_name`."""
         if folder not in self._listings:
-            names = () if self._is_whole else names_in(folder)
+            names = () if self._is_whole else list_names(folder)
             self._listings[folder] = spellings(names)
         return self._listings[folder]

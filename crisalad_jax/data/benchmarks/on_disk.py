@@ -5,7 +5,7 @@ import pathlib
 from collections.abc import Iterable, Sequence
 
 from crisalad_jax.data.images import OnBadImage, list_images
-from crisalad_jax.data.remote import is_file, is_folder, names_in
+from crisalad_jax.data.remote import is_file, is_folder, list_names
 from crisalad_jax.data.tables import Disk
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
@@ -41,7 +41,7 @@ def listing(folder: pathlib.Path) -> str:
     """Describe in a message what a folder holds."""
     if not is_folder(folder):
         return "a file" if is_file(folder) else "no such folder"
-    return shown(name + "/" * is_folder(folder / name) for name in names_in(folder))
+    return shown(name + "/" * is_folder(folder / name) for name in list_names(folder))
 
 
 def shown(names: Iterable[str]) -> str:
