@@ -77,6 +77,8 @@ def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
                 return module.parse(program, given)
             return tyro.cli(helping.class_of(name, module, given), prog=program, args=given)
     except InputError as error:
+        if isinstance(error.__cause__, OSError):  # the help cannot be printed
+            raise
         several = getattr(module, "SEVERAL", "")
         hint = f" ({several})" if re.match("--images: .* expected one value$", str(error)) else ""
         raise InputError(f"{error}{hint} (see {program} --help)") from error

@@ -137,10 +137,11 @@ Parts = Callable[[], Iterable[Float[np.ndarray, "rows d"]]]
 def build(kind: Kind, database: Descriptors | Parts, *, seed: int = 0, quiet: bool = True) -> Index:
     """Build an index of unit descriptors, which may be a memory map, reading some at a time.
 
-    IVF-RaBitQ rotates vectors at random, so that no number of theirs counts for more than others,
-    and has 4 sqrt(n) lists (faiss's guidelines: 4 to 16 sqrt(n)), or fewer, so that each is trained
-    from 39 vectors. The training sample is random, 1 GiB of descriptors at most. It takes an eighth
-    of a byte for each number, 8 bytes for two factors and 8 for the index of a descriptor.
+    IVF-RaBitQ rotates vectors by random signs and Hadamard matrices, so that no number of theirs
+    counts for more than others, and has 4 sqrt(n) lists (faiss's guidelines: 4 to 16 sqrt(n)), or
+    fewer, so that each is trained from 39 vectors. The training sample is random, 1 GiB of
+    descriptors at most. A descriptor takes a bit for each number, up to the next power of two, 8
+    bytes for two factors and 8 for its index.
 
     HNSW has 32 links for each vector. Its graph, and so the few neighbours that it misses, depend
     on the order in which threads insert vectors. With one thread (OMP_NUM_THREADS=1) the graph
@@ -191,14 +192,13 @@ def _lists(index: Any) -> Any:
 
 def _trained_lists(count: int, length: int, database: Parts, seed: int) -> Any:
     number = _list_count(count, length)
-    rotation = faiss.RandomRotationMatrix(length, length)
-    rotation.init(seed)
-    lists = faiss.IndexIVFRaBitQ(
-        faiss.IndexFlatIP(length), length, number, faiss.METRIC_INNER_PRODUCT
-    )
+    rotation = faiss.HadamardRotation(length, seed)
+    bits = rotation.d_out
+    lists = faiss.IndexIVFRaBitQ(faiss.IndexFlatIP(bits), bits, number, faiss.METRIC_INNER_PRODUCT)
     # The centroids are unit vectors, for they are compared by inner products.
     lists.cp.spherical = True
     lists.cp.seed = seed
+    lists.cp.min_points_per_centroid = 1  # or it warns of the single list of a few vectors
     places = sample(count, min(count, _PER_LIST * number), seed)
     start, chosen = 0, []
     for part in database():

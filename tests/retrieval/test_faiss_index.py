@@ -136,6 +136,15 @@ def test_the_parameters_are_those_that_are_documented(indexes):
     assert graph.hnsw.efConstruction == 128
 
 
+def test_a_few_long_vectors_fill_up_to_a_power_of_two(capfd):
+    rows = np.eye(20, 8200, dtype=np.float32)
+    index = build("ivf-rabitq", rows)
+    lists = faiss.downcast_index(index.faiss_index.index)
+    assert (lists.nlist, lists.code_size) == (1, 16384 // 8 + 8)
+    np.testing.assert_array_equal(index.search(rows, 1).indices[:, 0], np.arange(20))
+    assert capfd.readouterr() == ("", "")  # no warning of a library
+
+
 def test_the_same_seed_makes_the_same_lists_of_a_memory_map(places, indexes, tmp_path, monkeypatch):
     np.save(tmp_path / "database.npy", places[0].astype(np.float16))
     mapped = np.load(tmp_path / "database.npy", mmap_mode="r")
