@@ -89,7 +89,7 @@ class Query(ReadFlags, FrameFlags, JsonFlag):
     say no times or positions, images of the map a frame."""
     sequence_length: int | None = None
     """Frames that seqslam's lines go through; by default 10."""
-    where: str | None = None
+    where: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Search only some of the map's images: 'folder=monday, added>=2026-05-01,
     box=west,south,east,north', of which any may be left out; also time>= (docs/maps.md)."""
     exact: bool = False
@@ -226,8 +226,8 @@ def _sequence_of(arguments: Query) -> SequenceSearch | None:
 def _where_of(arguments: Query) -> Where | None:
     """Read the conditions on the map's images, before a model is loaded."""
     if arguments.sequence is not None:
-        refuse_with("--sequence", where=arguments.where)
-    return None if arguments.where is None else Where.parse(arguments.where)
+        refuse_with("--sequence", where=arguments.where or None)
+    return Where.parse(",".join(arguments.where)) if arguments.where else None
 
 
 def _verify_of(arguments: Query) -> Verify | None:

@@ -103,7 +103,7 @@ def test_answers_are_of_the_images_that_conditions_take(folder, queries, capfd):
 
     whole = answers()
     east = sorted(float(name.split("@")[1]) for name, _ in whole)[3]
-    some = answers("--where", f"added>=2020-01-01, box={east},0,9e9,9e9")
+    some = answers("--where", "added>=2020-01-01", "--where", f"box={east},0,9e9,9e9")
     assert some == [pair for pair in whole if float(pair[0].split("@")[1]) >= east]
     assert 0 < len(some) < len(whole)
     for text, words in (

@@ -83,14 +83,22 @@ MAPPING = """
 import functools, os, pathlib, signal, sys
 from crisalad_jax.utils import cluster
 
-def note(): pass
+def absolute(folder, item):
+    try:
+        (folder / str(item)).touch(exist_ok=False)
+    except FileExistsError:
+        return abs(item)
+    if item % 10 == 0:  # the first time
+        os.kill(os.getpid(), signal.SIGKILL)
+    return abs(item)
 
 with cluster.connected(sys.argv[1]) as ray:
     cluster.check_nodes(ray, read=[sys.argv[2]], write=pathlib.Path(sys.argv[2]))
     for kill in (False, True):
         items = range(-30, 0)
         how = {"prepare": int, "environment": {"SECRET": "1"}}
-        print(list(cluster.map_in_order(ray, abs, items, **how)) == list(map(abs, items)))
+        work = functools.partial(absolute, pathlib.Path(sys.argv[2])) if kill else abs
+        print(list(cluster.map_in_order(ray, work, items, **how)) == list(map(abs, items)))
     for work, items in ((int, "12x"), (os._exit, [1])):
         try:
             print(list(cluster.map_in_order(ray, work, items, **how)))
@@ -102,9 +110,10 @@ with cluster.connected(sys.argv[1]) as ray:
 @pytest.mark.slow
 def test_map_in_order(tmp_path):
     with ray_nodes() as nodes:
-        for address in (nodes.address, nodes.client):
+        for name, address in (("driver", nodes.address), ("client", nodes.client)):
+            (folder := tmp_path / name).mkdir()
             done = subprocess.run(
-                [sys.executable, "-c", MAPPING, address, str(tmp_path)],
+                [sys.executable, "-c", MAPPING, address, str(folder)],
                 env=dict(nodes.environment),
                 capture_output=True,
                 text=True,
