@@ -12,11 +12,13 @@ Ours is what `crisalad index --search` and `crisalad query` do: build an index f
 candidates from it, and rank them by the descriptors in the files. FAISS has all descriptors in
 memory in float32, in its flat index; and the same index as ours, asked without ranking its answers
 again. All take turns, with one query and with all. Recall is the share of the exact 10 nearest.
-Memory is what the process grows by when it opens an index.
+Memory is what a process grows by when it opens an index.
 """
 
 import argparse
+import concurrent.futures
 import contextlib
+import multiprocessing
 import pathlib
 import shutil
 import tempfile
@@ -42,6 +44,7 @@ from crisalad_jax.utils.progress import progress_bar
 
 K = 10
 TOGETHER = 4096
+SPAWN = multiprocessing.get_context("spawn")
 SEARCHES = ("hnsw", "ivf-rabitq")
 FILES, FLAT = "exact, of files", "exact, FAISS in memory"
 HEADER = (
@@ -95,6 +98,14 @@ def resident() -> int:
     return 4096 * int(pages)
 
 
+def memory_of(file: pathlib.Path) -> int:
+    """What a program grows by as it opens an index; one that built it has memory left over."""
+    before = resident()
+    index = load_index(file, verify=False)
+    assert index.size
+    return resident() - before
+
+
 def study(arguments: argparse.Namespace, folder: pathlib.Path) -> Study:
     rows, length = arguments.rows, arguments.length
     seconds = make(folder, arguments)
@@ -110,9 +121,9 @@ def study(arguments: argparse.Namespace, folder: pathlib.Path) -> Study:
             target.build_search(kind, quiet=False)
         built = time.perf_counter() - started
         (file,) = (folder / "approximate").glob("*.index")
-        before = resident()
+        with concurrent.futures.ProcessPoolExecutor(1, SPAWN) as other:
+            grown = other.submit(memory_of, file).result()
         index = load_index(file, verify=False)
-        grown = resident() - before
         opened = Map.open(folder, verify=False)
         alone = f"{kind}, FAISS alone"
         calls[kind] = lambda asked, opened=opened: opened.search(asked, K).indices
