@@ -12,6 +12,7 @@ import pytest
 import crisalad_jax as cj
 from crisalad_jax import sinkhorn
 from crisalad_jax.config.registry import REGISTRIES
+from tests.training.programs import SOON
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -162,7 +163,7 @@ def test_files_that_a_page_names_exist(page):
 def test_what_the_pages_show_runs():
     pages = [page for page in TEXTS if "```" in page.read_text(encoding="utf-8")]
     # Most of the time is XLA's, which need not optimise what runs once.
-    flags = "--xla_backend_optimization_level=0 " + os.environ.get("XLA_FLAGS", "")
+    flags = f"{SOON} {os.environ.get('XLA_FLAGS', '')}"
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
     program = [sys.executable, "tests/docs_blocks.py", *map(str, pages)]
     done = subprocess.run(

@@ -8,7 +8,8 @@ from typing import Any
 
 ROOT = pathlib.Path(__file__).parents[2]
 # Ten steps of a tiny model take XLA longer to optimise than to run.
-COMPILED_SOON = {**os.environ, "XLA_FLAGS": "--xla_backend_optimization_level=0"}
+SOON = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+COMPILED_SOON = {**os.environ, "XLA_FLAGS": SOON}
 
 
 def run_on_devices(count: int, source: str, *arguments: Any) -> list[str]:
