@@ -780,9 +780,10 @@ def attack_compare_on_ray(bench: Bench, scale: float) -> list[Row]:
             before |= finished(out)
             victims = workers(out) if name == "worker" else [program.pid]
             if program.poll() is None and victims:
-                os.kill(bench.random.choice(victims), signal.SIGKILL)
-                kills[name] -= 1
-                met.append(name)
+                with contextlib.suppress(ProcessLookupError):  # a worker may just have ended
+                    os.kill(bench.random.choice(victims), signal.SIGKILL)
+                    kills[name] -= 1
+                    met.append(name)
             said = ended(program)
             if program.returncode == 0:
                 break
