@@ -15,6 +15,7 @@ from crisalad_jax.config.short_repr import with_field_docs
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.files import read_text
+from crisalad_jax.utils.output import one_line
 from crisalad_jax.utils.shapes import Float64
 
 _MODELS = ("", "plumb_bob", "rational_polynomial", "radtan")
@@ -91,10 +92,8 @@ class Intrinsics:
         try:
             return cls(**_fields(next(yaml.safe_load_all(content))))
         except (yaml.YAMLError, LookupError, TypeError, ValueError, StopIteration) as error:
-            reason = " ".join(str(error).split())
-            raise InputError(f"{path}: found no intrinsics ({reason}), expected {_EXPECTED}") from (
-                error
-            )
+            reason = f"found no intrinsics ({one_line(error)})"
+            raise InputError(f"{path}: {reason}, expected {_EXPECTED}") from error
 
     def directions(
         self, points: Float64[np.ndarray, "n 2"], size: tuple[int, int], name: str
@@ -144,9 +143,7 @@ def _fields(content: Any) -> dict[str, Any]:
         raise ValueError(f"distortion model {model}")
     matrix = _data(content, "camera_matrix", "k", "K")
     names = ("fx", "fy", "cx", "cy")
-    numbers = (
-        [content[name] for name in names] if matrix is None else np.array(matrix)[[0, 4, 2, 5]]
-    )
+    numbers = map(content.__getitem__, names) if matrix is None else np.array(matrix)[[0, 4, 2, 5]]
     sizes = {
         name: int(content[each])
         for name in ("width", "height")

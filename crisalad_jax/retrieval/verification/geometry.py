@@ -99,11 +99,12 @@ def pose_from_points(
     """Compute the pose from points in metres to the camera that sees them (PnP); None without."""
     if len(points) < LEAST:
         return None
+    eye = np.eye(3)
     try:
         found, turn, shift, inliers = cv2.solvePnPRansac(
             points,
             directions,
-            np.eye(3),
+            eye,
             None,
             reprojectionError=distance,
             confidence=_SURE,
@@ -114,7 +115,7 @@ def pose_from_points(
             return None
         chosen = np.asarray(inliers[:, 0], int)
         turn, shift = cv2.solvePnPRefineLM(
-            points[chosen], directions[chosen], np.eye(3), None, turn, shift
+            points[chosen], directions[chosen], eye, None, turn, shift
         )
     except cv2.error:
         return None
@@ -136,11 +137,8 @@ def triangulated(first: Points, second: Points, pose: Pose) -> Float64[np.ndarra
 def common_points(first: Points, second: Points) -> tuple[Int64[np.ndarray, " m"], ...]:
     """Return the rows of two lists of the same image's keypoints that hold the same ones."""
     rows = {tuple(point): row for row, point in enumerate(first.tolist())}
-    pairs = [
-        (rows[tuple(point)], row)
-        for row, point in enumerate(second.tolist())
-        if tuple(point) in rows
-    ]
+    points = map(tuple, second.tolist())
+    pairs = [(rows[point], row) for row, point in enumerate(points) if point in rows]
     ours, theirs = np.array(pairs, int).reshape(-1, 2).T
     return ours, theirs
 
