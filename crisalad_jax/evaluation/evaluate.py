@@ -125,8 +125,7 @@ def evaluate(
         if rerank.needs_model and rerank.model is None:
             if not isinstance(model, tuple):
                 raise InputError(
-                    "rerank: found with a model in another engine, expected weights of its own "
-                    "(--rerank-weights)"
+                    "rerank: found another engine, expected weights of its own (--rerank-weights)"
                 )
             rerank = dataclasses.replace(rerank, model=model)
     benchmark.ground_truth()  # or there is none, which is known before any work
@@ -153,14 +152,13 @@ def evaluate(
             drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
             name = str(grouping) if config.cross_image.attends else ANY
             observer = observe and functools.partial(observe, name)
-            ranked = _rank(
+            rankings, shares = _rank(
                 sides, grouping, drawn, k, positives, observer, unit=is_unit, bits=is_bits
             )
-            rankings, shares = ranked
             for label, stage in stages.items():
                 result = summarise(
                     name,
-                    {seed: _first(stage(each), max(KS)) for seed, each in rankings.items()},
+                    {seed: stage(each).first(max(KS)) for seed, each in rankings.items()},
                     positives,
                     KS,
                     is_random=is_random,
@@ -186,11 +184,6 @@ def check_evaluation(
     if precision is not None:
         check_precision(precision)
     return check_groupings(groupings)
-
-
-def _first(neighbours: Neighbours, count: int) -> Neighbours:
-    """Return the best `count` neighbours of each query."""
-    return Neighbours(*(part[:, :count] for part in neighbours))
 
 
 class _Side(NamedTuple):

@@ -202,20 +202,15 @@ def to_json(result: GroupingResult) -> dict[str, Any]:
         "batch_size": size,
         "same_place": {"queries": result.query_share, "database": result.database_share},
         "mirrored": result.mirrored_share,
-        "over_single": None
-        if gain is None
-        else {"R@1": gain.mean, "interval": list(gain.interval)},
+        "over_single": gain and {"R@1": gain.mean, "interval": list(gain.interval)},
         **_scores_json(
             Scores(result.recalls, result.average_precision, result.recall_at_full_precision)
         ),
         "intervals": {f"R@{k}": list(ends) for k, ends in result.intervals.items()},
-        "spread": None if result.spread is None else _scores_json(result.spread),
+        "spread": result.spread and _scores_json(result.spread),
         "by_seed": {str(seed): _scores_json(each) for seed, each in result.by_seed.items()},
-        "precision_recall": None
-        if curve is None
-        else {
-            name: getattr(curve, name).tolist() for name in ("thresholds", "precision", "recall")
-        },
+        "precision_recall": curve
+        and {name: getattr(curve, name).tolist() for name in ("thresholds", "precision", "recall")},
     } | ({} if point is None else {"operating_point": point_json(point)})
 
 
