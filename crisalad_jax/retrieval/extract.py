@@ -6,7 +6,7 @@ import os
 import pathlib
 import tempfile
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -142,10 +142,8 @@ def extract(
     if every_metres is not None:
         require(len(sources) == 1, f"every_metres: found {len(sources)} files, expected one source")
         sources = [each.spaced(each.located(positions), every_metres) for each in sources]
-    require(
-        positions is None or every_metres is not None,
-        "--positions: found without --every-metres, expected both",
-    )
+    elif positions is not None:
+        raise InputError("--positions: found without --every-metres, expected both")
     paths, names = _listed(images, sources, root)
     made = {} if out is None else _made(describer, components)
     reading = reading.fitted(len(paths))
@@ -232,15 +230,6 @@ class _Work:
     paths: Sequence[pathlib.Path]
     names: Sequence[str]
 
-    def settings(self) -> dict[str, Any]:
-        """Return what all rows depend on, except the images."""
-        return {
-            **_made(self.describer, self.components),
-            "config": to_plain(self.describer.config),
-            "batch_size": self.reading.batch_size,
-            "rows": "descriptors" if self.grouping == "single" else "tokens",
-        }
-
     def opened(self, folder: pathlib.Path) -> Segments:
         """Open the rows in a folder."""
         if self.grouping == "single":
@@ -296,12 +285,18 @@ class _Work:
         return self.opened(folder)
 
     def _digest(self) -> str:
-        """Compute a digest of the settings, and of the names, sizes and times of the files."""
+        """Compute a digest of what rows depend on, and of the names, sizes and times of files."""
+        settings = {
+            **_made(self.describer, self.components),
+            "config": to_plain(self.describer.config),
+            "batch_size": self.reading.batch_size,
+            "rows": "descriptors" if self.grouping == "single" else "tokens",
+        }
         states = for_each(lambda path: state_of(file_of(path)), self.paths)
         each = zip(self.names, self.paths, states, strict=True)
         # A missing file is reported when it is read.
         files = [f"{name} {path} {state}" for name, path, state in each if state is not None]
-        return digest_of(files, self.settings())
+        return digest_of(files, settings)
 
     def _check(self, rows: np.ndarray, numbers: np.ndarray) -> None:
         check_rows(rows, f"{self.source}: descriptors", numbers, unit=self.is_unit)

@@ -37,6 +37,7 @@ class JaxDescriber:
         check_params(params, config)
         self.config = config
         self.preparation = Preparation.of(config)
+        self.row_length = config.unprojected_dim
         self.row_dtype = "float64" if config.compute_dtype == "float64" else "float32"
         self._given, self._params = params, cast_params(params, config)
         self._placed: tuple[int, Devices, Crisalad] | None = None
@@ -49,11 +50,6 @@ class JaxDescriber:
         """
         devices = jax.local_device_count() if jax.default_backend() == "cpu" else None
         return _sent, (jax.tree.map(np.asarray, self._given), self.config, devices)
-
-    @property
-    def row_length(self) -> int:
-        """Number of values in the row of an image's tokens."""
-        return self.config.unprojected_dim
 
     @functools.cached_property
     def digest(self) -> str:

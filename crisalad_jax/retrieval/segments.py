@@ -184,7 +184,10 @@ class Segments:
             write_record(path, whole)
         except BaseException:
             if not path.exists():
-                self._drop(first)
+                self.remove_waiting()
+                self.store.drop(first)
+                kept = sum(span.first < first for span in self.spans)
+                del self.spans[kept:], self.paths[kept:]
             raise
         self.changes += 1
         for each in (*added, (whole, path)):
@@ -197,12 +200,6 @@ class Segments:
             record.unlink()
             self.store.drop(_first_of(record))
         return len(waiting)
-
-    def _drop(self, first: int) -> None:
-        self.remove_waiting()
-        self.store.drop(first)
-        kept = sum(span.first < first for span in self.spans)
-        del self.spans[kept:], self.paths[kept:]
 
     def blocks(self) -> Iterator[Descriptors]:
         """Yield the rows of each segment in order."""

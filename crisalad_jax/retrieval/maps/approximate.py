@@ -82,13 +82,9 @@ class Approximate(NamedTuple):
             candidates = candidates * count // left
         numbers = self.ask(queries, min(left, candidates), count, removed).indices
         query, found = np.nonzero(numbers >= 0)
-        similarities = np.full(numbers.shape, -np.inf, np.float32)
-        similarities[query, found] = similarities_of(
-            queries, query, numbers[query, found], self.store.rows
-        )
-        numbers, similarities = (
-            part[:, :k] for part in Neighbours(numbers, similarities).in_order()
-        )
+        index, similarities = numbers[query, found], np.full(numbers.shape, -np.inf, np.float32)
+        similarities[query, found] = similarities_of(queries, query, index, self.store.rows)
+        numbers, similarities = Neighbours(numbers, similarities).in_order().first(k)
         few = np.flatnonzero(numbers[:, -1] < 0)
         if few.size:
             exact = self.store.search(queries[few], k, count, removed)

@@ -18,7 +18,6 @@ from crisalad_jax.retrieval.maps.query import (
     answers_of,
     asked_thresholds,
     asking,
-    found_at_least,
     json_rows,
     json_text,
     verified,
@@ -132,7 +131,7 @@ def query_live(
     describer = FrameDescriber(model_describer, window)
 
     def answers() -> Iterator[LiveAnswer]:
-        now, ask = places, asking(places, found_at_least(k, verifier), sequence, where)
+        now, ask = places, asking(places, k, verifier, sequence, where)
         blank = np.zeros((*(source.size or places.config.image_size), 3), np.uint8)
         places.search(places.shorten(describer(blank)), k)
         describer.forget()
@@ -140,7 +139,7 @@ def query_live(
         for frame in source.frames(check):
             asked = [pathlib.Path(frame.name)]
             if sequence is None and (then := now) is not (now := then.refreshed()):
-                ask = asking(now, found_at_least(k, verifier), None, where)
+                ask = asking(now, k, verifier, None, where)
             found = ask(now.shorten(describer(frame.image)), asked)
             answer = answers_of(now, asked, [found], thresholds)
             if verifier is not None:

@@ -191,15 +191,7 @@ class Map:
 
     @classmethod
     def _opened(cls, folder: pathlib.Path, metadata: MapMetadata) -> Self:
-        length, dtype = metadata.row
-        store = open_store(
-            metadata.store,
-            folder,
-            collection=metadata.collection,
-            length=length,
-            dtype=dtype,
-            new=not has_images(folder),
-        )
+        store = open_store(metadata, folder, new=not has_images(folder))
         try:
             return cls(folder, metadata, store)
         except BaseException:
@@ -531,14 +523,11 @@ class Map:
             + ("" if metadata.is_bits else f", {metadata.dtype}"),
             "image_size": list(self.config.image_size),
             "resize": self.config.images_in_words,
-            "grouping": metadata.grouping,
-            "store": metadata.store,
+            **{name: getattr(metadata, name) for name in ("grouping", "store")},
             "search": self.search_kind,
             "stale_search": self.stale_search or "none",
             "components": metadata.pca or "none",
-            "model": metadata.model,
-            "weights": metadata.weights,
-            "created": metadata.created,
+            **{name: getattr(metadata, name) for name in ("model", "weights", "created")},
             "calibration": None if self.calibration is None else to_plain(self.calibration),
             **({"verified": True} if verify else {}),
         }
@@ -576,13 +565,8 @@ class Map:
             config = with_non_semantic_fields_of(self.config, found.config)
             model = Model(found.params, config)
         else:
-            model = open_runtime(
-                file,
-                engine,
-                self.metadata.config,
-                any_grouping=set(groupings) != {"single"},
-                verify=verify,
-            )
+            how = {"any_grouping": set(groupings) != {"single"}, "verify": verify}
+            model = open_runtime(file, engine, self.metadata.config, **how)
             self._check_describer(cast(Describer, model), file)
         self._describer = model, describer_of(model, groupings)
         return model
@@ -615,9 +599,7 @@ class Map:
 
     def _check_describer(self, describer: Describer, given: object) -> None:
         quantised_from = getattr(describer, "quantised_from", None)
-        check_model(
-            self.metadata, self.folder, describer.digest, given, quantised_from=quantised_from
-        )
+        check_model(self.metadata, self.folder, describer.digest, given, quantised_from)
 
     def close(self) -> None:
         """Close the store; a map that nothing refers to any more closes itself."""

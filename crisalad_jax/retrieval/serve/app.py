@@ -33,6 +33,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.data.images import IMAGE_SUFFIXES, decode_image
 from crisalad_jax.data.positions import AXES, MOST_METRES, Positions, exif_position, utm_positions
 from crisalad_jax.data.resize import Pixels
@@ -406,16 +407,16 @@ def make_app(
         data, name = await receive_picture(request, max_bytes)
         async with _room(waiting):
             start = time.perf_counter()
-            answers, count = asked.k or k, 0 if rerank is None else rerank.answers
-            if asked.verify is not None:
-                count = asked.verify
-                if count and verifier is None:
-                    raise InputError("verify: found in a service without --rerank, expected none")
+            answers, count = asked.k or k, asked.verify
+            if count is None:
+                count = 0 if rerank is None else rerank.answers
+            if count and verifier is None:
+                raise InputError("verify: found in a service without --rerank, expected none")
             where = None if asked.where is None else Where.parse(asked.where)
             question = Question(await prepare(data, name), max(answers, count), where)
             places, found = await asyncio.wrap_future(worker.submit(question))
             best, checks = found[0][1], []
-            if verifier is not None and count:
+            if verifier and count:
                 loop = asyncio.get_running_loop()
                 found, checks = await loop.run_in_executor(
                     checking, _verified, verifier, decode_image(data, name), places, found, count
@@ -494,9 +495,8 @@ def _verified(
 def _check_parameters(request: Request) -> None:
     """Check that the URL has no parameter twice, of which the last one would count."""
     counts = collections.Counter(name for name, _ in request.query_params.multi_items())
-    for name, count in counts.most_common(1):
-        if count > 1:
-            raise InputError(f"{name}: found it {count} times, expected it once")
+    for name, count in counts.items():
+        require(count == 1, f"{name}: found it {count} times, expected it once")
 
 
 def bracketed(host: str) -> str:
