@@ -15,8 +15,8 @@ PREFIX = "published:"
 class Protocol:
     """The batches of a published evaluation: images in the order of names, each side apart."""
 
-    sizes: Mapping[str, int]
-    """Images in a batch, by a part of the set's name in small letters."""
+    sizes: Mapping[int, str]
+    """Parts of the names of sets in small letters, by how many of their images are in a batch."""
     otherwise: int | None
     """Images in a batch of any other set; None where none is known."""
     source: str
@@ -29,11 +29,12 @@ class Protocol:
             InputError: no size is known of the set, or its images are in another order.
         """
         words = benchmark.name.lower()
-        size = next((n for key, n in self.sizes.items() if key in words), self.otherwise)
+        known = {part: n for n, parts in self.sizes.items() for part in parts.split()}
+        size = next((n for part, n in known.items() if part in words), self.otherwise)
         if size is None:
             raise InputError(
                 f"grouping: found {PREFIX}{name} of {benchmark.name}, expected a set with one of "
-                f"{', '.join(self.sizes)} in its name, or a size, as in sequential@16"
+                f"{', '.join(known)} in its name, or a size, as in sequential@16"
             )
         for side in (benchmark.queries, benchmark.database):
             if [*side] != sorted(side, key=str):
@@ -45,18 +46,10 @@ class Protocol:
 
 
 PROTOCOLS: Mapping[str, Protocol] = {
-    "cricavpr": Protocol({"pitts": 8}, 16, "Lu et al., CVPR 2024: 8 of Pittsburgh, 16 of others"),
+    "cricavpr": Protocol({8: "pitts"}, 16, "Lu et al., CVPR 2024: 8 of Pittsburgh, 16 of others"),
     "crisalad": Protocol({}, 16, "Xu et al. 2025, section 4: 16"),
     "sage": Protocol(
-        {
-            "nordland": 26,
-            "eynsham": 20,
-            "msls": 16,
-            "tokyo": 16,
-            "pitts": 8,
-            "sped": 2,
-            "amstertime": 2,
-        },
+        {26: "nordland", 20: "eynsham", 16: "msls tokyo", 8: "pitts", 2: "sped amstertime"},
         None,
         "github.com/chenshunpeng/SAGE, config.py: a size for each set",
     ),

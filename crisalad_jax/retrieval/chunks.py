@@ -137,9 +137,7 @@ def joined(stream: Iterable[Block], size: int) -> Generator[Block, None, None]:
         yield Block(start, np.concatenate(parts))
 
 
-def regrouped(
-    parts: Iterable[Float[np.ndarray, "rows d"]], size: int
-) -> Generator[Block, None, None]:
+def regrouped(parts: Iterable[Descriptors], size: int) -> Generator[Block, None, None]:
     """Split and join consecutive arrays to blocks of about `size` rows, at most twice as many."""
     pieces = (
         Block(0, part[start : start + size])  # `joined` counts

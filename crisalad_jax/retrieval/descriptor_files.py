@@ -48,8 +48,7 @@ def record_of(path: pathlib.Path) -> pathlib.Path:
 def read_record(path: pathlib.Path) -> dict[str, Any]:
     """Read how the descriptors in `path` were made; nothing where they have no record."""
     record = record_of(path)
-    known = read_json(record, "a record of descriptors") if record.is_file() else {}
-    return known if isinstance(known, dict) else {}
+    return read_json(record, "a record of descriptors") if record.is_file() else {}
 
 
 def targets(path: pathlib.Path) -> list[pathlib.Path]:

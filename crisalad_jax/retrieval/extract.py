@@ -149,7 +149,7 @@ def extract(
     reading = reading.fitted(len(paths))
     source = str(images) if isinstance(images, str | os.PathLike) else "images"
     how = (describer, components, cluster, length, is_unit, grouping, seed, reading)
-    work = _Work(*how, source, paths, names)
+    work = _Work(*how, f"{source}: descriptors", paths, names)
     record = {
         "weights": None if weights is None else starter.named(weights),
         "images": source,
@@ -180,13 +180,7 @@ def extract(
             return found
 
 
-def check_extraction(
-    out: StrPath | None,
-    *,
-    grouping: str = "single",
-    seed: int = 0,
-    cluster: str | None = None,
-) -> None:
+def check_extraction(out: StrPath | None, *, grouping: str, seed: int, cluster: str | None) -> None:
     """Check what can be checked of an extraction before a model is loaded.
 
     Args:
@@ -200,7 +194,7 @@ def check_extraction(
             range.
 
     Example:
-        >>> check_extraction("descriptors.npy", grouping="single")
+        >>> check_extraction("descriptors.npy", grouping="single", seed=0, cluster=None)
     """
     for target in [] if out is None else targets(pathlib.Path(out)):
         check_target(target)
@@ -226,7 +220,8 @@ class _Work:
     grouping: str
     seed: int
     reading: Reading
-    source: str
+    label: str
+    """What messages call the descriptors."""
     paths: Sequence[pathlib.Path]
     names: Sequence[str]
 
@@ -264,7 +259,7 @@ class _Work:
             if not len(part.indices):
                 continue
             if is_single:
-                self._check(part.descriptors, part.indices)
+                check_rows(part.descriptors, self.label, part.indices, unit=self.is_unit)
             names = [self.names[first + int(number)] for number in part.indices]
             record = {"names": names, "skipped": unreadable, "work": digest}
             segments.append(record, part.descriptors)
@@ -298,9 +293,6 @@ class _Work:
         files = [f"{name} {path} {state}" for name, path, state in each if state is not None]
         return digest_of(files, settings)
 
-    def _check(self, rows: np.ndarray, numbers: np.ndarray) -> None:
-        check_rows(rows, f"{self.source}: descriptors", numbers, unit=self.is_unit)
-
     def descriptors(self, stored: Segments) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield the descriptors of stored rows, some at a time, with their numbers."""
         if self.grouping == "single":
@@ -310,7 +302,7 @@ class _Work:
         batches = batches_of(len(stored), self.grouping, self.reading.batch_size, self.seed)
         for numbers, rows in grouped(self.describer, stored, batches, quiet=self.reading.quiet):
             short = rows if self.components is None else self.components.apply(rows)
-            self._check(short, numbers)
+            check_rows(short, self.label, numbers, unit=self.is_unit)
             yield numbers, short
 
 

@@ -1,6 +1,7 @@
 """Describe images with a model in JAX, over all devices that can share a batch."""
 
 import functools
+import itertools
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -58,15 +59,16 @@ class JaxDescriber:
 
     def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[Rows, ImageBatch]]:
         """Yield each batch with its images' tokens; the devices compute one batch ahead."""
-        ahead: tuple[jax.Array, ImageBatch] | None = None
-        for batch in batches:
-            devices, params = self._on_devices(len(batch.images))
-            rows = _token_rows(params, devices.shard_batch(batch.images), self.config)
-            if ahead is not None:
-                yield np.asarray(ahead[0]), ahead[1]
-            ahead = rows, batch
-        if ahead is not None:
-            yield np.asarray(ahead[0]), ahead[1]
+
+        def dispatched() -> Iterator[tuple[jax.Array, ImageBatch] | None]:
+            for batch in batches:
+                devices, params = self._on_devices(len(batch.images))
+                yield _token_rows(params, devices.shard_batch(batch.images), self.config), batch
+            yield None
+
+        for ready, _ in itertools.pairwise(dispatched()):
+            if ready is not None:
+                yield np.asarray(ready[0]), ready[1]
 
     def _on_devices(self, batch_size: int) -> tuple[Devices, Crisalad]:
         if self._placed is None or self._placed[0] != batch_size:

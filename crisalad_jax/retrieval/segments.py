@@ -129,8 +129,7 @@ class Segments:
     @property
     def has_more(self) -> bool:
         """Whether another process has added a segment or a change since these were read."""
-        paths = self.path(len(self)), self.change_path(self.changes)
-        return any(path.exists() for path in paths)
+        return self.path(len(self)).exists() or self.change_path(self.changes).exists()
 
     def _take(self, record: dict[str, Any], path: pathlib.Path) -> None:
         names, digest = record.get("names"), record.get("sha256")

@@ -111,10 +111,8 @@ class BayesFilter:
         common = checked("common", common, (max(1, np.size(common)),))
         count = len(common)
         along = np.asarray(np.arange(count) if along is None else along, np.float64)
-        if along.shape != common.shape or not (np.diff(along) >= 0).all():
-            raise InputError(
-                f"along: found shape {along.shape}, expected {common.shape}, in ascending order"
-            )
+        rises = along.shape == common.shape and bool((np.diff(along) >= 0).all())
+        require(rises, f"along: found shape {along.shape}, expected {common.shape}, ascending")
         return SequenceState(np.full(count, 1 / count), common, np.zeros(count), 0, along)
 
     def predict(self, state: SequenceState, moved: float = 1.0) -> PerPlace:

@@ -18,7 +18,7 @@ from crisalad_jax.data.frames import moment_of
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import AXES, utm_degrees
 from crisalad_jax.retrieval.maps.map import Answer
-from crisalad_jax.retrieval.maps.query import Answers, json_lines, json_text
+from crisalad_jax.retrieval.maps.query import Answers, answer_fields, json_lines, json_text
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import printable
 
@@ -187,10 +187,9 @@ def _places(answers: Answers, *, degrees: bool = True) -> list[_Place]:
 
 
 def _answer_fields(answer: Answer) -> dict[str, Any]:
-    fields = {"answer": printable(answer.image.name), "similarity": round(answer.similarity, 6)}
-    if answer.probability is not None:
-        fields["probability"] = round(answer.probability, 6)
-    return fields
+    fields = answer_fields(answer, None)
+    known = {name: fields[name] for name in ("similarity", "probability") if name in fields}
+    return {"answer": printable(answer.image.name), **known}
 
 
 def _to_degrees(

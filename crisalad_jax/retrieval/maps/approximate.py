@@ -198,13 +198,8 @@ def build_approximate(
     built = built._replace(recall=_measuring(store, count)(built))
     with made_folder(path.parent):
         remove_temporaries(path.parent)
-        value = {
-            "kind": kind,
-            "images": count,
-            "recall": built.recall,
-            "queries": min(SAMPLE, count),
-        }
-        write_json(path.with_suffix(".json"), value)
+        value = {"kind": kind, "images": count, "recall": built.recall}
+        write_json(path.with_suffix(".json"), value | {"queries": min(SAMPLE, count)})
         save_index(path, index)
     for other in path.parent.iterdir():
         if other.stem != path.stem:

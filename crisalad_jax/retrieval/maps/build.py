@@ -221,22 +221,17 @@ def index(
         known = None
     describing = Describing(describer, reading.fitted(len(source.paths)), components)
     with open_for_appending(out, metadata, components) as target:
-        before = len(target)
+        before, given = len(target), () if table is None or known is None else known.of.keys()
+        there = {name for name in (*source.names, *given) if target.images.find(name) is not None}
         unreadable = _append(target, source, known, describing, cluster, novelty, again=again)
         check_readable(source.root, len(source.paths), len(target))
         recall = None if search is None else target.build_search(search, quiet=reading.quiet)
-
-        def there(names: Iterable[str]) -> int:
-            numbers = map(target.images.find, names)
-            return sum(number is not None and number < before for number in numbers)
-
         added, names = target.images[before:], set(source.names)
-        given = () if table is None or known is None else known.of.keys()
         result = Indexed(
             added=len(added),
-            there=there(names),
+            there=len(there & names),
             positions=sum(image.position is not None for image in added),
-            stay=there(given),
+            stay=len(there.intersection(given)),
             unreadable=unreadable,
             unmatched=[name for name in given if name not in names],
             images=len(target),

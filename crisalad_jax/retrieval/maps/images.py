@@ -226,12 +226,9 @@ class Images(Sequence[MapImage]):
         ends = np.cumsum(np.fromiter(lengths, np.int64)) + self._ends.values[-1]
         seconds = np.nan if added is None else time_of(added)
         self.parts.append(Part(added and sys.intern(added), sys.intern(root), first, seconds))
-        columns = (
-            (self._firsts, [first]),
-            (self._names, np.frombuffer(data, np.uint8)),
-            (self._ends, ends),
-            *columns,
-        )
+        self._firsts.extend([first])
+        self._names.extend(np.frombuffer(data, np.uint8))
+        self._ends.extend(ends)
         for column, new in columns:
             column.extend(new)
         self._recent.update(zip(names, range(first, self.rows), strict=True))

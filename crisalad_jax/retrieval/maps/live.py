@@ -56,11 +56,8 @@ class LiveAnswer(NamedTuple):
     def json_line(self) -> str:
         """Return the answer as one line of JSON."""
         (row,) = json_rows(self.answers)
-        more = {
-            "time": round(self.frame.time, 3),
-            "latency_ms": round(self.latency_ms, 1),
-            "dropped": self.frame.dropped,
-        }
+        time, latency = round(self.frame.time, 3), round(self.latency_ms, 1)
+        more = {"time": time, "latency_ms": latency, "dropped": self.frame.dropped}
         return json_text({"query": row.pop("query")} | more | row)
 
 

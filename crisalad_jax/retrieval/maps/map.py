@@ -54,7 +54,7 @@ from crisalad_jax.retrieval.segments import Segments, Take
 from crisalad_jax.retrieval.verification.results import Verification
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
-from crisalad_jax.utils.shapes import Float32, Int64
+from crisalad_jax.utils.shapes import Float32
 
 if TYPE_CHECKING:  # a map is searched without JAX
     from crisalad_jax.nn.config import ModelConfig
@@ -75,16 +75,6 @@ class Answer(NamedTuple):
     """Probability that the camera is there; None without a filter."""
     verification: Verification | None = None
     """What local features show; None where the answer was not verified."""
-
-
-def ranked(
-    images: Sequence[MapImage],
-    numbers: Int64[np.ndarray, " k"],
-    similarities: Float32[np.ndarray, " k"],
-) -> list[Answer]:
-    """Return the answers to one query, of images by number."""
-    pairs = zip(numbers, similarities, strict=True)
-    return [Answer(rank, float(value), images[i]) for rank, (i, value) in enumerate(pairs, 1)]
 
 
 class Map:
@@ -326,10 +316,8 @@ class Map:
         queries = self._rows("queries", queries)
         out, count = self.removed if where is None else self.left_out(where), self.images.rows
         k = min(k, count - len(out.rows))
-        if self._approximate is not None and not exact:
-            found = self._approximate.search(queries, k, count, out)
-        else:
-            found = self._segments.store.search(queries, k, count, out)
+        store = self._segments.store
+        found = (store if exact else self._approximate or store).search(queries, k, count, out)
         if where is None:
             return found
         return found._replace(indices=self.removed.numbers_of(out.rows_of(found.indices)))
@@ -432,7 +420,8 @@ class Map:
         pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
         descriptor = describe_images(self.describer(model), [pixels])
         found = self.search(self.shorten(descriptor), k, where=where)
-        return ranked(self.images, found.indices[0], found.similarities[0])
+        ranked = enumerate(zip(*(part[0].tolist() for part in found), strict=True), 1)
+        return [Answer(rank, similarity, self.images[i]) for rank, (i, similarity) in ranked]
 
     def similarities(self, queries: Queries) -> Float32[np.ndarray, "q n"]:
         """Compute the similarities of queries to all images, in the order of the images.

@@ -24,7 +24,7 @@ from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.neighbours import Neighbours, nearest
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
-from crisalad_jax.utils.output import warn, warn_once
+from crisalad_jax.utils.output import one_line, warn, warn_once
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Float, Int64
 
@@ -169,8 +169,8 @@ class MilvusStore:
                 words = f"no answer in time, {error.code().name}"  # pyright: ignore
             if "Open local milvus failed" in words:
                 words += " (damaged, or another process has it open)"
-            words = " ".join(words.split())
-            raise InputError(f"{self._address}: Milvus says: {words} (while {doing})") from error
+            words = f"{one_line(words)} (while {doing})"
+            raise InputError(f"{self._address}: Milvus says: {words}") from error
 
     def _ask(self, doing: str, method: str, *, wait: float = 0, **options: Any) -> Any:
         """Call a method of the client; again where a server is coming back.
@@ -195,7 +195,7 @@ class MilvusStore:
                     if not passes or self._is_file or time.monotonic() > end:
                         raise
                     words = f"Milvus says {error.message}; waiting for up to {_ANSWER:g} s"
-                    warn_once(self._address, " ".join(words.split()))
+                    warn_once(self._address, one_line(words))
             time.sleep(0.5)
             wait = max(1.0, end - time.monotonic())
             if self._loaded:

@@ -194,8 +194,7 @@ def _check_names(names: list[str]) -> None:
     if wrong:
         raise InputError(
             f"pairs: found the image name {wrong[0]!r} ({len(wrong)} such of {len(names)}), "
-            "expected names without spaces, and no # at the beginning, which COLMAP's and hloc's "
-            "pairs cannot have"
+            "expected names without spaces or # at the beginning, as COLMAP and hloc read pairs"
         )
 
 

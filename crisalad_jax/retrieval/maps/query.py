@@ -27,7 +27,7 @@ from crisalad_jax.retrieval.describe import (
 )
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.images import MapImage
-from crisalad_jax.retrieval.maps.map import Answer, Map, ranked
+from crisalad_jax.retrieval.maps.map import Answer, Map
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch, SequenceTracker, TrackResult
 from crisalad_jax.retrieval.maps.verified import calibration_of, verify_answers
 from crisalad_jax.retrieval.maps.where import Where
@@ -108,16 +108,12 @@ class Answers(NamedTuple):
 
     def rows(self) -> Iterator[tuple[pathlib.Path, list[Answer]]]:
         """Yield each query with its answers, best first."""
-        chances = self.probabilities
         for number, query in enumerate(self.queries):
-            answers = ranked(self.images, *(part[number] for part in self.neighbours))
-            if chances is not None:
-                pairs = zip(answers, chances[number], strict=True)
-                answers = [answer._replace(probability=float(chance)) for answer, chance in pairs]
-            if self.checks is not None:
-                pairs = itertools.zip_longest(answers, self.checks[number])
-                answers = [answer._replace(verification=check) for answer, check in pairs]
-            yield query, answers
+            found = [part[number].tolist() for part in self.neighbours]
+            found.append([] if self.probabilities is None else self.probabilities[number].tolist())
+            found.append([] if self.checks is None else self.checks[number])
+            ranked = enumerate(itertools.zip_longest(*found), 1)
+            yield query, [Answer(rank, s, self.images[i], *more) for rank, (i, s, *more) in ranked]
 
     def position(self, image: MapImage) -> dict[str, float] | None:
         """Return where an image was taken, by the names of the axes; None where unknown."""
@@ -365,18 +361,17 @@ def position_fields(image: MapImage, axes: tuple[str, str] | None) -> dict[str, 
 
 def answer_fields(answer: Answer, axes: tuple[str, str] | None) -> dict[str, Any]:
     """Return an answer's rank, name, similarity and position, as JSON has them."""
-    more: dict[str, Any] = {}
-    if answer.probability is not None:
-        more["probability"] = round(answer.probability, 6)
-    if answer.verification is not None:
-        more["verified"] = answer.verification.fields()
-    return {
+    fields: dict[str, Any] = {
         "rank": answer.rank,
         "name": answer.image.name,
         "similarity": round(answer.similarity, 6),
         "position": position_fields(answer.image, axes),
-        **more,
     }
+    if answer.probability is not None:
+        fields["probability"] = round(answer.probability, 6)
+    if answer.verification is not None:
+        fields["verified"] = answer.verification.fields()
+    return fields
 
 
 def json_lines(answers: Answers) -> Iterator[str]:

@@ -8,9 +8,9 @@ addition overwrites them.
 import pathlib
 from typing import TYPE_CHECKING
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.milvus_store import MilvusStore, check_address
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 
 if TYPE_CHECKING:
@@ -32,12 +32,10 @@ def check_store(name: str, dtype: str) -> None:
         InputError: neither "files" nor "milvus:URI", or such an URI or type that Milvus has not.
     """
     if name != "files":
-        if not name.startswith(_MILVUS):
-            raise InputError(f"store: found {name!r}, expected files or milvus:URI")
+        require(name.startswith(_MILVUS), f"store: found {name!r}, expected files or milvus:URI")
         check_address(name.removeprefix(_MILVUS))
     types = DTYPES if name == "files" else DTYPES[:1]
-    if dtype not in types:
-        raise InputError(f"dtype: found {dtype!r}, expected {' or '.join(types)} in {name}")
+    require(dtype in types, f"dtype: found {dtype!r}, expected {' or '.join(types)} in {name}")
 
 
 def store_name(name: str, folder: pathlib.Path) -> str:

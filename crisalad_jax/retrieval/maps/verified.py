@@ -74,13 +74,11 @@ def calibration_of(places: Map, verifier: Verifier | None) -> Calibration | None
     Raises:
         InputError: the file is damaged, or of another model.
     """
-    if verifier is None:
-        return places.calibration
-    found = read_calibration(places.folder, places.metadata.model, VERIFIED)
-    if found is not None and found.verifier != verifier.name:
+    found = verifier and read_calibration(places.folder, places.metadata.model, VERIFIED)
+    if verifier and found and found.verifier != verifier.name:
         warn(
             f"{places.folder / VERIFIED}: found inliers of {found.verifier}, and answers verified "
             f"by {verifier.name}: it is not used; `crisalad calibrate --verify` measures it again"
         )
-        return places.calibration
+        found = None
     return found or places.calibration

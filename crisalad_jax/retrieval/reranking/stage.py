@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.checks import choose
+from crisalad_jax.config.checks import choose, require
 from crisalad_jax.config.short_repr import with_field_docs
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
@@ -136,21 +136,19 @@ class Reranking:
                 too few patches; more retrievals than the database has images, if that is given.
         """
         method, own = _METHODS[self.name], config if self.model is None else self.model.config
-        found = own.aggregator.part_name, own.preprocessing.size_rule
-        wanted = (method and method.aggregator) or found[0], "fixed"
-        if method is not None and found != wanted:
-            raise InputError(
-                f"rerank: found a model with aggregator {found[0]} and size rule {found[1]}, "
-                f"expected {wanted[0]} and fixed, whose local features {self.name} "
-                "compares (--rerank-weights takes another model than the first stage's)"
-            )
         if method is not None:
+            found = own.aggregator.part_name, own.preprocessing.size_rule
+            wanted = method.aggregator or found[0], "fixed"
+            require(
+                found == wanted,
+                f"rerank: found a model with aggregator {found[0]} and size rule {found[1]}, "
+                f"expected {wanted[0]} and fixed, whose local features {self.name} compares "
+                "(--rerank-weights takes another model than the first stage's)",
+            )
             method.shape(own)
         if database is not None and self.top > database:
-            raise InputError(
-                f"rerank: found {self.label} over a database of {database} images, expected at "
-                f"most {database}"
-            )
+            found = f"{self.label} over a database of {database} images"
+            raise InputError(f"rerank: found {found}, expected at most {database}")
 
     def stage(
         self,

@@ -326,7 +326,7 @@ def make_app(
 
         pixels = await asyncio.to_thread(check_picture, data, name, max_pixels)
         lane = next(lane for most, lane in lanes if pixels <= most)
-        return await asyncio.get_running_loop().run_in_executor(lane, decode)
+        return await asyncio.wrap_future(lane.submit(decode))
 
     app = fastapi.FastAPI(
         title="crisalad serve",
@@ -366,10 +366,8 @@ def make_app(
     def describe_map(_: _Nothing) -> Places:
         """Tell how large the map is, and where its images were taken."""
         places = worker.places
-        positions, gone = places.images.positions, places.removed.rows  # by row
-        is_known = ~np.isnan(positions[:, 0])
-        is_known[gone] = False
-        known = np.flatnonzero(is_known)
+        positions, rows = places.images.positions, places.removed.rows_of(np.arange(len(places)))
+        known = rows[~np.isnan(positions[rows, 0])]
         shown = known[:: -(-len(known) // _DOTS) or 1]
         return Places(
             name=printable(places.folder.resolve().name),
@@ -393,10 +391,9 @@ def make_app(
     async def show_image(number: int, _: _Nothing) -> Response:
         """Show an image of the map."""
         try:
-            loop = asyncio.get_running_loop()
             places = worker.places
             image = image_in(places, number), places.folder, map_images
-            data = await loop.run_in_executor(shown, thumbnail, *image)
+            data = await asyncio.wrap_future(shown.submit(thumbnail, *image))
         except InputError as error:
             raise HTTPException(404, str(error)) from error
         return Response(data, media_type="image/jpeg")
@@ -417,10 +414,8 @@ def make_app(
             places, found = await asyncio.wrap_future(worker.submit(question))
             best, checks = found[0][1], []
             if verifier and count:
-                loop = asyncio.get_running_loop()
-                found, checks = await loop.run_in_executor(
-                    checking, _verified, verifier, decode_image(data, name), places, found, count
-                )
+                given = verifier, decode_image(data, name), places, found, count
+                found, checks = await asyncio.wrap_future(checking.submit(_verified, *given))
         pairs = itertools.zip_longest(found[:answers], checks[:answers])
         neighbours = [
             Neighbour(

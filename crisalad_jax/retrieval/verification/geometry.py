@@ -5,7 +5,7 @@ returns them. A pose (rotation, translation) turns the first camera's coordinate
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -100,16 +100,10 @@ def pose_from_points(
     if len(points) < LEAST:
         return None
     eye = np.eye(3)
+    how: Any = {"confidence": _SURE, "iterationsCount": _TRIALS, "flags": cv2.USAC_MAGSAC}
     try:
         found, turn, shift, inliers = cv2.solvePnPRansac(
-            points,
-            directions,
-            eye,
-            None,
-            reprojectionError=distance,
-            confidence=_SURE,
-            iterationsCount=_TRIALS,
-            flags=cv2.USAC_MAGSAC,
+            points, directions, eye, None, reprojectionError=distance, **how
         )
         if not found or inliers is None or len(inliers) < LEAST:
             return None

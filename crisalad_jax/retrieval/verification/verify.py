@@ -179,11 +179,8 @@ class Verifier:
             The pose in metres east and north, the number of the answer that it was computed from,
             and the metres from that answer's camera, as `Verification.translation`.
         """
-        known = [
-            number
-            for number, (check, position) in enumerate(zip(checks, positions, strict=True))
-            if check.rotation is not None and position is not None
-        ]
+        pairs = enumerate(zip(checks, positions, strict=True))
+        known = [n for n, (check, at) in pairs if check.rotation is not None and at is not None]
         for first, second in itertools.combinations(known, 2):
             here, there = positions[first], positions[second]
             metres = float(np.hypot(*(there - here)))
@@ -209,9 +206,8 @@ class Verifier:
         """Compute the query's pose in the first answer's axes, and the way to the second answer."""
         here, there = self._seen(*first), self._seen(*second)
         *_, theirs, ours = self._inliers(there, here)
-        rays, map_rays = (
-            self._rays(self._map_camera, *each) for each in ((there, theirs), (here, ours))
-        )
+        rays = self._rays(self._map_camera, there, theirs)
+        map_rays = self._rays(self._map_camera, here, ours)
         pose = relative_pose(rays, map_rays, self._distance(here))
         if pose is None:
             return None
