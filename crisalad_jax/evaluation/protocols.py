@@ -15,8 +15,8 @@ PREFIX = "published:"
 class Protocol:
     """The batches of a published evaluation: images in the order of names, each side apart."""
 
-    sizes: Mapping[int, str]
-    """Parts of the names of sets in small letters, by how many of their images are in a batch."""
+    sizes: Mapping[str, int]
+    """Images in a batch, by a part of the set's name in small letters."""
     otherwise: int | None
     """Images in a batch of any other set; None where none is known."""
     source: str
@@ -29,12 +29,11 @@ class Protocol:
             InputError: no size is known of the set, or its images are in another order.
         """
         words = benchmark.name.lower()
-        known = {part: n for n, parts in self.sizes.items() for part in parts.split()}
-        size = next((n for part, n in known.items() if part in words), self.otherwise)
+        size = next((n for key, n in self.sizes.items() if key in words), self.otherwise)
         if size is None:
             raise InputError(
                 f"grouping: found {PREFIX}{name} of {benchmark.name}, expected a set with one of "
-                f"{', '.join(known)} in its name, or a size, as in sequential@16"
+                f"{', '.join(self.sizes)} in its name, or a size, as in sequential@16"
             )
         for side in (benchmark.queries, benchmark.database):
             if [*side] != sorted(side, key=str):
@@ -45,11 +44,13 @@ class Protocol:
         return size
 
 
+_SAGE = {26: "nordland", 20: "eynsham", 16: "msls tokyo", 8: "pitts", 2: "sped amstertime"}
+"""Sets by the images in a batch."""
 PROTOCOLS: Mapping[str, Protocol] = {
-    "cricavpr": Protocol({8: "pitts"}, 16, "Lu et al., CVPR 2024: 8 of Pittsburgh, 16 of others"),
+    "cricavpr": Protocol({"pitts": 8}, 16, "Lu et al., CVPR 2024: 8 of Pittsburgh, 16 of others"),
     "crisalad": Protocol({}, 16, "Xu et al. 2025, section 4: 16"),
     "sage": Protocol(
-        {26: "nordland", 20: "eynsham", 16: "msls tokyo", 8: "pitts", 2: "sped amstertime"},
+        {part: size for size, parts in _SAGE.items() for part in parts.split()},
         None,
         "github.com/chenshunpeng/SAGE, config.py: a size for each set",
     ),
