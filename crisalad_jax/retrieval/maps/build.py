@@ -221,7 +221,8 @@ def index(
         known = None
     describing = Describing(describer, reading.fitted(len(source.paths)), components)
     with open_for_appending(out, metadata, components) as target:
-        before, given = len(target), () if table is None or known is None else known.of.keys()
+        before = len(target)
+        given = () if table is None or known is None else known.of.keys()
         there = {name for name in (*source.names, *given) if target.images.find(name) is not None}
         unreadable = _append(target, source, known, describing, cluster, novelty, again=again)
         check_readable(source.root, len(source.paths), len(target))

@@ -238,7 +238,8 @@ def replace_images(
 
         if changed:
             places.change("replace", added=parts())
-        replaced = [name for name in changed if name not in unreadable]
+        lost = set(unreadable)
+        replaced = [name for name in changed if name not in lost]
         unmatched = [name for name in files if places.image(name) is None]
         counts = len(known) - len(changed), len(places)
         return MapChange(replaced, *counts, unmatched, unreadable, 0, places.stale_search)
