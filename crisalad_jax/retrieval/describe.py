@@ -42,11 +42,6 @@ class Described(NamedTuple):
     unreadable: Int64[np.ndarray, " _"]
     """Indices of the images that could not be read."""
 
-    @property
-    def tried(self) -> int:
-        """Number of images, readable or not."""
-        return len(self.indices) + len(self.unreadable)
-
 
 def prepare_image(image: np.ndarray, config: "ModelConfig", name: str = "image") -> Pixels:
     """Resize an image as a model's configuration says, and normalise floats.
@@ -254,7 +249,7 @@ def shown(
     with progress_bar(label, total, "images", quiet=quiet, done=done) as bar:
         for part in stream:
             yield part
-            bar.advance(part.tried)
+            bar.advance(len(part.indices) + len(part.unreadable))
 
 
 def joined(stream: Iterator[Described], size: int) -> Iterator[Described]:

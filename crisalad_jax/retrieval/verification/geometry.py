@@ -133,8 +133,7 @@ def common_points(first: Points, second: Points) -> tuple[Int64[np.ndarray, " m"
     rows = {tuple(point): row for row, point in enumerate(first.tolist())}
     points = map(tuple, second.tolist())
     pairs = [(rows[point], row) for row, point in enumerate(points) if point in rows]
-    ours, theirs = np.array(pairs, int).reshape(-1, 2).T
-    return ours, theirs
+    return tuple(np.array(pairs, int).reshape(-1, 2).T)
 
 
 def pose_on_map(
