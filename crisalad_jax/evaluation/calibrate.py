@@ -80,9 +80,7 @@ def calibrate(
         >>> found.right, found.answered
         (4, 4)
     """
-    rerank = None
-    if verify is not None:
-        rerank = Reranking("local", verify.answers, matcher=verify.matcher)
+    rerank = verify and Reranking("local", verify.answers, matcher=verify.matcher)
     *_, result = evaluate(
         places.describer(model),
         benchmark,

@@ -112,10 +112,8 @@ def evaluate(
     """
     kinds = check_evaluation(groupings, seed=seed, seeds=seeds, precision=precision)
     describer = describer_of(model, kinds)
-    config = describer.config
-    parsed = [Grouping("single", "single")]
-    if config.cross_image.attends:
-        parsed = groupings_of(groupings, benchmark)
+    config, attends = describer.config, describer.config.cross_image.attends
+    parsed = groupings_of(groupings if attends else ["single"], benchmark)
     length, is_unit = shortened(pca, describer, "model")
     is_bits = dtype == "bits"
     if is_bits:
@@ -125,8 +123,7 @@ def evaluate(
         if rerank.needs_model and rerank.model is None:
             if not isinstance(model, tuple):
                 raise InputError(
-                    "rerank: found with a model in another engine, expected weights of its own "
-                    "(--rerank-weights)"
+                    "rerank: found another engine, expected weights of its own (--rerank-weights)"
                 )
             rerank = dataclasses.replace(rerank, model=model)
     benchmark.ground_truth()  # or there is none, which is known before any work
@@ -151,16 +148,15 @@ def evaluate(
         for grouping in parsed:
             is_random = "shuffled" in (grouping.queries, grouping.database)
             drawn = [seed + 2 * number for number in range(seeds if is_random else 1)]
-            name = str(grouping) if config.cross_image.attends else ANY
+            name = str(grouping) if attends else ANY
             observer = observe and functools.partial(observe, name)
-            ranked = _rank(
+            rankings, shares = _rank(
                 sides, grouping, drawn, k, positives, observer, unit=is_unit, bits=is_bits
             )
-            rankings, shares = ranked
             for label, stage in stages.items():
                 result = summarise(
                     name,
-                    {seed: _first(stage(each), max(KS)) for seed, each in rankings.items()},
+                    {seed: stage(each).first(max(KS)) for seed, each in rankings.items()},
                     positives,
                     KS,
                     is_random=is_random,
@@ -186,11 +182,6 @@ def check_evaluation(
     if precision is not None:
         check_precision(precision)
     return check_groupings(groupings)
-
-
-def _first(neighbours: Neighbours, count: int) -> Neighbours:
-    """Return the best `count` neighbours of each query."""
-    return Neighbours(*(part[:, :count] for part in neighbours))
 
 
 class _Side(NamedTuple):
@@ -250,17 +241,11 @@ def _rank(
     Returns:
         The rankings by seed, and what leaks: fields of `GroupingResult`, the mean over the seeds.
     """
-
-    def compare(database: Descriptors, queries: Descriptors) -> Neighbours:
-        if not unit and not bits:
-            database, queries = to_unit_vectors(database, queries)
-        return search(database, queries, k=k)
-
     kinds = grouping.database, grouping.queries
     descriptors: dict[int, Descriptors] = {}
     batches: dict[int, Batches] = {}
     shares: dict[int, float | None] = {}
-    leaks: dict[str, list[float | None]] = {}
+    leaks: list[tuple[float | None, ...]] = []
     rankings = {}
     for seed in seeds:
         for number, (side, kind) in enumerate(zip(sides, kinds, strict=True)):
@@ -270,18 +255,16 @@ def _rank(
                 shares[number] = same_place_share(batches[number], side.same)
                 described = side.describe(batches[number])
                 descriptors[number] = pack_bits(described) if bits else described
-        found = {
-            "database_share": shares[0],
-            "query_share": shares[1],
-            "mirrored_share": mirrored_share(batches[1], batches[0], positives),
-        }
-        for name, share in found.items():
-            leaks.setdefault(name, []).append(share)
+        leaks.append((*shares.values(), mirrored_share(batches[1], batches[0], positives)))
+        pair = descriptors[0], descriptors[1]
         if observe is not None and seed == seeds[0]:
-            pair = descriptors[0], descriptors[1]
             observe(*(map(sign_vectors, pair) if bits else pair))
-        rankings[seed] = compare(descriptors[0], descriptors[1])
-    return rankings, {name: _mean_known(shares) for name, shares in leaks.items()}
+        if not unit and not bits:
+            pair = to_unit_vectors(*pair)
+        rankings[seed] = search(*pair, k=k)
+    names = ("database_share", "query_share", "mirrored_share")
+    means = map(_mean_known, zip(*leaks, strict=True))
+    return rankings, dict(zip(names, means, strict=True))
 
 
 def _mean_known(shares: Sequence[float | None]) -> float | None:

@@ -71,10 +71,8 @@ class Interval(NamedTuple):
     high: float
 
 
-def bootstrap_interval(
-    hits: Int[np.ndarray, " q"], trials: int = 1, confidence: float = 0.95
-) -> Interval:
-    """Compute the percentile bootstrap's interval (Efron 1979) of the mean of hits / trials.
+def bootstrap_interval(hits: Int[np.ndarray, " q"], trials: int = 1) -> Interval:
+    """Compute the percentile bootstrap's 95 % interval (Efron 1979) of the mean of hits / trials.
 
     For whole numbers the limit of infinitely many resamples is known exactly, without drawing any.
     A resample sums q independent draws from the queries' hits. That sum is distributed as the
@@ -88,16 +86,14 @@ def bootstrap_interval(
     Args:
         hits: in how many of the trials each query was a hit.
         trials: for instance the seeds of a shuffle; the interval does not hold their spread.
-        confidence: of the interval, above 0 and below 1.
 
     Raises:
-        InputError: no queries, a hit below 0 or above `trials`, or such a confidence.
+        InputError: no queries, or a hit below 0 or above `trials`.
     """
     require(
         np.size(hits) > 0 and bool(np.isin(hits, np.arange(trials + 1)).all()),
         f"hits: found {in_one_line(hits)}, expected numbers of hits, from 0 to {trials}",
     )
-    require(0 < confidence < 1, f"confidence: found {confidence}, expected above 0 and below 1")
     queries = len(hits)
     size = queries * trials + 1
     frequencies = np.bincount(hits, minlength=trials + 1) / queries
@@ -105,8 +101,7 @@ def bootstrap_interval(
     length = 1 << size.bit_length()
     sums = np.fft.irfft(np.fft.rfft(frequencies, length) ** queries, length)[:size]
     cumulative = np.cumsum(np.maximum(sums, 0))
-    tail = (1 - confidence) / 2
-    low, high = np.searchsorted(cumulative, [tail, 1 - tail])
+    low, high = np.searchsorted(cumulative, [0.025, 0.975])
     return Interval(float(low) / (size - 1), float(high) / (size - 1))
 
 

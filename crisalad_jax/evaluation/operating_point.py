@@ -149,14 +149,6 @@ _FEWEST = 3
 """Answers that a map's similarity rests on at least."""
 
 
-def needed(precision: float) -> int | None:
-    """Return how many accepted queries, all right, a lower bound of `precision` takes.
-
-    None at a precision of 1, which no number of queries shows.
-    """
-    return None if precision == 1 else math.ceil(math.log(1 - CONFIDENCE) / math.log(precision))
-
-
 def check_supported(point: OperatingPoint, source: str) -> None:
     """Check that a similarity rests on more than a coincidence; `caveats` tell what it shows.
 
@@ -194,7 +186,7 @@ def caveats(point: OperatingPoint) -> list[str]:
         f"rests on few queries: {measured}, which shows a precision of at least "
         f"{100 * point.lower_bound:.1f} % (95 % confidence)"
     )
-    enough = needed(point.asked)
-    if point.right == point.answered and enough is not None:
+    if point.right == point.answered and point.asked < 1:  # which no number of queries shows
+        enough = math.ceil(math.log(1 - CONFIDENCE) / math.log(point.asked))
         sure += f"; {asked} takes {enough} answers, all of them right"
     return [sure]

@@ -1,7 +1,7 @@
 """How published evaluations group images, by the name of their method."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from crisalad_jax.config.checks import choose
 from crisalad_jax.data.benchmarks import Benchmark
@@ -44,19 +44,13 @@ class Protocol:
         return size
 
 
+_SAGE = {26: "nordland", 20: "eynsham", 16: "msls tokyo", 8: "pitts", 2: "sped amstertime"}
+"""Sets by the images in a batch."""
 PROTOCOLS: Mapping[str, Protocol] = {
     "cricavpr": Protocol({"pitts": 8}, 16, "Lu et al., CVPR 2024: 8 of Pittsburgh, 16 of others"),
     "crisalad": Protocol({}, 16, "Xu et al. 2025, section 4: 16"),
     "sage": Protocol(
-        {
-            "nordland": 26,
-            "eynsham": 20,
-            "msls": 16,
-            "tokyo": 16,
-            "pitts": 8,
-            "sped": 2,
-            "amstertime": 2,
-        },
+        {part: size for size, parts in _SAGE.items() for part in parts.split()},
         None,
         "github.com/chenshunpeng/SAGE, config.py: a size for each set",
     ),
@@ -73,7 +67,7 @@ def check_groupings(texts: Sequence[str]) -> list[str]:
     for text in texts:
         if text.startswith(PREFIX):
             choose(f"grouping {PREFIX}NAME", text.removeprefix(PREFIX), PROTOCOLS)
-    parsed = [each for text in texts for each in parse_groupings(_parts(text, 1))]
+    parsed = parse_groupings(_expanded(texts, lambda _: 1))
     return list(dict.fromkeys(kind for each in parsed for kind in (each.queries, each.database)))
 
 
@@ -97,19 +91,18 @@ def groupings_of(texts: Sequence[str], benchmark: Benchmark) -> list[Grouping]:
         >>> [str(each) for each in groupings_of(["published:sage"], benchmark)]
         ['sequential@26', 'single', 'shuffled@26', 'masked@26']
     """
-    found = []
+    sizes = _expanded(texts, lambda name: PROTOCOLS[name].batch_size(name, benchmark))
+    return parse_groupings(sizes)
+
+
+def _expanded(texts: Sequence[str], size_of: Callable[[str], int]) -> Iterator[str]:
+    """Yield groupings, with those that a published name stands for in its place."""
     for text in texts:
-        name, size = text.removeprefix(PREFIX), 0
-        if name != text:
-            size = PROTOCOLS[name].batch_size(name, benchmark)
-        found += _parts(text, size)
-    return parse_groupings(found)
-
-
-def _parts(text: str, size: int) -> list[str]:
-    if not text.startswith(PREFIX):
-        return [text]
-    return [f"sequential@{size}", "single", f"shuffled@{size}", f"{MASKED}@{size}"]
+        if text.startswith(PREFIX):
+            size = size_of(text.removeprefix(PREFIX))
+            yield from (f"sequential@{size}", "single", f"shuffled@{size}", f"{MASKED}@{size}")
+        else:
+            yield text
 
 
 def protocol_notes(texts: Sequence[str]) -> list[str]:

@@ -133,20 +133,17 @@ def summarise(
     scores = [
         Scores(
             recalls(each.indices, positives, ks),
-            None if curve is None else curve.average_precision,
-            None if curve is None else curve.recall_at_full_precision,
+            *(getattr(curve, name, None) for name in Scores._fields[1:]),
         )
         for each, curve in zip(rankings.values(), curves, strict=True)
     ]
     mean = _over(scores, statistics.mean)
     return GroupingResult(
         grouping,
-        mean.recalls,
-        first,
+        neighbours=first,
+        **mean._asdict(),
         intervals={k: bootstrap_interval(hits[k], trials=len(rights)) for k in ks},
         precision_recall=curves[0],
-        average_precision=mean.average_precision,
-        recall_at_full_precision=mean.recall_at_full_precision,
         spread=_over(scores, statistics.stdev) if len(scores) > 1 else None,
         by_seed=dict(zip(rankings, scores, strict=True)) if is_random else {},
         firsts=np.array([right[:, 0] for right in rights]),
@@ -202,20 +199,13 @@ def to_json(result: GroupingResult) -> dict[str, Any]:
         "batch_size": size,
         "same_place": {"queries": result.query_share, "database": result.database_share},
         "mirrored": result.mirrored_share,
-        "over_single": None
-        if gain is None
-        else {"R@1": gain.mean, "interval": list(gain.interval)},
-        **_scores_json(
-            Scores(result.recalls, result.average_precision, result.recall_at_full_precision)
-        ),
+        "over_single": gain and {"R@1": gain.mean, "interval": list(gain.interval)},
+        **_scores_json(Scores(*(getattr(result, name) for name in Scores._fields))),
         "intervals": {f"R@{k}": list(ends) for k, ends in result.intervals.items()},
-        "spread": None if result.spread is None else _scores_json(result.spread),
+        "spread": result.spread and _scores_json(result.spread),
         "by_seed": {str(seed): _scores_json(each) for seed, each in result.by_seed.items()},
-        "precision_recall": None
-        if curve is None
-        else {
-            name: getattr(curve, name).tolist() for name in ("thresholds", "precision", "recall")
-        },
+        "precision_recall": curve
+        and {name: getattr(curve, name).tolist() for name in ("thresholds", "precision", "recall")},
     } | ({} if point is None else {"operating_point": point_json(point)})
 
 

@@ -7,13 +7,13 @@ from collections.abc import Generator, Iterable
 
 import numpy as np
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.retrieval.chunks import (
     BITS,
     Block,
-    Descriptors,
     as_rows,
     check_rows,
-    joined,
+    regrouped,
 )
 from crisalad_jax.retrieval.neighbours import (
     QUERY_CHUNK,
@@ -52,7 +52,7 @@ def pack_bits(descriptors: Float[np.ndarray, "n d"]) -> UInt8[np.ndarray, "n d/8
         >>> pack_bits(np.array([[0.5, -0.5, 0.0, 0.1, -0.2, -0.3, -0.4, 0.7]])).tolist()
         [[177]]
     """
-    return _packed(as_rows(descriptors, "descriptors"), "descriptors")
+    return _packed(descriptors, "descriptors")
 
 
 def to_bits(array: np.ndarray, name: str, length: int) -> Bits:
@@ -61,13 +61,12 @@ def to_bits(array: np.ndarray, name: str, length: int) -> Bits:
     Raises:
         InputError: what `pack_bits` and `as_bits` raise.
     """
-    is_packed = np.asanyarray(array).dtype == BITS
-    return (
-        as_bits(array, name, length) if is_packed else _packed(as_rows(array, name, length), name)
-    )
+    convert = as_bits if np.asanyarray(array).dtype == BITS else _packed
+    return convert(array, name, length)
 
 
-def _packed(rows: Descriptors, name: str) -> Bits:
+def _packed(array: np.ndarray, name: str, length: int | None = None) -> Bits:
+    rows = as_rows(array, name, length)
     check_packable(rows.shape[1], name)
     check_rows(rows, name, range(len(rows)), unit=False)
     return np.packbits(rows >= 0, axis=1)
@@ -75,11 +74,7 @@ def _packed(rows: Descriptors, name: str) -> Bits:
 
 def check_packable(length: int, name: str) -> None:
     """Raise InputError where descriptors of so many numbers do not fill whole bytes."""
-    if length % 8:
-        raise InputError(
-            f"{name}: found descriptors of {length} numbers, expected a multiple of 8 to pack as "
-            "bits"
-        )
+    require(length % 8 == 0, f"{name}: found {length} numbers, expected a multiple of 8 as bits")
 
 
 def sign_vectors(bits: Bits) -> Float32[np.ndarray, "n d"]:
@@ -128,13 +123,7 @@ def nearest_bits(database: Iterable[Bits], queries: Bits, k: int) -> Neighbours:
         Their similarities are 1 - 2 h / d, where h of the d bits differ: the cosines of the vectors
         of signs.
     """
-
-    pieces = (
-        Block(0, part[start : start + _ROWS])  # `joined` counts
-        for part in database
-        for start in range(0, len(part), _ROWS)
-    )
-    compared = _compared(joined(pieces, _ROWS), _as_words(queries), 8 * queries.shape[1])
+    compared = _compared(regrouped(database, _ROWS), _as_words(queries), 8 * queries.shape[1])
     return best_products(compared, len(queries), k)
 
 

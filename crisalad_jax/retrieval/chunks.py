@@ -20,8 +20,6 @@ WIDE = np.dtype(np.float32)
 BITS = np.dtype(np.uint8)
 """Type of packed bits (`retrieval.bits`), which no other descriptors have."""
 _NARROW = (np.dtype(np.float16), np.dtype(ml_dtypes.bfloat16))
-_CHECKED = 4096
-"""Number of rows that are checked at a time."""
 _NEIGHBOURS = 2**21
 """Bytes around a page that is read which Linux maps with it, at most."""
 _SCATTERED = 4
@@ -139,6 +137,16 @@ def joined(stream: Iterable[Block], size: int) -> Generator[Block, None, None]:
         yield Block(start, np.concatenate(parts))
 
 
+def regrouped(parts: Iterable[Descriptors], size: int) -> Generator[Block, None, None]:
+    """Split and join consecutive arrays to blocks of about `size` rows, at most twice as many."""
+    pieces = (
+        Block(0, part[start : start + size])  # `joined` counts
+        for part in parts
+        for start in range(0, len(part), size)
+    )
+    return joined(pieces, size)
+
+
 def gathered(array: Descriptors, places: Int[np.ndarray, " m"]) -> Float[np.ndarray, "m d"]:
     """Read the rows at some places in ascending order, and release their pages."""
     parts = []
@@ -187,16 +195,6 @@ def check_rows(
             f"{name}: row {places[row]} is {fault}, expected {expected} "
             f"({wrong.size} wrong of {len(rows)} rows from {places[0]})"
         )
-
-
-def check_all_rows(array: Descriptors, name: str, *, unit: bool) -> None:
-    """Check all rows of an array in memory or on disk, as `check_rows`, before they are used.
-
-    Raises:
-        InputError: a row is not finite, or not of unit length where that is asked for.
-    """
-    for _ in blocks(array, name, _CHECKED, unit=unit):
-        pass
 
 
 def _let_go(rows: np.ndarray) -> None:

@@ -3,15 +3,15 @@
 Nothing here imports JAX: what computes is a `Describer`.
 """
 
-import itertools
 import os
 import pathlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.short_repr import brief, in_one_line
 from crisalad_jax.data.loader import ImageBatch
 from crisalad_jax.data.prepare import Preparation
@@ -29,6 +29,8 @@ if TYPE_CHECKING:  # an engine describes images without JAX
     from crisalad_jax.nn.model import Model
     from crisalad_jax.retrieval.segments import Segments
 
+_T = TypeVar("_T")
+
 
 @brief
 class Described(NamedTuple):
@@ -39,11 +41,6 @@ class Described(NamedTuple):
     descriptors: Float32[np.ndarray, "n d"]
     unreadable: Int64[np.ndarray, " _"]
     """Indices of the images that could not be read."""
-
-    @property
-    def tried(self) -> int:
-        """Number of images, readable or not."""
-        return len(self.indices) + len(self.unreadable)
 
 
 def prepare_image(image: np.ndarray, config: "ModelConfig", name: str = "image") -> Pixels:
@@ -81,15 +78,13 @@ def _as_list(name: str, given: Any) -> list[Any]:
     if not isinstance(given, str | os.PathLike | Iterable):
         raise InputError(f"{name}: found {in_one_line(given)}, expected images")
     found = [given] if isinstance(given, str | os.PathLike) else list(given)
-    if not found:
-        raise InputError(f"{name}: found none, expected at least one image")
+    require(bool(found), f"{name}: found none, expected at least one image")
     return found
 
 
 def check_readable(source: object, tried: int, readable: int) -> None:
     """Raise InputError where none of a source's images could be read."""
-    if not readable:
-        raise InputError(f"{source}: found {tried} images, none of them readable")
+    require(readable > 0, f"{source}: found {tried} images, none of them readable")
 
 
 def describe_files(
@@ -209,8 +204,8 @@ def described(
     could be read.
 
     Raises:
-        InputError: an image cannot be read and `reading` says "stop"; or what `check_window`
-            raises.
+        InputError: an image cannot be read and `reading` says "stop"; or what
+            `FrameDescriber` raises.
     """
     shorten = (lambda rows: rows) if components is None else components.apply
     frames = FrameDescriber(describer, window)
@@ -247,30 +242,6 @@ def _each_batch(
         yield Described(batch.indices[batch.valid], describe(rows, batch.valid), unreadable)
 
 
-def described_sources(
-    describer: Describer,
-    sources: Sequence[list[pathlib.Path]],
-    reading: Reading,
-    *,
-    window: int,
-    components: Pca | None = None,
-) -> Iterator[Described]:
-    """Describe the images of all sources in order; a window holds images of one source only.
-
-    Indices count the images of all sources.
-
-    Raises:
-        InputError: what `described` raises.
-    """
-    if window == 1:
-        sources = [list(itertools.chain(*sources))]
-    first = 0
-    for source in sources:
-        for part in described(describer, source, reading, window=window, components=components):
-            yield Described(part.indices + first, part.descriptors, part.unreadable + first)
-        first += len(source)
-
-
 def shown(
     stream: Iterator[Described], label: str, total: int, *, quiet: bool, done: int = 0
 ) -> Iterator[Described]:
@@ -278,7 +249,7 @@ def shown(
     with progress_bar(label, total, "images", quiet=quiet, done=done) as bar:
         for part in stream:
             yield part
-            bar.advance(part.tried)
+            bar.advance(len(part.indices) + len(part.unreadable))
 
 
 def joined(stream: Iterator[Described], size: int) -> Iterator[Described]:
@@ -296,6 +267,23 @@ def joined(stream: Iterator[Described], size: int) -> Iterator[Described]:
 def concatenated(parts: Sequence[Described]) -> Described:
     """Join the descriptors of consecutive images."""
     return Described(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def readable(
+    stream: Iterator[Described], size: int, items: Sequence[_T], unreadable: list[_T]
+) -> Iterator[tuple[list[_T], Rows]]:
+    """Yield the items of the images that could be read, and their descriptors, as `joined` does.
+
+    Args:
+        stream: descriptors.
+        size: number of descriptors to join.
+        items: of all images, such as their names.
+        unreadable: gets the items of the other images.
+    """
+    for part in joined(stream, size):
+        unreadable.extend(items[index] for index in part.unreadable)
+        if len(part.indices):
+            yield [items[index] for index in part.indices], part.descriptors
 
 
 class TokenSet:
@@ -372,19 +360,6 @@ def grouped(
             bar.advance(int(part.kept.sum()))
 
 
-def check_window(config: "ModelConfig", window: int) -> None:
-    """Check a number of frames that are described together.
-
-    Raises:
-        InputError: it is below 1, or above with a model whose images do not attend to each other.
-    """
-    if window < 1 or (window > 1 and not config.cross_image.attends):
-        expected = "at least 1"
-        if not config.cross_image.attends:
-            expected = "1 of a model without a cross-image encoder"
-        raise InputError(f"window: found {window}, expected {expected}")
-
-
 class FrameDescriber:
     """Describe images as they come, each with the `window - 1` before it."""
 
@@ -392,10 +367,14 @@ class FrameDescriber:
         """Start without an image.
 
         Raises:
-            InputError: what `check_window` raises.
+            InputError: the window is below 1, or above with a model whose images do not attend to
+                each other.
         """
-        if window != 1:  # an engine's configuration needs JAX, which takes a second to import
-            check_window(describer.config, window)
+        # An engine's configuration needs JAX, which takes a second to import.
+        attends = window == 1 or describer.config.cross_image.attends
+        if window < 1 or not attends:
+            expected = "at least 1" if attends else "1 of a model without a cross-image encoder"
+            raise InputError(f"window: found {window}, expected {expected}")
         self._describer, self._window = describer, window
         self.forget()
 

@@ -38,8 +38,6 @@ _DIGESTS = "files"
 MADE_BY = "model_sha256"
 """Key of the `model_hash` in the record of descriptors that this package made."""
 _SUFFIXES = (".npy", ".h5")
-_INFLATION = 1100
-"""Largest ratio of numbers to bytes that deflate, HDF5's compression, reaches."""
 
 
 def record_of(path: pathlib.Path) -> pathlib.Path:
@@ -50,8 +48,7 @@ def record_of(path: pathlib.Path) -> pathlib.Path:
 def read_record(path: pathlib.Path) -> dict[str, Any]:
     """Read how the descriptors in `path` were made; nothing where they have no record."""
     record = record_of(path)
-    known = read_json(record, "a record of descriptors") if record.is_file() else {}
-    return known if isinstance(known, dict) else {}
+    return read_json(record, "a record of descriptors") if record.is_file() else {}
 
 
 def targets(path: pathlib.Path) -> list[pathlib.Path]:
@@ -100,11 +97,9 @@ def write_descriptors(
     targets(path)
     with contextlib.ExitStack() as stack:
         # The files that are entered last are renamed first.
-        files = {
-            role: stack.enter_context(atomic_path(file, within))
-            for role, file in _files_of(path).items()
-        }
-        recorded = stack.enter_context(atomic_path(record_of(path), within))
+        enter = stack.enter_context
+        files = {role: enter(atomic_path(file, within)) for role, file in _files_of(path).items()}
+        recorded = enter(atomic_path(record_of(path), within))
         if path.suffix == ".h5":
             _write_h5(files["descriptors"], descriptors, names, path)
         else:
@@ -264,34 +259,13 @@ def _read_npy(path: pathlib.Path) -> tuple[list[str], Descriptors]:
 def _read_h5(path: pathlib.Path) -> tuple[list[str], Descriptors]:
     import h5py
 
-    names: list[str] = []
-    rows: list[np.ndarray] = []
-
-    def take(name: str) -> None:
-        group, _, last = name.rpartition("/")
-        # Other groups are not opened: of a chain of them that takes the square of its length.
-        item = file[name] if last == "global_descriptor" else None
-        if not isinstance(item, h5py.Dataset):
-            return
-        # The header may claim any size, or numbers of other files.
-        stored = item.id.get_storage_size() * (1 if item.compression is None else _INFLATION)
-        is_whole = item.nbytes <= stored and not item.external and not item.is_virtual
-        is_vector = item.ndim == 1 and item.dtype.kind == "f"
-        if not is_vector or not is_whole or (rows and item.shape != rows[0].shape):
-            raise InputError(
-                f"{path}: found {item.dtype} {item.shape} as {name}, expected floats "
-                f"{rows[0].shape if rows else '(descriptor,)'}, all of them in this file"
-            )
-        names.append(group)
-        rows.append(item[()])
-
+    found: list[str] = []
     try:
         with h5py.File(path) as file:
-            file.visit(take)
-    except InputError:
-        raise
+            file.visit(found.append)
+            found = [name for name in found if name.endswith("/global_descriptor")]
+            rows: Any = np.stack([file[name][()] for name in found])  # pyright: ignore
     except Exception as error:  # damaged files end in errors of many kinds
-        raise InputError(f"{path}: not a whole HDF5 file: {one_line(error)}") from error
-    if not rows:
-        raise InputError(f"{path}: found no dataset global_descriptor, expected one for each image")
-    return names, np.stack(rows)
+        reason = one_line(error)
+        raise InputError(f"{path}: not a whole HDF5 file of descriptors: {reason}") from error
+    return [name.removesuffix("/global_descriptor") for name in found], as_rows(rows, str(path))

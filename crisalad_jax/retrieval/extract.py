@@ -6,7 +6,7 @@ import os
 import pathlib
 import tempfile
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -142,16 +142,14 @@ def extract(
     if every_metres is not None:
         require(len(sources) == 1, f"every_metres: found {len(sources)} files, expected one source")
         sources = [each.spaced(each.located(positions), every_metres) for each in sources]
-    require(
-        positions is None or every_metres is not None,
-        "--positions: found without --every-metres, expected both",
-    )
+    elif positions is not None:
+        raise InputError("--positions: found without --every-metres, expected both")
     paths, names = _listed(images, sources, root)
     made = {} if out is None else _made(describer, components)
     reading = reading.fitted(len(paths))
     source = str(images) if isinstance(images, str | os.PathLike) else "images"
     how = (describer, components, cluster, length, is_unit, grouping, seed, reading)
-    work = _Work(*how, source, paths, names)
+    work = _Work(*how, f"{source}: descriptors", paths, names)
     record = {
         "weights": None if weights is None else starter.named(weights),
         "images": source,
@@ -182,13 +180,7 @@ def extract(
             return found
 
 
-def check_extraction(
-    out: StrPath | None,
-    *,
-    grouping: str = "single",
-    seed: int = 0,
-    cluster: str | None = None,
-) -> None:
+def check_extraction(out: StrPath | None, *, grouping: str, seed: int, cluster: str | None) -> None:
     """Check what can be checked of an extraction before a model is loaded.
 
     Args:
@@ -202,7 +194,7 @@ def check_extraction(
             range.
 
     Example:
-        >>> check_extraction("descriptors.npy", grouping="single")
+        >>> check_extraction("descriptors.npy", grouping="single", seed=0, cluster=None)
     """
     for target in [] if out is None else targets(pathlib.Path(out)):
         check_target(target)
@@ -228,18 +220,10 @@ class _Work:
     grouping: str
     seed: int
     reading: Reading
-    source: str
+    label: str
+    """What messages call the descriptors."""
     paths: Sequence[pathlib.Path]
     names: Sequence[str]
-
-    def settings(self) -> dict[str, Any]:
-        """Return what all rows depend on, except the images."""
-        return {
-            **_made(self.describer, self.components),
-            "config": to_plain(self.describer.config),
-            "batch_size": self.reading.batch_size,
-            "rows": "descriptors" if self.grouping == "single" else "tokens",
-        }
 
     def opened(self, folder: pathlib.Path) -> Segments:
         """Open the rows in a folder."""
@@ -275,7 +259,7 @@ class _Work:
             if not len(part.indices):
                 continue
             if is_single:
-                self._check(part.descriptors, part.indices)
+                check_rows(part.descriptors, self.label, part.indices, unit=self.is_unit)
             names = [self.names[first + int(number)] for number in part.indices]
             record = {"names": names, "skipped": unreadable, "work": digest}
             segments.append(record, part.descriptors)
@@ -296,15 +280,18 @@ class _Work:
         return self.opened(folder)
 
     def _digest(self) -> str:
-        """Compute a digest of the settings, and of the names, sizes and times of the files."""
+        """Compute a digest of what rows depend on, and of the names, sizes and times of files."""
+        settings = {
+            **_made(self.describer, self.components),
+            "config": to_plain(self.describer.config),
+            "batch_size": self.reading.batch_size,
+            "rows": "descriptors" if self.grouping == "single" else "tokens",
+        }
         states = for_each(lambda path: state_of(file_of(path)), self.paths)
         each = zip(self.names, self.paths, states, strict=True)
         # A missing file is reported when it is read.
         files = [f"{name} {path} {state}" for name, path, state in each if state is not None]
-        return digest_of(files, self.settings())
-
-    def _check(self, rows: np.ndarray, numbers: np.ndarray) -> None:
-        check_rows(rows, f"{self.source}: descriptors", numbers, unit=self.is_unit)
+        return digest_of(files, settings)
 
     def descriptors(self, stored: Segments) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield the descriptors of stored rows, some at a time, with their numbers."""
@@ -315,7 +302,7 @@ class _Work:
         batches = batches_of(len(stored), self.grouping, self.reading.batch_size, self.seed)
         for numbers, rows in grouped(self.describer, stored, batches, quiet=self.reading.quiet):
             short = rows if self.components is None else self.components.apply(rows)
-            self._check(short, numbers)
+            check_rows(short, self.label, numbers, unit=self.is_unit)
             yield numbers, short
 
 

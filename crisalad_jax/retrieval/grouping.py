@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.checks import choose
-from crisalad_jax.utils.errors import InputError
+from crisalad_jax.config.checks import choose, require
 from crisalad_jax.utils.shapes import Bool, Int64
 
 GROUPINGS = {
@@ -56,21 +55,16 @@ class Grouping:
             InputError: an unknown grouping, more than two, or no such size.
         """
         names, at, size = text.partition("@")
+        kinds, expected = names.split("/"), None
         if at and not re.fullmatch("[1-9][0-9]{0,5}", size):
-            raise InputError(
-                f"grouping: found {text!r}, expected a number of images after @, as in {names}@16"
-            )
-        kinds = names.split("/")
-        if len(kinds) > 2:
-            raise InputError(
-                f"grouping: found {text!r}, expected one for both sides, or QUERIES/DATABASE"
-            )
+            expected = f"a number of images after @, as in {names}@16"
+        elif len(kinds) > 2:
+            expected = "one for both sides, or QUERIES/DATABASE"
+        elif at and {*kinds} == {"single"}:
+            expected = "single without a number of images"
+        require(expected is None, f"grouping: found {text!r}, expected {expected}")
         for kind in kinds:
             choose("grouping", kind, _WORDS)
-        if at and {*kinds} == {"single"}:
-            raise InputError(
-                f"grouping: found {text!r}, expected single without a number of images"
-            )
         return cls(kinds[0], kinds[-1], int(size) if at else None)
 
     def __str__(self) -> str:
@@ -160,7 +154,6 @@ def batches_of(count: int, grouping: str, batch_size: int, seed: int = 0) -> Bat
     places = starts[:, None] + np.arange(batch_size)
     filled = places < count
     # The last batch is padded with its own images, masked out, so that all have one shape.
-    wrapped = (
-        starts[:, None] + np.arange(batch_size) % np.minimum(count - starts, batch_size)[:, None]
-    )
+    sizes = np.minimum(count - starts, batch_size)[:, None]
+    wrapped = starts[:, None] + np.arange(batch_size) % sizes
     return Batches(order[wrapped], filled, filled, grouping)

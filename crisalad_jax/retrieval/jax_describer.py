@@ -1,6 +1,7 @@
 """Describe images with a model in JAX, over all devices that can share a batch."""
 
 import functools
+import itertools
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -37,6 +38,7 @@ class JaxDescriber:
         check_params(params, config)
         self.config = config
         self.preparation = Preparation.of(config)
+        self.row_length = config.unprojected_dim
         self.row_dtype = "float64" if config.compute_dtype == "float64" else "float32"
         self._given, self._params = params, cast_params(params, config)
         self._placed: tuple[int, Devices, Crisalad] | None = None
@@ -50,11 +52,6 @@ class JaxDescriber:
         devices = jax.local_device_count() if jax.default_backend() == "cpu" else None
         return _sent, (jax.tree.map(np.asarray, self._given), self.config, devices)
 
-    @property
-    def row_length(self) -> int:
-        """Number of values in the row of an image's tokens."""
-        return self.config.unprojected_dim
-
     @functools.cached_property
     def digest(self) -> str:
         """The `model_hash` of the model."""
@@ -62,15 +59,16 @@ class JaxDescriber:
 
     def tokens(self, batches: Iterable[ImageBatch]) -> Iterator[tuple[Rows, ImageBatch]]:
         """Yield each batch with its images' tokens; the devices compute one batch ahead."""
-        ahead: tuple[jax.Array, ImageBatch] | None = None
-        for batch in batches:
-            devices, params = self._on_devices(len(batch.images))
-            rows = _token_rows(params, devices.shard_batch(batch.images), self.config)
-            if ahead is not None:
-                yield np.asarray(ahead[0]), ahead[1]
-            ahead = rows, batch
-        if ahead is not None:
-            yield np.asarray(ahead[0]), ahead[1]
+
+        def dispatched() -> Iterator[tuple[jax.Array, ImageBatch] | None]:
+            for batch in batches:
+                devices, params = self._on_devices(len(batch.images))
+                yield _token_rows(params, devices.shard_batch(batch.images), self.config), batch
+            yield None
+
+        for ready, _ in itertools.pairwise(dispatched()):
+            if ready is not None:
+                yield np.asarray(ready[0]), ready[1]
 
     def _on_devices(self, batch_size: int) -> tuple[Devices, Crisalad]:
         if self._placed is None or self._placed[0] != batch_size:

@@ -35,6 +35,10 @@ class Neighbours(NamedTuple):
     indices: Int64[np.ndarray, "q k"]
     similarities: Float32[np.ndarray, "q k"]
 
+    def first(self, k: int) -> "Neighbours":
+        """Return the k best neighbours of each query."""
+        return Neighbours(*(part[:, :k] for part in self))
+
     def in_order(self) -> "Neighbours":
         """Sort each query's neighbours by falling similarity, and then by index."""
         order = np.lexsort((self.indices, -self.similarities))

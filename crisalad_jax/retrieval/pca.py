@@ -109,18 +109,6 @@ class Pca(NamedTuple):
         layer = Linear(jnp.asarray(weight, WIDE), jnp.asarray(-(self.mean @ weight), WIDE))
         return layer, ProjectionConfig(len(self.components), self.config.renormalise)
 
-    def check(self, length: int, name: str) -> None:
-        """Check that descriptors have the length of those that were fitted.
-
-        Raises:
-            InputError: they are not.
-        """
-        if length != len(self.mean):
-            raise InputError(
-                f"{name}: found descriptors of length {length}, expected {len(self.mean)} as the "
-                "components were fitted to"
-            )
-
 
 def shortened(
     pca: Pca | None, describer: "Describer", name: str, *, unit: bool = False
@@ -139,7 +127,11 @@ def shortened(
     config = describer.config
     length, is_unit = config.descriptor_dim, config.unit_length
     if pca is not None:
-        pca.check(length, name)
+        require(
+            length == len(pca.mean),
+            f"{name}: found descriptors of length {length}, expected {len(pca.mean)} as the "
+            "components were fitted to",
+        )
         require(
             not pca.model or pca.model == describer.digest,
             f"{name}: found components that were fitted to descriptors of model {pca.model[:12]}, "

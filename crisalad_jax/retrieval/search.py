@@ -24,7 +24,7 @@ from crisalad_jax.retrieval.chunks import (
     as_sides,
     as_unit_rows,
     blocks,
-    check_all_rows,
+    check_rows,
     gathered,
 )
 from crisalad_jax.retrieval.neighbours import QUERY_CHUNK, Neighbours, Products, multiply, nearest
@@ -136,7 +136,7 @@ def to_unit_vectors(
     """
     sides = as_sides(database, queries)
     for name, side in zip(("database", "queries"), sides, strict=True):
-        check_all_rows(side, name, unit=False)
+        check_rows(side, name, range(len(side)), unit=False)
     lengths = [np.linalg.norm(side.astype(np.float64), axis=1) for side in sides]
     largest = max(1e-30, *(found.max() for found in lengths))
     squares = [np.square(found / largest) for found in lengths]
@@ -162,9 +162,7 @@ def _by_devices(
     width = min(width, size // devices.mesh.size)
     together = min(QUERY_CHUNK, len(queries))
     firsts = range(0, len(queries), together)
-    parts = [
-        devices.replicate(_padded(queries[first : first + together], together)) for first in firsts
-    ]
+    parts = [devices.replicate(_padded(queries[i : i + together], together)) for i in firsts]
 
     def dispatched() -> Generator[tuple[int, int, tuple[Array, Array]], None, None]:
         for block in one_ahead(stream):

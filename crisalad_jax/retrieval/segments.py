@@ -129,8 +129,7 @@ class Segments:
     @property
     def has_more(self) -> bool:
         """Whether another process has added a segment or a change since these were read."""
-        paths = self.path(len(self)), self.change_path(self.changes)
-        return any(path.exists() for path in paths)
+        return self.path(len(self)).exists() or self.change_path(self.changes).exists()
 
     def _take(self, record: dict[str, Any], path: pathlib.Path) -> None:
         names, digest = record.get("names"), record.get("sha256")
@@ -184,7 +183,10 @@ class Segments:
             write_record(path, whole)
         except BaseException:
             if not path.exists():
-                self._drop(first)
+                self.remove_waiting()
+                self.store.drop(first)
+                kept = sum(span.first < first for span in self.spans)
+                del self.spans[kept:], self.paths[kept:]
             raise
         self.changes += 1
         for each in (*added, (whole, path)):
@@ -197,12 +199,6 @@ class Segments:
             record.unlink()
             self.store.drop(_first_of(record))
         return len(waiting)
-
-    def _drop(self, first: int) -> None:
-        self.remove_waiting()
-        self.store.drop(first)
-        kept = sum(span.first < first for span in self.spans)
-        del self.spans[kept:], self.paths[kept:]
 
     def blocks(self) -> Iterator[Descriptors]:
         """Yield the rows of each segment in order."""

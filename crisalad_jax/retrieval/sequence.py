@@ -13,7 +13,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.checks import check_types, require_field
+from crisalad_jax.config.checks import check_types, require, require_field
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.shapes import Float, Float64, Int64
@@ -110,13 +110,9 @@ class BayesFilter:
         """
         common = checked("common", common, (max(1, np.size(common)),))
         count = len(common)
-        along = (
-            np.arange(count, dtype=np.float64) if along is None else np.asarray(along, np.float64)
-        )
-        if along.shape != common.shape or not (np.diff(along) >= 0).all():
-            raise InputError(
-                f"along: found shape {along.shape}, expected {common.shape}, in ascending order"
-            )
+        along = np.asarray(np.arange(count) if along is None else along, np.float64)
+        rises = along.shape == common.shape and bool((np.diff(along) >= 0).all())
+        require(rises, f"along: found shape {along.shape}, expected {common.shape}, ascending")
         return SequenceState(np.full(count, 1 / count), common, np.zeros(count), 0, along)
 
     def predict(self, state: SequenceState, moved: float = 1.0) -> PerPlace:
@@ -156,8 +152,7 @@ class BayesFilter:
         Raises:
             InputError: `moved` below 0, or similarities that are not one finite number a place.
         """
-        if not moved >= 0:
-            raise InputError(f"moved: found {moved}, expected at least 0")
+        require(moved >= 0, f"moved: found {moved}, expected at least 0")
         row = checked("similarities", similarities, state.common.shape)
         seen, frames = state.seen + row, state.frames + 1
         if self.adapt:
@@ -191,11 +186,8 @@ class BayesFilter:
         """
         state, places, probabilities = self.start(common, along), [], []
         steps = np.ones(len(similarities)) if moved is None else np.asarray(moved)
-        if steps.shape != (len(similarities),):
-            raise InputError(
-                f"moved: found shape {steps.shape}, expected one of each of the "
-                f"{len(similarities)} frames"
-            )
+        frames = (len(similarities),)
+        require(steps.shape == frames, f"moved: found shape {steps.shape}, expected {frames}")
         for row, step in zip(similarities, steps, strict=True):
             state = self.step(state, row, float(step))
             places.append(int(state.belief.argmax()))

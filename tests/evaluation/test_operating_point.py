@@ -13,7 +13,6 @@ from crisalad_jax.evaluation.operating_point import (
     OperatingPoint,
     caveats,
     check_supported,
-    needed,
     operating_point,
 )
 from crisalad_jax.nn.model import Model
@@ -76,9 +75,10 @@ def test_the_bound_is_where_the_binomial_says(right, answered):
 
 
 def test_how_many_answers_a_precision_takes():
-    assert needed(0.99) == 299  # 0.99 ** 298 is 0.05003
-    assert needed(0.9) == 29
-    assert needed(1) is None
+    (rarer,) = caveats(OperatingPoint(0.99, 0.5, 29, 29, 40, 0, 0))
+    assert rarer.endswith("99 % takes 299 answers, all of them right")  # 0.99 ** 298 is 0.05003
+    (certain,) = caveats(OperatingPoint(1.0, 0.5, 29, 29, 40, 0, 0))
+    assert certain.endswith("(95 % confidence)")  # no number of answers shows that
     many = OperatingPoint(0.9, 0.5, 29, 29, 40, 0, 0)
     assert caveats(many) == []
     (words,) = caveats(many._replace(answered=28, right=28))

@@ -120,8 +120,9 @@ def test_what_is_refused(params, images, options, words, tmp_path, monkeypatch):
 )
 def test_what_is_known_before_there_is_a_model(options, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    usual = {"out": "d.npy", "grouping": "single", "seed": 0, "cluster": None}
     with pytest.raises(InputError, match=words):
-        check_extraction(**{"out": "d.npy"} | options)
+        check_extraction(**usual | options)
 
 
 def test_a_descriptor_that_is_not_finite_is_not_written(params, town, tmp_path):

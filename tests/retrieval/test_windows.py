@@ -12,7 +12,6 @@ from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.describe import (
     FrameDescriber,
     TokenSet,
-    check_window,
     described,
     group,
 )
@@ -72,13 +71,13 @@ def test_one_by_one(town):
     np.testing.assert_allclose(describer(images[0]), town.expected[:1], atol=ROUNDING)
 
 
-def test_windows_that_mean_nothing_are_refused():
+def test_windows_that_mean_nothing_are_refused(town):
     with pytest.raises(InputError, match="window: found 0, expected at least 1"):
-        check_window(MODEL, 0)
-    alone = dataclasses.replace(MODEL, cross_image="none")
+        FrameDescriber(town.describer, 0)
+    alone = types.SimpleNamespace(config=dataclasses.replace(MODEL, cross_image="none"))
     with pytest.raises(InputError, match="window: found 2, expected 1 of a model without a cross"):
-        check_window(alone, 2)
-    check_window(alone, 1)
+        FrameDescriber(alone, 2)
+    FrameDescriber(alone, 1)
 
 
 def test_components_shorten_what_is_described(town, tmp_path):

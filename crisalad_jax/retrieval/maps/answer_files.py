@@ -18,9 +18,8 @@ from crisalad_jax.data.frames import moment_of
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import AXES, utm_degrees
 from crisalad_jax.retrieval.maps.map import Answer
-from crisalad_jax.retrieval.maps.query import Answers, json_lines, json_text
+from crisalad_jax.retrieval.maps.query import Answers, answer_fields, json_lines, json_text
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import atomic_path
 from crisalad_jax.utils.output import printable
 
 POSITION_SUFFIXES = (".csv", ".geojson", ".gpx", ".kml")
@@ -42,8 +41,8 @@ class _Place(NamedTuple):
     """The best answer's name, its similarity, and what else is known of it."""
 
 
-def write_answers(path: str | os.PathLike[str], answers: Answers) -> int:
-    """Write answers in the format that the file's name says.
+def format_answers(path: str | os.PathLike[str], answers: Answers) -> tuple[str, int]:
+    """Put answers into the format that the file's name says.
 
     JSON has all answers: a line for each query (.jsonl, or any other suffix) or a list of them
     (.json). The others have the best answer's position: .csv in the map's axes, for `--positions`;
@@ -56,20 +55,7 @@ def write_answers(path: str | os.PathLike[str], answers: Answers) -> int:
         answers: what `query` found.
 
     Returns:
-        The number of queries in the file.
-
-    Raises:
-        InputError: the map has no positions or, for degrees, metres without a known zone of UTM; or
-            the file cannot be made.
-    """
-    text, count = format_answers(path, answers)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="")
-    return count
-
-
-def format_answers(path: str | os.PathLike[str], answers: Answers) -> tuple[str, int]:
-    """Return what `write_answers` writes, and the number of queries in it.
+        The file's text, and the number of queries in it.
 
     Raises:
         InputError: as `check_positions`.
@@ -146,14 +132,12 @@ def _geojson(answers: Answers) -> tuple[str, int]:
 
 
 def _gpx(answers: Answers) -> tuple[str, int]:
-    places = [place for place in _places(answers) if place.position]
+    places = _in_degrees(answers)
     root = xml.Element("gpx", version="1.1", creator="crisalad-jax")
     root.set("xmlns", "http://www.topografix.com/GPX/1/1")
-    is_track = bool(places) and all(isinstance(place.time, str) for place in places)
+    is_track = bool(places) and all(isinstance(place.time, str) for place, *_ in places)
     parent = xml.SubElement(xml.SubElement(root, "trk"), "trkseg") if is_track else root
-    for place in places:
-        assert place.position is not None
-        latitude, longitude = map(_degrees, place.position)
+    for place, latitude, longitude in places:
         tag = "trkpt" if is_track else "wpt"
         point = xml.SubElement(parent, tag, lat=latitude, lon=longitude)
         if isinstance(place.time, str):
@@ -164,12 +148,10 @@ def _gpx(answers: Answers) -> tuple[str, int]:
 
 
 def _kml(answers: Answers) -> tuple[str, int]:
-    places = [place for place in _places(answers) if place.position]
+    places = _in_degrees(answers)
     root = xml.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
     document = xml.SubElement(root, "Document")
-    for place in places:
-        assert place.position is not None
-        latitude, longitude = map(_degrees, place.position)
+    for place, latitude, longitude in places:
         mark = xml.SubElement(document, "Placemark")
         xml.SubElement(mark, "name").text = place.query
         xml.SubElement(mark, "description").text = _words(place.answer)
@@ -205,10 +187,9 @@ def _places(answers: Answers, *, degrees: bool = True) -> list[_Place]:
 
 
 def _answer_fields(answer: Answer) -> dict[str, Any]:
-    fields = {"answer": printable(answer.image.name), "similarity": round(answer.similarity, 6)}
-    if answer.probability is not None:
-        fields["probability"] = round(answer.probability, 6)
-    return fields
+    fields = answer_fields(answer, None)
+    known = {name: fields[name] for name in ("similarity", "probability") if name in fields}
+    return {"answer": printable(answer.image.name), **known}
 
 
 def _to_degrees(
@@ -229,6 +210,12 @@ def _time(query: pathlib.Path) -> str | float | None:
         return None if moment is None else moment.seconds
     time = datetime.datetime.fromtimestamp(moment.seconds, datetime.UTC)
     return time.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _in_degrees(answers: Answers) -> list[tuple[_Place, *tuple[str, ...]]]:
+    """Return the queries with positions, and their latitude and longitude as XML has them."""
+    known = [place for place in _places(answers) if place.position]
+    return [(place, *map(_degrees, place.position or ())) for place in known]
 
 
 def _degrees(value: float) -> str:

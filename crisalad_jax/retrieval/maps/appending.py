@@ -100,8 +100,7 @@ class AppendableMap(Map):
             verb: why. "replace" also removes the images that have the names of those that are
                 added.
             removed: numbers of images.
-            moved: new positions, by the names of images; in other axes than the map's only where no
-                other image has one.
+            moved: new positions, by the names of images, as `fitted_anew` returns them.
             added: new images.
 
         Raises:
@@ -110,10 +109,7 @@ class AppendableMap(Map):
         """
         self._check_there()
         gone = set(removed)
-        axes, zone, new = self.axes, self.zone, {}
-        if moved is not None:
-            moved = self.fitted_anew(moved)
-            axes, zone, new = moved.axes, moved.zone, moved.of
+        axes, new, zone = moved or (self.axes, {}, self.zone)
         record = {
             "verb": verb,
             "changed": _now(),

@@ -82,13 +82,9 @@ class Approximate(NamedTuple):
             candidates = candidates * count // left
         numbers = self.ask(queries, min(left, candidates), count, removed).indices
         query, found = np.nonzero(numbers >= 0)
-        similarities = np.full(numbers.shape, -np.inf, np.float32)
-        similarities[query, found] = similarities_of(
-            queries, query, numbers[query, found], self.store.rows
-        )
-        numbers, similarities = (
-            part[:, :k] for part in Neighbours(numbers, similarities).in_order()
-        )
+        index, similarities = numbers[query, found], np.full(numbers.shape, -np.inf, np.float32)
+        similarities[query, found] = similarities_of(queries, query, index, self.store.rows)
+        numbers, similarities = Neighbours(numbers, similarities).in_order().first(k)
         few = np.flatnonzero(numbers[:, -1] < 0)
         if few.size:
             exact = self.store.search(queries[few], k, count, removed)
@@ -202,13 +198,8 @@ def build_approximate(
     built = built._replace(recall=_measuring(store, count)(built))
     with made_folder(path.parent):
         remove_temporaries(path.parent)
-        value = {
-            "kind": kind,
-            "images": count,
-            "recall": built.recall,
-            "queries": min(SAMPLE, count),
-        }
-        write_json(path.with_suffix(".json"), value)
+        value = {"kind": kind, "images": count, "recall": built.recall}
+        write_json(path.with_suffix(".json"), value | {"queries": min(SAMPLE, count)})
         save_index(path, index)
     for other in path.parent.iterdir():
         if other.stem != path.stem:

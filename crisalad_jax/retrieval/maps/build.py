@@ -1,10 +1,12 @@
 """Build maps from folders of images: each image is described independently, in bounded memory."""
 
-import dataclasses
+import itertools
 import os
 import pathlib
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
 
 from crisalad_jax.checkpoints.runtime import Runtime
 from crisalad_jax.config.short_repr import brief
@@ -14,8 +16,8 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.remote import for_each, size_of, whole_name
 from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.data.tracks import Track
-from crisalad_jax.retrieval.describe import check_readable, joined, shown
-from crisalad_jax.retrieval.describer import Describer, describer_of
+from crisalad_jax.retrieval.describe import check_readable, readable, shown
+from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.maps.appending import AppendableMap, open_for_appending
 from crisalad_jax.retrieval.maps.approximate import check_search
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
@@ -72,8 +74,8 @@ class Indexed(NamedTuple):
 
 def _new_images(
     target: Map, source: ImageSource, left_out: Mapping[str, int], *, again: bool
-) -> tuple[list[str], list[int], list[pathlib.Path]]:
-    """List names, sizes and paths of the images that the map lacks.
+) -> tuple[dict[str, int], list[pathlib.Path]]:
+    """List the images that the map lacks: their sizes by name, and their paths.
 
     Those that were removed from it are left out, unless their bytes changed or they come `again`.
 
@@ -86,7 +88,7 @@ def _new_images(
     Raises:
         InputError: a name in the map is of another image here.
     """
-    names, sizes, new = [], [], []
+    sizes, new = {}, []
     all_sizes = for_each(size_of, source.paths)
     # A size of None is of a missing file, which is skipped.
     for name, path, size in zip(source.names, source.paths, all_sizes, strict=True):
@@ -96,15 +98,14 @@ def _new_images(
                 continue
             if not again and target.was_removed(name, size):
                 continue
-            names.append(name)
-            sizes.append(size or 0)
+            sizes[name] = size or 0
             new.append(path)
         elif size not in (None, known.bytes):
             raise InputError(
                 f"{path}: found {size} bytes, but the map has {name!r} of {known.bytes} bytes from "
                 f"{known.root}, expected new names for new images"
             )
-    return names, sizes, new
+    return sizes, new
 
 
 def index(
@@ -218,121 +219,89 @@ def index(
         check_search(search, metadata.store, metadata.dtype)
     if table is None and not known.of:
         known = None
-    fitted = reading.fitted(len(source.paths))
-    how = {"cluster": cluster, "again": again, "novelty": novelty}
-    work = _Indexing(describer, source, known, metadata, components, search, fitted, **how)
+    describing = Describing(describer, reading.fitted(len(source.paths)), components)
     with open_for_appending(out, metadata, components) as target:
-        result = work.into(target)
+        before = len(target)
+        given = () if table is None or known is None else known.of.keys()
+        there = {name for name in (*source.names, *given) if target.images.find(name) is not None}
+        unreadable = _append(target, source, known, describing, cluster, novelty, again=again)
+        check_readable(source.root, len(source.paths), len(target))
+        recall = None if search is None else target.build_search(search, quiet=reading.quiet)
+        added, names = target.images[before:], set(source.names)
+        result = Indexed(
+            added=len(added),
+            there=len(there & names),
+            positions=sum(image.position is not None for image in added),
+            stay=len(there.intersection(given)),
+            unreadable=unreadable,
+            unmatched=[name for name in given if name not in names],
+            images=len(target),
+            metadata=metadata,
+            recall=recall,
+            removed=sum(map(target.was_removed, source.names)),
+            near=listed - len(source.names),
+        )
+    if novelty is not None:
+        rest = len(names) - result.there - result.added - len(unreadable) - result.removed
+        result = result._replace(similar=rest)
     if result.added == result.images and describer.config.cross_image.attends:
         warn(
             f"{out}: a map describes each image alone, and this model attends across images: "
             "recalls that are published for batches are not the map's (`crisalad evaluate "
             "--grouping single` measures those of single images)"
         )
-    result = result._replace(near=listed - len(source.names))
-    return result if table is not None else result._replace(stay=0)
+    return result
 
 
-@dataclasses.dataclass(frozen=True)
-class _Indexing:
-    """Images to be described, and the map that they are appended to."""
+def _append(
+    target: AppendableMap,
+    source: ImageSource,
+    positions: Positions | None,
+    describing: Describing,
+    cluster: str | None,
+    novelty: float | None,
+    *,
+    again: bool,
+) -> list[str]:
+    """Describe images as the map's are, and append them, `SEGMENT` at a time.
 
-    describer: Describer
-    source: ImageSource
-    positions: Positions | None
-    """Where they were taken; None is what the images' EXIF data says."""
-    metadata: MapMetadata
-    components: Pca | None
-    search: str | None
-    reading: Reading
-    cluster: str | None = None
-    again: bool = False
-    novelty: float | None = None
-    """Largest similarity to the last image that was taken; None is any."""
+    Images whose names the map has are left out, so that the same call resumes after a kill.
 
-    def into(self, target: AppendableMap) -> Indexed:
-        """Append all images to a map that is open for appending.
+    Args:
+        target: the map.
+        source: the images.
+        positions: where they were taken; None is what the images' EXIF data says.
+        describing: the model, and how images are read.
+        cluster: as of `index`, and so are the others.
+        novelty: largest similarity to the last image that was taken.
+        again: whether images that were removed are taken.
 
-        Raises:
-            InputError: what `_append` and `_finish` raise.
-        """
-        known = len(target)
-        unreadable = self._append(target)
-        result = self._counts(target, known, unreadable)
-        return result._replace(recall=self._finish(target))
+    Returns:
+        The names of the images that cannot be read.
 
-    def _append(self, target: AppendableMap) -> list[str]:
-        """Describe images as the map's are, and append them, `SEGMENT` at a time.
-
-        Images whose names the map has are left out, so that the same call resumes after a kill.
-
-        Returns:
-            The names of the images that cannot be read.
-
-        Raises:
-            InputError: an image cannot be read; a name in a map is of another image here; or what
-                `AppendableMap.append` raises.
-        """
-        root, total = whole_name(self.source.root), len(self.source.paths)
-        choice = None if self.novelty is None else Novelty(target, self.source, root, self.novelty)
-        left_out = {} if choice is None else choice.left_out
-        names, sizes, new = _new_images(target, self.source, left_out, again=self.again)
-        positions = self.positions
-        if positions is None:
-            positions = _by_exif(target, zip(names, new, strict=True))
-        target.fitted(names, positions)  # checks them before any work
-        unreadable: list[str] = []
-        how = Describing(self.describer, self.reading, target.components)
-        stream = how.stream(new, self.cluster)
-        done, quiet = total - len(new), self.reading.quiet
-        stream = shown(stream, "images", total, quiet=quiet, done=done)
-        for part in joined(stream, SEGMENT):
-            unreadable.extend(names[i] for i in part.unreadable)
-            if not len(part.indices):
-                continue
-            numbers, rows = part.indices, part.descriptors
-            alike = numbers[:0]
-            if choice is not None:
-                is_new = choice.choose([names[i] for i in numbers], rows)
-                numbers, alike, rows = numbers[is_new], numbers[~is_new], rows[is_new]
-            if len(numbers):
-                some, bytes_ = ([column[i] for i in numbers] for column in (names, sizes))
-                target.append(some, bytes_, rows, root=root, positions=positions)
-            if choice is not None and len(alike):
-                choice.leave_out([names[i] for i in alike], [sizes[i] for i in alike])
-        return unreadable
-
-    def _counts(self, target: Map, known: int, unreadable: list[str]) -> Indexed:
-        """Count what became of the images, of a map that had `known` ones before."""
-        added, listed = target.images[known:], set(self.source.names)
-        given = () if self.positions is None else self.positions.of.keys()
-
-        def there(names: Iterable[str]) -> int:
-            numbers = map(target.images.find, names)
-            return sum(number is not None and number < known for number in numbers)
-
-        there_now = there(listed)
-        removed = sum(map(target.was_removed, self.source.names))
-        rest = len(listed) - there_now - len(added) - len(unreadable) - removed
-        return Indexed(
-            added=len(added),
-            there=there_now,
-            positions=sum(image.position is not None for image in added),
-            stay=there(given),
-            unreadable=unreadable,
-            unmatched=[name for name in given if name not in listed],
-            images=len(target),
-            metadata=self.metadata,
-            removed=removed,
-            similar=0 if self.novelty is None else rest,
-        )
-
-    def _finish(self, target: Map) -> float | None:
-        """Build the search that was asked for, and return its recall."""
-        check_readable(self.source.root, len(self.source.paths), len(target))
-        if self.search is None:
-            return None
-        return target.build_search(self.search, quiet=self.reading.quiet)
+    Raises:
+        InputError: an image cannot be read; a name in a map is of another image here; or what
+            `AppendableMap.append` raises.
+    """
+    root, total = whole_name(source.root), len(source.paths)
+    choice = None if novelty is None else Novelty(target, source, root, novelty)
+    left_out = {} if choice is None else choice.left_out
+    sizes, new = _new_images(target, source, left_out, again=again)
+    if positions is None:
+        positions = _by_exif(target, zip(sizes, new, strict=True))
+    target.fitted(sizes, positions)  # checks them before any work
+    unreadable: list[str] = []
+    stream, quiet = describing.stream(new, cluster), describing.reading.quiet
+    stream = shown(stream, "images", total, quiet=quiet, done=total - len(new))
+    for names, rows in readable(stream, SEGMENT, list(sizes), unreadable):
+        is_new = np.ones(len(names), bool) if choice is None else choice.choose(names, rows)
+        new, alike = (list(itertools.compress(names, which)) for which in (is_new, ~is_new))
+        if new:
+            given = new, [sizes[name] for name in new], rows[is_new]
+            target.append(*given, root=root, positions=positions)
+        if choice is not None and alike:
+            choice.leave_out(alike, [sizes[name] for name in alike])
+    return unreadable
 
 
 def _by_exif(target: Map, images: Iterable[tuple[str, pathlib.Path]]) -> Positions:

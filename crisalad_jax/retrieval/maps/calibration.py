@@ -4,6 +4,7 @@ import dataclasses
 import pathlib
 from typing import Literal
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.io import from_plain, to_plain
 from crisalad_jax.retrieval.segments import write_record
 from crisalad_jax.utils.errors import InputError
@@ -97,5 +98,4 @@ def write_calibration(folder: pathlib.Path, calibration: Calibration) -> None:
 
 def check_min_similarity(value: float, name: str = "min_similarity") -> None:
     """Raise InputError unless a similarity is a cosine."""
-    if not -1 <= value <= 1:
-        raise InputError(f"{name}: found similarity {value}, expected one from -1 to 1")
+    require(-1 <= value <= 1, f"{name}: found similarity {value}, expected one from -1 to 1")

@@ -2,6 +2,7 @@
 
 import collections
 import datetime
+import functools
 import itertools
 import operator
 import pathlib
@@ -72,15 +73,10 @@ def _times(moments: Sequence[Moment | None]) -> dict[str, float | str]:
     if len(known) < len(moments) or len({moment.clock for moment in known}) > 1:
         return {}
     ends = {"first": min(known), "last": max(known)}
-    return {
-        name: moment.seconds if moment.clock else _day_and_time(moment.seconds)
-        for name, moment in ends.items()
-    }
-
-
-def _day_and_time(seconds: float) -> str:
-    when = datetime.datetime.fromtimestamp(seconds, datetime.UTC)
-    return when.strftime("%Y-%m-%dT%H:%M:%SZ")
+    if known[0].clock:
+        return {name: moment.seconds for name, moment in ends.items()}
+    utc = functools.partial(datetime.datetime.fromtimestamp, tz=datetime.UTC)
+    return {name: f"{utc(moment.seconds):%Y-%m-%dT%H:%M:%SZ}" for name, moment in ends.items()}
 
 
 def _extent(

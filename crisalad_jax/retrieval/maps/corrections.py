@@ -24,11 +24,11 @@ from crisalad_jax.data.positions import Positions, positions_of
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import open_sources
 from crisalad_jax.data.tracks import Track
-from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
+from crisalad_jax.retrieval.describe import check_readable, described, readable, shown
 from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.maps.appending import AppendableMap, open_for_appending
 from crisalad_jax.retrieval.maps.build import check_settings
-from crisalad_jax.retrieval.maps.images import NewImages
+from crisalad_jax.retrieval.maps.images import MapImage, NewImages
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.metadata import (
     MapMetadata,
@@ -69,12 +69,6 @@ class MapChange(NamedTuple):
     """Number of images that were removed from the map before, and are not merged into it."""
     stale_search: str | None = None
     """Kind of an approximate search that lacks images now, and is not used."""
-
-
-@contextlib.contextmanager
-def _open_existing(folder: str | os.PathLike[str]) -> Iterator[AppendableMap]:
-    with open_for_appending(folder, existing_metadata(folder)) as places:
-        yield places
 
 
 def find_images(
@@ -160,7 +154,7 @@ def remove_images(
     names = [names] if isinstance(names, str) else list(names)
     if not names and addition is None and day is None:
         raise InputError("names: found none, expected names or patterns, an addition or a day")
-    with _open_existing(folder) as places:
+    with open_for_appending(folder, existing_metadata(folder)) as places:
         numbers, there = find_images(places, names, addition, day)
         found = [places.images[number].name for number in numbers]
         if numbers:
@@ -217,43 +211,41 @@ def replace_images(
     check_settings(metadata, pathlib.Path(folder), describer.config)
     (source,) = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
     with open_for_appending(folder, metadata) as places:
-        pairs = list(zip(source.names, source.paths, strict=True))
-        known = [(name, path) for name, path in pairs if places.image(name) is not None]
+        files = dict(zip(source.names, source.paths, strict=True))
+        known = {name: image for name in files if (image := places.image(name))}
         if not known:
             raise InputError(
                 f"{images}: found none of the {len(places)} images of {folder}, expected names "
                 f"such as {places.images[0].name!r}"
             )
-        changed = [(name, path) for name, path in known if _has_changed(places, name, path)]
-        replaced, unreadable = list[str](), list[str]()
-        root, paths = real_path(source.root).as_posix(), [path for _, path in changed]
+        changed = [
+            name
+            for name, image in known.items()
+            if _has_changed(image, places.added(name), files[name])
+        ]
+        unreadable, root = list[str](), real_path(source.root).as_posix()
+        paths = [files[name] for name in changed]
         stream = described(
             describer, paths, reading.fitted(len(paths)), components=places.components
         )
         stream = shown(stream, "images", len(paths), quiet=reading.quiet)
 
         def parts() -> Iterator[NewImages]:
-            for part in joined(stream, SEGMENT):
-                unreadable.extend(changed[i][0] for i in part.unreadable)
-                some = [changed[i] for i in part.indices]
-                if some:
-                    sizes = [stored_bytes(path) or 0 for _, path in some]
-                    names = [name for name, _ in some]
-                    positions = places.positions_of(names)
-                    yield NewImages(names, sizes, part.descriptors, root, positions)
-                    replaced.extend(names)
-            check_readable(images, len(paths), len(replaced))
+            for names, descriptors in readable(stream, SEGMENT, changed, unreadable):
+                sizes = [stored_bytes(files[name]) or 0 for name in names]
+                yield NewImages(names, sizes, descriptors, root, places.positions_of(names))
+            check_readable(images, len(paths), len(paths) - len(unreadable))
 
         if changed:
             places.change("replace", added=parts())
-        unmatched = [name for name in source.names if places.image(name) is None]
+        lost = set(unreadable)
+        replaced = [name for name in changed if name not in lost]
+        unmatched = [name for name in files if places.image(name) is None]
         counts = len(known) - len(changed), len(places)
         return MapChange(replaced, *counts, unmatched, unreadable, 0, places.stale_search)
 
 
-def _has_changed(places: Map, name: str, path: pathlib.Path) -> bool:
-    image, added = places.image(name), places.added(name)
-    assert image is not None
+def _has_changed(image: MapImage, added: str | None, path: pathlib.Path) -> bool:
     if added is None or stored_bytes(path) != image.bytes:  # a missing file is skipped, or refused
         return True
     written = int(file_of(path).stat().st_mtime)
@@ -290,7 +282,7 @@ def move_images(
         >>> move_images(folder / "map", folder / "poses.csv").names
         ['1.png']
     """
-    with _open_existing(folder) as places:
+    with open_for_appending(folder, existing_metadata(folder)) as places:
         names = [image.name for image in places.images]
         paths = [pathlib.Path(image.root, image.name) for image in places.images]
         given = positions_of(positions, names, paths, folder)
@@ -349,9 +341,8 @@ def merge_maps(
     require(bool(others), "others: found none, expected at least one map")
     folder = pathlib.Path(folder)
     with contextlib.ExitStack() as stack:
-        for other in others:
-            if real_path(other) == real_path(folder):
-                raise InputError(f"{other}: found the map itself, expected others")
+        is_other = real_path(folder) not in map(real_path, others)
+        require(is_other, f"{folder}: found the map itself, expected others")
         opened = [stack.enter_context(Map.open(each, calibrated=False)) for each in others]
         metadata = read_metadata(folder)
         exists = metadata is not None
@@ -378,20 +369,17 @@ def merge_maps(
 
 
 def _check_alike(other: Map, metadata: MapMetadata, folder: pathlib.Path) -> None:
-    for name in ("model", "config", "dtype", "pca"):
-        found, expected = (getattr(each, name) for each in (other.metadata, metadata))
+    theirs, ours = (
+        {"model": each.model, **each.config, "dtype": each.dtype, "pca": each.pca}
+        for each in (other.metadata, metadata)
+    )
+    for name, expected in ours.items():
+        found = theirs.get(name)
         if found != expected and not (metadata.store != "files" and found == "float16"):
-            words = name
-            if name == "config":
-                words = next(key for key in expected if found.get(key) != expected[key])
-                found, expected = found.get(words), expected[words]
-            elif name in ("model", "pca"):  # digests, as `query` writes them
-                found, expected = found[:12], expected[:12]
-            found, expected = (str(each)[:60] or "none" for each in (found, expected))
-            raise InputError(
-                f"{other.folder}: found a map of {words} {found}, expected {expected} as in "
-                f"{folder}"
-            )
+            most = 12 if name in ("model", "pca") else 60  # of digests as `query` writes them
+            found, expected = (str(each)[:most] or "none" for each in (found, expected))
+            words = f"found a map of {name} {found}, expected {expected} as in {folder}"
+            raise InputError(f"{other.folder}: {words}")
 
 
 def _merge(target: AppendableMap, others: Sequence[Map], *, quiet: bool) -> MapChange:
@@ -405,9 +393,7 @@ def _merge(target: AppendableMap, others: Sequence[Map], *, quiet: bool) -> MapC
             nonlocal there, stay_out
             for other in others:
                 for part in other.parts():
-                    known = [
-                        name in sources or target.image(name) is not None for name in part.names
-                    ]
+                    known = [bool(name in sources or target.image(name)) for name in part.names]
                     gone = list(map(target.was_removed, part.names, part.sizes))
                     _check_same(part.only(known), other, sources, target)
                     new = part.only([not any(pair) for pair in zip(known, gone, strict=True)])

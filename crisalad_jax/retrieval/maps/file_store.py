@@ -52,7 +52,13 @@ class FileStore:
         return self._folder / f"{first:010d}.npy"
 
     def add(self, first: int, descriptors: Descriptors, record: Mapping[str, Any]) -> None:
-        """Write descriptors to a file; see `Store.add`."""
+        """Write descriptors as numbers `first` and on; they are durable once this returns.
+
+        Args:
+            first: number of the first.
+            descriptors: in order.
+            record: of their images, which conditions of a search are about.
+        """
         del record  # the map's own has it
         path = self._path(first)
         with atomic_path(path, durable=True) as temporary:
@@ -60,13 +66,13 @@ class FileStore:
         self._counts[first], self._held = len(descriptors), None
 
     def check(self, segments: Sequence[tuple[int, int]]) -> None:
-        """Open the file of each addition; see `Store.check`."""
+        """Check, without reading them, that all additions, as (first, count), are there."""
         for first, count in segments:
             self._counts[first] = count
             self._open(first)
 
     def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
-        """Read the file of one addition; see `Store.read`."""
+        """Read the descriptors that were added together as numbers `first` and on."""
         return np.array(self._open(first))
 
     def _open(self, first: int) -> Descriptors:
@@ -86,7 +92,7 @@ class FileStore:
         return np.memmap(path, self._dtype, "r", len(header), shape).view(np.ndarray)
 
     def drop(self, first: int) -> None:
-        """Remove files; see `Store.drop`."""
+        """Forget what was added from number `first` on, which did not count."""
         for path in self._folder.glob("[0-9]*.npy"):
             if int(path.stem) >= first:
                 path.unlink()
@@ -96,7 +102,17 @@ class FileStore:
     def search(
         self, queries: Queries | Bits, k: int, count: int, removed: Removed = NONE
     ) -> Neighbours:
-        """Find the k most similar descriptors of each query; see `Store.search`."""
+        """Find the k nearest of numbers below `count`, exactly.
+
+        They are compared by inner product, packed bits by those that are equal. Of equal
+        similarities the lower number stands first, also at the k-th place.
+
+        Args:
+            queries: as they are compared.
+            k: neighbours of each, from 1 to as many as are left.
+            count: number of descriptors, those that were removed included.
+            removed: which are left out. The others are numbered in its way in the result.
+        """
         if self._dtype == BITS:
             parts = (
                 self._open(first) if places is None else self._open(first)[places]
@@ -117,9 +133,7 @@ class FileStore:
                 (block,) = joined(files(), left)
                 self._held = count, removed, block
             block = self._held[2]
-            return nearest(
-                lambda: (each for each in [block]), queries, k, block.rows.__getitem__, size
-            )
+            return nearest(lambda: joined([block], left), queries, k, block.rows.__getitem__, size)
 
         def read_rows(numbers: Int64[np.ndarray, " n"]) -> Descriptors:
             return self.rows(removed.rows_of(numbers), release=True)

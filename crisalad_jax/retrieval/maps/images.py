@@ -52,12 +52,9 @@ class NewImages(NamedTuple):
 
     def only(self, chosen: Sequence[bool]) -> "NewImages":
         """Return those of the images that are chosen."""
-        names, sizes = (
-            list(itertools.compress(column, chosen)) for column in (self.names, self.sizes)
-        )
-        return self._replace(
-            names=names, sizes=sizes, descriptors=self.descriptors[np.array(chosen)]
-        )
+        names, sizes = (list(itertools.compress(x, chosen)) for x in (self.names, self.sizes))
+        rows = self.descriptors[np.array(chosen)]
+        return self._replace(names=names, sizes=sizes, descriptors=rows)
 
 
 class Part(NamedTuple):
@@ -106,12 +103,8 @@ class Images(Sequence[MapImage]):
         """What was removed, by the row of each in the store, which no change alters."""
         self.parts: list[Part] = []
         """In order."""
-        self._firsts, self._names, self._ends = (
-            _Column(kind) for kind in (np.int64, np.uint8, np.int64)
-        )
-        self._hashes, self._sizes, self._taken = (
-            _Column(kind) for kind in (np.int64, np.int64, np.float64)
-        )
+        self._firsts, self._ends, self._hashes, self._sizes = (_Column(np.int64) for _ in range(4))
+        self._names, self._taken = _Column(np.uint8), _Column(np.float64)
         self._positions = _Column(np.float64, 2)
         self.has_moved = False
         """Whether an image has another position than its record of images says."""
@@ -233,12 +226,9 @@ class Images(Sequence[MapImage]):
         ends = np.cumsum(np.fromiter(lengths, np.int64)) + self._ends.values[-1]
         seconds = np.nan if added is None else time_of(added)
         self.parts.append(Part(added and sys.intern(added), sys.intern(root), first, seconds))
-        columns = (
-            (self._firsts, [first]),
-            (self._names, np.frombuffer(data, np.uint8)),
-            (self._ends, ends),
-            *columns,
-        )
+        self._firsts.extend([first])
+        self._names.extend(np.frombuffer(data, np.uint8))
+        self._ends.extend(ends)
         for column, new in columns:
             column.extend(new)
         self._recent.update(zip(names, range(first, self.rows), strict=True))

@@ -18,7 +18,6 @@ from crisalad_jax.retrieval.maps.query import (
     answers_of,
     asked_thresholds,
     asking,
-    found_at_least,
     json_rows,
     json_text,
     verified,
@@ -57,11 +56,8 @@ class LiveAnswer(NamedTuple):
     def json_line(self) -> str:
         """Return the answer as one line of JSON."""
         (row,) = json_rows(self.answers)
-        more = {
-            "time": round(self.frame.time, 3),
-            "latency_ms": round(self.latency_ms, 1),
-            "dropped": self.frame.dropped,
-        }
+        time, latency = round(self.frame.time, 3), round(self.latency_ms, 1)
+        more = {"time": time, "latency_ms": latency, "dropped": self.frame.dropped}
         return json_text({"query": row.pop("query")} | more | row)
 
 
@@ -132,7 +128,7 @@ def query_live(
     describer = FrameDescriber(model_describer, window)
 
     def answers() -> Iterator[LiveAnswer]:
-        now, ask = places, asking(places, found_at_least(k, verifier), sequence, where)
+        now, ask = places, asking(places, k, verifier, sequence, where)
         blank = np.zeros((*(source.size or places.config.image_size), 3), np.uint8)
         places.search(places.shorten(describer(blank)), k)
         describer.forget()
@@ -140,7 +136,7 @@ def query_live(
         for frame in source.frames(check):
             asked = [pathlib.Path(frame.name)]
             if sequence is None and (then := now) is not (now := then.refreshed()):
-                ask = asking(now, found_at_least(k, verifier), None, where)
+                ask = asking(now, k, verifier, None, where)
             found = ask(now.shorten(describer(frame.image)), asked)
             answer = answers_of(now, asked, [found], thresholds)
             if verifier is not None:

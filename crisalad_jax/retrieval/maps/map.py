@@ -54,7 +54,7 @@ from crisalad_jax.retrieval.segments import Segments, Take
 from crisalad_jax.retrieval.verification.results import Verification
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
-from crisalad_jax.utils.shapes import Float32, Int64
+from crisalad_jax.utils.shapes import Float32
 
 if TYPE_CHECKING:  # a map is searched without JAX
     from crisalad_jax.nn.config import ModelConfig
@@ -75,16 +75,6 @@ class Answer(NamedTuple):
     """Probability that the camera is there; None without a filter."""
     verification: Verification | None = None
     """What local features show; None where the answer was not verified."""
-
-
-def ranked(
-    images: Sequence[MapImage],
-    numbers: Int64[np.ndarray, " k"],
-    similarities: Float32[np.ndarray, " k"],
-) -> list[Answer]:
-    """Return the answers to one query, of images by number."""
-    pairs = zip(numbers, similarities, strict=True)
-    return [Answer(rank, float(value), images[i]) for rank, (i, value) in enumerate(pairs, 1)]
 
 
 class Map:
@@ -191,15 +181,7 @@ class Map:
 
     @classmethod
     def _opened(cls, folder: pathlib.Path, metadata: MapMetadata) -> Self:
-        length, dtype = metadata.row
-        store = open_store(
-            metadata.store,
-            folder,
-            collection=metadata.collection,
-            length=length,
-            dtype=dtype,
-            new=not has_images(folder),
-        )
+        store = open_store(metadata, folder, new=not has_images(folder))
         try:
             return cls(folder, metadata, store)
         except BaseException:
@@ -334,10 +316,8 @@ class Map:
         queries = self._rows("queries", queries)
         out, count = self.removed if where is None else self.left_out(where), self.images.rows
         k = min(k, count - len(out.rows))
-        if self._approximate is not None and not exact:
-            found = self._approximate.search(queries, k, count, out)
-        else:
-            found = self._segments.store.search(queries, k, count, out)
+        store = self._segments.store
+        found = (store if exact else self._approximate or store).search(queries, k, count, out)
         if where is None:
             return found
         return found._replace(indices=self.removed.numbers_of(out.rows_of(found.indices)))
@@ -440,7 +420,8 @@ class Map:
         pixels = read_pixels(image) if isinstance(image, str | os.PathLike) else image
         descriptor = describe_images(self.describer(model), [pixels])
         found = self.search(self.shorten(descriptor), k, where=where)
-        return ranked(self.images, found.indices[0], found.similarities[0])
+        ranked = enumerate(zip(*(part[0].tolist() for part in found), strict=True), 1)
+        return [Answer(rank, similarity, self.images[i]) for rank, (i, similarity) in ranked]
 
     def similarities(self, queries: Queries) -> Float32[np.ndarray, "q n"]:
         """Compute the similarities of queries to all images, in the order of the images.
@@ -531,14 +512,11 @@ class Map:
             + ("" if metadata.is_bits else f", {metadata.dtype}"),
             "image_size": list(self.config.image_size),
             "resize": self.config.images_in_words,
-            "grouping": metadata.grouping,
-            "store": metadata.store,
+            **{name: getattr(metadata, name) for name in ("grouping", "store")},
             "search": self.search_kind,
             "stale_search": self.stale_search or "none",
             "components": metadata.pca or "none",
-            "model": metadata.model,
-            "weights": metadata.weights,
-            "created": metadata.created,
+            **{name: getattr(metadata, name) for name in ("model", "weights", "created")},
             "calibration": None if self.calibration is None else to_plain(self.calibration),
             **({"verified": True} if verify else {}),
         }
@@ -576,13 +554,8 @@ class Map:
             config = with_non_semantic_fields_of(self.config, found.config)
             model = Model(found.params, config)
         else:
-            model = open_runtime(
-                file,
-                engine,
-                self.metadata.config,
-                any_grouping=set(groupings) != {"single"},
-                verify=verify,
-            )
+            how = {"any_grouping": set(groupings) != {"single"}, "verify": verify}
+            model = open_runtime(file, engine, self.metadata.config, **how)
             self._check_describer(cast(Describer, model), file)
         self._describer = model, describer_of(model, groupings)
         return model
@@ -615,9 +588,7 @@ class Map:
 
     def _check_describer(self, describer: Describer, given: object) -> None:
         quantised_from = getattr(describer, "quantised_from", None)
-        check_model(
-            self.metadata, self.folder, describer.digest, given, quantised_from=quantised_from
-        )
+        check_model(self.metadata, self.folder, describer.digest, given, quantised_from)
 
     def close(self) -> None:
         """Close the store; a map that nothing refers to any more closes itself."""

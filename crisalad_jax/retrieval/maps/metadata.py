@@ -29,10 +29,7 @@ METADATA, SEGMENTS = "map.json", "segments"
 """Names of the metadata's file, and of the folder of additions."""
 COMPONENTS = "pca.safetensors"
 """Name of the components that shorten descriptors."""
-_PARTS = (
-    *(METADATA, SEGMENTS, COMPONENTS, LOCK),
-    *("calibration.json", "approximate", "added"),
-)
+_PARTS = (METADATA, SEGMENTS, COMPONENTS, LOCK, "calibration.json", "approximate", "added")
 """All names that a map may have in its folder."""
 
 
@@ -197,7 +194,6 @@ def check_model(
     folder: str | os.PathLike[str],
     digest: str,
     weights: object,
-    *,
     quantised_from: str | None = None,
 ) -> None:
     """Check that a map was made by the model with the hash `digest`.

@@ -50,9 +50,8 @@ def condition_of(where: Where) -> list[str]:
     """Return the parts of Milvus' filter for conditions on images as they were added."""
     parts = []
     if where.folder.rstrip("*"):
-        ends = [
-            (begin, begin[:-1] + chr(ord(begin[-1]) + 1)) for begin in map(_encoded, where.prefixes)
-        ]
+        begins = map(_encoded, where.prefixes)
+        ends = [(begin, begin[:-1] + chr(ord(begin[-1]) + 1)) for begin in begins]
         parts.append(_any([f'(name >= "{begin}" and name < "{end}")' for begin, end in ends]))
     for name, (first, end) in (("added", where.added), ("taken", where.time)):
         if (first, end) != ALWAYS:

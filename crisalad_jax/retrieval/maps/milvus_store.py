@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.checks import choose
+from crisalad_jax.config.checks import choose, require
 from crisalad_jax.retrieval.bits import Bits
 from crisalad_jax.retrieval.chunks import Block, Descriptors, Queries
 from crisalad_jax.retrieval.maps.milvus_filter import among, columns_of, left_in
@@ -24,7 +24,7 @@ from crisalad_jax.retrieval.maps.removed import NONE, Removed
 from crisalad_jax.retrieval.neighbours import Neighbours, nearest
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
-from crisalad_jax.utils.output import warn, warn_once
+from crisalad_jax.utils.output import one_line, warn, warn_once
 from crisalad_jax.utils.progress import progress_bar
 from crisalad_jax.utils.shapes import Float, Int64
 
@@ -147,8 +147,7 @@ class MilvusStore:
             self._create()
         elif not self._ask("looking for the map", "has_collection"):
             raise InputError(
-                f"{address}: found no collection {collection}, expected it with the "
-                "descriptors of this map"
+                f"{address}: found no collection {collection}, expected it with this map's rows"
             )
         elif found := self._index():
             names = {each.name: kind for kind, each in KINDS.items()}
@@ -170,8 +169,8 @@ class MilvusStore:
                 words = f"no answer in time, {error.code().name}"  # pyright: ignore
             if "Open local milvus failed" in words:
                 words += " (damaged, or another process has it open)"
-            words = " ".join(words.split())
-            raise InputError(f"{self._address}: Milvus says: {words} (while {doing})") from error
+            words = f"{one_line(words)} (while {doing})"
+            raise InputError(f"{self._address}: Milvus says: {words}") from error
 
     def _ask(self, doing: str, method: str, *, wait: float = 0, **options: Any) -> Any:
         """Call a method of the client; again where a server is coming back.
@@ -196,7 +195,7 @@ class MilvusStore:
                     if not passes or self._is_file or time.monotonic() > end:
                         raise
                     words = f"Milvus says {error.message}; waiting for up to {_ANSWER:g} s"
-                    warn_once(self._address, " ".join(words.split()))
+                    warn_once(self._address, one_line(words))
             time.sleep(0.5)
             wait = max(1.0, end - time.monotonic())
             if self._loaded:
@@ -283,7 +282,7 @@ class MilvusStore:
         self._load()
 
     def add(self, first: int, descriptors: Descriptors, record: Mapping[str, Any]) -> None:
-        """Upsert descriptors by number; see `Store.add`."""
+        """Upsert descriptors by number; see `FileStore.add`."""
         numbers = range(first, first + len(descriptors))
         columns = {"id": numbers, "descriptor": np.asarray(descriptors, np.float32)}
         columns |= columns_of(record)
@@ -296,7 +295,7 @@ class MilvusStore:
         self._since = None
 
     def check(self, segments: Sequence[tuple[int, int]]) -> None:
-        """Count the stored descriptors; see `Store.check`."""
+        """Count the stored descriptors; see `FileStore.check`."""
         if not segments:  # a new map is loaded once it is searched
             return
         expected = sum(count for _, count in segments)
@@ -319,11 +318,11 @@ class MilvusStore:
         return self._ask(doing, method, filter=condition, **options)
 
     def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
-        """Fetch the descriptors of one addition; see `Store.read`."""
+        """Fetch the descriptors of one addition; see `FileStore.read`."""
         return self.rows(np.arange(first, first + count))
 
     def rows(self, numbers: Int64[np.ndarray, " n"]) -> Descriptors:
-        """Fetch the descriptors of these numbers; see `Store.rows`."""
+        """Fetch the descriptors of these numbers; see `FileStore.rows`."""
         found, ordered = dict[int, Any](), np.sort(numbers)
         for start in range(0, len(ordered), self._rows):
             condition = among(ordered[start : start + self._rows])
@@ -338,17 +337,16 @@ class MilvusStore:
         return np.array([found[number] for number in numbers.tolist()])
 
     def drop(self, first: int) -> None:
-        """Do nothing, as the next addition overwrites them; see `Store.drop`."""
+        """Do nothing, as the next addition overwrites them; see `FileStore.drop`."""
 
     def search(
         self, queries: Queries | Bits, k: int, count: int, removed: Removed = NONE
     ) -> Neighbours:
-        """Find the k most similar descriptors of each query; see `Store.search`.
+        """Find the k most similar descriptors of each query; see `FileStore.search`.
 
         Milvus does it with its index FLAT; with others all descriptors are read.
         """
-        if k > _MOST:
-            raise InputError(f"k: found {k}, expected at most {_MOST}, of which Milvus gives")
+        require(k <= _MOST, f"k: found {k}, expected at most {_MOST}, of which Milvus gives")
         if self.kind != "exact":
             return self._search_here(queries, k, count, removed)
         left = min(count - len(removed.rows), _MOST)

@@ -17,9 +17,8 @@ from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.positions import AXES
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import ImageSource, open_sources
-from crisalad_jax.retrieval.chunks import Block, Descriptors
-from crisalad_jax.retrieval.chunks import joined as joined_blocks
-from crisalad_jax.retrieval.describe import check_readable, described, joined, shown
+from crisalad_jax.retrieval.chunks import Descriptors, regrouped
+from crisalad_jax.retrieval.describe import check_readable, described, readable, shown
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import AT_ONCE
@@ -126,9 +125,8 @@ def image_pairs(
     check_rules(among=images is None, k=k, overlap=overlap, within=within, min_gap=min_gap)
     check_min_similarity(min_similarity)
     roots = {image.root for image in places.images}
-    if images is None:
-        source = None
-    else:
+    source = None
+    if images is not None:
         (source,) = open_sources(images, fps=fps, on_bad_image=reading.on_bad_image)
         roots.add(real_path(source.root).as_posix())
     holder = real_path(root or os.path.commonpath(roots))
@@ -196,8 +194,7 @@ def _check_names(names: list[str]) -> None:
     if wrong:
         raise InputError(
             f"pairs: found the image name {wrong[0]!r} ({len(wrong)} such of {len(names)}), "
-            "expected names without spaces, and no # at the beginning, which COLMAP's and hloc's "
-            "pairs cannot have"
+            "expected names without spaces or # at the beginning, as COLMAP and hloc read pairs"
         )
 
 
@@ -207,13 +204,7 @@ _Queries = Iterator[tuple[list[str], Descriptors]]
 
 def _stored(places: Map, names: list[str]) -> _Queries:
     """Yield the images of a map."""
-    size = _at_once(places)
-    parts = (
-        Block(0, part[start : start + size])
-        for part in places.descriptors
-        for start in range(0, len(part), size)
-    )
-    for start, rows in joined_blocks(parts, size):
+    for start, rows in regrouped(places.descriptors, _at_once(places)):
         yield names[start : start + len(rows)], rows
 
 
@@ -230,10 +221,7 @@ def _described(
     reading = reading.fitted(count)
     stream = described(describer, source.paths, reading, components=places.components)
     stream = shown(stream, "images", count, quiet=reading.quiet)
-    for part in joined(stream, _at_once(places)):
-        unreadable += (names[index] for index in part.unreadable)
-        if len(part.indices):
-            yield [names[index] for index in part.indices], part.descriptors
+    yield from readable(stream, _at_once(places), names, unreadable)
     check_readable("images", count, count - len(unreadable))
 
 

@@ -19,14 +19,15 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.remote import is_remote
 from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.retrieval.describe import (
+    Described,
     check_readable,
-    described_sources,
-    joined,
+    described,
+    readable,
     shown,
 )
 from crisalad_jax.retrieval.maps.calibration import check_min_similarity
 from crisalad_jax.retrieval.maps.images import MapImage
-from crisalad_jax.retrieval.maps.map import Answer, Map, ranked
+from crisalad_jax.retrieval.maps.map import Answer, Map
 from crisalad_jax.retrieval.maps.tracking import SequenceSearch, SequenceTracker, TrackResult
 from crisalad_jax.retrieval.maps.verified import calibration_of, verify_answers
 from crisalad_jax.retrieval.maps.where import Where
@@ -107,16 +108,12 @@ class Answers(NamedTuple):
 
     def rows(self) -> Iterator[tuple[pathlib.Path, list[Answer]]]:
         """Yield each query with its answers, best first."""
-        chances = self.probabilities
         for number, query in enumerate(self.queries):
-            answers = ranked(self.images, *(part[number] for part in self.neighbours))
-            if chances is not None:
-                pairs = zip(answers, chances[number], strict=True)
-                answers = [answer._replace(probability=float(chance)) for answer, chance in pairs]
-            if self.checks is not None:
-                pairs = itertools.zip_longest(answers, self.checks[number])
-                answers = [answer._replace(verification=check) for answer, check in pairs]
-            yield query, answers
+            found = [part[number].tolist() for part in self.neighbours]
+            found.append([] if self.probabilities is None else self.probabilities[number].tolist())
+            found.append([] if self.checks is None else self.checks[number])
+            ranked = enumerate(itertools.zip_longest(*found), 1)
+            yield query, [Answer(rank, s, self.images[i], *more) for rank, (i, s, *more) in ranked]
 
     def position(self, image: MapImage) -> dict[str, float] | None:
         """Return where an image was taken, by the names of the axes; None where unknown."""
@@ -192,18 +189,23 @@ def query(
     root, sources = _below_one_root(open_sources(images, **how, position_topic="none"))
     paths = list(itertools.chain(*sources))
     describer = places.describer(model, groupings=["single" if window == 1 else "window"])
-    ask = asking(places, found_at_least(k, verifier), sequence, where, exact=exact)
-    reading, components = reading.fitted(len(paths)), places.components
-    stream = described_sources(describer, sources, reading, window=window, components=components)
+    ask = asking(places, k, verifier, sequence, where, exact=exact)
+    reading, how = reading.fitted(len(paths)), {"window": window, "components": places.components}
+
+    def stream() -> Iterator[Described]:
+        first = 0
+        for some in [paths] if window == 1 else sources:  # a window is of one source
+            for part in described(describer, some, reading, **how):
+                yield Described(part.indices + first, part.descriptors, part.unreadable + first)
+            first += len(some)
+
     found: list[Sequence[np.ndarray]] = []
     asked: list[pathlib.Path] = []
     unreadable: list[pathlib.Path] = []
-    for part in joined(shown(stream, "queries", len(paths), quiet=reading.quiet), AT_ONCE):
-        unreadable += (paths[index] for index in part.unreadable)
-        if len(part.indices):
-            frames = [paths[index] for index in part.indices]
-            found.append(ask(part.descriptors, frames))
-            asked += frames
+    parts = shown(stream(), "queries", len(paths), quiet=reading.quiet)
+    for frames, descriptors in readable(parts, AT_ONCE, paths, unreadable):
+        found.append(ask(descriptors, frames))
+        asked += frames
     check_readable("images", len(paths), len(asked))
     answers = answers_of(places, asked, found, thresholds, unreadable=unreadable, root=root)
     if verifier is None:
@@ -225,6 +227,7 @@ Ask = Callable[[Float32[np.ndarray, "query d"], Sequence[pathlib.Path]], Neighbo
 def asking(
     places: Map,
     k: int,
+    verifier: Verifier | None,
     sequence: SequenceSearch | None,
     where: Where | str | None,
     *,
@@ -232,13 +235,15 @@ def asking(
 ) -> Ask:
     """Return what asks a map for k answers: its search, or a filter over consecutive frames.
 
+    More are asked for where more are verified, of which `verified` leaves k.
+
     Raises:
         InputError: conditions that no image meets, or for such a filter, which is of all images.
     """
+    if verifier is not None:
+        k = max(k, verifier.verify.answers)
     if where is not None:
-        require(
-            sequence is None, f"where: found {where} with a sequence, expected only one of both"
-        )
+        require(sequence is None, f"where: found {where} with a sequence, expected one of both")
         places.left_out(where)
     if sequence is None:
         return lambda descriptors, _: places.search(descriptors, k, exact=exact, where=where)
@@ -251,29 +256,21 @@ def answers_of(
     asked: list[pathlib.Path],
     found: Sequence[Sequence[np.ndarray]],
     thresholds: Thresholds,
-    *,
-    unreadable: Sequence[pathlib.Path] = (),
-    root: pathlib.Path | None = None,
+    **more: Any,
 ) -> Answers:
-    """Join what `asking` found, part by part."""
+    """Join what `asking` found, part by part; `more` are other fields of `Answers`."""
     indices, similarities, *filtered = map(np.concatenate, zip(*found, strict=True))
     neighbours = Neighbours(indices, similarities)
-    least, inliers = thresholds
-    given = (places.images, places.axes, unreadable, least)
-    answers = Answers(asked, neighbours, *given, *filtered, zone=places.zone, root=root)
-    return answers._replace(min_inliers=inliers)
-
-
-def found_at_least(k: int, verifier: Verifier | None) -> int:
-    """Return how many answers are searched for, of which k are left."""
-    return k if verifier is None else max(k, verifier.verify.answers)
+    more |= dict(zip(("probabilities", "best"), filtered, strict=False))  # of a filter
+    more |= dict(zip(("min_similarity", "min_inliers"), thresholds, strict=True))
+    return Answers(asked, neighbours, places.images, places.axes, zone=places.zone, **more)
 
 
 def verified(answers: Answers, verifier: Verifier, images: Iterable[np.ndarray], k: int) -> Answers:
     """Verify answers, put the verified ones in order by their inliers, and leave k of each query.
 
     Args:
-        answers: as many as `found_at_least` says.
+        answers: what `asking` finds.
         verifier: what verifies.
         images: the queries.
         k: answers to each query that are left.
@@ -320,12 +317,10 @@ def asked_thresholds(
         InputError: the similarity is no cosine; what `calibration_of` raises.
     """
     inliers = None if verifier is None else verifier.verify.min_inliers
-    if min_similarity is None or (verifier is not None and inliers is None):
-        measured = calibration_of(places, verifier)
-        if measured is not None and inliers is None and verifier is not None:
-            inliers = measured.min_inliers
-        if measured is not None and min_similarity is None:
-            min_similarity = measured.min_similarity
+    measured = calibration_of(places, verifier) if None in (min_similarity, inliers) else None
+    if measured is not None:  # without verified answers, of no inliers
+        min_similarity = measured.min_similarity if min_similarity is None else min_similarity
+        inliers = measured.min_inliers if inliers is None else inliers
     if min_similarity is not None:
         check_min_similarity(min_similarity)
         min_similarity = min_similarity if min_similarity > -1 else None
@@ -366,18 +361,17 @@ def position_fields(image: MapImage, axes: tuple[str, str] | None) -> dict[str, 
 
 def answer_fields(answer: Answer, axes: tuple[str, str] | None) -> dict[str, Any]:
     """Return an answer's rank, name, similarity and position, as JSON has them."""
-    more: dict[str, Any] = {}
-    if answer.probability is not None:
-        more["probability"] = round(answer.probability, 6)
-    if answer.verification is not None:
-        more["verified"] = answer.verification.fields()
-    return {
+    fields: dict[str, Any] = {
         "rank": answer.rank,
         "name": answer.image.name,
         "similarity": round(answer.similarity, 6),
         "position": position_fields(answer.image, axes),
-        **more,
     }
+    if answer.probability is not None:
+        fields["probability"] = round(answer.probability, 6)
+    if answer.verification is not None:
+        fields["verified"] = answer.verification.fields()
+    return fields
 
 
 def json_lines(answers: Answers) -> Iterator[str]:
@@ -398,9 +392,7 @@ def json_rows(answers: Answers) -> Iterator[dict[str, Any]]:
     poses = answers.poses or [None] * len(answers.queries)
     columns = answers.names, answers.known, poses, answers.rows()
     for name, known, pose, (path, found) in zip(*columns, strict=True):
-        neighbours = [
-            answer_fields(answer, answers.axes) | _time(answer.image.name) for answer in found
-        ]
+        neighbours = [answer_fields(x, answers.axes) | _time(x.image.name) for x in found]
         row = {"query": name, **_time(path), **zone, "neighbours": neighbours}
         if pose is not None:
             at = dict(zip(answers.axes or (), pose.position, strict=True))

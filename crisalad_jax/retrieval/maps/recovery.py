@@ -37,7 +37,4 @@ def remove_unrecorded(folder: pathlib.Path, images: int) -> None:
         )
     for path in unrecorded:
         path.unlink()
-        warn(
-            f"{path}: descriptors without a record are removed; a kill leaves such, but so does "
-            "the loss of a record"
-        )
+        warn(f"{path}: descriptors without a record are removed, as of a kill or of a lost record")

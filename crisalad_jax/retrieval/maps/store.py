@@ -6,71 +6,23 @@ addition overwrites them.
 """
 
 import pathlib
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from crisalad_jax.retrieval.bits import Bits
-from crisalad_jax.retrieval.chunks import Descriptors, Queries
+from crisalad_jax.config.checks import require
 from crisalad_jax.retrieval.maps.file_store import FileStore
 from crisalad_jax.retrieval.maps.milvus_store import MilvusStore, check_address
-from crisalad_jax.retrieval.maps.removed import NONE, Removed
-from crisalad_jax.retrieval.neighbours import Neighbours
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
-from crisalad_jax.utils.shapes import Float, Int64
+
+if TYPE_CHECKING:
+    from crisalad_jax.retrieval.maps.metadata import MapMetadata
 
 DTYPES = ("float32", "float16", "bits")
 """Types that descriptors may be stored as; bits are their signs (`retrieval.bits`)."""
 _MILVUS = "milvus:"
 
 
-class Store(Protocol):
-    """Descriptors by number. Each method raises InputError where the store is damaged or gone."""
-
-    def add(self, first: int, descriptors: Descriptors, record: Mapping[str, Any]) -> None:
-        """Write descriptors as numbers `first` and on; they are durable once this returns.
-
-        Args:
-            first: number of the first.
-            descriptors: in order.
-            record: of their images, which conditions of a search are about.
-        """
-
-    def check(self, segments: Sequence[tuple[int, int]]) -> None:
-        """Check, without reading them, that all additions, as (first, count), are there."""
-
-    def read(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
-        """Read the descriptors that were added together as numbers `first` and on."""
-        ...
-
-    def rows(self, numbers: Int64[np.ndarray, " n"]) -> Descriptors:
-        """Read the descriptors of these numbers, in any order."""
-        ...
-
-    def drop(self, first: int) -> None:
-        """Forget what was added from number `first` on, which did not count."""
-
-    def search(
-        self, queries: Queries | Bits, k: int, count: int, removed: Removed = NONE
-    ) -> Neighbours:
-        """Find the k nearest of numbers below `count`, exactly.
-
-        They are compared by inner product, packed bits by those that are equal.
-
-        Of equal similarities the lower number stands first, also at the k-th place.
-
-        Args:
-            queries: as they are compared.
-            k: neighbours of each, from 1 to as many as are left.
-            count: number of descriptors, those that were removed included.
-            removed: which are left out. The others are numbered in its way in the result.
-        """
-        ...
-
-    def close(self) -> None:
-        """Close connections, if there are any."""
+Store = FileStore | MilvusStore
+"""Descriptors by number. Each method raises InputError where the store is damaged or gone."""
 
 
 def check_store(name: str, dtype: str) -> None:
@@ -80,12 +32,10 @@ def check_store(name: str, dtype: str) -> None:
         InputError: neither "files" nor "milvus:URI", or such an URI or type that Milvus has not.
     """
     if name != "files":
-        if not name.startswith(_MILVUS):
-            raise InputError(f"store: found {name!r}, expected files or milvus:URI")
+        require(name.startswith(_MILVUS), f"store: found {name!r}, expected files or milvus:URI")
         check_address(name.removeprefix(_MILVUS))
     types = DTYPES if name == "files" else DTYPES[:1]
-    if dtype not in types:
-        raise InputError(f"dtype: found {dtype!r}, expected {' or '.join(types)} in {name}")
+    require(dtype in types, f"dtype: found {dtype!r}, expected {' or '.join(types)} in {name}")
 
 
 def store_name(name: str, folder: pathlib.Path) -> str:
@@ -101,25 +51,20 @@ def store_name(name: str, folder: pathlib.Path) -> str:
     return f"{_MILVUS}{path.relative_to(folder) if path.is_relative_to(folder) else path}"
 
 
-def open_store(
-    name: str, folder: pathlib.Path, *, collection: str, length: int, dtype: str, new: bool
-) -> Store:
-    """Open the store that `store_name` named for the map in `folder`.
+def open_store(metadata: "MapMetadata", folder: pathlib.Path, *, new: bool) -> Store:
+    """Open the store of the map in `folder`.
 
     Args:
-        name: the store.
+        metadata: the map's.
         folder: the map's.
-        collection: what Milvus keeps this map's descriptors under.
-        length: numbers in a stored row.
-        dtype: of the files, "uint8" of packed bits.
         new: whether the store is made anew, in place of one that a kill left unfinished.
 
     Raises:
         InputError: it cannot be reached, is missing, or holds something else.
     """
-    if name == "files":
-        return FileStore(folder / "segments", length, dtype)
-    address = name.removeprefix(_MILVUS)
+    if metadata.store == "files":
+        return FileStore(folder / "segments", *metadata.row)
+    address = metadata.store.removeprefix(_MILVUS)
     if not check_address(address):
         address = str(real_path(folder) / address)
-    return MilvusStore(address, collection, length, new=new)
+    return MilvusStore(address, metadata.collection, metadata.descriptor_length, new=new)

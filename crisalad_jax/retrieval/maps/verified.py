@@ -1,7 +1,6 @@
 """Verification of the answers of a map: their order by inliers, and the camera's place."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,24 +15,13 @@ from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.shapes import Float32, Float64, Int64
 
 
-class VerifiedAnswers(NamedTuple):
-    """The verified answers to one query."""
-
-    order: Int64[np.ndarray, " n"]
-    """Their numbers, as `order_by_inliers` has them."""
-    checks: list[Verification]
-    """In that order."""
-    pose: MapPose | None
-    """Where the query's camera was, as far as two answers say so."""
-
-
 def verify_answers(
     verifier: Verifier,
     image: np.ndarray,
     found: Sequence[MapImage],
     similarities: Float32[np.ndarray, " n"],
     axes: tuple[str, str] | None,
-) -> VerifiedAnswers:
+) -> tuple[Int64[np.ndarray, " n"], list[Verification], MapPose | None]:
     """Verify answers to a query, put them in order, and compute where its camera was.
 
     Args:
@@ -42,6 +30,10 @@ def verify_answers(
         found: the answers, best first.
         similarities: theirs.
         axes: of their positions; None where there are none.
+
+    Returns:
+        The answers' numbers, as `order_by_inliers` has them; their verifications in that order; and
+        where the query's camera was, as far as two answers say so.
 
     Raises:
         InputError: what `Verifier.check` raises.
@@ -59,13 +51,13 @@ def verify_answers(
     positions = [each.position and _metres(each.position, zone) for each in found]
     located = verifier.locate(checks, names, positions, image.shape[:2])
     if located is None:
-        return VerifiedAnswers(order, checks, None)
+        return order, checks, None
     pose, number, translation = located
     checks[number] = checks[number]._replace(translation=translation)
     if zone is not None:
         latitude, longitude = np.concatenate(zone.to_degrees(*np.array([pose.position]).T))
         pose = pose._replace(position=(float(latitude), float(longitude)))
-    return VerifiedAnswers(order, checks, pose)
+    return order, checks, pose
 
 
 def _metres(position: tuple[float, float], zone: Zone | None) -> Float64[np.ndarray, " 2"]:
@@ -82,13 +74,11 @@ def calibration_of(places: Map, verifier: Verifier | None) -> Calibration | None
     Raises:
         InputError: the file is damaged, or of another model.
     """
-    if verifier is None:
-        return places.calibration
-    found = read_calibration(places.folder, places.metadata.model, VERIFIED)
-    if found is not None and found.verifier != verifier.name:
+    found = verifier and read_calibration(places.folder, places.metadata.model, VERIFIED)
+    if verifier and found and found.verifier != verifier.name:
         warn(
             f"{places.folder / VERIFIED}: found inliers of {found.verifier}, and answers verified "
             f"by {verifier.name}: it is not used; `crisalad calibrate --verify` measures it again"
         )
-        return places.calibration
+        found = None
     return found or places.calibration

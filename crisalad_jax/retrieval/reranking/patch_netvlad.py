@@ -161,9 +161,8 @@ def _parts(config: ModelConfig) -> list[tuple[slice, Grid]]:
     """List which windows have each size, and their rows and columns."""
     grids = [grid for _, _, grid in windows_of(config)]
     bounds = itertools.accumulate((rows * columns for rows, columns in grids), initial=0)
-    return [
-        (slice(*pair), grid) for pair, grid in zip(itertools.pairwise(bounds), grids, strict=True)
-    ]
+    slices = itertools.starmap(slice, itertools.pairwise(bounds))
+    return list(zip(slices, grids, strict=True))
 
 
 def weighted_sum(scores: Scores, config: ModelConfig) -> Scores:

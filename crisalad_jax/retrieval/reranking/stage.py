@@ -1,30 +1,28 @@
 """The second stage: local features of the retrieved images, computed once, and the new order."""
 
-import contextlib
 import dataclasses
 import os
 import pathlib
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Self
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from crisalad_jax.config.checks import choose
+from crisalad_jax.config.checks import choose, require
 from crisalad_jax.config.short_repr import with_field_docs
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, cast_params
-from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.reranking import divergence, fol, matching, pair_vpr, patch_netvlad
 from crisalad_jax.retrieval.reranking.local import LocalReranker
+from crisalad_jax.retrieval.reranking.second_stage import SecondStage
 from crisalad_jax.retrieval.verification.verify import Verifier, Verify
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.progress import Bar, progress_bar
 from crisalad_jax.utils.shapes import Bool, Float, Int
 
 
@@ -38,59 +36,49 @@ class Method:
     """Returns the number of an image's features, and their length."""
     describe: Callable[[Crisalad, Any, ModelConfig], Any]
     """Computes the features of a batch of images."""
-    score: Callable[[Crisalad, Any, Any, ModelConfig], Any]
-    """Scores any number of a query's candidates, each by itself: one score, or one of each part."""
+    score: Callable[..., Any]
+    """Scores any number of a query's candidates, each by itself: one score, or one of each part.
+    It takes the features of the query and of the candidates, and the configuration."""
     fuse: Callable[[np.ndarray, ModelConfig], Float[np.ndarray, " candidate"]] = (
         lambda scores, config: scores
     )
     """Makes one score of the parts, of all candidates of a query together."""
     dtype: type[np.floating] = np.float16
     """Type of the features in the temporary file."""
-
-
-def _by_features(score: Callable[[Any, Any, ModelConfig], Any]) -> Callable[..., Any]:
-    """Score features without the model's parameters."""
-    return lambda params, *rest: score(*rest)
+    by_params: bool = False
+    """Whether `score` takes the model's parameters, too, and first."""
 
 
 _PATCH_NETVLAD = Method(
     "netvlad",
     patch_netvlad.shape,
     patch_netvlad.describe,
-    _by_features(patch_netvlad.spatial_scores),
+    patch_netvlad.spatial_scores,
     patch_netvlad.standardised_sum,
 )
 _METHODS: Mapping[str, Method | None] = {
-    "fol": Method("fol", fol.shape, fol.describe, _by_features(fol.count_matches)),
+    "fol": Method("fol", fol.shape, fol.describe, fol.count_matches),
     "local": None,
-    "pair-vpr": Method("pair-vpr", matching.patch_shape, pair_vpr.describe, pair_vpr.scores),
+    "pair-vpr": Method(
+        "pair-vpr", matching.patch_shape, pair_vpr.describe, pair_vpr.scores, by_params=True
+    ),
     "patch-netvlad": _PATCH_NETVLAD,
-    "patch-netvlad-ransac": dataclasses.replace(
-        _PATCH_NETVLAD, score=_by_features(patch_netvlad.inlier_scores)
-    ),
+    "patch-netvlad-ransac": dataclasses.replace(_PATCH_NETVLAD, score=patch_netvlad.inlier_scores),
     "patch-netvlad-sum": dataclasses.replace(_PATCH_NETVLAD, fuse=patch_netvlad.weighted_sum),
-    "sinkhorn-divergence": Method(
-        None, divergence.shape, divergence.describe, _by_features(divergence.scores)
-    ),
+    "sinkhorn-divergence": Method(None, divergence.shape, divergence.describe, divergence.scores),
     "selavpr": Method(
-        "selavpr",
-        matching.selavpr_shape,
-        matching.describe_selavpr,
-        _by_features(matching.count_matches),
+        "selavpr", matching.selavpr_shape, matching.describe_selavpr, matching.count_matches
     ),
     # One feature an image: float32 takes little, and ranks as the authors' code does.
     "selavprpp": Method(
         "selavprpp-hash",
         matching.selavprpp_shape,
         matching.describe_selavprpp,
-        _by_features(matching.nearness),
+        matching.nearness,
         dtype=np.float32,
     ),
     "transvpr": Method(
-        "transvpr",
-        matching.patch_shape,
-        matching.describe_transvpr,
-        _by_features(matching.count_inliers),
+        "transvpr", matching.patch_shape, matching.describe_transvpr, matching.count_inliers
     ),
 }
 RERANKERS = tuple(_METHODS)
@@ -148,28 +136,26 @@ class Reranking:
                 too few patches; more retrievals than the database has images, if that is given.
         """
         method, own = _METHODS[self.name], config if self.model is None else self.model.config
-        found = own.aggregator.part_name, own.preprocessing.size_rule
-        wanted = (method and method.aggregator) or found[0], "fixed"
-        if method is not None and found != wanted:
-            raise InputError(
-                f"rerank: found a model with aggregator {found[0]} and size rule {found[1]}, "
-                f"expected {wanted[0]} and fixed, whose local features {self.name} "
-                "compares (--rerank-weights takes another model than the first stage's)"
-            )
         if method is not None:
+            found = own.aggregator.part_name, own.preprocessing.size_rule
+            wanted = method.aggregator or found[0], "fixed"
+            require(
+                found == wanted,
+                f"rerank: found a model with aggregator {found[0]} and size rule {found[1]}, "
+                f"expected {wanted[0]} and fixed, whose local features {self.name} compares "
+                "(--rerank-weights takes another model than the first stage's)",
+            )
             method.shape(own)
         if database is not None and self.top > database:
-            raise InputError(
-                f"rerank: found {self.label} over a database of {database} images, expected at "
-                f"most {database}"
-            )
+            found = f"{self.label} over a database of {database} images"
+            raise InputError(f"rerank: found {found}, expected at most {database}")
 
     def stage(
         self,
         database: Sequence[pathlib.Path],
         queries: Sequence[pathlib.Path],
         reading: Reading = Reading(),
-    ) -> "Reranker | LocalReranker":
+    ) -> SecondStage:
         """Make the second stage over some images, which is entered before use.
 
         Raises:
@@ -205,7 +191,7 @@ class _Side(NamedTuple):
     """Whether the features of an image are there."""
 
 
-class Reranker:
+class Reranker(SecondStage):
     """Puts the neighbours of any number of first stages over the same images in a new order.
 
     Local features of the queries and of the retrieved database images are computed once, by
@@ -234,11 +220,10 @@ class Reranker:
             )
         params, self._config = reranking.model
         reranking.check(self._config, len(database))
-        self._top, self._label = reranking.top, reranking.name
-        self._method, self._reading = method, reading
+        super().__init__(reranking.name, reranking.top, reading)
+        self._method = method
         self._devices = devices_for(reading.batch_size)
         self._params = self._devices.replicate(cast_params(params, self._config))
-        self._scores: dict[tuple[int, int], float | list[float]] = {}
         self._folder = tempfile.TemporaryDirectory(prefix="rerank-", ignore_cleanup_errors=True)
         self._database, self._queries = self._side(database, "db"), self._side(queries, "queries")
 
@@ -248,40 +233,15 @@ class Reranker:
         features = np.memmap(file, self._method.dtype, "w+", shape=shape)
         return _Side(paths, features, np.zeros(len(paths), bool))
 
-    def __enter__(self) -> Self:
-        """Return the second stage itself."""
-        return self
-
     def __exit__(self, *_: object) -> None:
         """Remove the temporary files."""
         del self._database, self._queries  # some systems cannot remove open files
         self._folder.cleanup()
 
-    def __call__(self, neighbours: Neighbours) -> Neighbours:
-        """Sort each query's first `top` neighbours by falling score.
-
-        Equal scores keep the first stage's order, and so do the neighbours after the first `top`.
-        Scores replace the similarities of the neighbours that are re-ranked.
-
-        Raises:
-            InputError: an image cannot be read; the disk has no room for the features.
-        """
-        indices, similarities = (np.array(part) for part in neighbours)
-        top = self._top
-        first = indices[:, :top]
-        self._describe(self._queries, np.arange(len(indices)), "queries")
+    def prepare(self, first: Int[np.ndarray, "query candidate"]) -> None:
+        """Compute the features of all queries and of their candidates."""
+        self._describe(self._queries, np.arange(len(first)), "queries")
         self._describe(self._database, np.unique(first), "candidates")
-        with self._bar("pairs", len(first) * top, "pairs") as bar:
-            for query, candidates in enumerate(first):
-                scores = self._score(query, candidates)
-                order = np.argsort(-scores, kind="stable")
-                indices[query, :top] = candidates[order]
-                similarities[query, :top] = scores[order]
-                bar.advance(top)
-        return Neighbours(indices, similarities)
-
-    def _bar(self, what: str, count: int, unit: str) -> contextlib.AbstractContextManager[Bar]:
-        return progress_bar(f"{self._label}, {what}", count, unit, quiet=self._reading.quiet)
 
     def _describe(self, side: _Side, images: Int[np.ndarray, " image"], name: str) -> None:
         """Compute the features of those images that have none yet.
@@ -300,7 +260,7 @@ class Reranker:
                 f"{needed / 2**30:.1f} GiB for the local features of {len(missing)} images"
             )
         config, paths = self._config, [side.paths[i] for i in missing]
-        with self._bar(name, len(missing), "images") as bar:
+        with self.bar(name, len(missing), "images") as bar:
             for batch in self._reading.batches(paths, Preparation.of(config)):
                 sharded = self._devices.shard_batch(batch.images)
                 found = np.asarray(self._method.describe(self._params, sharded, config))
@@ -308,21 +268,21 @@ class Reranker:
                 side.features[rows], side.known[rows] = found[batch.valid], True
                 bar.advance(len(rows))
 
-    def _score(
-        self, query: int, candidates: Int[np.ndarray, " candidate"]
-    ) -> Float[np.ndarray, " candidate"]:
-        """Score all candidates of one query; scores of pairs are kept for later calls."""
-        new = np.array([c for c in candidates if (query, int(c)) not in self._scores], int)
+    def compare(self, query: int, candidates: Sequence[int]) -> Iterator[float | list[float]]:
+        """Yield the score of a query and each of some candidates, or one of each part."""
         patches, dim = self._queries.features.shape[1:]
         step = max(1, min(_AT_ONCE, self._top, _NUMBERS // (patches * dim)))
-        for start in range(0, len(new), step):
-            part = new[start : start + step]
+        given = (self._params,) if self._method.by_params else ()
+        for start in range(0, len(candidates), step):
+            part = candidates[start : start + step]
             # The last part is padded, so that all have one shape and compile once.
             filled = np.resize(part, step)
             ours, theirs = self._queries.features[query], self._database.features[filled]
             pairs = np.asarray(ours), np.asarray(theirs)
-            found = self._method.score(self._params, *pairs, self._config)
-            values = np.asarray(found)[: len(part)]
-            self._scores |= {(query, int(c)): s for c, s in zip(part, values.tolist(), strict=True)}
-        scores = np.array([self._scores[query, int(c)] for c in candidates])
-        return self._method.fuse(scores, self._config).astype(np.float32)
+            found = self._method.score(*given, *pairs, self._config)
+            yield from np.asarray(found)[: len(part)].tolist()
+
+    def order(self, scores: np.ndarray, similarities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Put candidates in order by their scores alone, fused where there are several."""
+        fused = self._method.fuse(scores, self._config).astype(np.float32)
+        return np.argsort(-fused, kind="stable"), fused

@@ -33,6 +33,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.data.images import IMAGE_SUFFIXES, decode_image
 from crisalad_jax.data.positions import AXES, MOST_METRES, Positions, exif_position, utm_positions
 from crisalad_jax.data.resize import Pixels
@@ -325,7 +326,7 @@ def make_app(
 
         pixels = await asyncio.to_thread(check_picture, data, name, max_pixels)
         lane = next(lane for most, lane in lanes if pixels <= most)
-        return await asyncio.get_running_loop().run_in_executor(lane, decode)
+        return await asyncio.wrap_future(lane.submit(decode))
 
     app = fastapi.FastAPI(
         title="crisalad serve",
@@ -365,10 +366,8 @@ def make_app(
     def describe_map(_: _Nothing) -> Places:
         """Tell how large the map is, and where its images were taken."""
         places = worker.places
-        positions, gone = places.images.positions, places.removed.rows  # by row
-        is_known = ~np.isnan(positions[:, 0])
-        is_known[gone] = False
-        known = np.flatnonzero(is_known)
+        positions, rows = places.images.positions, places.removed.rows_of(np.arange(len(places)))
+        known = rows[~np.isnan(positions[rows, 0])]
         shown = known[:: -(-len(known) // _DOTS) or 1]
         return Places(
             name=printable(places.folder.resolve().name),
@@ -392,10 +391,9 @@ def make_app(
     async def show_image(number: int, _: _Nothing) -> Response:
         """Show an image of the map."""
         try:
-            loop = asyncio.get_running_loop()
             places = worker.places
             image = image_in(places, number), places.folder, map_images
-            data = await loop.run_in_executor(shown, thumbnail, *image)
+            data = await asyncio.wrap_future(shown.submit(thumbnail, *image))
         except InputError as error:
             raise HTTPException(404, str(error)) from error
         return Response(data, media_type="image/jpeg")
@@ -406,20 +404,18 @@ def make_app(
         data, name = await receive_picture(request, max_bytes)
         async with _room(waiting):
             start = time.perf_counter()
-            answers, count = asked.k or k, 0 if rerank is None else rerank.answers
-            if asked.verify is not None:
-                count = asked.verify
-                if count and verifier is None:
-                    raise InputError("verify: found in a service without --rerank, expected none")
+            answers, count = asked.k or k, asked.verify
+            if count is None:
+                count = 0 if rerank is None else rerank.answers
+            if count and verifier is None:
+                raise InputError("verify: found in a service without --rerank, expected none")
             where = None if asked.where is None else Where.parse(asked.where)
             question = Question(await prepare(data, name), max(answers, count), where)
             places, found = await asyncio.wrap_future(worker.submit(question))
             best, checks = found[0][1], []
-            if verifier is not None and count:
-                loop = asyncio.get_running_loop()
-                found, checks = await loop.run_in_executor(
-                    checking, _verified, verifier, decode_image(data, name), places, found, count
-                )
+            if verifier and count:
+                given = verifier, decode_image(data, name), places, found, count
+                found, checks = await asyncio.wrap_future(checking.submit(_verified, *given))
         pairs = itertools.zip_longest(found[:answers], checks[:answers])
         neighbours = [
             Neighbour(
@@ -494,9 +490,8 @@ def _verified(
 def _check_parameters(request: Request) -> None:
     """Check that the URL has no parameter twice, of which the last one would count."""
     counts = collections.Counter(name for name, _ in request.query_params.multi_items())
-    for name, count in counts.most_common(1):
-        if count > 1:
-            raise InputError(f"{name}: found it {count} times, expected it once")
+    for name, count in counts.items():
+        require(count == 1, f"{name}: found it {count} times, expected it once")
 
 
 def bracketed(host: str) -> str:

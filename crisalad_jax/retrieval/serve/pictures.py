@@ -13,6 +13,7 @@ from PIL import Image
 from starlette.datastructures import UploadFile
 from starlette.types import Message
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.data.frames import frame_time
 from crisalad_jax.data.images import IMAGE_SUFFIXES, jpeg_scans, read_image
 from crisalad_jax.data.remote import size_of
@@ -134,8 +135,7 @@ def image_in(places: Map, row: int) -> MapImage:
     if not 0 <= number < len(places):
         last = places.removed.rows_of(np.array(len(places) - 1))
         raise InputError(f"number: found {row}, expected 0 to {last}")
-    if places.removed.has(row):
-        raise InputError(f"number: found {row}, which was removed from the map")
+    require(not places.removed.has(row), f"number: found {row}, which was removed from the map")
     return places.images[number]
 
 

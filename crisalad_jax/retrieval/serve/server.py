@@ -121,18 +121,10 @@ def serve_map(
         worker.compile(quiet=quiet)
         stop.check()
         stop.has_work = True
-        app = make_app(
-            worker,
-            host=host,
-            token=token,
-            appends=append,
-            map_images=map_images,
-            k=k,
-            max_bytes=max_bytes,
-            max_pixels=max_pixels,
-            tiles=behind,
-            rerank=rerank,
-        )
+        access: dict[str, Any] = {"host": host, "token": token, "appends": append}
+        limits = {"k": k, "max_bytes": max_bytes, "max_pixels": max_pixels}
+        shown: dict[str, Any] = {"map_images": map_images, "tiles": behind, "rerank": rerank}
+        app = make_app(worker, **access, **limits, **shown)
         address = f"http://{bracketed(host)}:{listener.getsockname()[1]}"
         Server(app, stop, lambda: ready(address), behind).run([listener])
 

@@ -174,13 +174,10 @@ class MapWorker:
                     with atomic_path(root / work.name, durable=True) as temporary:
                         temporary.write_bytes(work.data)
                     undo.callback((root / work.name).unlink, missing_ok=True)
-                places.append(
-                    [work.name for work in works],
-                    [len(work.data) for work in works],
-                    descriptors,
-                    root=real_path(root).as_posix(),
-                    positions=fitted[0]._replace(of=known) if fitted else None,
-                )
+                names, sizes = [work.name for work in works], [len(work.data) for work in works]
+                where = fitted[0]._replace(of=known) if fitted else None
+                holder = real_path(root).as_posix()
+                places.append(names, sizes, descriptors, root=holder, positions=where)
                 undo.pop_all()
         except Exception as error:
             raise MapFailedError(str(error)) from error

@@ -15,6 +15,7 @@ from crisalad_jax.config.short_repr import with_field_docs
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.files import read_text
+from crisalad_jax.utils.output import one_line
 from crisalad_jax.utils.shapes import Float64
 
 _MODELS = ("", "plumb_bob", "rational_polynomial", "radtan")
@@ -89,12 +90,10 @@ class Intrinsics:
         except ModuleNotFoundError as error:
             raise InputError(missing_extra(error, f"{path}")) from error
         try:
-            return cls(**_fields(next(yaml.safe_load_all(content))))
+            return cls(*_fields(next(yaml.safe_load_all(content))))
         except (yaml.YAMLError, LookupError, TypeError, ValueError, StopIteration) as error:
-            reason = " ".join(str(error).split())
-            raise InputError(f"{path}: found no intrinsics ({reason}), expected {_EXPECTED}") from (
-                error
-            )
+            reason = f"found no intrinsics ({one_line(error)})"
+            raise InputError(f"{path}: {reason}, expected {_EXPECTED}") from error
 
     def directions(
         self, points: Float64[np.ndarray, "n 2"], size: tuple[int, int], name: str
@@ -135,7 +134,7 @@ class Intrinsics:
         return (self.fx + self.fy) / 2 * (1.0 if self.width is None else width / self.width)
 
 
-def _fields(content: Any) -> dict[str, Any]:
+def _fields(content: Any) -> tuple[Any, ...]:
     """Read the fields of `Intrinsics` from what a file says, by ROS's names or ours."""
     if not isinstance(content, Mapping):
         raise TypeError(f"{type(content).__name__} in place of names and numbers")
@@ -143,22 +142,13 @@ def _fields(content: Any) -> dict[str, Any]:
     if model not in _MODELS:
         raise ValueError(f"distortion model {model}")
     matrix = _data(content, "camera_matrix", "k", "K")
-    names = ("fx", "fy", "cx", "cy")
-    numbers = (
-        [content[name] for name in names] if matrix is None else np.array(matrix)[[0, 4, 2, 5]]
-    )
-    sizes = {
-        name: int(content[each])
-        for name in ("width", "height")
-        for each in (name, f"image_{name}")
-        if each in content
-    }
+    numbers = (content[name] for name in ("fx", "fy", "cx", "cy"))
+    if matrix is not None:
+        numbers = np.array(matrix)[[0, 4, 2, 5]]
+    sizes = (_data(content, name, f"image_{name}") for name in ("width", "height"))
+    whole = (size if size is None else int(size) for size in sizes)
     distortion = tuple(map(float, _data(content, "distortion_coefficients", "d", "D") or ()))
-    return {
-        **dict(zip(names, map(float, numbers), strict=True)),
-        **sizes,
-        "distortion": distortion if any(distortion) else (),
-    }
+    return *map(float, numbers), *whole, distortion if any(distortion) else ()
 
 
 def _data(content: Mapping[str, Any], *names: str) -> Any:

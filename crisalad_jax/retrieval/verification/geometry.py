@@ -5,7 +5,7 @@ returns them. A pose (rotation, translation) turns the first camera's coordinate
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -99,22 +99,17 @@ def pose_from_points(
     """Compute the pose from points in metres to the camera that sees them (PnP); None without."""
     if len(points) < LEAST:
         return None
+    eye = np.eye(3)
+    how: Any = {"confidence": _SURE, "iterationsCount": _TRIALS, "flags": cv2.USAC_MAGSAC}
     try:
         found, turn, shift, inliers = cv2.solvePnPRansac(
-            points,
-            directions,
-            np.eye(3),
-            None,
-            reprojectionError=distance,
-            confidence=_SURE,
-            iterationsCount=_TRIALS,
-            flags=cv2.USAC_MAGSAC,
+            points, directions, eye, None, reprojectionError=distance, **how
         )
         if not found or inliers is None or len(inliers) < LEAST:
             return None
         chosen = np.asarray(inliers[:, 0], int)
         turn, shift = cv2.solvePnPRefineLM(
-            points[chosen], directions[chosen], np.eye(3), None, turn, shift
+            points[chosen], directions[chosen], eye, None, turn, shift
         )
     except cv2.error:
         return None
@@ -136,13 +131,9 @@ def triangulated(first: Points, second: Points, pose: Pose) -> Float64[np.ndarra
 def common_points(first: Points, second: Points) -> tuple[Int64[np.ndarray, " m"], ...]:
     """Return the rows of two lists of the same image's keypoints that hold the same ones."""
     rows = {tuple(point): row for row, point in enumerate(first.tolist())}
-    pairs = [
-        (rows[tuple(point)], row)
-        for row, point in enumerate(second.tolist())
-        if tuple(point) in rows
-    ]
-    ours, theirs = np.array(pairs, int).reshape(-1, 2).T
-    return ours, theirs
+    points = map(tuple, second.tolist())
+    pairs = [(rows[point], row) for row, point in enumerate(points) if point in rows]
+    return tuple(np.array(pairs, int).reshape(-1, 2).T)
 
 
 def pose_on_map(

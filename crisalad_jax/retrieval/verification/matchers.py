@@ -3,7 +3,7 @@
 import functools
 import os
 import pathlib
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.files import check_source
+from crisalad_jax.utils.output import one_line
 from crisalad_jax.utils.shapes import Float32, Float64, UInt8
 
 Image = UInt8[np.ndarray, "h w 3"]
@@ -33,30 +34,6 @@ _CONTRACT = (
 )
 
 
-class Matcher(Protocol):
-    """Finds the matches of two images, each of which is prepared once."""
-
-    name: str
-    """Which matcher: inliers of another one are not comparable."""
-
-    def prepare(self, image: Image) -> Any:
-        """Compute what depends on one image only."""
-        ...
-
-    def match(self, query: Any, database: Any) -> tuple[Points, Points]:
-        """Match two prepared images: pixels (x, y) in each, row by row."""
-        ...
-
-
-def open_matcher(file: str | os.PathLike[str] | None) -> Matcher:
-    """Open the matcher of a file ONNX, by default SIFT.
-
-    Raises:
-        InputError: there is no such file, or it is a program of another kind.
-    """
-    return SiftMatcher() if file is None else OnnxMatcher(pathlib.Path(file))
-
-
 class SiftFeatures(NamedTuple):
     """Local features of an image."""
 
@@ -68,10 +45,11 @@ class SiftFeatures(NamedTuple):
 class SiftMatcher:
     """SIFT features (Lowe, IJCV 2004) as RootSIFT (Arandjelovic and Zisserman, CVPR 2012)."""
 
-    name = "sift"
+    name: str = "sift"
+    """Which matcher: inliers of another one are not comparable."""
 
     def prepare(self, image: Image) -> SiftFeatures:
-        """Find an image's features."""
+        """Find an image's features, which depend on no other image."""
         factor = min(2.0, SIDE / max(image.shape))
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         how = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
@@ -85,7 +63,11 @@ class SiftMatcher:
         return SiftFeatures((points + 0.5) / factor - 0.5, np.sqrt(rows / sums, dtype=np.float32))
 
     def match(self, query: SiftFeatures, database: SiftFeatures) -> tuple[Points, Points]:
-        """Match features that are each other's nearest, and much nearer than the second."""
+        """Match features that are each other's nearest, and much nearer than the second.
+
+        Returns:
+            Pixels (x, y) in each image, row by row.
+        """
         if min(len(query.points), len(database.points)) < 2:
             return np.zeros((0, 2)), np.zeros((0, 2))
         products = query.descriptors @ database.descriptors.T
@@ -124,8 +106,7 @@ class OnnxMatcher:
                 file, options, providers=["CPUExecutionProvider"]
             )
         except Exception as error:  # onnxruntime's errors are of many classes
-            reason = " ".join(str(error).split())[:200]
-            raise InputError(f"{file}: onnxruntime cannot load it: {reason}") from error
+            raise InputError(f"{file}: onnxruntime cannot load it: {one_line(error)}") from error
         inputs, outputs = session.get_inputs(), [each.name for each in session.get_outputs()]
         shape = inputs[0].shape if inputs else []
         types = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
@@ -169,6 +150,20 @@ class OnnxMatcher:
                 for points, numbers, factors in pairs
             ]
         except Exception as error:  # of a program that says other shapes than it has
-            reason = " ".join(str(error).split())[:200]
-            raise InputError(f"{self._file}: found {reason}, expected {_CONTRACT}") from error
+            raise InputError(
+                f"{self._file}: found {one_line(error)}, expected {_CONTRACT}"
+            ) from error
         return ours, theirs
+
+
+Matcher = SiftMatcher | OnnxMatcher
+"""Finds the matches of two images, each of which is prepared once."""
+
+
+def open_matcher(file: str | os.PathLike[str] | None) -> Matcher:
+    """Open the matcher of a file ONNX, by default SIFT.
+
+    Raises:
+        InputError: there is no such file, or it is a program of another kind.
+    """
+    return SiftMatcher() if file is None else OnnxMatcher(pathlib.Path(file))

@@ -39,11 +39,8 @@ class Verification(NamedTuple):
 
     def fields(self) -> dict[str, Any]:
         """Return what JSON has of it: not the points, and a quaternion (x, y, z, w)."""
-        fields: dict[str, Any] = {
-            "inliers": self.inliers,
-            "matches": self.matches,
-            "confidence": round(self.confidence, 4),
-        }
+        fields: dict[str, Any] = {"inliers": self.inliers, "matches": self.matches}
+        fields["confidence"] = round(self.confidence, 4)
         if self.rotation is not None:
             vector = cv2.Rodrigues(self.rotation)[0][:, 0]
             angle = float(np.linalg.norm(vector))

@@ -86,11 +86,8 @@ class Verify:
             folder = getattr(self, name)
             if folder is not None and not pathlib.Path(folder).is_dir():
                 raise InputError(f"{name}: found no folder {folder}, expected one")
-        if self.min_inliers is not None:
-            require(
-                self.min_inliers >= 0,
-                f"min_inliers: found {self.min_inliers}, expected at least 0",
-            )
+        least = self.min_inliers
+        require(least is None or least >= 0, f"min_inliers: found {least}, expected at least 0")
 
 
 class _View(NamedTuple):
@@ -106,17 +103,6 @@ class _View(NamedTuple):
         return min(1.0, SIDE / max(self.size))
 
 
-class Located(NamedTuple):
-    """Where a query's camera was, from two of its answers."""
-
-    pose: MapPose
-    """In metres east and north."""
-    answer: int
-    """Number of the answer that it was computed from."""
-    translation: Float64[np.ndarray, " 3"]
-    """Metres from that answer's camera, as `Verification.translation`."""
-
-
 class Verifier:
     """Matches queries with images of a map; features of the latter are cached."""
 
@@ -128,8 +114,8 @@ class Verifier:
         """
         self.verify = verify
         self._matcher = open_matcher(verify.matcher)
-        self._camera = verify.intrinsics
-        self._map_camera = verify.map_intrinsics or verify.intrinsics
+        self._camera: Any = verify.intrinsics  # of both sides there is one, or of none
+        self._map_camera: Any = verify.map_intrinsics or verify.intrinsics
         self._read = functools.lru_cache(_CACHED)(
             lambda file, _: self._view(read_image(file, bit_depth="contrast-stretch"), str(file))
         )
@@ -174,9 +160,9 @@ class Verifier:
         self,
         checks: Sequence[Verification],
         names: Sequence[tuple[str, str]],
-        positions: Sequence[Float64[np.ndarray, " 2"] | None],
+        positions: Sequence[Any],
         size: tuple[int, int],
-    ) -> Located | None:
+    ) -> tuple[MapPose, int, Float64[np.ndarray, " 3"]] | None:
         """Compute where the query's camera was from the first two answers that say so.
 
         With depth, these are two answers with a translation. Otherwise matches of the two answers,
@@ -186,18 +172,17 @@ class Verifier:
         Args:
             checks: from `check`.
             names: as `check` takes them.
-            positions: of the answers in metres east and north; None where unknown.
+            positions: of the answers, two metres east and north; None where unknown.
             size: height and width of the query.
+
+        Returns:
+            The pose in metres east and north, the number of the answer that it was computed from,
+            and the metres from that answer's camera, as `Verification.translation`.
         """
-        known = [
-            number
-            for number, (check, position) in enumerate(zip(checks, positions, strict=True))
-            if check.rotation is not None and position is not None
-        ]
+        pairs = enumerate(zip(checks, positions, strict=True))
+        known = [n for n, (check, at) in pairs if check.rotation is not None and at is not None]
         for first, second in itertools.combinations(known, 2):
             here, there = positions[first], positions[second]
-            assert here is not None
-            assert there is not None
             metres = float(np.hypot(*(there - here)))
             if metres < _BASELINE:
                 continue
@@ -207,7 +192,7 @@ class Verifier:
             if found is not None:
                 pose, other = found
                 placed = pose_on_map(pose, other, here.tolist(), there.tolist())
-                return Located(placed, first, pose.translation)
+                return placed, first, pose.translation
         return None
 
     def _by_motion(
@@ -219,13 +204,10 @@ class Verifier:
         size: tuple[int, int],
     ) -> tuple[Pose, np.ndarray] | None:
         """Compute the query's pose in the first answer's axes, and the way to the second answer."""
-        assert self._camera is not None
-        assert self._map_camera is not None
         here, there = self._seen(*first), self._seen(*second)
         *_, theirs, ours = self._inliers(there, here)
-        rays, map_rays = (
-            self._rays(self._map_camera, *each) for each in ((there, theirs), (here, ours))
-        )
+        rays = self._rays(self._map_camera, there, theirs)
+        map_rays = self._rays(self._map_camera, here, ours)
         pose = relative_pose(rays, map_rays, self._distance(here))
         if pose is None:
             return None
@@ -250,7 +232,7 @@ class Verifier:
 
     def _check(self, query: _View, database: _View, name: str) -> Verification:
         checked = Verification(*self._inliers(query, database))
-        if self._camera is None or self._map_camera is None:
+        if self._camera is None:
             return checked
         rays = self._rays(self._camera, query, checked.query_points)
         map_rays = self._rays(self._map_camera, database, checked.database_points)
@@ -284,15 +266,13 @@ class Verifier:
 
     def _distance(self, view: _View) -> float:
         """Return the largest distance of an inlier in directions of the map's camera."""
-        assert self._map_camera is not None
         return _POSE_DISTANCE / (self._map_camera.focal(view.size[1]) * view.factor)
 
     def _depths(self, view: _View, name: str, points: _Points) -> Float64[np.ndarray, " n"]:
         """Return the depth in metres at some pixels of an answer, 0 where it is unknown."""
-        if self.verify.map_depth is None:
-            return np.zeros(len(points))
-        file = pathlib.Path(self.verify.map_depth, name).with_suffix(".png")
-        if not file.is_file():
+        folder = self.verify.map_depth
+        file = pathlib.Path(folder or "", name).with_suffix(".png")
+        if folder is None or not file.is_file():
             return np.zeros(len(points))
         data = np.frombuffer(read_bytes(file, "depth"), np.uint8)
         depth = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None

@@ -14,7 +14,7 @@ import pytest
 
 from crisalad_jax.data.metres import Zone
 from crisalad_jax.data.positions import read_image_table
-from crisalad_jax.retrieval.maps.answer_files import write_answers
+from crisalad_jax.retrieval.maps.answer_files import format_answers
 from crisalad_jax.retrieval.maps.images import MapImage
 from crisalad_jax.retrieval.maps.query import Answers
 from crisalad_jax.retrieval.neighbours import Neighbours
@@ -40,6 +40,13 @@ def answered(names=NAMES, *, axes=("east", "north"), zone=ZONE, **changes) -> An
     found = Neighbours(np.arange(3)[:, None], similarities)
     given = Answers(paths, found, images, axes, zone=zone, root=pathlib.Path("/q"))
     return given._replace(**changes)
+
+
+def write_answers(path: pathlib.Path, answers: Answers) -> int:
+    """Write answers as `crisalad query --out` does, and return how many."""
+    text, count = format_answers(path, answers)
+    path.write_text(text, "utf-8", newline="")
+    return count
 
 
 def expected_degrees(number: int) -> tuple[float, float]:

@@ -13,6 +13,7 @@ import pytest
 
 from crisalad_jax.retrieval.maps import file_store
 from crisalad_jax.retrieval.maps import milvus_store as milvus
+from crisalad_jax.retrieval.maps.metadata import MapMetadata
 from crisalad_jax.retrieval.maps.store import Store, check_store, open_store, store_name
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.search import search
@@ -31,9 +32,10 @@ def unit_rows(count: int, seed: int = 0, length: int = LENGTH) -> np.ndarray:
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
-def opened(folder: pathlib.Path, name: str, **options) -> Store:
-    usual = {"collection": "rows", "length": LENGTH, "dtype": "float32", "new": True}
-    return open_store(name, folder, **usual | options)
+def opened(folder: pathlib.Path, name: str, *, new=True, length=LENGTH, **options) -> Store:
+    fields = {"store": name, "collection": "rows", "descriptor_length": length} | options
+    metadata = MapMetadata(model="", weights="", config={}, **fields)
+    return open_store(metadata, folder, new=new)
 
 
 @pytest.fixture(params=STORES)

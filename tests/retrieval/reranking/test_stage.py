@@ -137,8 +137,9 @@ def test_the_order_is_that_of_single_pairs(name: str, first_stage, benchmark, mo
         for paths in (benchmark.database, benchmark.queries)
     )
     assert database.shape[1:] == method.shape(config)
+    given = (own,) if method.by_params else ()
     parts = np.stack(
-        [[method.score(own, q, d[None], config)[0] for d in database] for q in queries]
+        [[method.score(*given, q, d[None], config)[0] for d in database] for q in queries]
     )
     assert len(np.unique(parts)) > 5
     top = 5
@@ -176,7 +177,7 @@ def test_equal_scores_keep_the_first_stages_order(
     name: str, parts: tuple[int, ...], first_stage, benchmark, monkeypatch
 ) -> None:
     """Also where they are divided by their deviation, which is 0."""
-    changed(monkeypatch, name, score=lambda p, q, c, _: np.full((len(c), *parts), 0.1, np.float32))
+    changed(monkeypatch, name, score=lambda q, c, _: np.full((len(c), *parts), 0.1, np.float32))
     found = rerank(reranking(name, 6), first_stage, benchmark.database, benchmark.queries)
     np.testing.assert_array_equal(found.indices, first_stage.indices)
     assert np.isfinite(found.similarities).all()
@@ -189,7 +190,7 @@ def test_images_are_described_and_pairs_scored_once(first_stage, benchmark, monk
         monkeypatch,
         "transvpr",
         describe=lambda p, x, c: described.append(x) or describe(p, x, c),
-        score=lambda p, q, x, c: scored.append(x) or score(q, x, c),
+        score=lambda q, x, c: scored.append(x) or score(q, x, c),
     )
     two = Neighbours(first_stage.indices[:, :2], first_stage.similarities[:, :2])
     candidates = len(np.unique(two.indices))

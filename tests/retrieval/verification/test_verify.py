@@ -97,12 +97,12 @@ def test_depth_gives_metres(names, tmp_path):
 def test_two_answers_with_positions_locate_the_camera(names):
     verifier = Verifier(Verify(intrinsics=CAMERA))
     checks = verifier.check(picture(QUERY), names)
-    located = verifier.locate(checks, names, POSITIONS[:QUERY], SIZE)
+    pose, answer, translation = verifier.locate(checks, names, POSITIONS[:QUERY], SIZE)
     # Metres rest on a baseline of 1.2 m, so that 2 degrees of its direction are some 4 % of 2 m.
-    assert located.pose.position == pytest.approx(POSITIONS[QUERY], abs=0.15)
-    assert located.pose.heading == pytest.approx(VIEWS[QUERY].heading, abs=2 * DIRECTION)
-    truth = relative(QUERY, located.answer)[1]
-    assert np.linalg.norm(located.translation - truth) < 0.15
+    assert pose.position == pytest.approx(POSITIONS[QUERY], abs=0.15)
+    assert pose.heading == pytest.approx(VIEWS[QUERY].heading, abs=2 * DIRECTION)
+    truth = relative(QUERY, answer)[1]
+    assert np.linalg.norm(translation - truth) < 0.15
     # One position, or both in one place, say nothing.
     assert verifier.locate(checks, names, [POSITIONS[0], None, None], SIZE) is None
     assert verifier.locate(checks, names, [POSITIONS[0]] * 3, SIZE) is None
