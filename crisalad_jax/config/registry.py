@@ -52,14 +52,15 @@ class Registry(Generic[P]):
     def register(self, name: str, **presets: Mapping[str, Any]) -> Callable[[_C], _C]:
         """Return a decorator that registers a class, or a plain function, under `name`.
 
+        A class that is not a frozen dataclass yet becomes one.
+
         Args:
             name: what configurations, files and flags call the part.
             presets: by the name of a preset of model sizes, the fields that differ there from the
                 part's defaults.
 
         Raises:
-            InputError: when it decorates: the name is taken, or the part is no frozen dataclass of
-                this kind.
+            InputError: when it decorates: the name is taken, or the part is not of this kind.
         """
         where = f"register_{self.kind}"
         require(
@@ -86,12 +87,10 @@ class Registry(Generic[P]):
             made = type(part.__name__, (self.base,), members)
             return cast(type[P], dataclasses.dataclass(frozen=True)(made))
         is_part = isinstance(part, type) and issubclass(part, self.base)
-        parameters = vars(part).get("__dataclass_params__") if is_part else None
-        require(
-            parameters is not None and parameters.frozen,
-            f"found {getattr(part, '__qualname__', type(part).__name__)}, expected a subclass of "
-            f"{self.base.__name__} with @dataclasses.dataclass(frozen=True) below the registration",
-        )
+        name = getattr(part, "__qualname__", type(part).__name__)
+        require(is_part, f"found {name}, expected a subclass of {self.base.__name__}")
+        if "__dataclass_params__" not in vars(part):
+            part = dataclasses.dataclass(frozen=True)(cast(Any, part))
         methods = {each for each in dir(self.base) if callable(getattr(self.base, each))}
         for field in dataclasses.fields(cast(Any, part)):
             # Files have a part's own name and plug-in among its fields.

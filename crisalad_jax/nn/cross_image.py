@@ -110,7 +110,6 @@ register_cross_image = CROSS_IMAGE.register
 
 
 @CROSS_IMAGE.register("none")
-@dataclasses.dataclass(frozen=True)
 class NoCrossImage(CrossImage):
     """No encoder: a descriptor depends on no other image."""
 
@@ -179,7 +178,6 @@ _TINY = {"heads": 4, "feedforward": 128, "dropout": 0.0}
 
 
 @CROSS_IMAGE.register("transformer", tiny=_TINY)
-@dataclasses.dataclass(frozen=True)
 class CrossImageConfig(TransformerEncoder):
     """The transformer encoder that attends across the images of a batch (paper section 3.4).
 
@@ -193,7 +191,6 @@ class CrossImageConfig(TransformerEncoder):
 
 
 @CROSS_IMAGE.register("sage-encoder", tiny={**_TINY, "width": 96})
-@dataclasses.dataclass(frozen=True)
 class SageCrossImageConfig(TransformerEncoder):
     """SAGE's transformer encoder (ICLR 2026), over a finished descriptor cut into tokens.
 
@@ -215,7 +212,6 @@ class GatedEncoder:
 
 
 @CROSS_IMAGE.register("gated", tiny=_TINY)
-@dataclasses.dataclass(frozen=True)
 class GatedCrossImageConfig(CrossImageConfig):
     """The paper's encoder behind a learnt gate: y = x + tanh(g) (f(x) - x).
 

@@ -201,7 +201,6 @@ class _Moments(Optimiser):
 
 
 @OPTIMISERS.register("adamw")
-@dataclasses.dataclass(frozen=True)
 class AdamW(_Moments):
     """AdamW (Loshchilov and Hutter 2019), as torch has it: weights decay apart from the gradient.
 
@@ -219,7 +218,6 @@ class AdamW(_Moments):
 
 
 @OPTIMISERS.register("adam")
-@dataclasses.dataclass(frozen=True)
 class Adam(_Moments):
     """Adam (Kingma and Ba 2015), as torch has it: the weight decay is part of the gradient."""
 
@@ -231,7 +229,6 @@ class Adam(_Moments):
 
 
 @OPTIMISERS.register("sgd")
-@dataclasses.dataclass(frozen=True)
 class Sgd(Optimiser):
     """SGD with torch's momentum, without dampening; the weight decay is part of the gradient."""
 

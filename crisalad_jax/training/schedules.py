@@ -75,7 +75,6 @@ register_schedule = SCHEDULES.register
 
 
 @SCHEDULES.register("constant")
-@dataclasses.dataclass(frozen=True)
 class ConstantSchedule(Schedule):
     """The same learning rate for the whole run."""
 
@@ -109,7 +108,6 @@ class _Decay(Schedule):
 
 
 @SCHEDULES.register("linear")
-@dataclasses.dataclass(frozen=True)
 class LinearSchedule(_Decay):
     """Linear decay, step by step (SALAD's code, `LinearLR` of torch)."""
 
@@ -122,7 +120,6 @@ class LinearSchedule(_Decay):
 
 
 @SCHEDULES.register("cosine")
-@dataclasses.dataclass(frozen=True)
 class CosineSchedule(_Decay):
     """Half a period of a cosine (Loshchilov and Hutter 2017, without restarts)."""
 
@@ -135,7 +132,6 @@ class CosineSchedule(_Decay):
 
 
 @SCHEDULES.register("step")
-@dataclasses.dataclass(frozen=True)
 class StepSchedule(Schedule):
     """A step down every few epochs after the warm-up; the defaults are CricaVPR's."""
 
@@ -158,7 +154,6 @@ class StepSchedule(Schedule):
 
 
 @SCHEDULES.register("milestones")
-@dataclasses.dataclass(frozen=True)
 class MilestonesSchedule(Schedule):
     """A step down after each of some epochs, counted from the start; the defaults are MixVPR's.
 

@@ -1,6 +1,5 @@
 """Tokens that the backbone itself makes: its class token, or learnt ones that run through it."""
 
-import dataclasses
 from typing import ClassVar
 
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -22,7 +21,6 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 
 @AGGREGATORS.register("class-token")
-@dataclasses.dataclass(frozen=True)
 class ClassTokenConfig(Aggregator):
     """The backbone's class token, by itself (Oquab et al. 2023)."""
 
@@ -47,7 +45,6 @@ class AggregationTokens:
 
 
 @AGGREGATORS.register("aggregation-tokens", tiny={"insertion": -2})
-@dataclasses.dataclass(frozen=True)
 class AggregationTokensConfig(Aggregator):
     """ImAge's learnt tokens, which run through the backbone's last blocks (Lu et al., 2025).
 

@@ -1,6 +1,5 @@
 """Conv-AP, the baseline of GSV-Cities (Ali-bey et al., Neurocomputing 2022)."""
 
-import dataclasses
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -29,7 +28,6 @@ class ConvAp:
 
 
 @AGGREGATORS.register("conv-ap", tiny={"channels": 128})
-@dataclasses.dataclass(frozen=True)
 class ConvApConfig(Aggregator):
     """Conv-AP, the baseline of GSV-Cities (Ali-bey et al., Neurocomputing 2022)."""
 

@@ -1,6 +1,5 @@
 """Generalised means of patches (GeM): of an image, of a pyramid, and heads with a linear layer."""
 
-import dataclasses
 import itertools
 import math
 
@@ -38,7 +37,6 @@ class Gem:
 
 
 @AGGREGATORS.register("gem")
-@dataclasses.dataclass(frozen=True)
 class GemConfig(Aggregator):
     """Generalised mean of all patches (Radenovic et al., TPAMI 2018)."""
 
@@ -56,7 +54,6 @@ class GemConfig(Aggregator):
 
 
 @AGGREGATORS.register("gem-pyramid")
-@dataclasses.dataclass(frozen=True)
 class GemPyramidConfig(GemConfig):
     """CricaVPR's class token and generalised means over 13 regions (Lu et al., CVPR 2024).
 
@@ -90,7 +87,6 @@ class CosPlace:
 
 
 @AGGREGATORS.register("cosplace", tiny={"dim": 256})
-@dataclasses.dataclass(frozen=True)
 class CosPlaceConfig(Aggregator):
     """The head of CosPlace (Berton et al., CVPR 2022) and EigenPlaces (ICCV 2023)."""
 
@@ -137,7 +133,6 @@ class ApGem:
 
 
 @AGGREGATORS.register("ap-gem", tiny={"dim": 256})
-@dataclasses.dataclass(frozen=True)
 class ApGemConfig(CosPlaceConfig):
     """The head of AP-GeM (Revaud et al., ICCV 2019), with its whitening."""
 

@@ -3,7 +3,6 @@
 The parameters fit one grid of patches, so a model describes images of one size only.
 """
 
-import dataclasses
 import math
 from typing import ClassVar
 
@@ -47,7 +46,6 @@ class MixVpr:
 
 
 @AGGREGATORS.register("mixvpr", tiny={"channels": 128})
-@dataclasses.dataclass(frozen=True)
 class MixVprConfig(Aggregator):
     """MixVPR (Ali-bey et al., WACV 2023)."""
 

@@ -3,7 +3,6 @@
 Written from the papers: the decoder is that of CroCo (Weinzaepfel et al., NeurIPS 2022).
 """
 
-import dataclasses
 import functools
 import math
 
@@ -68,7 +67,6 @@ class PairVpr:
 @AGGREGATORS.register(
     "pair-vpr", tiny={"dim": 64, "width": 64, "layers": 2, "hidden": 32, "positions": 49}
 )
-@dataclasses.dataclass(frozen=True)
 class PairVprConfig(Aggregator):
     """Pair-VPR's class token and its second stage's decoder (Hausler and Moghadam, RA-L 2025).
 

@@ -4,7 +4,6 @@ Attentions and encoder layers are torch's: `nn.MultiheadAttention` and, with ReL
 feed-forward network of four times the width, `nn.TransformerEncoderLayer`.
 """
 
-import dataclasses
 from typing import ClassVar
 
 import jax
@@ -61,7 +60,6 @@ class Boq:
 
 
 @AGGREGATORS.register("boq", tiny={"channels": 64, "queries": 16, "rows": 8})
-@dataclasses.dataclass(frozen=True)
 class BoqConfig(Aggregator):
     """Bag of queries (Ali-bey et al., CVPR 2024)."""
 
@@ -161,7 +159,6 @@ class EdtFormer:
 
 
 @AGGREGATORS.register("edtformer", tiny={"width": 64, "heads": 4, "queries": 16, "channels": 64})
-@dataclasses.dataclass(frozen=True)
 class EdtFormerConfig(Aggregator):
     """EDTformer's decoder (Jin et al., 2025).
 

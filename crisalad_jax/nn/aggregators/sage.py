@@ -3,7 +3,6 @@
 Written from the facts of the public model; the training code is not published.
 """
 
-import dataclasses
 from typing import ClassVar
 
 import jax
@@ -43,7 +42,6 @@ class Sage:
 @AGGREGATORS.register(
     "sage", tiny={"clusters": 16, "cluster_dim": 32, "token_dim": 64, "hidden": 128}
 )
-@dataclasses.dataclass(frozen=True)
 class SageConfig(Aggregator):
     """SAGE's aggregation (ICLR 2026).
 

@@ -60,7 +60,6 @@ _TINY = {"clusters": 16, "cluster_dim": 32, "token_dim": 64, "hidden": 128, "dro
 
 
 @AGGREGATORS.register("salad", tiny=_TINY)
-@dataclasses.dataclass(frozen=True)
 class SaladConfig(Aggregator):
     """SALAD aggregation (Izquierdo and Civera, CVPR 2024).
 
@@ -213,7 +212,6 @@ class Fol(Salad):
 
 
 @AGGREGATORS.register("fol", tiny={**_TINY, "local_hidden": 32, "local": 16})
-@dataclasses.dataclass(frozen=True)
 class FolConfig(SaladConfig):
     """FoL's global descriptor: SALAD's with a dustbin of attention (Wang et al., AAAI 2025).
 

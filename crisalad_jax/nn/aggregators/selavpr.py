@@ -1,7 +1,5 @@
 """SelaVPR: a generalised mean, and local features to re-rank by (Lu et al., ICLR 2024)."""
 
-import dataclasses
-
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -36,7 +34,6 @@ class SelaVpr:
 
 
 @AGGREGATORS.register("selavpr", tiny={"hidden": 32, "local": 16})
-@dataclasses.dataclass(frozen=True)
 class SelaVprConfig(Aggregator):
     """SelaVPR's global and local features (Lu et al., ICLR 2024).
 

@@ -4,8 +4,6 @@ Written from the facts of the public model (Lu et al. 2025, "SelaVPR++: Towards 
 of Foundation Models for Efficient Place Recognition").
 """
 
-import dataclasses
-
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import PositiveInt
@@ -28,7 +26,6 @@ class SelaVprPp:
 
 
 @AGGREGATORS.register("selavprpp", tiny={"dim": 256})
-@dataclasses.dataclass(frozen=True)
 class SelaVprPpConfig(Aggregator):
     """SelaVPR++'s head (Lu et al. 2025).
 
@@ -67,7 +64,6 @@ class SelaVprPpHash:
 
 
 @AGGREGATORS.register("selavprpp-hash", tiny={"dim": 256, "bits": 128})
-@dataclasses.dataclass(frozen=True)
 class SelaVprPpHashConfig(SelaVprPpConfig):
     """SelaVPR++ with its second path: a short descriptor whose bits are searched, and re-ranking.
 

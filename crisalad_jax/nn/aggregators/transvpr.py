@@ -3,8 +3,6 @@
 Features hold the patches of all levels side by side (`FeatureSpec.levels`).
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -31,7 +29,6 @@ class TransVpr:
 
 
 @AGGREGATORS.register("transvpr", tiny={"levels": 2, "dim": 128})
-@dataclasses.dataclass(frozen=True)
 class TransVprConfig(Aggregator):
     """TransVPR: patches of several layers, weighed by attention (Wang et al., CVPR 2022)."""
 

@@ -81,7 +81,6 @@ class NetVlad:
 
 
 @AGGREGATORS.register("netvlad", tiny={"clusters": 16})
-@dataclasses.dataclass(frozen=True)
 class NetVladConfig(VladConfig):
     """NetVLAD (Arandjelovic et al., CVPR 2016)."""
 
@@ -112,7 +111,6 @@ class SuperVlad:
 
 
 @AGGREGATORS.register("supervlad")
-@dataclasses.dataclass(frozen=True)
 class SuperVladConfig(VladConfig):
     """SuperVLAD (Lu et al., NeurIPS 2024).
 
@@ -168,7 +166,6 @@ class VladBuff:
 
 
 @AGGREGATORS.register("vlad-buff", tiny={"clusters": 16, "reduced": 32})
-@dataclasses.dataclass(frozen=True)
 class VladBuffConfig(VladConfig):
     """VLAD-BuFF (Khaliq et al., ECCV 2024).
 
@@ -233,7 +230,6 @@ class AnyLoc:
 
 
 @AGGREGATORS.register("anyloc", tiny={"clusters": 16, "layer": -1})
-@dataclasses.dataclass(frozen=True)
 class AnyLocConfig(VladConfig):
     """AnyLoc: hard VLAD of a facet of one layer, nothing learnt (Keetha et al., RA-L 2023)."""
 

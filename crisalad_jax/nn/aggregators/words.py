@@ -3,7 +3,6 @@
 Patches of zeros are none: an image may have fewer features than there is room for.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -37,7 +36,6 @@ class Vlad:
 
 
 @AGGREGATORS.register("vlad", tiny={"clusters": 16})
-@dataclasses.dataclass(frozen=True)
 class HardVladConfig(VladConfig):
     """VLAD (Jegou et al., CVPR 2010), intra-normalised (Arandjelovic and Zisserman, CVPR 2013)."""
 
@@ -72,7 +70,6 @@ class Bow:
 
 
 @AGGREGATORS.register("bow", tiny={"clusters": 100})
-@dataclasses.dataclass(frozen=True)
 class BowConfig(Aggregator):
     """Bags of visual words by tf-idf (Sivic and Zisserman, ICCV 2003)."""
 

@@ -36,7 +36,6 @@ class Residual:
 
 
 @BACKBONES.register("resnet", tiny={"layers": 18, "stages": 2})
-@dataclasses.dataclass(frozen=True)
 class ResNetConfig(StagedBackbone):
     """A ResNet (He et al., CVPR 2016), for images of any size."""
 

@@ -74,7 +74,6 @@ class TransVprNet:
 
 
 @BACKBONES.register("transvpr-net", tiny={"dim": 64, "depth": 4})
-@dataclasses.dataclass(frozen=True)
 class TransVprNetConfig(Backbone):
     """TransVPR's convolutions and transformer, without positions (Wang et al., CVPR 2022)."""
 

@@ -395,7 +395,6 @@ class VisionTransformer(Backbone):
 
 
 @BACKBONES.register("vit")
-@dataclasses.dataclass(frozen=True)
 class ViTConfig(VisionTransformer):
     """A DINOv2 vision transformer with patches of 14 x 14 (Oquab et al. 2023).
 

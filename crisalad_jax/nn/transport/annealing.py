@@ -1,6 +1,5 @@
 """Sinkhorn's iteration at an epsilon that falls (Schmitzer, SIAM J. Sci. Comput. 2019)."""
 
-import dataclasses
 import math
 from typing import Any, ClassVar
 
@@ -13,7 +12,6 @@ from crisalad_jax.nn.transport.steps import STEPS, Step, check_balanced, tempere
 
 
 @STEPS.register("annealing")
-@dataclasses.dataclass(frozen=True)
 class AnnealingStep(Step):
     """Take Sinkhorn's step at `start` times epsilon first, and at epsilon after `cooling` steps.
 

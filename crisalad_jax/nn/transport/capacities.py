@@ -1,6 +1,5 @@
 """Transport to columns that take at most their marginals (Benamou et al., 2015)."""
 
-import dataclasses
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -11,7 +10,6 @@ from crisalad_jax.nn.transport.steps import STEPS, Step
 
 
 @STEPS.register("capacities")
-@dataclasses.dataclass(frozen=True)
 class CapacityStep(Step):
     """Treat the columns' marginals as capacities: lower full columns, leave the others.
 

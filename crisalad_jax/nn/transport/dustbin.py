@@ -81,7 +81,6 @@ def check_params(params: Any, *shape: int) -> Array:
 
 
 @DUSTBINS.register("none")
-@dataclasses.dataclass(frozen=True)
 class NoDustbin(Dustbin):
     """No dustbin: the clusters share the patches' mass equally."""
 
@@ -93,7 +92,6 @@ class NoDustbin(Dustbin):
 
 
 @DUSTBINS.register("column")
-@dataclasses.dataclass(frozen=True)
 class ColumnDustbin(Dustbin):
     """A column of one learnt score, as published; plain iterations do not depend on the score."""
 
@@ -109,7 +107,6 @@ class ColumnDustbin(Dustbin):
 
 
 @DUSTBINS.register("row and column")
-@dataclasses.dataclass(frozen=True)
 class RowAndColumnDustbin(Dustbin):
     """A row and a column of one learnt score, as SuperGlue has them (Sarlin et al., CVPR 2020)."""
 
@@ -129,7 +126,6 @@ class RowAndColumnDustbin(Dustbin):
 
 
 @DUSTBINS.register("token")
-@dataclasses.dataclass(frozen=True)
 class TokenDustbin(Dustbin):
     """A score that the score network gives each patch."""
 
@@ -144,7 +140,6 @@ class TokenDustbin(Dustbin):
 
 
 @DUSTBINS.register("mass")
-@dataclasses.dataclass(frozen=True)
 class MassDustbin(Dustbin):
     """A column of learnt mass, as the logit of its share; clusters share the rest equally."""
 

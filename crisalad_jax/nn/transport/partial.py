@@ -7,7 +7,6 @@ exp(kernel + row + column), where no row potential is above 0, and no column pot
 that all clusters share. The level is such that the total is met.
 """
 
-import dataclasses
 import math
 from typing import Any, ClassVar
 
@@ -28,7 +27,6 @@ from crisalad_jax.nn.transport.steps import STEPS, Step
 
 
 @DUSTBINS.register("partial")
-@dataclasses.dataclass(frozen=True)
 class PartialDustbin(Dustbin):
     """The mass that partial transport leaves in the patches; it has no score.
 
@@ -75,7 +73,6 @@ class PartialDustbin(Dustbin):
 
 
 @STEPS.register("partial")
-@dataclasses.dataclass(frozen=True)
 class PartialStep(Step):
     """Move all mass but the last column's marginal, within the marginals of patches and clusters.
 

@@ -1,6 +1,5 @@
 """Sparse plans: quadratic transport, and the largest entries of an entropic plan's rows."""
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -13,7 +12,6 @@ from crisalad_jax.nn.transport.steps import STEPS, SinkhornStep, Step, check_bal
 
 
 @STEPS.register("quadratic")
-@dataclasses.dataclass(frozen=True)
 class QuadraticStep(Step):
     """Maximise <P, S> - epsilon / 2 * |P|^2, whose plan is sparse (Blondel et al., AISTATS 2018).
 
@@ -71,7 +69,6 @@ def simplex_offset(scores: Matrix, mass: Rows) -> Rows:
 
 
 @STEPS.register("top-k")
-@dataclasses.dataclass(frozen=True)
 class TopKStep(SinkhornStep):
     """Sinkhorn's step; of the plan each row keeps its k largest entries, scaled to the row's mass.
 

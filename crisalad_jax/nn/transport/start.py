@@ -68,7 +68,6 @@ def from_columns(problem: Problem, column: Columns) -> Potentials:
 
 
 @STARTS.register("zeros")
-@dataclasses.dataclass(frozen=True)
 class ZeroStart(Start):
     """Start at zeros, as published."""
 
@@ -78,7 +77,6 @@ class ZeroStart(Start):
 
 
 @STARTS.register("gaussian")
-@dataclasses.dataclass(frozen=True)
 class GaussianStart(Start):
     """Start at the potentials of two Gaussians, in closed form from the scores' spectrum.
 
@@ -126,7 +124,6 @@ def _root_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
 
 
 @STARTS.register("network")
-@dataclasses.dataclass(frozen=True)
 class NetworkStart(Start):
     """Start at Sinkhorn's first columns, moved by a small network of each column's statistics.
 

@@ -110,7 +110,6 @@ STEPS = Registry("step", Step, of_function=_of_function)
 
 
 @STEPS.register("sinkhorn")
-@dataclasses.dataclass(frozen=True)
 class SinkhornStep(Step):
     """Meet the columns' marginals, then the rows' (paper Eq. 5).
 
@@ -173,7 +172,6 @@ HOTTEST = 1e12
 
 
 @STEPS.register("newton")
-@dataclasses.dataclass(frozen=True)
 class NewtonStep(Step):
     """Newton's method on the semi-dual, a concave function of the column potentials alone.
 
@@ -257,7 +255,6 @@ def _cooled(temperature: Array, newton: Array, error: Array) -> Array:
 
 
 @STEPS.register("softmax")
-@dataclasses.dataclass(frozen=True)
 class SoftmaxStep(Step):
     """Distribute every row by a softmax: a baseline without transport."""
 
@@ -270,7 +267,6 @@ class SoftmaxStep(Step):
 
 
 @STEPS.register("dual-softmax")
-@dataclasses.dataclass(frozen=True)
 class DualSoftmaxStep(Step):
     """Multiply a softmax of the rows by one of the columns: a baseline without transport."""
 
