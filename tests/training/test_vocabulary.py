@@ -14,12 +14,12 @@ from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.vlad import (
-    AnyLoc,
     AnyLocConfig,
     NetVlad,
     NetVladConfig,
     VladBuff,
     VladBuffConfig,
+    Words,
 )
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, unit_features
@@ -50,7 +50,7 @@ CONFIGS = pytest.mark.parametrize("config", [ANYLOC, NETVLAD], ids=["anyloc", "n
 def fresh() -> Crisalad:
     """AnyLoc without a vocabulary."""
     params = random_params(ANYLOC)
-    return dataclasses.replace(params, aggregator=AnyLoc(jnp.ones((4, 32))))
+    return dataclasses.replace(params, aggregator=Words(jnp.ones((4, 32))))
 
 
 @pytest.fixture(scope="module")

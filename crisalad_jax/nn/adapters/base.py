@@ -172,21 +172,6 @@ class Adapter(Part, abc.ABC):
         """Return whether it has one of these methods of its own."""
         return any(getattr(type(self), hook) is not getattr(Adapter, hook) for hook in hooks)
 
-    @property
-    def has_prompts(self) -> bool:
-        """Whether it has `prompts`."""
-        return self.has("prompts")
-
-    @property
-    def can_merge(self) -> bool:
-        """Whether it has a `merge`."""
-        return self.has("merge")
-
-    @property
-    def has_side_path(self) -> bool:
-        """Whether it has a `side_path`."""
-        return self.has("side_path")
-
 
 HOOKS = (
     *("prompts", "linear_update", "attention_update", "mlp_update", "output_update", "side_path"),

@@ -32,7 +32,7 @@ class ClassTokenConfig(Aggregator):
         """Return the shape of a global token as wide as the backbone."""
         return TokenShape(dim, 0, dim)
 
-    def apply(self, params: None, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: None, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the class token as it is."""
         return Tokens.of_global(at_least_float32(features.class_token))
 
@@ -88,7 +88,7 @@ class AggregationTokensConfig(Aggregator):
         return params.tokens
 
     def apply(
-        self, params: AggregationTokens, features: Features, grid: Grid, *, key: Keys | None
+        self, params: AggregationTokens, features: Features, grid: Grid, *, key: Keys
     ) -> Tokens:
         """Return the tokens as the backbone's last layer norm leaves them."""
         assert features.inserted is not None

@@ -106,7 +106,7 @@ class Aggregator(Part, abc.ABC):
         return None
 
     @abc.abstractmethod
-    def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the tokens of one image or of a batch, in float32 at least.
 
         Args:
@@ -249,9 +249,7 @@ def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
         tokens = jax.eval_shape(outputs, features)
         return TokenShape(tokens.global_token.shape[0], *tokens.local.shape)
 
-    def apply(
-        self: Aggregator, params: Any, features: Features, grid: Any, *, key: Keys | None
-    ) -> Tokens:
+    def apply(self: Aggregator, params: Any, features: Features, grid: Any, *, key: Keys) -> Tokens:
         each = outputs
         for _ in features.class_token.shape[:-1]:
             each = jax.vmap(each)

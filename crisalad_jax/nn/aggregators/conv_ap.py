@@ -49,7 +49,7 @@ class ConvApConfig(Aggregator):
         """Draw parameters as torch's convolutions do."""
         return ConvAp(init_linear(key, backbone.dim, self.channels))
 
-    def apply(self, params: ConvAp, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: ConvAp, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return a token for each of side x side regions, row by row.
 
         The published order is convolution, then means. Both are linear and the weights of a mean

@@ -48,7 +48,7 @@ class GemConfig(Aggregator):
         """Start at an exponent of 3, as public implementations do."""
         return Gem(random_init.full((), START))
 
-    def apply(self, params: Gem, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Gem, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the mean of all patches, a global token as wide as the backbone."""
         return Tokens.of_global(gem(features.patches, params.p))
 
@@ -72,7 +72,7 @@ class GemPyramidConfig(GemConfig):
         """Require a patch in every region."""
         require_side(self.part_name, grid, max(PYRAMID_LEVELS), patch_size)
 
-    def apply(self, params: Gem, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Gem, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the class token, and a generalised mean for each region."""
         means = gem_pyramid(features.patches, params.p, grid)
         return Tokens(at_least_float32(features.class_token), means)
@@ -101,9 +101,7 @@ class CosPlaceConfig(Aggregator):
         """Draw parameters as the public code: an exponent of 3, torch's default linear layer."""
         return CosPlace(random_init.full((), START), init_linear(key, backbone.dim, self.dim))
 
-    def apply(
-        self, params: CosPlace, features: Features, grid: Grid, *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: CosPlace, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return a linear layer of the generalised mean of unit patches.
 
         The descriptor is scaled to unit length later.
@@ -145,7 +143,7 @@ class ApGemConfig(CosPlaceConfig):
         whitening = Whitening(zeros(self.dim), jnp.diag(ones(self.dim)), ones(self.dim))
         return ApGem(head.p, head.fc, whitening)
 
-    def apply(self, params: ApGem, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: ApGem, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the whitened unit output of a linear layer of the mean of patches as they are.
 
         The whitening is measured, not learnt: no gradient changes it.

@@ -85,7 +85,7 @@ class MixVprConfig(Aggregator):
             row_proj=init_linear(rows, patches, self.rows),
         )
 
-    def apply(self, params: MixVpr, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: MixVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return a token of `channels` numbers for each row (paper Eqs. 1 to 4)."""
         maps = features.patches.swapaxes(-2, -1)
         for mixer in params.mix:

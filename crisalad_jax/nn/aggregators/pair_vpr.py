@@ -133,7 +133,7 @@ class PairVprConfig(Aggregator):
             norm_other=init_layer_norm(width),
         )
 
-    def apply(self, params: PairVpr, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: PairVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the projected class token, and no local token."""
         return Tokens.of_global(at_least_float32(linear(params.reduction, features.class_token)))
 

@@ -104,7 +104,7 @@ class BoqConfig(Aggregator):
             fc=init_linear(rows_key, self.layers * self.queries, self.rows),
         )
 
-    def apply(self, params: Boq, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Boq, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return a token of `channels` numbers for each row."""
         patches = features.patches
         maps = patches.reshape(-1, *grid, patches.shape[-1])
@@ -216,9 +216,7 @@ class EdtFormerConfig(Aggregator):
             row_proj=init_linear(rows, self.queries, self.rows),
         )
 
-    def apply(
-        self, params: EdtFormer, features: Features, grid: Grid, *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: EdtFormer, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return a token of `channels` numbers for each row."""
         answers = decode(params, features, self.heads)
         channels = linear(params.channel_proj, answers).swapaxes(-2, -1)

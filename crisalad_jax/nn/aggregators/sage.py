@@ -84,7 +84,7 @@ class SageConfig(Aggregator):
             power=init_two_layer(keys[4], self.clusters, self.clusters // 2, 1),
         )
 
-    def apply(self, params: Sage, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Sage, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the global token and the clusters, each L2-normalised, in float32."""
         patches = weighted(params.weighting, features.patches)
         means = pooled(params, patches)

@@ -155,7 +155,7 @@ class SaladConfig(Aggregator):
         """Return the dustbin's parameters, by default those that are learnt."""
         return params.dust_bin
 
-    def transport(self, params: Any, features: Features, *, key: Keys | None) -> SinkhornResult:
+    def transport(self, params: Any, features: Features, *, key: Keys) -> SinkhornResult:
         """Assign patches to clusters, dustbin last (SALAD's Eqs. 3 to 5), in float32.
 
         Raises:
@@ -175,7 +175,7 @@ class SaladConfig(Aggregator):
             start_params=params.start,
         )
 
-    def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the global token and cluster tokens (paper Eq. 6), each L2-normalised, in float32.
 
         The tokens carry the transport's statistics, without a gradient. A whole batch is faster

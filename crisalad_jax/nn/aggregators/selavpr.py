@@ -65,7 +65,7 @@ class SelaVprConfig(Aggregator):
             upconv2=init_transposed_conv(second, 3, self.hidden, self.local),
         )
 
-    def apply(self, params: SelaVpr, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: SelaVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the mean of all patches; and in training, for its loss, the local features."""
         tokens = Tokens.of_global(gem(features.patches, params.p))
         if key is None:

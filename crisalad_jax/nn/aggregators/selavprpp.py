@@ -46,9 +46,7 @@ class SelaVprPpConfig(Aggregator):
         """Start at an exponent of 3, with linear layers as torch's."""
         return init_head(key, backbone.dim, self.dim)
 
-    def apply(
-        self, params: SelaVprPp, features: Features, grid: Grid, *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: SelaVprPp, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the head's output, which is scaled to unit length later."""
         return Tokens.of_global(head(params, features.patches))
 
@@ -94,9 +92,7 @@ class SelaVprPpHashConfig(SelaVprPpConfig):
             init_head(first, backbone.dim, self.dim), init_head(second, backbone.dim, self.bits)
         )
 
-    def apply(
-        self, params: SelaVprPpHash, features: Features, grid: Grid, *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: SelaVprPpHash, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the output of the second path's head, which is scaled to unit length later."""
         return Tokens.of_global(head(params.hash, features.patches))
 

@@ -55,9 +55,7 @@ class TransVprConfig(Aggregator):
             init_linear(first, wide, self.levels, bias=False), init_linear(second, wide, self.dim)
         )
 
-    def apply(
-        self, params: TransVpr, features: Features, grid: Grid, *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: TransVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the global descriptor, and no local token."""
         patches = at_least_float32(features.patches)
         weights = attentions(params, features.patches)

@@ -112,7 +112,7 @@ class Backbone(Part, abc.ABC):
 
     @abc.abstractmethod
     def apply(
-        self, params: Any, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
+        self, params: Any, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, Any]:
         """Return the features of normalised images, and the parameters.
 

@@ -47,7 +47,7 @@ class WholeImageBackbone(HandmadeBackbone):
         """Return the descriptors of images of `size`."""
 
     def apply(
-        self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
+        self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, None]:
         """Return the descriptor as the class token, and as the only patch."""
         descriptors = self.descriptors(images)

@@ -44,7 +44,7 @@ class _LocalFeatureBackbone(HandmadeBackbone):
         """Return unit vectors of the bytes of descriptors."""
 
     def apply(
-        self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
+        self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, None]:
         """Return the features as patches, strongest first, and 0 where there are no more.
 

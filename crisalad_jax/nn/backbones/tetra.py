@@ -135,13 +135,7 @@ class TetraVitConfig(Backbone):
         )
 
     def apply(
-        self,
-        params: TetraVit,
-        images: Pixels,
-        request: FeatureSpec,
-        *,
-        remat: str,
-        valid: Valid = None,
+        self, params: TetraVit, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, TetraVit]:
         """Return the last block's tokens; there is no last norm.
 

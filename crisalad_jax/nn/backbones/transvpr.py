@@ -121,13 +121,7 @@ class TransVprNetConfig(Backbone):
         )
 
     def apply(
-        self,
-        params: TransVprNet,
-        images: Pixels,
-        request: FeatureSpec,
-        *,
-        remat: str,
-        valid: Valid = None,
+        self, params: TransVprNet, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, TransVprNet]:
         """Return the patches of the requested levels side by side, and the last one's class token.
 

@@ -156,7 +156,7 @@ class VisionTransformer(Backbone):
         acts = isinstance(adapter, NoAdapter) or adapter.has(*HOOKS)
         require_field(self, "adapter", acts, f"one with a method {', '.join(HOOKS)}")
         words = f"one of all blocks, which {adapter.part_name} with prompts has to be"
-        require_field(self, "adapter", not (few and adapter.has_prompts), words)
+        require_field(self, "adapter", not (few and adapter.has("prompts")), words)
         adapter.check(self.block_shape)
 
     @property
@@ -360,7 +360,7 @@ class VisionTransformer(Backbone):
         """Merge the adapters into the linear layers that they update."""
         adapter = self.adapter
         require(
-            adapter.can_merge,
+            adapter.has("merge"),
             f"merge_adapters: found adapter {adapter.part_name}, expected one of weights, as lora",
         )
 
@@ -473,10 +473,10 @@ def _checked_levels(request: FeatureSpec, config: VisionTransformer) -> tuple[in
         "levels or a facet": levels != (config.depth,) or request.facet != "token",
         "inserted tokens": request.inserted is not None,
         "the class token's attention": request.class_attention,
-        "adapters on a side path": config.adapter.has_side_path,
+        "adapters on a side path": config.adapter.has("side_path"),
     }
     if request.class_attention:
-        special["adapters with prompts"] = config.adapter.has_prompts
+        special["adapters with prompts"] = config.adapter.has("prompts")
     found = [name for name, is_asked in special.items() if is_asked]
     require(len(found) < 2, f"features: found {' and '.join(found)}, expected one of these alone")
     return levels
@@ -614,7 +614,7 @@ def run_blocks(
         (tokens, statistics): the second has a stack of running statistics for each of `stacks`.
     """
     front = 0
-    if config.adapter.has_prompts:
+    if config.adapter.has("prompts"):
         prompts: Any = jax.eval_shape(lambda: config.adapter.prompts(_block_at(stacks, 0).adapter))
         wanted = jax.ShapeDtypeStruct((prompts.shape[0], config.dim), jnp.float32)
         expect_like(f"adapter {config.adapter.part_name}", prompts, wanted)
@@ -656,7 +656,7 @@ def run_blocks(
                 if start >= stop:
                     continue
                 part = dataclasses.replace(stack, adapter=None) if start < first else stack
-                if start == first and config.adapter.has_side_path and side is None:
+                if start == first and config.adapter.has("side_path") and side is None:
                     side = tokens
                 if is_whole:
                     (tokens, side), measured = jax.lax.scan(body, (tokens, side), part)

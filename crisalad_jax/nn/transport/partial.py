@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_field
 from crisalad_jax.nn.transport.dustbin import (
@@ -23,7 +23,7 @@ from crisalad_jax.nn.transport.dustbin import (
     check_params,
 )
 from crisalad_jax.nn.transport.problem import EMPTY, Columns, Matrix, Potentials, Problem
-from crisalad_jax.nn.transport.steps import STEPS, Step
+from crisalad_jax.nn.transport.steps import STEPS, Moved, Step
 
 
 @DUSTBINS.register("partial")
@@ -83,9 +83,7 @@ class PartialStep(Step):
 
     capacities: ClassVar[bool] = True
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Fill the columns to one level, then lower the rows that give more than they have."""
         sums, log_nu = problem.lse_rows(potentials.row)[..., :-1], problem.log_nu[..., :-1]
         moved = jnp.exp(problem.log_mu).sum(axis=-1) - jnp.exp(problem.log_nu[..., -1])

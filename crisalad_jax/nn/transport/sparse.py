@@ -4,11 +4,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
 from crisalad_jax.config.checks import PositiveInt
 from crisalad_jax.nn.transport.problem import EMPTY, Matrix, Potentials, Problem, Rows
-from crisalad_jax.nn.transport.steps import STEPS, SinkhornStep, Step, check_balanced
+from crisalad_jax.nn.transport.steps import STEPS, Moved, SinkhornStep, Step, check_balanced
 
 
 @STEPS.register("quadratic")
@@ -25,9 +25,7 @@ class QuadraticStep(Step):
         [[1.0, 0.0], [0.0, 1.0]]
     """
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Meet the columns' marginals, then the rows'.
 
         Raises:

@@ -22,6 +22,9 @@ from crisalad_jax.nn.transport.problem import (
     product,
 )
 
+Moved = tuple[Potentials, Any]
+"""The potentials and the state after a step."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Step(Part, abc.ABC):
@@ -126,9 +129,7 @@ class SinkhornStep(Step):
         fits = 1 <= self.relaxation < 2
         require_field(self, "relaxation", fits, "from 1 to less than 2")
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Take both half steps."""
         column = problem.column_tau * (problem.log_nu - problem.lse_rows(potentials.row))
         column = self._further(potentials.column, column, problem.column_tau)
@@ -190,9 +191,7 @@ class NewtonStep(Step):
         """Return a temperature of 1; the first step finds the one for its potentials."""
         return 0 * problem.log_mu[..., 0] + 1
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Take the best of four steps at the state's temperature.
 
         Raises:
@@ -258,9 +257,7 @@ def _cooled(temperature: Array, newton: Array, error: Array) -> Array:
 class SoftmaxStep(Step):
     """Distribute every row by a softmax: a baseline without transport."""
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Meet the rows' marginals, and ignore the columns'."""
         column = problem.zeros().column
         return Potentials(problem.log_mu - problem.lse_columns(column), column), state
@@ -270,9 +267,7 @@ class SoftmaxStep(Step):
 class DualSoftmaxStep(Step):
     """Multiply a softmax of the rows by one of the columns: a baseline without transport."""
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Normalise rows and columns, independently of each other."""
         row, column = problem.zeros()
         return Potentials(-problem.lse_columns(column), -problem.lse_rows(row)), state
