@@ -222,6 +222,20 @@ def make_part(kind: str, name: str, **settings: Any) -> Any:
     return registry.make(name, **settings)
 
 
+def add_named(kind: str, table: dict[str, Any], name: str, value: Any) -> None:
+    """Add a class or function to a plain table of names, for `register_{kind}`.
+
+    Raises:
+        InputError: another module has taken the name.
+    """
+    taken = table.get(name, value).__module__
+    require(
+        taken == value.__module__,
+        f"register_{kind} {name!r}: found the name taken by {taken}, expected another",
+    )
+    table[name] = value
+
+
 def _home(part: type[Part]) -> str:
     return f"{part.__module__}.{part.__qualname__}"
 
