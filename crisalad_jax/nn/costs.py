@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend import core
 
+from crisalad_jax.nn.backbones.vit import run_blocks
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import TAPS
 from crisalad_jax.nn.model import attend_across_images, extract_tokens, parameter_shapes, self_mask
@@ -143,6 +144,20 @@ def _macs(equation: Any, name: str, scope: str) -> int:
     return out if name == "mul" and TAPS in _NAMES.findall(scope) else 0
 
 
+def adapter_macs(config: ModelConfig) -> int:
+    """Count the multiply-accumulates per image that the adapter adds to a block."""
+    backbone: Any = dataclasses.replace(config.backbone, depth=1)  # pyright: ignore
+    shape = 1, 1 + backbone.registers + config.patches, backbone.dim
+    tokens = jax.ShapeDtypeStruct(shape, jnp.float32)
+
+    def count(backbone: Any) -> int:
+        stacks = [jax.eval_shape(backbone.init, jax.random.key(0)).blocks]
+        run = functools.partial(run_blocks, grid=config.grid, config=backbone)
+        return count_macs(run, stacks, tokens).total()
+
+    return count(backbone) - count(dataclasses.replace(backbone, adapter="none"))
+
+
 def paper_adapter_macs(config: ModelConfig, macs: int) -> int:
     """Count an adapter's multiply-accumulates as the paper (Table 3: 39.223 M), each linear once.
 
@@ -150,7 +165,7 @@ def paper_adapter_macs(config: ModelConfig, macs: int) -> int:
 
     Args:
         config: the model.
-        macs: the adapter's own, with each linear layer at every token.
+        macs: those of `adapter_macs`, which counts a linear layer at every token instead.
     """
     backbone: Any = config.backbone
     weights = named_leaves(parameter_shapes(config).backbone.blocks.adapter).items()

@@ -31,7 +31,6 @@ Mask = Bool[Array, "image image"] | None
 """`mask[i, j]` allows image i to attend to image j; None allows all."""
 
 
-@dataclasses.dataclass(frozen=True)
 class CrossImage(Part, abc.ABC):
     """A network that relates the images of a batch: a frozen dataclass with its settings as fields.
 

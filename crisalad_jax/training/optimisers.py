@@ -23,7 +23,6 @@ Rate = Callable[[Any], Any]
 _PREFIX = "optax."
 
 
-@dataclasses.dataclass(frozen=True)
 class Optimiser(Part, abc.ABC):
     """What turns gradients into steps: a frozen dataclass whose fields are its settings.
 
@@ -133,7 +132,6 @@ def _plain_type(default: Any, annotation: Any) -> Any:
     return None
 
 
-@dataclasses.dataclass(frozen=True)
 class _OptaxOptimiser(Optimiser):
     """The base class of the parts that `_of_optax` makes."""
 

@@ -27,7 +27,6 @@ class RunSteps(NamedTuple):
     """Steps of the warm-up."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Schedule(Part, abc.ABC):
     """A learning rate that changes: a frozen dataclass whose fields are its settings.
 

@@ -4,9 +4,8 @@
 """
 
 import dataclasses
-import functools
 import math
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,9 +26,9 @@ from crisalad_jax.nn.aggregators.vlad import (
     SuperVladConfig,
     VladBuffConfig,
 )
-from crisalad_jax.nn.backbones.vit import ViTConfig, run_blocks
+from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
-from crisalad_jax.nn.costs import count_macs, paper_adapter_macs, part_costs
+from crisalad_jax.nn.costs import adapter_macs, count_macs, paper_adapter_macs, part_costs
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import parameter_shapes
 from crisalad_jax.sinkhorn import SinkhornConfig
@@ -40,20 +39,6 @@ LINEARS = 257 * 768 * 384 * 2
 
 def macs_of(config: ModelConfig, images: int = 1) -> dict[str, int]:
     return {cost.part: cost.macs for cost in part_costs(config, images=images)}
-
-
-def adapter_macs(config: ModelConfig) -> int:
-    """Count the multiply-accumulates per image that the adapter adds to a block."""
-    backbone: Any = dataclasses.replace(cast(Any, config.backbone), depth=1)
-    shape = 1, 1 + backbone.registers + config.patches, backbone.dim
-    tokens = jax.ShapeDtypeStruct(shape, jnp.float32)
-
-    def count(backbone: Any) -> int:
-        stacks = [jax.eval_shape(backbone.init, jax.random.key(0)).blocks]
-        run = functools.partial(run_blocks, grid=config.grid, config=backbone)
-        return count_macs(run, stacks, tokens).total()
-
-    return count(backbone) - count(dataclasses.replace(backbone, adapter="none"))
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Adapters of a vision transformer's blocks: their interface and registry."""
 
 import abc
-import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -40,7 +39,6 @@ class TokenInfo(NamedTuple):
     (`layers.train_batch_norm`); None takes the stored ones."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Adapter(Part, abc.ABC):
     """Small layers that are added to every block: a frozen dataclass whose fields are its settings.
 

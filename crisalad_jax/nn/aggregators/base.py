@@ -1,7 +1,6 @@
 """Aggregators, which turn an image's features into tokens: their interface and registry."""
 
 import abc
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -39,7 +38,6 @@ class TokenShape(NamedTuple):
     """Width of a local token, and of the cross-image encoder."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Aggregator(Part, abc.ABC):
     """A method that makes tokens of features: a frozen dataclass whose fields are its settings.
 

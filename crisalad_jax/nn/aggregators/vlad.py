@@ -229,7 +229,6 @@ class Words:
     """k-means centroids of unit features."""
 
 
-@dataclasses.dataclass(frozen=True)
 class WordsConfig(VladConfig):
     """What sums by the nearest visual word share: words that k-means alone finds."""
 

@@ -26,7 +26,6 @@ class HandmadeBackbone(Backbone):
         """Return no parameters."""
 
 
-@dataclasses.dataclass(frozen=True)
 class WholeImageBackbone(HandmadeBackbone):
     """A descriptor of a whole image of one size."""
 

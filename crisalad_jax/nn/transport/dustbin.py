@@ -5,7 +5,6 @@ The mass of a dustbin is decided here, in `marginals`: what the clusters leave f
 that it appends is another thing.
 """
 
-import dataclasses
 import math
 from typing import Any, ClassVar, NamedTuple
 
@@ -30,7 +29,6 @@ class Marginals(NamedTuple):
     log_nu: Float[Array, "*#batch columns"]
 
 
-@dataclasses.dataclass(frozen=True)
 class Dustbin(Part):
     """Base class of dustbins, which take the patches that belong to no cluster.
 

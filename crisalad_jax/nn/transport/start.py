@@ -1,7 +1,6 @@
 """Where a solver starts: at zeros, at a Gaussian guess, or where a small network says."""
 
 import abc
-import dataclasses
 from typing import Any
 
 import jax
@@ -14,7 +13,6 @@ from crisalad_jax.config.registry import Registry
 from crisalad_jax.nn.transport.problem import Columns, Potentials, Problem, product
 
 
-@dataclasses.dataclass(frozen=True)
 class Start(Part, abc.ABC):
     """Base class of starts: the potentials from which the iterations of any step begin.
 

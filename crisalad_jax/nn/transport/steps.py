@@ -1,7 +1,6 @@
 """Steps of a transport solver: the interface, the built-in steps and their registry."""
 
 import abc
-import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
@@ -26,7 +25,6 @@ Moved = tuple[Potentials, Any]
 """The potentials and the state after a step."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Step(Part, abc.ABC):
     """One iteration of a transport solver: a frozen dataclass whose fields are its settings.
 

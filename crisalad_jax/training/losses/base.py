@@ -75,7 +75,6 @@ class LossValue(NamedTuple):
     """Other scalars by name, such as a learnt temperature; each step logs them as `loss.NAME`."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Loss(Part, abc.ABC):
     """A loss of a batch: a frozen dataclass whose fields are its constants.
 
