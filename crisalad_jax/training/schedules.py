@@ -7,7 +7,7 @@ import abc
 import dataclasses
 from collections.abc import Callable, Mapping
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from crisalad_jax.config.checks import NonNegativeFloat, PositiveFloat, PositiveInt, require_field
 from crisalad_jax.config.part import Part
@@ -42,10 +42,8 @@ class Schedule(Part, abc.ABC):
         'quadratic'
     """
 
-    @property
-    def spans_run(self) -> bool:
-        """Whether a longer run has other learning rates from the start; by default True."""
-        return True
+    spans_run: ClassVar[bool] = True
+    """Whether a longer run has other learning rates from the start."""
 
     @abc.abstractmethod
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
@@ -76,10 +74,7 @@ register_schedule = SCHEDULES.register
 class ConstantSchedule(Schedule):
     """The same learning rate for the whole run."""
 
-    @property
-    def spans_run(self) -> bool:
-        """Return False."""
-        return False
+    spans_run: ClassVar[bool] = False
 
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
         """Return the learning rate itself."""
@@ -129,15 +124,11 @@ class CosineSchedule(_Decay):
 class StepSchedule(Schedule):
     """A step down every few epochs after the warm-up; the defaults are CricaVPR's."""
 
+    spans_run: ClassVar[bool] = False
     epochs: PositiveInt = 3
     """Epochs from one step down to the next."""
     gamma: PositiveFloat = 0.5
     """What a step down multiplies the learning rate by."""
-
-    @property
-    def spans_run(self) -> bool:
-        """Return False."""
-        return False
 
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
         """Return the learning rate after the steps down so far."""
@@ -155,6 +146,7 @@ class MilestonesSchedule(Schedule):
     the warm-up sets the learning rate anew.
     """
 
+    spans_run: ClassVar[bool] = False
     epochs: tuple[int, ...] = (5, 10, 15, 25, 45)
     """Numbers of epochs after which the learning rate steps down."""
     gamma: PositiveFloat = 0.3
@@ -164,11 +156,6 @@ class MilestonesSchedule(Schedule):
         """Check the numbers."""
         rises = bool(self.epochs) and all(a < b for a, b in pairwise((0, *self.epochs)))
         require_field(self, "epochs", rises, "numbers of epochs that rise")
-
-    @property
-    def spans_run(self) -> bool:
-        """Return False."""
-        return False
 
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
         """Return the learning rate after the steps down so far."""

@@ -24,9 +24,7 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 class ClassTokenConfig(Aggregator):
     """The backbone's class token, by itself (Oquab et al. 2023)."""
 
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the class token."""
-        return FeatureSpec(class_token=True)
+    class_token: ClassVar[bool] = True
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of a global token as wide as the backbone."""

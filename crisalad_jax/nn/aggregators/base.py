@@ -69,6 +69,11 @@ class Aggregator(Part, abc.ABC):
     """Whether its parameters fit the patches of one image size only."""
     centroid_images: ClassVar[int] = 500
     """Number of training images, at most, whose features' centroids training starts from."""
+    spherical_centroids: ClassVar[bool] = False
+    """Whether k-means compares features with centroids by the angle, not the distance. A centroid
+    is the mean of its features either way."""
+    class_token: ClassVar[bool] = False
+    """Whether it takes the backbone's class token, with the last patches."""
 
     def numbers(self, params: Any) -> Mapping[str, Any]:
         """Return numbers of the parameters that validations log by name; by default none."""
@@ -84,7 +89,7 @@ class Aggregator(Part, abc.ABC):
         Raises:
             InputError: the backbone has too few blocks.
         """
-        return FeatureSpec()
+        return FeatureSpec(class_token=self.class_token)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Any:
         """Draw random parameters, a pytree of arrays in float32; by default None.
@@ -147,14 +152,6 @@ class Aggregator(Part, abc.ABC):
         By default there is one for each local token.
         """
         return self.token_shape(dim).tokens
-
-    @property
-    def spherical_centroids(self) -> bool:
-        """Whether k-means compares features with centroids by the angle; by default the distance.
-
-        A centroid is the mean of its features either way.
-        """
-        return False
 
     @property
     def starts_from_centroids(self) -> bool:

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from crisalad_jax.nn.aggregators.base import (
     regions,
     require_side,
 )
-from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
+from crisalad_jax.nn.backbones.base import Backbone, Features, Grid, Patches
 from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise, linear
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
@@ -60,9 +61,7 @@ class GemPyramidConfig(GemConfig):
     All regions have one exponent.
     """
 
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches and the class token."""
-        return FeatureSpec(class_token=True)
+    class_token: ClassVar[bool] = True
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of tokens as wide as the backbone."""

@@ -168,6 +168,7 @@ class EdtFormerConfig(Aggregator):
         4096
     """
 
+    class_token: ClassVar[bool] = True
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     width: PositiveInt = 768
     """Width of the decoder."""
@@ -185,10 +186,6 @@ class EdtFormerConfig(Aggregator):
         """Check the ranges."""
         fits = self.width % self.heads == 0
         require_field(self, "width", fits, f"a multiple of the {self.heads} heads")
-
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches and the class token."""
-        return FeatureSpec(class_token=True)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of one token for each row."""

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from crisalad_jax.config.checks import PositiveInt
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, FlattenOrder, TokenShape
-from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
+from crisalad_jax.nn.backbones.base import Backbone, Features, Grid, Patches
 from crisalad_jax.nn.layers import (
     Keys,
     TwoLayer,
@@ -55,6 +55,7 @@ class SageConfig(Aggregator):
         8448
     """
 
+    class_token: ClassVar[bool] = True
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     clusters: PositiveInt = 64
     cluster_dim: PositiveInt = 128
@@ -64,10 +65,6 @@ class SageConfig(Aggregator):
     """Hidden width of the networks over features."""
     weighting_hidden: PositiveInt = 128
     """Hidden width of the network of a patch's length."""
-
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches and the class token."""
-        return FeatureSpec(class_token=True)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the tokens' shape, which does not depend on the backbone."""

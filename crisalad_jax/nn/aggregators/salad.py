@@ -69,6 +69,7 @@ class SaladConfig(Aggregator):
         4352
     """
 
+    class_token: ClassVar[bool] = True
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     clusters: PositiveInt = 64
     cluster_dim: PositiveInt = 128
@@ -106,10 +107,6 @@ class SaladConfig(Aggregator):
     def scores(self) -> int:
         """Number of scores of a patch: one for each cluster, and the dustbin's."""
         return self.clusters + self.dustbin.scores
-
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches and the class token."""
-        return FeatureSpec(class_token=True)
 
     def check_grid(self, grid: Grid, patch_size: int) -> None:
         """Require more patches than clusters, where the dustbin's mass is the difference."""

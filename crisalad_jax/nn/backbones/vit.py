@@ -315,8 +315,10 @@ class VisionTransformer(Backbone):
                     request.inserted, (tokens.shape[0], *request.inserted.shape)
                 )
                 tokens = jnp.concatenate([first.astype(tokens.dtype), tokens], axis=1)
-            else:
-                attended = _class_attention(_block_at(stacks, end), tokens, grid, self)
+            else:  # the block's own attention does not keep its weights: a row is computed again
+                layer = _block_at(stacks, end)
+                shares = self._attention_by(first_token_attention, layer, tokens, grid)
+                attended = shares.sum(axis=-2)[:, 1 + self.registers :]
         if request.norm:
             outputs = [layer_norm(params.norm, x, epsilon=self.norm_epsilon) for x in outputs]
         features = Features(
@@ -334,7 +336,17 @@ class VisionTransformer(Backbone):
         stack, grid = _one_stack(params), self.grid((images.shape[1], images.shape[2]))
         _checked_levels(FeatureSpec(class_attention=True), self)  # the same adapters are refused
         tokens, _ = run_blocks([stack], embed(params, images, self), grid, self, count=block)
-        return _attention_by(attention_weights, _block_at([stack], block), tokens, grid, self)
+        return self._attention_by(attention_weights, _block_at([stack], block), tokens, grid)
+
+    def _attention_by(
+        self, weigh: Callable[..., Array], layer: Block, tokens: TokenBatch, grid: Grid
+    ) -> Array:
+        """Compute weights of a block's attention: of `first_token_attention`, or of all tokens."""
+        with jax.named_scope("blocks"):
+            normed = layer_norm(layer.norm1, tokens, epsilon=self.norm_epsilon)
+            attn, rotation = self.attention_of(layer), self.rotation(grid)
+            update = _update_of(layer, self)
+            return weigh(attn, normed, self.heads, rotation=rotation, update=update)
 
     @property
     def trains(self) -> tuple[str, ...]:
@@ -537,32 +549,6 @@ def _facet(layer: Block, tokens: TokenBatch, config: VisionTransformer, name: st
     number = ("query", "key", "value").index(name)
     normed = layer_norm(layer.norm1, tokens, epsilon=config.norm_epsilon)
     return part_of_qkv(config.attention_of(layer), number, normed, _update_of(layer, config))
-
-
-def _class_attention(
-    layer: Block, tokens: TokenBatch, grid: Grid, config: VisionTransformer
-) -> Float[Array, "image patch"]:
-    """Return how much of each patch a block's class token takes, summed over heads.
-
-    The block's own attention does not keep its weights: one row of them is computed a second time.
-    """
-    shares = _attention_by(first_token_attention, layer, tokens, grid, config)
-    return shares.sum(axis=-2)[:, 1 + config.registers :]
-
-
-def _attention_by(
-    weigh: Callable[..., Array],
-    layer: Block,
-    tokens: TokenBatch,
-    grid: Grid,
-    config: VisionTransformer,
-) -> Array:
-    """Compute weights of a block's attention, those of `first_token_attention` or of all tokens."""
-    with jax.named_scope("blocks"):
-        normed = layer_norm(layer.norm1, tokens, epsilon=config.norm_epsilon)
-        attn, rotation = config.attention_of(layer), config.rotation(grid)
-        update = _update_of(layer, config)
-        return weigh(attn, normed, config.heads, rotation=rotation, update=update)
 
 
 def embed(

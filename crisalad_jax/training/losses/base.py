@@ -97,14 +97,11 @@ class Loss(Part, abc.ABC):
     of_tuples: ClassVar[bool] = False
     """Whether the loss takes mined tuples alone, where an image is in a single pair."""
 
+    grouping: ClassVar[ClassesConfig | None] = None
+    """Grouping of images into classes; None where the loss is of pairs of places."""
     reads_tokens: ClassVar[Literal["local", "dense"] | None] = None
     """Field of `Tokens` that the loss compares, besides descriptors: the aggregator's local tokens,
     or local features, which few aggregators have in training."""
-
-    @property
-    def grouping(self) -> ClassesConfig | None:
-        """Grouping of images into classes; None where the loss is of pairs of places."""
-        return None
 
     def init(self, key: PRNGKeyArray, classes: int, dim: int) -> Any:
         """Return the loss's own trainable parameters, a pytree of arrays; by default None.
