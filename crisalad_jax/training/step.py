@@ -160,11 +160,7 @@ class StepConfig:
 
 @takes(config=StepConfig)
 def init_train_state(
-    params: Crisalad,
-    trainable: str,
-    config: StepConfig,
-    *,
-    key: PRNGKeyArray | None = None,
+    params: Crisalad, trainable: str, config: StepConfig, *, key: PRNGKeyArray | None = None
 ) -> tuple[TrainState, PyTree]:
     """Make the state before the first step, and the frozen parameters, which no step changes.
 

@@ -14,9 +14,8 @@ from jaxtyping import PRNGKeyArray, PyTree
 from crisalad_jax.data.loader import ImageBatch, one_ahead
 from crisalad_jax.nn.model import Crisalad, cast_params
 from crisalad_jax.training import distributed
-from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
-from crisalad_jax.training.mining import Miner
+from crisalad_jax.training.mining import Batches
 from crisalad_jax.training.step import (
     Metrics,
     TrainState,
@@ -43,12 +42,7 @@ class Trainer:
     """What trains, on the devices; a step is started before the one before is finished."""
 
     def __init__(
-        self,
-        config: TrainConfig,
-        data: PlaceBatches | Miner,
-        initial: Crisalad,
-        *,
-        shard_state: bool,
+        self, config: TrainConfig, data: Batches, initial: Crisalad, *, shard_state: bool
     ) -> None:
         """Make the state before the first step; see `fit` for the arguments.
 

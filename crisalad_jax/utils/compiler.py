@@ -12,7 +12,7 @@ from jax.extend.core import get_opaque_trace_state
 from crisalad_jax.utils.executable_cache import cached_executable
 from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.host import usable_cores
-from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.output import counted, warn
 from crisalad_jax.utils.target import lowering_platforms, machine, over_devices_of, target
 
 _P = ParamSpec("_P")
@@ -52,11 +52,9 @@ class Jitted(Protocol[_P, _R]):
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         """Compute it."""
-        ...
 
     def lower(self, *args: Any, **kwargs: Any) -> jax.stages.Lowered:
         """Lower it for the `target`; arguments may be shapes."""
-        ...
 
 
 def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) -> Jitted[_P, _R]:
@@ -144,8 +142,7 @@ class Session(NamedTuple):
     def __repr__(self) -> str:
         """Return one line for a notebook."""
         cached = f"compiled programs in {self.cache}" if self.cache else "no compile cache"
-        plural = "" if self.devices == 1 else "s"
-        return f"{self.devices} {self.platform} device{plural}; {cached}"
+        return f"{counted(self.devices, f'{self.platform} device')}; {cached}"
 
 
 def set_up() -> Session:

@@ -53,6 +53,17 @@ _mesh = jax.make_user_context(None)
 _ONE_DEVICE = AbstractMesh((1,), ("image",), axis_types=(AxisType.Auto,))
 
 
+@contextlib.contextmanager
+def jax_setting(name: str, value: Any) -> Iterator[None]:
+    """Change one of JAX's settings while the block runs."""
+    before = jax.config.values[name]
+    jax.config.update(name, value)
+    try:
+        yield
+    finally:
+        jax.config.update(name, before)
+
+
 def target() -> Target:
     """Return the target of what is traced now: that of `lowering_for`, or this machine."""
     return _chosen.value or machine()

@@ -128,6 +128,8 @@ class SaladConfig(Aggregator):
         """Draw parameters as the public code: torch's default linears, dustbin score 1."""
         token_key, cluster_key, score_key = random_init.split(key, 3)
         dim, hidden = backbone.dim, self.hidden
+        below = {name: tau for name, tau in self._taus.items() if tau < 1}
+        logits = {name: jnp.full((), math.log(tau / (1 - tau))) for name, tau in below.items()}
         return Salad(
             token_features=init_two_layer(token_key, dim, hidden, self.token_dim),
             cluster_features=init_two_layer(cluster_key, dim, hidden, self.cluster_dim),
@@ -137,16 +139,12 @@ class SaladConfig(Aggregator):
             log_epsilon=jnp.log(jnp.full((), self.epsilon)) if self.learn_epsilon else None,
             step=self.sinkhorn.step.init_params(jax.random.fold_in(key, 4)),
             start=self.sinkhorn.start.init_params(jax.random.fold_in(key, 5)),
-            logit_tau=self._logits() if self.learn_tau else None,
+            logit_tau=logits if self.learn_tau else None,
         )
 
     @property
     def _taus(self) -> dict[str, Any]:
         return {"row_tau": self.row_tau, "column_tau": self.column_tau}
-
-    def _logits(self) -> dict[str, Array]:
-        below = {name: tau for name, tau in self._taus.items() if tau < 1}
-        return {name: jnp.full((), math.log(tau / (1 - tau))) for name, tau in below.items()}
 
     def dustbin_params(self, params: Any, features: Features) -> Any:
         """Return the dustbin's parameters, by default those that are learnt."""

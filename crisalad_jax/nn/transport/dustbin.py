@@ -89,15 +89,19 @@ class NoDustbin(Dustbin):
         return Marginals(scores, jnp.zeros(rows, scores.dtype), log_nu)
 
 
+class ScalarDustbin(Dustbin):
+    """What dustbins of one learnt number share."""
+
+    def init(self, key: PRNGKeyArray, dim: int) -> Array:
+        """Start at 1: a score as the public implementation's, or a logit, whose share is 0.73."""
+        return jnp.ones(())
+
+
 @DUSTBINS.register("column")
-class ColumnDustbin(Dustbin):
+class ColumnDustbin(ScalarDustbin):
     """A column of one learnt score, as published; plain iterations do not depend on the score."""
 
     takes_difference: ClassVar[bool] = True
-
-    def init(self, key: PRNGKeyArray, dim: int) -> Array:
-        """Start at a score of 1, as the public implementation."""
-        return jnp.ones(())
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Append a column of the score."""
@@ -105,12 +109,8 @@ class ColumnDustbin(Dustbin):
 
 
 @DUSTBINS.register("row and column")
-class RowAndColumnDustbin(Dustbin):
+class RowAndColumnDustbin(ScalarDustbin):
     """A row and a column of one learnt score, as SuperGlue has them (Sarlin et al., CVPR 2020)."""
-
-    def init(self, key: PRNGKeyArray, dim: int) -> Array:
-        """Start at a score of 1."""
-        return jnp.ones(())
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Append the column, then the row."""
@@ -138,12 +138,11 @@ class TokenDustbin(Dustbin):
 
 
 @DUSTBINS.register("mass")
-class MassDustbin(Dustbin):
-    """A column of learnt mass, as the logit of its share; clusters share the rest equally."""
+class MassDustbin(ScalarDustbin):
+    """A column of learnt mass, as the logit of its share; clusters share the rest equally.
 
-    def init(self, key: PRNGKeyArray, dim: int) -> Array:
-        """Start at a logit of 1, a share of 0.73; the published one at 224 x 224 is 0.75."""
-        return jnp.ones(())
+    The first share is 0.73; the published one at 224 x 224 is 0.75.
+    """
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Append a column of zero scores."""

@@ -96,6 +96,8 @@ class Loss(Part, abc.ABC):
 
     of_tuples: ClassVar[bool] = False
     """Whether the loss takes mined tuples alone, where an image is in a single pair."""
+    learning_rate = 1e-2  # without a type, so that a class may make it a field
+    """Learning rate of the loss's own parameters, which have their own Adam optimizer."""
 
     grouping: ClassVar[ClassesConfig | None] = None
     """Grouping of images into classes; None where the loss is of pairs of places."""
@@ -112,11 +114,6 @@ class Loss(Part, abc.ABC):
             dim: width of a descriptor.
         """
         return None
-
-    @property
-    def learning_rate(self) -> float:
-        """Learning rate of the loss's own parameters, which have their own Adam optimizer."""
-        return 1e-2
 
     def from_scratch(self) -> "Loss":
         """Return the loss with constants that learn from random weights; by default as it is."""
