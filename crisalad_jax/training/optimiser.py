@@ -126,8 +126,8 @@ def warn_of_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: in
     flag = "epochs" if config.warmup_epochs else "steps"
     warn(
         f"--optimiser.warmup-{flag}: found {warmup} steps for a run of {steps}, which leaves "
-        f"{max(steps - warmup, 0)} at the learning rate and its decay; at most {short.warmup_steps} would be "
-        "a quarter"
+        f"{max(steps - warmup, 0)} at the learning rate and its decay; at most "
+        f"{short.warmup_steps} would be a quarter"
     )
 
 

@@ -52,9 +52,11 @@ class Jitted(Protocol[_P, _R]):
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         """Compute it."""
+        ...
 
     def lower(self, *args: Any, **kwargs: Any) -> jax.stages.Lowered:
         """Lower it for the `target`; arguments may be shapes."""
+        ...
 
 
 def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) -> Jitted[_P, _R]:
