@@ -80,7 +80,7 @@ class Trainer:
     def resume(self, state: TrainState) -> None:
         """Go on from a state, which has to be the same in all processes."""
         # Copied, because a step donates the buffers of its state.
-        self.state = _copied(self._place(state))
+        self.state = jax.jit(lambda state: jax.tree.map(jnp.copy, state))(self._place(state))
 
     def on_devices(self, batches: Iterator[ImageBatch]) -> Generator[Batch, None, None]:
         """Return batches on the devices, each copied while they compute the one before."""
@@ -192,11 +192,6 @@ def run_keys(seed: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
     params, dropout = jax.random.split(key)
     # Folds in 2, because folding in 0 or 1 may repeat the keys of the split.
     return params, dropout, jax.random.fold_in(key, 2)
-
-
-@jax.jit
-def _copied(tree: PyTree) -> PyTree:
-    return jax.tree.map(jnp.copy, tree)
 
 
 def _choose_devices(config: TrainConfig) -> Devices:

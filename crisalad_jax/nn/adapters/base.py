@@ -171,8 +171,6 @@ class Adapter(Part, abc.ABC):
         return any(getattr(type(self), hook) is not getattr(Adapter, hook) for hook in hooks)
 
 
-HOOKS = (
-    *("prompts", "linear_update", "attention_update", "mlp_update", "output_update", "side_path"),
-)
+HOOKS = ("prompts", "linear_update", "attention_update", "mlp_update", "output_update", "side_path")
 """Methods of adapters that change what a block does."""
 ADAPTERS = Registry("adapter", Adapter)
