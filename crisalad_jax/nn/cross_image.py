@@ -40,7 +40,6 @@ class CrossImage(Part, abc.ABC):
         >>> import jax
         >>> from crisalad_jax import ModelConfig, register_cross_image
         >>> @register_cross_image("mean")
-        ... @dataclasses.dataclass(frozen=True)
         ... class Mean(CrossImage):
         ...     share: float = 0.5
         ...

@@ -52,7 +52,6 @@ class Adapter(Part, abc.ABC):
         >>> import jax.numpy as jnp
         >>> from crisalad_jax import ViTConfig, register_adapter
         >>> @register_adapter("shift")
-        ... @dataclasses.dataclass(frozen=True)
         ... class Shift(Adapter):
         ...     def init(self, key, shape):
         ...         return {"shift": jnp.zeros(shape.dim)}

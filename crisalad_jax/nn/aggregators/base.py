@@ -47,7 +47,6 @@ class Aggregator(Part, abc.ABC):
     Example:
         >>> from crisalad_jax import ModelConfig, register_aggregator
         >>> @register_aggregator("largest")
-        ... @dataclasses.dataclass(frozen=True)
         ... class Largest(Aggregator):
         ...     power: float = 1.0
         ...

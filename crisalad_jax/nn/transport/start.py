@@ -19,7 +19,6 @@ class Start(Part, abc.ABC):
     Example:
         >>> from crisalad_jax.sinkhorn import SinkhornConfig, register_start, solve
         >>> @register_start("softmax-rows")
-        ... @dataclasses.dataclass(frozen=True)
         ... class SoftmaxRows(Start):
         ...     def potentials(self, problem, params):
         ...         return from_columns(problem, problem.zeros().column)
