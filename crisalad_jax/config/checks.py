@@ -169,9 +169,6 @@ NonNegativeInt = Annotated[int, Kind(lambda value: value >= 0, "a whole number o
 PositiveFloat = Annotated[
     float, Kind(lambda value: 0 < value < math.inf, "a finite number above 0")
 ]
-NonNegativeFloat = Annotated[
-    float, Kind(lambda value: 0 <= value < math.inf, "a finite number of at least 0")
-]
 Fraction = Annotated[
     float, Kind(lambda value: 0 <= value < 1, "a number of at least 0 and less than 1")
 ]
@@ -223,6 +220,11 @@ def require_range(config: object, least: float, most: float, *names: str) -> Non
     """Check that fields are from `least` to `most`, both included."""
     limits = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
     _require_each(config, names, lambda value: least <= value <= most, limits)
+
+
+def require_positive(config: object, *names: str) -> None:
+    """Check that fields, of whose types `check_types` takes care, are positive and finite."""
+    _require_each(config, names, lambda value: 0 < value < math.inf, "more than 0, and finite")
 
 
 def require_fraction(config: object, *names: str) -> None:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from crisalad_jax.config.checks import Fraction, PositiveFloat, PositiveInt, require_range
+from crisalad_jax.config.checks import require_fraction, require_positive, require_range
 from crisalad_jax.training.losses.base import (
     LOSSES,
     Loss,
@@ -22,10 +22,14 @@ from crisalad_jax.training.losses.base import (
 class MultiSimilarityConfig(Loss):
     """Multi-similarity loss (Wang et al., CVPR 2019), the constants of GSV-Cities."""
 
-    alpha: PositiveFloat = 1.0
-    beta: PositiveFloat = 50.0
+    alpha: float = 1.0
+    beta: float = 50.0
     base: float = 0.0
     """Similarity around which pairs are weighted. From random weights 0.5 learns where 0 fails."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "alpha", "beta")
 
     def from_scratch(self) -> Loss:
         """Return base 0.5: from random weights base 0 drives all similarities to 0 together."""
@@ -67,10 +71,14 @@ class ContrastiveConfig(Loss):
 class TripletConfig(Loss):
     """Triplet margin loss (Schroff et al., CVPR 2015), the margin of GSV-Cities."""
 
-    margin: PositiveFloat = 0.1
+    margin: float = 0.1
     """Distance by which a positive must be nearer than a negative."""
     average: Literal["violating", "all"] = "violating"
     """Triplets that the mean is over: those that violate the margin, or all (NetVLAD's code)."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "margin")
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Average the violations of the margin over triplets of distances.
@@ -98,7 +106,11 @@ class TripletConfig(Loss):
 class SupConConfig(Loss):
     """Supervised contrastive loss (Khosla et al., NeurIPS 2020), GSV-Cities' temperature."""
 
-    temperature: PositiveFloat = 0.07
+    temperature: float = 0.07
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "temperature")
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Compute the cross entropy of each positive among all pairs (L_out of the paper)."""
@@ -116,10 +128,15 @@ class SupConConfig(Loss):
 class CircleConfig(Loss):
     """Circle loss (Sun et al., CVPR 2020), the constants of GSV-Cities."""
 
-    margin: Fraction = 0.4
+    margin: float = 0.4
     """Relaxation margin, the paper's m."""
-    scale: PositiveFloat = 80.0
+    scale: float = 80.0
     """Scale of the similarities, the paper's gamma."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "scale")
+        require_fraction(self, "margin")
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Weigh each similarity by how far it is from its optimum."""
@@ -139,8 +156,12 @@ class FastAPConfig(Loss):
     """FastAP (Cakir et al., CVPR 2019), GSV-Cities' number of bins."""
 
     ranks_all: ClassVar[bool] = True
-    bins: PositiveInt = 30
+    bins: int = 30
     """Number of bins of the histogram of squared distances, from 0 to 4."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "bins")
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Compute 1 - average precision from soft histograms of squared distances."""
@@ -170,8 +191,12 @@ class SelaVprLoss(Loss):
     of_tuples: ClassVar[bool] = True
     reads_tokens: ClassVar[Literal["local", "dense"]] = "dense"
 
-    margin: PositiveFloat = 0.1
+    margin: float = 0.1
     """Distance by which a positive's descriptor must be nearer than a negative's."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        require_positive(self, "margin")
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Add the mean of the triplets of descriptors and that of local similarities."""
