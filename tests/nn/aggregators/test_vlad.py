@@ -178,7 +178,7 @@ def test_a_start_from_features_that_are_all_alike_is_refused() -> None:
 def test_without_features_centroids_are_random_and_unit() -> None:
     for config in (MODEL.aggregator, AnyLocConfig(clusters=3, layer=1)):
         params = config.init(jax.random.key(0), VIT, MODEL.grid)
-        assert isinstance(params, NetVlad | AnyLoc)
+        assert isinstance(params, NetVlad | Words)
         centroids = params.centroids if isinstance(params, NetVlad) else params.words
         assert centroids.shape == (3, 32)
         np.testing.assert_allclose(np.linalg.norm(centroids, axis=1), 1, rtol=1e-6)
