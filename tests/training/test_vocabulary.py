@@ -65,8 +65,8 @@ def built(fresh: Crisalad, paths: list[pathlib.Path]) -> Crisalad:
 
 def centroids_of(params: Crisalad) -> np.ndarray:
     aggregator = params.aggregator
-    assert isinstance(aggregator, AnyLoc | NetVlad)
-    return np.asarray(aggregator.words if isinstance(aggregator, AnyLoc) else aggregator.centroids)
+    assert isinstance(aggregator, Words | NetVlad)
+    return np.asarray(aggregator.words if isinstance(aggregator, Words) else aggregator.centroids)
 
 
 def features_of(params: Crisalad, config: ModelConfig, paths: list[pathlib.Path]) -> np.ndarray:
