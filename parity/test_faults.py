@@ -21,6 +21,7 @@ import parity.cases.run
 from crisalad_jax.nn import layers
 from crisalad_jax.nn.adapters import TokenInfo
 from crisalad_jax.nn.backbones import vit
+from crisalad_jax.nn.cross_image import TransformerEncoder
 from crisalad_jax.nn.layers import Linear, at_least_float32
 from parity.cases import checks
 from parity.compare import OWN_STEP, STEP
@@ -201,7 +202,7 @@ FAULTS: dict[str, tuple[str, set[str], Callable[[Patch], None]]] = {
     "mask transposed": (
         "cross-image encoder, masked",
         FORWARD,
-        replace(PARTS, "cross_image_encoder", _transposed_mask),
+        replace(TransformerEncoder, "apply", _transposed_mask),
     ),
     "margin of the miner": (
         "miner",

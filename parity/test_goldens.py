@@ -32,7 +32,7 @@ from crisalad_jax.nn.backbones.vit import (
     run_blocks,
 )
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig, cross_image_encoder
+from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.layers import layer_norm
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.sinkhorn import SinkhornConfig, assign_with_dustbin
@@ -242,7 +242,7 @@ def test_cross_image_encoder() -> None:
     config = CrossImageConfig(layers=2, heads=4, feedforward=40)
 
     def function(params: Any, inputs: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        return {"tokens": cross_image_encoder(params, inputs["tokens"], config, key=None)}
+        return {"tokens": config.apply(params, inputs["tokens"], mask=None, key=None)}
 
     template = jax.eval_shape(lambda key: config.init(key, 16), jax.random.key(0))
     names = part_names(TABLES["encoder"], template, "cross_image.", "encoder.")

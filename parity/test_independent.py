@@ -37,7 +37,7 @@ from crisalad_jax.checkpoints.public import read_checkpoint, write_checkpoint
 from crisalad_jax.nn.aggregators.backbone_tokens import ClassTokenConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import CrossImageConfig, cross_image_encoder
+from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.nn.model import Crisalad
 from crisalad_jax.training.config import OptimiserConfig
 from crisalad_jax.training.losses import LossConfig
@@ -362,7 +362,7 @@ def test_masked_encoder_is_torchs() -> None:
     assert tokens.grad is not None
 
     def loss(params: Any, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        output = cross_image_encoder(params, x, config, mask=jnp.asarray(mask), key=None)
+        output = config.apply(params, x, mask=jnp.asarray(mask), key=None)
         return golden_loss(output), output
 
     (params_gradient, gradient), ours = jax.grad(loss, argnums=(0, 1), has_aux=True)(

@@ -23,7 +23,7 @@ from crisalad_jax.nn.aggregators.queries import decode
 from crisalad_jax.nn.aggregators.sage import pooled, weighted
 from crisalad_jax.nn.aggregators.selavpr import local_features
 from crisalad_jax.nn.aggregators.selavprpp import SelaVprPpConfig
-from crisalad_jax.nn.aggregators.vlad import AnyLoc, nearest_words
+from crisalad_jax.nn.aggregators.vlad import Words, nearest_words
 from crisalad_jax.nn.backbones import Features
 from crisalad_jax.nn.backbones.vit import embed, run_blocks
 from crisalad_jax.nn.layers import l2_normalise, linear, powers
@@ -341,7 +341,7 @@ def test_anylocs_facets_are_the_public_codes(facet: str) -> None:
     backbone = to_params(state, base, "dinov2", source="backbone")[0].backbone
     config = vocabulary_model(len(words), base, {"layer": 9, "facet": facet})
     backbone = jax.tree.map(jnp.asarray, backbone)
-    params = Crisalad(backbone, AnyLoc(jnp.asarray(words)), None)
+    params = Crisalad(backbone, Words(jnp.asarray(words)), None)
     suffix = "" if facet == "value" else f"_{facet}"
 
     patches = unit_features(params, golden["images"], config)

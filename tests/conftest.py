@@ -45,6 +45,7 @@ from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.pytree import named_leaves
+from scripts.compile_check.absent import assuming_cudnn
 
 # A shell that runs the tests in the background has SIGINT ignored, and so would the commands that
 # they interrupt.
@@ -159,6 +160,13 @@ def scripts() -> Iterator[Callable[[str], ModuleType]]:
     yield load
     for folder in folders:
         sys.path.remove(folder)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def absent_gpu() -> Iterator[None]:
+    """Let programs for a GPU be traced where there is none."""
+    with assuming_cudnn():
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -5,12 +5,11 @@ weights lie beside them unless the program holds them. StableHLO is of `jax.expo
 `onnx_format`, and OpenVINO converts that.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 import os
 import pathlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -46,7 +45,7 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_folder, check_new_folder, write_json
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.pytree import named_leaves
-from crisalad_jax.utils.target import PORTABLE, STRAIGHT, lowering_for
+from crisalad_jax.utils.target import PORTABLE, STRAIGHT, jax_setting, lowering_for
 
 PROGRAM, WEIGHTS = "describe.jax_export", "weights.safetensors"
 FORMATS = ("stablehlo", *engines.FORMATS)
@@ -58,7 +57,8 @@ GROUPINGS = {
     "any": "images are described together as a mask says",
 }
 _SOURCES = "jax_traceback_in_locations_limit"
-"""JAX's setting: how many lines of source a program has beside each operation."""
+"""JAX's setting: how many lines of source a program has with each operation; none in ours, for they
+differ by disk and by caller."""
 _LARGEST = 2**31
 """Largest size of a program in bytes: offsets of a flatbuffer and of a protobuf have 31 bits."""
 _PROBES = 3
@@ -156,12 +156,15 @@ def export_model(params: Crisalad, config: ModelConfig, how: ExportConfig) -> ex
     """
     program = _whole_program(Model(params, config), how)
     run, weights, (images,) = program.run, program.weights, program.inputs.values()
-    with number_types([config]), lowering_for(PORTABLE), _without_sources():
+    with number_types([config]), lowering_for(PORTABLE), jax_setting(_SOURCES, 0):
         if how.weights_inside:
             whole = jax.jit(lambda images: run(weights, images))
             return export.export(whole, platforms=how.platforms)(images)
         shapes = {n: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for n, leaf in weights.items()}
         return export.export(jax.jit(run), platforms=how.platforms)(shapes, images)
+
+
+Shapes = dict[str, jax.ShapeDtypeStruct]
 
 
 class _Program(NamedTuple):
@@ -171,7 +174,7 @@ class _Program(NamedTuple):
     """A function of the weights and the inputs."""
     weights: dict[str, Any]
     """The arrays by their dotted names."""
-    inputs: dict[str, jax.ShapeDtypeStruct]
+    inputs: Shapes
     """Shapes and types of the inputs by name."""
     output: str
     """Name of the output."""
@@ -191,10 +194,7 @@ def _whole_program(model: Model, how: ExportConfig) -> _Program:
 
 
 def _program(
-    function: Callable[..., Any],
-    params: Crisalad,
-    inputs: dict[str, jax.ShapeDtypeStruct],
-    output: str,
+    function: Callable[..., Any], params: Crisalad, inputs: Shapes, output: str
 ) -> _Program:
     """Make a function of parameters one of the weights by name."""
     # A dictionary's leaves come in the order of its keys, not in that of the fields.
@@ -222,17 +222,6 @@ def _sides(config: ModelConfig, how: ExportConfig) -> tuple[int, ...]:
 
 def _takes_bytes(config: ModelConfig, how: ExportConfig) -> bool:
     return not how.for_colmap and (how.pixels or config.preprocessing.pixels) == "bytes"
-
-
-@contextlib.contextmanager
-def _without_sources() -> Iterator[None]:
-    """Keep names and lines of source files out of programs: they differ by disk and by caller."""
-    before = jax.config.values[_SOURCES]
-    jax.config.update(_SOURCES, 0)
-    try:
-        yield
-    finally:
-        jax.config.update(_SOURCES, before)
 
 
 @takes(out=PATH)

@@ -48,7 +48,7 @@ from crisalad_jax.config.checks import PATH, choose, takes
 from crisalad_jax.config.io import differences, from_plain, to_plain
 from crisalad_jax.config.part import with_non_semantic_fields_of
 from crisalad_jax.config.preprocessing import PreprocessingConfig
-from crisalad_jax.nn.aggregators.vlad import AnyLoc, AnyLocConfig
+from crisalad_jax.nn.aggregators.vlad import AnyLocConfig, Words
 from crisalad_jax.nn.backbones import Backbone
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.cross_image import NoCrossImage
@@ -157,7 +157,7 @@ def read_vocabulary(
         found = f"found a tensor of shape {words.shape}"
         raise InputError(f"{path}: {found}, expected (words, {width}), for the backbone's width")
     config = vocabulary_model(len(words), base.config, fields or {})
-    params = Crisalad(base.params.backbone, AnyLoc(jnp.asarray(words)), None)
+    params = Crisalad(base.params.backbone, Words(jnp.asarray(words)), None)
     return Checkpoint(params, config, base.extras, VOCABULARY)
 
 

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import importlib
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, dataclass_transform
 
 from crisalad_jax.config.checks import check_types
 from crisalad_jax.config.short_repr import concise_repr, default_of
@@ -19,9 +19,13 @@ NAME = "name"
 _NON_SEMANTIC = "non-semantic"
 
 
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """Base class of everything that can be swapped without changing this package."""
+    """Base class of everything that can be swapped without changing this package.
+
+    Registering a subclass makes it a frozen dataclass.
+    """
 
     registry: ClassVar[Any]
     """The `Registry` of its kind."""

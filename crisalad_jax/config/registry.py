@@ -52,14 +52,15 @@ class Registry(Generic[P]):
     def register(self, name: str, **presets: Mapping[str, Any]) -> Callable[[_C], _C]:
         """Return a decorator that registers a class, or a plain function, under `name`.
 
+        A class that is not a frozen dataclass yet becomes one.
+
         Args:
             name: what configurations, files and flags call the part.
             presets: by the name of a preset of model sizes, the fields that differ there from the
                 part's defaults.
 
         Raises:
-            InputError: when it decorates: the name is taken, or the part is no frozen dataclass of
-                this kind.
+            InputError: when it decorates: the name is taken, or the part is not of this kind.
         """
         where = f"register_{self.kind}"
         require(
@@ -86,12 +87,10 @@ class Registry(Generic[P]):
             made = type(part.__name__, (self.base,), members)
             return cast(type[P], dataclasses.dataclass(frozen=True)(made))
         is_part = isinstance(part, type) and issubclass(part, self.base)
-        parameters = vars(part).get("__dataclass_params__") if is_part else None
-        require(
-            parameters is not None and parameters.frozen,
-            f"found {getattr(part, '__qualname__', type(part).__name__)}, expected a subclass of "
-            f"{self.base.__name__} with @dataclasses.dataclass(frozen=True) below the registration",
-        )
+        name = getattr(part, "__qualname__", type(part).__name__)
+        require(is_part, f"found {name}, expected a subclass of {self.base.__name__}")
+        if "__dataclass_params__" not in vars(part):
+            part = dataclasses.dataclass(frozen=True)(cast(Any, part))
         methods = {each for each in dir(self.base) if callable(getattr(self.base, each))}
         for field in dataclasses.fields(cast(Any, part)):
             # Files have a part's own name and plug-in among its fields.
@@ -221,6 +220,20 @@ def make_part(kind: str, name: str, **settings: Any) -> Any:
     expected = f"one of {', '.join(names)}" if names else "none: it has no settings"
     require(not unknown, f"{kind} {name}: found a setting {unknown}, expected {expected}")
     return registry.make(name, **settings)
+
+
+def add_named(kind: str, table: dict[str, Any], name: str, value: Any) -> None:
+    """Add a class or function to a plain table of names, for `register_{kind}`.
+
+    Raises:
+        InputError: another module has taken the name.
+    """
+    taken = table.get(name, value).__module__
+    require(
+        taken == value.__module__,
+        f"register_{kind} {name!r}: found the name taken by {taken}, expected another",
+    )
+    table[name] = value
 
 
 def _home(part: type[Part]) -> str:

@@ -19,7 +19,7 @@ from crisalad_jax.config.part import Part, non_semantic_field
 from crisalad_jax.config.registry import Registry
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.attention import Attention, attention_weights, dot_product_attention
-from crisalad_jax.nn.layers import at_least_float32, dropout, gelu, linear, split_key
+from crisalad_jax.nn.layers import Keys, at_least_float32, dropout, gelu, linear, split_key
 from crisalad_jax.nn.torch_layers import EncoderLayer, encoder_layer, init_encoder_layer
 from crisalad_jax.utils.devices import IMAGE, image_mesh
 from crisalad_jax.utils.errors import InputError
@@ -31,7 +31,6 @@ Mask = Bool[Array, "image image"] | None
 """`mask[i, j]` allows image i to attend to image j; None allows all."""
 
 
-@dataclasses.dataclass(frozen=True)
 class CrossImage(Part, abc.ABC):
     """A network that relates the images of a batch: a frozen dataclass with its settings as fields.
 
@@ -41,7 +40,6 @@ class CrossImage(Part, abc.ABC):
         >>> import jax
         >>> from crisalad_jax import ModelConfig, register_cross_image
         >>> @register_cross_image("mean")
-        ... @dataclasses.dataclass(frozen=True)
         ... class Mean(CrossImage):
         ...     share: float = 0.5
         ...
@@ -77,9 +75,7 @@ class CrossImage(Part, abc.ABC):
         """Draw random parameters, a pytree of arrays in float32, for tokens of width `dim`."""
 
     @abc.abstractmethod
-    def apply(
-        self, params: Any, tokens: Sequences, *, mask: Mask, key: PRNGKeyArray | None
-    ) -> Sequences:
+    def apply(self, params: Any, tokens: Sequences, *, mask: Mask, key: Keys) -> Sequences:
         """Return the images' tokens, in the shape and type in which they come.
 
         Args:
@@ -110,7 +106,6 @@ register_cross_image = CROSS_IMAGE.register
 
 
 @CROSS_IMAGE.register("none")
-@dataclasses.dataclass(frozen=True)
 class NoCrossImage(CrossImage):
     """No encoder: a descriptor depends on no other image."""
 
@@ -119,9 +114,7 @@ class NoCrossImage(CrossImage):
     def init(self, key: PRNGKeyArray, dim: int) -> None:
         """Return None: there are no parameters."""
 
-    def apply(
-        self, params: None, tokens: Sequences, *, mask: Mask, key: PRNGKeyArray | None
-    ) -> Sequences:
+    def apply(self, params: None, tokens: Sequences, *, mask: Mask, key: Keys) -> Sequences:
         """Return the tokens."""
         return tokens
 
@@ -157,11 +150,11 @@ class TransformerEncoder(CrossImage):
         layers = (init_encoder_layer(key, dim, self.feedforward) for _ in range(self.layers))
         return CrossImageEncoder(tuple(layers))
 
-    def apply(
-        self, params: Any, tokens: Sequences, *, mask: Mask, key: PRNGKeyArray | None
-    ) -> Sequences:
+    def apply(self, params: Any, tokens: Sequences, *, mask: Mask, key: Keys) -> Sequences:
         """Attend from each token to the same token of all images."""
-        return cross_image_encoder(params, tokens, self, mask=mask, key=key)
+        for layer, layer_key in zip(params.layers, split_key(key, self.layers), strict=True):
+            tokens = self._run_layer(layer, tokens, mask, layer_key)
+        return tokens
 
     def attention(
         self, params: Any, tokens: Sequences, *, mask: Mask
@@ -171,15 +164,52 @@ class TransformerEncoder(CrossImage):
         for layer in params.layers:
             by_token = tokens.swapaxes(0, 1)
             weights.append(attention_weights(layer.attn, by_token, self.heads, mask=mask))
-            tokens = _run_layer(layer, tokens, self, mask=mask, key=None)
+            tokens = self._run_layer(layer, tokens, mask, None)
         return jnp.stack(weights)
+
+    def _run_layer(
+        self, params: EncoderLayer, tokens: Sequences, mask: Mask, key: Keys
+    ) -> Sequences:
+        weights_key, *keys = split_key(key, 4)
+        attended = self._attend_across(params.attn, tokens, mask, weights_key)
+        return encoder_layer(params, tokens, attended, gelu, rate=self.dropout, keys=keys)
+
+    def _attend_across(self, params: Attention, x: Sequences, mask: Mask, key: Keys) -> Sequences:
+        """Attend from each token to the same token of all images.
+
+        Where images are sharded, a device attends from its own to those of all: keys and values are
+        gathered once, and their gradient is scattered once. Left alone, XLA splits the keys and
+        adds up scores, totals and results, with twelve collectives a layer. Dropout has the same
+        bits as on one device.
+        """
+        images, tokens, dim = x.shape
+        mesh, heads = image_mesh(), self.heads
+        dropout_mask = None
+        if key is not None and self.dropout > 0:
+            every = jnp.ones((tokens, heads, images, images), at_least_float32(x[:0]).dtype)
+            dropout_mask = dropout(every, self.dropout, key=key)
+
+        def by_token(x: Array) -> Float[Array, "token image head _"]:
+            return x.reshape(x.shape[0], tokens, heads, -1).swapaxes(0, 1)
+
+        def attend(qkv: Array, mask: Array | None, dropout_mask: Array | None) -> Array:
+            queries, others = jnp.split(qkv, [dim], axis=-1)
+            keys, values = jnp.split(others if mesh is None else _gathered(others), 2, axis=-1)
+            parts = map(by_token, (queries, keys, values))
+            mixed = dot_product_attention(*parts, mask=mask, dropout_mask=dropout_mask)
+            return mixed.swapaxes(0, 1).reshape(queries.shape)
+
+        if mesh is not None:
+            own, by_query = PartitionSpec(IMAGE), PartitionSpec(None, None, None, IMAGE)
+            specs: Any = {"in_specs": (own, own, by_query), "out_specs": own, "check_vma": False}
+            attend = jax.shard_map(attend, mesh=mesh, **specs)
+        return linear(params.proj, attend(linear(params.qkv, x), mask, dropout_mask))
 
 
 _TINY = {"heads": 4, "feedforward": 128, "dropout": 0.0}
 
 
 @CROSS_IMAGE.register("transformer", tiny=_TINY)
-@dataclasses.dataclass(frozen=True)
 class CrossImageConfig(TransformerEncoder):
     """The transformer encoder that attends across the images of a batch (paper section 3.4).
 
@@ -193,7 +223,6 @@ class CrossImageConfig(TransformerEncoder):
 
 
 @CROSS_IMAGE.register("sage-encoder", tiny={**_TINY, "width": 96})
-@dataclasses.dataclass(frozen=True)
 class SageCrossImageConfig(TransformerEncoder):
     """SAGE's transformer encoder (ICLR 2026), over a finished descriptor cut into tokens.
 
@@ -215,7 +244,6 @@ class GatedEncoder:
 
 
 @CROSS_IMAGE.register("gated", tiny=_TINY)
-@dataclasses.dataclass(frozen=True)
 class GatedCrossImageConfig(CrossImageConfig):
     """The paper's encoder behind a learnt gate: y = x + tanh(g) (f(x) - x).
 
@@ -228,9 +256,7 @@ class GatedCrossImageConfig(CrossImageConfig):
         """Draw the encoder, and a gate of 0."""
         return GatedEncoder(random_init.zeros(), super().init(key, dim))
 
-    def apply(
-        self, params: GatedEncoder, tokens: Sequences, *, mask: Mask, key: PRNGKeyArray | None
-    ) -> Sequences:
+    def apply(self, params: GatedEncoder, tokens: Sequences, *, mask: Mask, key: Keys) -> Sequences:
         """Add what the encoder adds, times the gate's hyperbolic tangent."""
         attended = super().apply(params.encoder, tokens, mask=mask, key=key)
         before, after = at_least_float32(tokens), at_least_float32(attended)
@@ -245,76 +271,6 @@ class GatedCrossImageConfig(CrossImageConfig):
     ) -> Float[Array, "layer token head image image"]:
         """Return the weights behind the gate."""
         return super().attention(params.encoder, tokens, mask=mask)
-
-
-def cross_image_encoder(
-    params: CrossImageEncoder,
-    tokens: Float[Array, "image token dim"],
-    config: TransformerEncoder,
-    *,
-    mask: Bool[Array, "image image"] | None = None,
-    key: PRNGKeyArray | None,
-) -> Float[Array, "image token dim"]:
-    """Let each token attend to the same token of the other images.
-
-    `mask[i, j]` allows image i to attend to image j; None allows all. `key` draws the dropout; None
-    means inference.
-    """
-    for layer, layer_key in zip(params.layers, split_key(key, config.layers), strict=True):
-        tokens = _run_layer(layer, tokens, config, mask=mask, key=layer_key)
-    return tokens
-
-
-def _run_layer(
-    params: EncoderLayer,
-    tokens: Sequences,
-    config: TransformerEncoder,
-    *,
-    mask: Mask,
-    key: PRNGKeyArray | None,
-) -> Sequences:
-    weights_key, *keys = split_key(key, 4)
-    attended = _attend_across(params.attn, tokens, config, mask=mask, key=weights_key)
-    return encoder_layer(params, tokens, attended, gelu, rate=config.dropout, keys=keys)
-
-
-def _attend_across(
-    params: Attention,
-    x: Float[Array, "image token dim"],
-    config: TransformerEncoder,
-    *,
-    mask: Bool[Array, "image image"] | None,
-    key: PRNGKeyArray | None,
-) -> Float[Array, "image token dim"]:
-    """Attend from each token to the same token of all images.
-
-    Where images are sharded, a device attends from its own to those of all: keys and values are
-    gathered once, and their gradient is scattered once. Left alone, XLA splits the keys and adds up
-    scores, totals and results, with twelve collectives a layer. Dropout has the same bits as on one
-    device.
-    """
-    images, tokens, dim = x.shape
-    mesh, heads = image_mesh(), config.heads
-    dropout_mask = None
-    if key is not None and config.dropout > 0:
-        every = jnp.ones((tokens, heads, images, images), at_least_float32(x[:0]).dtype)
-        dropout_mask = dropout(every, config.dropout, key=key)
-
-    def by_token(x: Array) -> Float[Array, "token image head _"]:
-        return x.reshape(x.shape[0], tokens, heads, -1).swapaxes(0, 1)
-
-    def attend(qkv: Array, mask: Array | None, dropout_mask: Array | None) -> Array:
-        queries, others = jnp.split(qkv, [dim], axis=-1)
-        keys, values = jnp.split(others if mesh is None else _gathered(others), 2, axis=-1)
-        parts = map(by_token, (queries, keys, values))
-        mixed = dot_product_attention(*parts, mask=mask, dropout_mask=dropout_mask)
-        return mixed.swapaxes(0, 1).reshape(queries.shape)
-
-    if mesh is not None:
-        own, by_query = PartitionSpec(IMAGE), PartitionSpec(None, None, None, IMAGE)
-        specs = (own, own, by_query)
-        attend = jax.shard_map(attend, mesh=mesh, in_specs=specs, out_specs=own, check_vma=False)
-    return linear(params.proj, attend(linear(params.qkv, x), mask, dropout_mask))
 
 
 @jax.custom_vjp

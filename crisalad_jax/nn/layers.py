@@ -14,8 +14,8 @@ from crisalad_jax.nn import random_init
 from crisalad_jax.nn.products import convolve, matmul
 from crisalad_jax.utils.pytree import pytree_dataclass
 
-Keys = Key[Array, "*keys"]
-"""One random key for all, or one for each entry of a batch."""
+Keys = Key[Array, "*keys"] | None
+"""One random key for all, or one for each entry of a batch; None is inference."""
 Grid = tuple[int, int]
 """Rows and columns of patches."""
 Valid = Bool[Array, " image"] | None
@@ -368,7 +368,7 @@ def _gelu_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Arr
     return (wide * below).astype(x.dtype), (slope * at_least_float32(change)).astype(x.dtype)
 
 
-def dropout(x: Float[Array, "*shape"], rate: float, *, key: Keys | None) -> Float[Array, "*shape"]:
+def dropout(x: Float[Array, "*shape"], rate: float, *, key: Keys) -> Float[Array, "*shape"]:
     """Zero a share `rate` of `x` and scale the rest up; return `x` for `key=None` (inference).
 
     With one key for each entry of the leading axis, an entry's draws do not depend on the others.
@@ -380,7 +380,7 @@ def dropout(x: Float[Array, "*shape"], rate: float, *, key: Keys | None) -> Floa
     return jnp.where(keep, x / (1 - rate), 0)
 
 
-def split_key(key: Keys | None, count: int) -> list[Keys | None]:
+def split_key(key: Keys, count: int) -> list[Keys]:
     """Split one key, or each of several, into `count` keys; return Nones for None."""
     if key is None:
         return [None] * count
@@ -405,7 +405,7 @@ def init_two_layer(key: PRNGKeyArray, d_in: int, hidden: int, d_out: int) -> Two
 
 
 def two_layer(
-    params: TwoLayer, x: Float[Array, "*batch d_in"], rate: float, key: Keys | None
+    params: TwoLayer, x: Float[Array, "*batch d_in"], rate: float, key: Keys
 ) -> Float[Array, "*batch d_out"]:
     """Apply the network, with dropout of this rate before the ReLU where there is a key."""
     hidden = dropout(linear(params.fc1, x), rate, key=key)

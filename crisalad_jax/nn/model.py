@@ -380,7 +380,7 @@ def tokens_and_statistics(
         at_once = max(1, micro_batch // mesh.size)
         micro_batch = max(n for n in range(1, at_once + 1) if own % n == 0)
 
-    def tokens_of_own(params: Crisalad, images: Images, keys: Keys | None) -> Tokens:
+    def tokens_of_own(params: Crisalad, images: Images, keys: Keys) -> Tokens:
         return _tokens_in_parts(params, images, None, config, keys, micro_batch)[0]
 
     alike, shared = PartitionSpec(), PartitionSpec(IMAGE)
@@ -399,13 +399,13 @@ def _tokens_in_parts(
     images: Images,
     valid: Bool[Array, " image"] | None,
     config: ModelConfig,
-    keys: Keys | None,
+    keys: Keys,
     micro_batch: int | None,
 ) -> tuple[Tokens, Crisalad | None]:
     """Extract tokens `micro_batch` images at a time; see `tokens_and_statistics`."""
 
     def tokens_of(
-        statistics: Crisalad | None, part: tuple[Images, Keys | None, Array | None]
+        statistics: Crisalad | None, part: tuple[Images, Keys, Array | None]
     ) -> tuple[Crisalad | None, Tokens]:
         images, keys, valid = part
         current = params if statistics is None else merge_statistics(statistics, params)

@@ -138,30 +138,23 @@ class PlaceBatches:
     ) -> Int[np.ndarray, "steps places images"]:
         """Draw the batches of an epoch from all sets."""
         joined = self._turns[epoch % len(self._turns)]
+        how = {"epoch": epoch, "steps": self.steps_per_epoch, "describe": describe}
         drawn = [
-            _draw(run, places, epoch, self.steps_per_epoch, describe) + start
+            _draw(run, places, **how) + start
             for run, places, start in zip(self._runs, joined.sets, joined.starts[:-1], strict=True)
         ]
         return np.concatenate(drawn, axis=1)
 
 
-def _draw(
-    run: TrainConfig,
-    places: Places,
-    epoch: int,
-    steps: int | None = None,
-    describe: Describe | None = None,
-) -> Int[np.ndarray, "steps places images"]:
-    """Draw the sub-batches of an epoch from one set."""
+def _draw(run: TrainConfig, places: Places, **how: Any) -> Int[np.ndarray, "steps places images"]:
+    """Draw the sub-batches of an epoch from one set, as `epoch_batches` does."""
     return epoch_batches(
         places,
         sampler=run.sampler,
         places_per_batch=run.places_per_batch,
         images_per_place=run.images_per_place,
         seed=run.seed,
-        epoch=epoch,
-        steps=steps,
-        describe=describe,
+        **how,
     )
 
 
@@ -171,4 +164,4 @@ def _steps(run: TrainConfig, *groups: Places) -> int:
         (places,) = groups
         run.sampler.check(places)
         return max(1, len(places.names) // run.places_per_batch)
-    return max(len(_draw(run, group, 0)) for group in groups)
+    return max(len(_draw(run, group, epoch=0)) for group in groups)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.plugins import load_entry_points
+from crisalad_jax.config.registry import add_named
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.distributed import is_primary
 from crisalad_jax.utils.errors import InputError
@@ -101,12 +102,7 @@ def register_callback(name: str) -> Callable[[_C], _C]:
     def decorate(kind: _C) -> _C:
         is_kind = isinstance(kind, type) and issubclass(kind, Callback)
         require(is_kind, f"register_callback {name!r}: found {kind!r}, expected a Callback class")
-        taken = CALLBACKS.get(name, kind).__module__
-        require(
-            taken == kind.__module__,
-            f"register_callback {name!r}: found the name taken by {taken}, expected another",
-        )
-        CALLBACKS[name] = kind
+        add_named("callback", CALLBACKS, name, kind)
         return kind
 
     return decorate
@@ -176,17 +172,13 @@ class CsvCallback(Callback):
 
 def _write_rows(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Append rows, with the columns that the file has, or in a new one those of the first row."""
-    columns = []
-    if path.exists() and path.stat().st_size:
-        with path.open(encoding="utf-8", newline="") as file:
-            columns = next(csv.reader(file))
-    with wrap_os_errors(path), path.open("a", encoding="utf-8", newline="") as file:
-        for row in rows:
-            writer = csv.DictWriter(file, columns or [*row], extrasaction="ignore")
-            if not columns:
-                writer.writeheader()
-                columns = [*row]
-            writer.writerow(row)
+    with wrap_os_errors(path), path.open("a+", encoding="utf-8", newline="") as file:
+        file.seek(0)
+        columns = next(csv.reader(file), [])
+        writer = csv.DictWriter(file, columns or [*rows[0]] if rows else [], extrasaction="ignore")
+        if rows and not columns:
+            writer.writeheader()
+        writer.writerows(rows)
 
 
 @register_callback("wandb")

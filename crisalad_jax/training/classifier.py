@@ -102,10 +102,8 @@ def load_loss(path: str | os.PathLike[str]) -> tuple[LossConfig, PyTree]:
             part that is not registered.
 
     Example:
-        >>> import dataclasses
         >>> import crisalad_jax as cj
         >>> @cj.register_loss("warm")
-        ... @dataclasses.dataclass(frozen=True)
         ... class Warm(cj.Loss):
         ...     def init(self, key, classes, dim):
         ...         return {"temperature": jnp.ones(())}

@@ -22,6 +22,7 @@ from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.loader import THREADS, ImageCache
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.remote import is_remote, read_remote
 from crisalad_jax.nn.model import Crisalad, init_crisalad
 from crisalad_jax.training import distributed
@@ -29,7 +30,7 @@ from crisalad_jax.training.batches import PlaceBatches, TrainingSet, sets_of
 from crisalad_jax.training.callbacks import Callback, Callbacks
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.lost import ends_with_the_others
-from crisalad_jax.training.mining import Miner
+from crisalad_jax.training.mining import Batches, Miner
 from crisalad_jax.training.mixture import check_names
 from crisalad_jax.training.run_files import (
     RunFiles,
@@ -46,7 +47,7 @@ from crisalad_jax.training.validation import Validator
 from crisalad_jax.utils.errors import Interrupted
 from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.progress import Bar, progress_bar
-from crisalad_jax.utils.signals import SignalState, defer_signals
+from crisalad_jax.utils.signals import SignalState, defer_signals, watch
 
 STATUS_STEPS = 5
 """Several processes exchange their status before every so many steps of a round."""
@@ -166,14 +167,15 @@ def fit(
     read_far = distributed.raise_together(lambda: _reader(places, cache_gb))
     cache = ImageCache(read_far=read_far)
     make: Any = Miner if config.mines else PlaceBatches
-    data: PlaceBatches | Miner = make(
+    data: Batches = make(
         config, places, part=part, on_bad_image=on_bad_image, threads=threads, cache=cache
     )
     trainer = Trainer(config, data, initial, shard_state=shard_state)
     del initial  # the trainer has copied what it needs
     record = RunRecord(checksums, {name: [*source] for name, source in sources_of(config).items()})
     files = RunFiles(pathlib.Path(out), config, record)
-    validator = Validator(config, validation, on_bad_image=on_bad_image, cache=cache)
+    reading = Reading(on_bad_image=on_bad_image, cache=cache, quiet=True)
+    validator = Validator(config, validation, reading)
     with contextlib.closing(files):
         state = files.load(RunState(trainer.state, data.mined))
         trainer.resume(state.training)
@@ -208,7 +210,7 @@ class _Loop:
     """The parts of a run, and the phases in which they act."""
 
     config: TrainConfig
-    data: PlaceBatches | Miner
+    data: Batches
     trainer: Trainer
     validator: Validator
     files: RunFiles
@@ -278,7 +280,7 @@ class _Loop:
                     self._exchange_status(error)
                     if self.callbacks.stopped:
                         return
-                self.signals.watch()
+                watch()
                 self.trainer.start_step(batch, waited)
                 self.signals.has_work = True  # before it, XLA compiles the step
                 attempt(lambda: self._log_steps(leave=1))

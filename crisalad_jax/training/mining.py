@@ -15,7 +15,7 @@ from crisalad_jax.config.checks import require
 from crisalad_jax.data.loader import ImageBatch, batches_of_groups
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.data.samplers.base import Describe
-from crisalad_jax.training.batches import prepared_as
+from crisalad_jax.training.batches import PlaceBatches, prepared_as
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.losses.pairs import Role, tuple_labels
 
@@ -171,6 +171,10 @@ class Miner:
         # The spawn key makes these streams independent of the loader's from the same numbers.
         numbers = self._config.seed, *numbers
         return np.random.default_rng(np.random.SeedSequence(numbers, spawn_key=(key,)))
+
+
+Batches = PlaceBatches | Miner
+"""What yields the batches of a run."""
 
 
 def _distances(

@@ -118,16 +118,16 @@ def with_short_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int)
 
 def warn_of_long_warmup(config: OptimiserConfig, steps: int, steps_per_epoch: int) -> None:
     """Warn if a warm-up takes more than its largest share of a run's steps."""
+    short = with_short_warmup(config, steps, steps_per_epoch)
+    if short is config:
+        return
     warmup = warmup_length(config, steps_per_epoch)
     steps = count_steps(config, steps, steps_per_epoch)
-    longest = steps // WARMUP_SHARE
-    if warmup <= longest:
-        return
     flag = "epochs" if config.warmup_epochs else "steps"
     warn(
         f"--optimiser.warmup-{flag}: found {warmup} steps for a run of {steps}, which leaves "
-        f"{max(steps - warmup, 0)} at the learning rate and its decay; at most {longest} would be "
-        "a quarter"
+        f"{max(steps - warmup, 0)} at the learning rate and its decay; at most "
+        f"{short.warmup_steps} would be a quarter"
     )
 
 

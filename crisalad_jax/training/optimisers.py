@@ -23,7 +23,6 @@ Rate = Callable[[Any], Any]
 _PREFIX = "optax."
 
 
-@dataclasses.dataclass(frozen=True)
 class Optimiser(Part, abc.ABC):
     """What turns gradients into steps: a frozen dataclass whose fields are its settings.
 
@@ -133,7 +132,6 @@ def _plain_type(default: Any, annotation: Any) -> Any:
     return None
 
 
-@dataclasses.dataclass(frozen=True)
 class _OptaxOptimiser(Optimiser):
     """The base class of the parts that `_of_optax` makes."""
 
@@ -201,7 +199,6 @@ class _Moments(Optimiser):
 
 
 @OPTIMISERS.register("adamw")
-@dataclasses.dataclass(frozen=True)
 class AdamW(_Moments):
     """AdamW (Loshchilov and Hutter 2019), as torch has it: weights decay apart from the gradient.
 
@@ -219,7 +216,6 @@ class AdamW(_Moments):
 
 
 @OPTIMISERS.register("adam")
-@dataclasses.dataclass(frozen=True)
 class Adam(_Moments):
     """Adam (Kingma and Ba 2015), as torch has it: the weight decay is part of the gradient."""
 
@@ -231,7 +227,6 @@ class Adam(_Moments):
 
 
 @OPTIMISERS.register("sgd")
-@dataclasses.dataclass(frozen=True)
 class Sgd(Optimiser):
     """SGD with torch's momentum, without dampening; the weight decay is part of the gradient."""
 

@@ -8,7 +8,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from crisalad_jax.config.checks import PositiveFloat, PositiveInt, require_field, require_range
 from crisalad_jax.config.part import Part
@@ -28,7 +28,6 @@ class RunSteps(NamedTuple):
     """Steps of the warm-up."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Schedule(Part, abc.ABC):
     """A learning rate that changes: a frozen dataclass whose fields are its settings.
 
@@ -44,10 +43,8 @@ class Schedule(Part, abc.ABC):
         'quadratic'
     """
 
-    @property
-    def spans_run(self) -> bool:
-        """Whether a longer run has other learning rates from the start; by default True."""
-        return True
+    spans_run: ClassVar[bool] = True
+    """Whether a longer run has other learning rates from the start."""
 
     @abc.abstractmethod
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
@@ -75,14 +72,10 @@ register_schedule = SCHEDULES.register
 
 
 @SCHEDULES.register("constant")
-@dataclasses.dataclass(frozen=True)
 class ConstantSchedule(Schedule):
     """The same learning rate for the whole run."""
 
-    @property
-    def spans_run(self) -> bool:
-        """Return False."""
-        return False
+    spans_run: ClassVar[bool] = False
 
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
         """Return the learning rate itself."""
@@ -109,7 +102,6 @@ class _Decay(Schedule):
 
 
 @SCHEDULES.register("linear")
-@dataclasses.dataclass(frozen=True)
 class LinearSchedule(_Decay):
     """Linear decay, step by step (SALAD's code, `LinearLR` of torch)."""
 
@@ -122,7 +114,6 @@ class LinearSchedule(_Decay):
 
 
 @SCHEDULES.register("cosine")
-@dataclasses.dataclass(frozen=True)
 class CosineSchedule(_Decay):
     """Half a period of a cosine (Loshchilov and Hutter 2017, without restarts)."""
 
@@ -135,19 +126,14 @@ class CosineSchedule(_Decay):
 
 
 @SCHEDULES.register("step")
-@dataclasses.dataclass(frozen=True)
 class StepSchedule(Schedule):
     """A step down every few epochs after the warm-up; the defaults are CricaVPR's."""
 
+    spans_run: ClassVar[bool] = False
     epochs: PositiveInt = 3
     """Epochs from one step down to the next."""
     gamma: PositiveFloat = 0.5
     """What a step down multiplies the learning rate by."""
-
-    @property
-    def spans_run(self) -> bool:
-        """Return False."""
-        return False
 
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
         """Return the learning rate after the steps down so far."""
@@ -158,7 +144,6 @@ class StepSchedule(Schedule):
 
 
 @SCHEDULES.register("milestones")
-@dataclasses.dataclass(frozen=True)
 class MilestonesSchedule(Schedule):
     """A step down after each of some epochs, counted from the start; the defaults are MixVPR's.
 
@@ -166,6 +151,7 @@ class MilestonesSchedule(Schedule):
     the warm-up sets the learning rate anew.
     """
 
+    spans_run: ClassVar[bool] = False
     epochs: tuple[int, ...] = (5, 10, 15, 25, 45)
     """Numbers of epochs after which the learning rate steps down."""
     gamma: PositiveFloat = 0.3
@@ -175,11 +161,6 @@ class MilestonesSchedule(Schedule):
         """Check the numbers."""
         rises = bool(self.epochs) and all(a < b for a, b in pairwise((0, *self.epochs)))
         require_field(self, "epochs", rises, "numbers of epochs that rise")
-
-    @property
-    def spans_run(self) -> bool:
-        """Return False."""
-        return False
 
     def apply(self, step: Any, learning_rate: float, run: RunSteps) -> Any:
         """Return the learning rate after the steps down so far."""

@@ -93,7 +93,7 @@ def read_inputs(
     given = {"configuration": checksum_of_config(config), "--weights": weights is not None}
     distributed.check_same(given)
     if weights is None and config.model.aggregator.trainable:
-        how: Any = {"on_bad_image": on_bad_image, "quiet": quiet}
+        how = {"on_bad_image": on_bad_image, "quiet": quiet}
         initial = with_vocabulary_of(initial, config, places, **how)
     return places, benchmark, initial
 
@@ -142,11 +142,7 @@ def _read_set(
 
 
 def read_start(
-    config: TrainConfig,
-    *,
-    weights: Path | None = None,
-    backbone: Path | None = None,
-    quiet: bool = False,
+    config: TrainConfig, *, weights: Path | None = None, backbone: Path | None = None, quiet: bool
 ) -> Crisalad | None:
     """Read the parameters that a run starts from.
 
@@ -184,12 +180,7 @@ def read_start(
 
 
 def with_vocabulary_of(
-    initial: Crisalad | None,
-    config: TrainConfig,
-    places: TrainingSet,
-    *,
-    on_bad_image: OnBadImage = "stop",
-    quiet: bool = False,
+    initial: Crisalad | None, config: TrainConfig, places: TrainingSet, **how: Any
 ) -> Crisalad | None:
     """Fit an aggregator's centroids to the training images, if it starts from centroids.
 
@@ -200,8 +191,7 @@ def with_vocabulary_of(
         initial: the parameters; None for random ones, by the run's seed.
         config: the run's.
         places: the training images.
-        on_bad_image: "stop", or "skip" to leave unreadable images out.
-        quiet: no progress bar.
+        **how: `on_bad_image` and `quiet` of `with_vocabulary`.
 
     Returns:
         The parameters; as they are where the aggregator has no centroids.
@@ -220,7 +210,6 @@ def with_vocabulary_of(
     ]
     model = Model(initial, config.model)
     images, seed = config.model.aggregator.centroid_images, config.seed
-    how: Any = {"on_bad_image": on_bad_image, "quiet": quiet}
     fitted = distributed.raise_together(
         lambda: with_vocabulary(model, paths, images=images, seed=seed, **how)
     )

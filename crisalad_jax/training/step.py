@@ -160,11 +160,7 @@ class StepConfig:
 
 @takes(config=StepConfig)
 def init_train_state(
-    params: Crisalad,
-    trainable: str,
-    config: StepConfig,
-    *,
-    key: PRNGKeyArray | None = None,
+    params: Crisalad, trainable: str, config: StepConfig, *, key: PRNGKeyArray | None = None
 ) -> tuple[TrainState, PyTree]:
     """Make the state before the first step, and the frozen parameters, which no step changes.
 
@@ -356,10 +352,9 @@ def train_step(
     a loop may read metrics one step late, and still have the state before the failed step.
     """
     dropout_key = jax.random.fold_in(key, state.step)
-    found, (gradient, classifier_gradient) = loss_and_gradient(
+    (result, transport, statistics, all_valid), (gradient, classifier_gradient) = loss_and_gradient(
         state, frozen, images, labels, valid, dropout_key, config
     )
-    loss, result, transport, statistics, all_valid = found
     norm = optax.tree.norm((gradient, classifier_gradient))
     learning_rate = config.learning_rate(state.step)
     optimiser = config.make_optimiser()
@@ -371,10 +366,13 @@ def train_step(
         classifiers = update_classifiers(classifiers, group, classifier_gradient, rate)
     trainable = eqx.combine(optax.apply_updates(learnt, updates), statistics)
     new = TrainState(state.step + 1, trainable, new_optimiser, classifiers)
-    updated = proceed & jnp.isfinite(loss) & jnp.isfinite(norm) & all_valid.any()
+    updated = proceed & jnp.isfinite(result.loss) & jnp.isfinite(norm) & all_valid.any()
     state = jax.tree.map(lambda after, before: jnp.where(updated, after, before), new, state)
-    return _sharded(state, config.shard_over), Metrics(
-        loss=loss,
+    if (mesh := config.shard_over) is not None:
+        shards = jax.tree.map(lambda leaf: devices.shard_spec(mesh, leaf.shape), state)
+        state = jax.lax.with_sharding_constraint(state, shards)
+    return state, Metrics(
+        loss=result.loss,
         easy_anchor_fraction=result.easy_anchor_fraction,
         accuracy=result.accuracy,
         loss_numbers=result.numbers,
@@ -394,7 +392,6 @@ def _group(state: TrainState, config: StepConfig) -> Int[Array, ""]:
 class BatchLoss(NamedTuple):
     """What a forward pass of a batch gives."""
 
-    loss: Float[Array, ""]
     result: LossResult
     transport: TransportStatistics | None
     """Means over the valid images."""
@@ -459,28 +456,15 @@ def loss_and_gradient(
         updated = measured if updates_statistics else statistics
         return result.loss, (result, tokens.transport, updated)
 
-    (loss, (result, transport, statistics)), gradients = jax.value_and_grad(loss_of, has_aux=True)(
-        _replicated((learnt, classifier), config.shard_over)
-    )
+    weights = learnt, classifier
+    if config.shard_over is not None:
+        whole = NamedSharding(config.shard_over, PartitionSpec())
+        weights = jax.lax.with_sharding_constraint(weights, whole)
+    gradients, (result, transport, statistics) = jax.grad(loss_of, has_aux=True)(weights)
     transport = jax.tree.map(
         lambda each: jnp.where(valid, each, 0).sum() / all_valid.sum(), transport
     )
-    return BatchLoss(loss, result, transport, statistics, all_valid), gradients
-
-
-def _replicated(tree: PyTree, mesh: Mesh | None) -> PyTree:
-    """Constrain arrays to be whole on every device, where the state is sharded."""
-    if mesh is None:
-        return tree
-    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
-
-
-def _sharded(tree: PyTree, mesh: Mesh | None) -> PyTree:
-    """Constrain arrays to the shards of `devices.shard_spec`, where the state is sharded."""
-    if mesh is None:
-        return tree
-    shards = jax.tree.map(lambda leaf: devices.shard_spec(mesh, leaf.shape), tree)
-    return jax.lax.with_sharding_constraint(tree, shards)
+    return BatchLoss(result, transport, statistics, all_valid), gradients
 
 
 def _gathered(

@@ -14,9 +14,8 @@ from jaxtyping import PRNGKeyArray, PyTree
 from crisalad_jax.data.loader import ImageBatch, one_ahead
 from crisalad_jax.nn.model import Crisalad, cast_params
 from crisalad_jax.training import distributed
-from crisalad_jax.training.batches import PlaceBatches
 from crisalad_jax.training.config import TrainConfig
-from crisalad_jax.training.mining import Miner
+from crisalad_jax.training.mining import Batches
 from crisalad_jax.training.step import (
     Metrics,
     TrainState,
@@ -43,12 +42,7 @@ class Trainer:
     """What trains, on the devices; a step is started before the one before is finished."""
 
     def __init__(
-        self,
-        config: TrainConfig,
-        data: PlaceBatches | Miner,
-        initial: Crisalad,
-        *,
-        shard_state: bool,
+        self, config: TrainConfig, data: Batches, initial: Crisalad, *, shard_state: bool
     ) -> None:
         """Make the state before the first step; see `fit` for the arguments.
 
@@ -86,7 +80,7 @@ class Trainer:
     def resume(self, state: TrainState) -> None:
         """Go on from a state, which has to be the same in all processes."""
         # Copied, because a step donates the buffers of its state.
-        self.state = _copied(self._place(state))
+        self.state = jax.jit(lambda state: jax.tree.map(jnp.copy, state))(self._place(state))
 
     def on_devices(self, batches: Iterator[ImageBatch]) -> Generator[Batch, None, None]:
         """Return batches on the devices, each copied while they compute the one before."""
@@ -198,11 +192,6 @@ def run_keys(seed: int) -> tuple[PRNGKeyArray, PRNGKeyArray, PRNGKeyArray]:
     params, dropout = jax.random.split(key)
     # Folds in 2, because folding in 0 or 1 may repeat the keys of the split.
     return params, dropout, jax.random.fold_in(key, 2)
-
-
-@jax.jit
-def _copied(tree: PyTree) -> PyTree:
-    return jax.tree.map(jnp.copy, tree)
 
 
 def _choose_devices(config: TrainConfig) -> Devices:

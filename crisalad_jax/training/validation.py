@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from crisalad_jax.data.benchmarks import Benchmark
-from crisalad_jax.data.images import OnBadImage
-from crisalad_jax.data.loader import ImageCache
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
@@ -43,14 +41,7 @@ class Validation(NamedTuple):
 class Validator:
     """Evaluates the model of a run between its steps."""
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        benchmark: Benchmark | None,
-        *,
-        on_bad_image: OnBadImage,
-        cache: ImageCache,
-    ) -> None:
+    def __init__(self, config: TrainConfig, benchmark: Benchmark | None, reading: Reading) -> None:
         """Check the benchmark's ground truth; without a benchmark no validation is due.
 
         Raises:
@@ -58,12 +49,11 @@ class Validator:
         """
         if benchmark is not None:
             benchmark.ground_truth()
-        self._config, self._benchmark = config, benchmark
+        self._config, self._benchmark, self._reading = config, benchmark, reading
         self.name = "" if benchmark is None else benchmark.name
         """Name of the benchmark."""
         size = config.validation_size or config.model.image_size
         self._model = dataclasses.replace(config.model, image_size=size)
-        self._reading = Reading(on_bad_image=on_bad_image, cache=cache, quiet=True)
 
     def is_due(self, step: int, steps_per_epoch: int, *, last: int) -> bool:
         """Return whether the epoch that ends with this step needs a validation.

@@ -12,7 +12,7 @@ from jax.extend.core import get_opaque_trace_state
 from crisalad_jax.utils.executable_cache import cached_executable
 from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.host import usable_cores
-from crisalad_jax.utils.output import warn
+from crisalad_jax.utils.output import counted, warn
 from crisalad_jax.utils.target import lowering_platforms, machine, over_devices_of, target
 
 _P = ParamSpec("_P")
@@ -144,8 +144,7 @@ class Session(NamedTuple):
     def __repr__(self) -> str:
         """Return one line for a notebook."""
         cached = f"compiled programs in {self.cache}" if self.cache else "no compile cache"
-        plural = "" if self.devices == 1 else "s"
-        return f"{self.devices} {self.platform} device{plural}; {cached}"
+        return f"{counted(self.devices, f'{self.platform} device')}; {cached}"
 
 
 def set_up() -> Session:

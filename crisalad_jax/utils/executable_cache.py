@@ -26,6 +26,7 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from crisalad_jax.utils.checksums import sha256_of
 from crisalad_jax.utils.files import atomic_path, user_cache
+from crisalad_jax.utils.target import jax_setting
 from crisalad_jax.utils.version import VERSION
 
 _MOST = 128
@@ -110,13 +111,11 @@ def cached_executable(
 @contextlib.contextmanager
 def _without_jaxs_cache() -> Iterator[None]:
     """Compile again: what comes from JAX's own cache lacks its functions when cached again."""
-    before = jax.config.values[_ENABLED]
-    jax.config.update(_ENABLED, False)
-    compilation_cache.reset_cache()
     try:
-        yield
+        with jax_setting(_ENABLED, False):
+            compilation_cache.reset_cache()
+            yield
     finally:
-        jax.config.update(_ENABLED, before)
         compilation_cache.reset_cache()
 
 

@@ -163,12 +163,12 @@ def download_kaggle(handle: str, folder: pathlib.Path, *, quiet: bool = False) -
     """
     with _extra(f"kaggle: {handle}"):
         import kagglehub
+    from unittest import mock  # rarely needed
 
-    before = os.environ.get(_KAGGLE_CACHE)
-    # An output folder that is not empty is refused, so that nothing there would be resumed.
-    os.environ[_KAGGLE_CACHE] = str(folder)
     try:
         with (
+            # An output folder that is not empty is refused, so that nothing there would be resumed.
+            mock.patch.dict(os.environ, {_KAGGLE_CACHE: str(folder)}),
             open(os.devnull, "w") as nothing,
             contextlib.redirect_stderr(nothing if quiet else sys.stderr),
         ):
@@ -178,10 +178,6 @@ def download_kaggle(handle: str, folder: pathlib.Path, *, quiet: bool = False) -
             f"kaggle: {handle}: found {_first_line(error)}, expected the data set (a token: "
             "https://www.kaggle.com/settings; the same command resumes)"
         ) from error
-    finally:
-        del os.environ[_KAGGLE_CACHE]
-        if before is not None:
-            os.environ[_KAGGLE_CACHE] = before
 
 
 @contextlib.contextmanager
@@ -233,11 +229,8 @@ def _bars(quiet: bool) -> Iterator[None]:
     """Let the clients show no progress bars while the block runs."""
     from huggingface_hub import utils
 
-    if not quiet or utils.are_progress_bars_disabled():
+    with contextlib.ExitStack() as stack:
+        if quiet and not utils.are_progress_bars_disabled():
+            utils.disable_progress_bars()
+            stack.callback(utils.enable_progress_bars)
         yield
-        return
-    utils.disable_progress_bars()
-    try:
-        yield
-    finally:
-        utils.enable_progress_bars()

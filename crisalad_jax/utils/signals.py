@@ -38,7 +38,7 @@ def end_at_signals() -> None:
     global _pipe
     reading, _pipe = os.pipe()
     os.set_blocking(_pipe, False)
-    _watch()
+    watch()
     threading.Thread(target=_end_late, args=(reading,), daemon=True).start()
 
 
@@ -46,7 +46,11 @@ _pipe = -1
 """Gets the number of each signal, for the second thread; -1 where there is none."""
 
 
-def _watch() -> None:
+def watch() -> None:
+    """Watch for signals in a second thread, again before a library works in the main thread.
+
+    orbax writes by uvloop, which takes the watching for itself, and does not give it back.
+    """
     if _pipe >= 0 and threading.current_thread() is threading.main_thread():
         signal.set_wakeup_fd(_pipe, warn_on_full_buffer=False)
 
@@ -159,13 +163,6 @@ class SignalState:
         if self._at_once:
             raise Interrupted(number)
 
-    def watch(self) -> None:
-        """Watch for signals in a second thread again, before a library works in the main thread.
-
-        orbax writes by uvloop, which takes the watching for itself, and does not give it back.
-        """
-        _watch()
-
 
 @contextlib.contextmanager
 def defer_signals() -> Iterator[SignalState]:
@@ -180,13 +177,13 @@ def defer_signals() -> Iterator[SignalState]:
     # Ignored signals, as under nohup, stay ignored.
     before = {n: h for n in _SIGNALS if (h := signal.getsignal(n)) is not signal.SIG_IGN}
     state = SignalState.current = SignalState(before)
-    _watch()
+    watch()
     for number in before:
         signal.signal(number, state.handle)
     try:
         yield state
     finally:
-        _watch()
+        watch()
         if not state.number:
             SignalState.current = None
         for number, handler in before.items():

@@ -14,8 +14,6 @@ from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding
 
 Platform = Literal["cpu", "gpu", "tpu", "portable"]
 _LOWERED_AS = {"cpu": "cpu", "gpu": "cuda", "tpu": "tpu"}
-_CUDNN = 91000
-"""The cuDNN that an absent GPU is assumed to have: 9.10."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +51,17 @@ STRAIGHT = Target("portable", branches=False)
 _chosen = jax.make_user_context(None)
 _mesh = jax.make_user_context(None)
 _ONE_DEVICE = AbstractMesh((1,), ("image",), axis_types=(AxisType.Auto,))
+
+
+@contextlib.contextmanager
+def jax_setting(name: str, value: Any) -> Iterator[None]:
+    """Change one of JAX's settings while the block runs."""
+    before = jax.config.values[name]
+    jax.config.update(name, value)
+    try:
+        yield
+    finally:
+        jax.config.update(name, before)
 
 
 def target() -> Target:
@@ -135,7 +144,8 @@ def lowering_for(chosen: Target) -> Iterator[None]:
     """Trace and lower for another platform while the block runs, whether it is here or not.
 
     Every choice by platform reads `target`, and becomes that platform's. Traces of other targets
-    are neither used nor changed.
+    are neither used nor changed. For an absent GPU, `scripts/compile_check/absent.py` answers what
+    JAX asks of cuDNN.
 
     Args:
         chosen: the target, such as `TPU`.
@@ -145,8 +155,7 @@ def lowering_for(chosen: Target) -> Iterator[None]:
         ...     target().platform
         'tpu'
     """
-    absent = chosen.cudnn and machine().platform != "gpu"
-    with _chosen(chosen), _assuming_cudnn() if absent else contextlib.nullcontext():
+    with _chosen(chosen):
         yield
 
 
@@ -157,25 +166,3 @@ def lowering_platforms() -> tuple[str, ...] | None:
     """
     name = _LOWERED_AS.get(_chosen.value.platform) if _chosen.value else None
     return None if name is None else (name,)
-
-
-@contextlib.contextmanager
-def _assuming_cudnn() -> Iterator[None]:
-    """Answer for an absent GPU what JAX's fused attention asks of it while it is traced.
-
-    These questions have no public answer: JAX reads the version of the loaded cuDNN, and the
-    devices' compute capability. It is the one place that replaces something of JAX, and a program
-    for a platform that is here never comes by. The assumed GPU is an H100.
-    """
-    from unittest import mock  # both imports are slow, and rarely needed
-
-    from jax._src.cudnn import fused_attention_stablehlo as fused
-
-    def has(capability: str) -> bool:
-        return tuple(map(int, capability.split("."))) <= (9, 0)
-
-    with (
-        mock.patch.object(fused, "check_cudnn_version", return_value=_CUDNN),
-        mock.patch.object(fused, "check_compute_capability", has),
-    ):
-        yield

@@ -17,3 +17,15 @@ class ExampleSections(griffe.Extension):
         if obj.docstring is not None:
             text = re.sub(r"^Example:$", "Examples:", obj.docstring.value, flags=re.MULTILINE)
             obj.docstring.value = re.sub(r"<(\w+, \w+)>", r"&lt;\1&gt;", text)
+
+    def on_class_instance(self, *, cls: griffe.Class, **kwargs: Any) -> None:
+        """Let a registered class have the signature of the dataclass that it becomes."""
+        names = [str(each.value).partition("(")[0] for each in cls.decorators]
+        if any(name.endswith(".register") for name in names):
+            cls.decorators.append(griffe.Decorator(_Dataclass(), lineno=None, endlineno=None))
+
+
+class _Dataclass(griffe.Expr):
+    """What griffe takes for `@dataclasses.dataclass`."""
+
+    canonical_path = "dataclasses.dataclass"

@@ -24,7 +24,6 @@ from crisalad_jax.nn.backbones.vit import (
     interpolate_positions,
 )
 from crisalad_jax.nn.config import ModelConfig
-from crisalad_jax.nn.cross_image import cross_image_encoder
 from crisalad_jax.nn.model import Crisalad, describe
 from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.sinkhorn import assign_with_dustbin
@@ -172,9 +171,7 @@ SINKHORN = Part(_our_sinkhorn, _their_sinkhorn)
 def _our_encoder(params: Crisalad, x: Inputs, config: ModelConfig) -> dict[str, jax.Array]:
     assert params.cross_image is not None
     mask = x.get("mask")
-    tokens = cross_image_encoder(
-        params.cross_image, x["tokens"], config.cross_image, mask=mask, key=None
-    )
+    tokens = config.cross_image.apply(params.cross_image, x["tokens"], mask=mask, key=None)
     return {"tokens": tokens}
 
 

@@ -14,6 +14,7 @@ from crisalad_jax.nn.model import cast_params, describe, parameter_shapes
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.step import init_train_state, step_config, train_step
 from crisalad_jax.utils.target import GPU, TPU, lowering_for
+from scripts.compile_check.absent import assuming_cudnn
 from scripts.compile_check.targets import COMPILER_OPTIONS, Machine, devices_of
 
 _TARGETS = {"tpu": TPU, "cuda": GPU}
@@ -41,7 +42,7 @@ def compile_program(
     """
     machine.check_batch(images)
     mesh = Mesh(np.array(devices_of(machine)), ("image",))
-    with lowering_for(_TARGETS[machine.platform]):
+    with lowering_for(_TARGETS[machine.platform]), assuming_cudnn():
         lowered = _LOWER[program](config, images, mesh)
         with _without_cache():
             return lowered.compile(compiler_options=COMPILER_OPTIONS[machine.platform])

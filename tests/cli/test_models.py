@@ -113,8 +113,8 @@ def test_weights_by_name(capfd, tmp_path):
 @pytest.mark.filterwarnings("ignore::crisalad_jax.utils.output.Note")
 def test_a_run_starts_from_weights_or_a_backbone_by_name():
     expected, config = load_weights(cached_weights(PUBLISHED["tiny-model"]))
-    whole = read_start(dataclasses.replace(RECIPE, model=config), weights="tiny-model")
+    whole = read_start(dataclasses.replace(RECIPE, model=config), weights="tiny-model", quiet=True)
     assert_equal(whole, expected)
     model = dataclasses.replace(RECIPE.model, backbone=config.backbone)
-    start = read_start(dataclasses.replace(RECIPE, model=model), backbone="tiny-model")
+    start = read_start(dataclasses.replace(RECIPE, model=model), backbone="tiny-model", quiet=True)
     assert_equal(start.backbone, expected.backbone)

@@ -13,6 +13,7 @@ import crisalad_jax as cj
 from crisalad_jax.checkpoints.weights import load_weights
 from crisalad_jax.cli import train as train_command
 from crisalad_jax.data.loader import ImageCache
+from crisalad_jax.data.reading import Reading
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.cross_image import CrossImageConfig
 from crisalad_jax.training import callbacks as module
@@ -114,8 +115,8 @@ def test_parts_own_numbers_are_those_of_a_validation(monkeypatch, benchmark, par
     monkeypatch.setattr(validation.Validator, "_watch_transport", lambda *_: {})
     monkeypatch.setattr(SaladConfig, "numbers", lambda _, own: {"dust_bin": own.dust_bin})
     monkeypatch.setattr(CrossImageConfig, "numbers", lambda _, own: {"layers": len(own.layers)})
-    how: Any = {"on_bad_image": "stop", "cache": ImageCache(0)}
-    found = validation.Validator(ENDLESS, benchmark, **how).validate(params)
+    reading = Reading(cache=ImageCache(0))
+    found = validation.Validator(ENDLESS, benchmark, reading).validate(params)
     own = {"dust_bin": float(params.aggregator.dust_bin), "layers": 2}
     assert found.metrics == {"R@1": 0.25, "R@5": 0.5, **own}
 

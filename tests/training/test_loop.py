@@ -276,10 +276,8 @@ def test_a_validation_has_its_own_size(params, benchmark, monkeypatch):
 
 
 def validated(config: TrainConfig, params: Crisalad, benchmark: Benchmark) -> validation.Validation:
-    cache = ImageCache()
-    return validation.Validator(config, benchmark, on_bad_image="stop", cache=cache).validate(
-        params
-    )
+    reading = Reading(cache=ImageCache(), quiet=True)
+    return validation.Validator(config, benchmark, reading).validate(params)
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,12 @@ from crisalad_jax.data.images import list_images, read_image
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.vlad import (
-    AnyLoc,
     AnyLocConfig,
     NetVlad,
     NetVladConfig,
     VladBuff,
     VladBuffConfig,
+    Words,
 )
 from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, unit_features
@@ -50,7 +50,7 @@ CONFIGS = pytest.mark.parametrize("config", [ANYLOC, NETVLAD], ids=["anyloc", "n
 def fresh() -> Crisalad:
     """AnyLoc without a vocabulary."""
     params = random_params(ANYLOC)
-    return dataclasses.replace(params, aggregator=AnyLoc(jnp.ones((4, 32))))
+    return dataclasses.replace(params, aggregator=Words(jnp.ones((4, 32))))
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +65,8 @@ def built(fresh: Crisalad, paths: list[pathlib.Path]) -> Crisalad:
 
 def centroids_of(params: Crisalad) -> np.ndarray:
     aggregator = params.aggregator
-    assert isinstance(aggregator, AnyLoc | NetVlad)
-    return np.asarray(aggregator.words if isinstance(aggregator, AnyLoc) else aggregator.centroids)
+    assert isinstance(aggregator, Words | NetVlad)
+    return np.asarray(aggregator.words if isinstance(aggregator, Words) else aggregator.centroids)
 
 
 def features_of(params: Crisalad, config: ModelConfig, paths: list[pathlib.Path]) -> np.ndarray:

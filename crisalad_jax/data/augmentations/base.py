@@ -33,7 +33,6 @@ def _checked(default: Any, check: Callable[[object, str], None]) -> Any:
     return dataclasses.field(default=default, metadata={_CHECK: check})
 
 
-@dataclasses.dataclass(frozen=True)
 class Augmentation(Part, abc.ABC):
     """A random change of training images: a frozen dataclass whose fields are its strengths.
 
@@ -81,7 +80,6 @@ AUGMENTATIONS = Registry("augmentation", Augmentation, of_function=_of_function)
 
 
 @AUGMENTATIONS.register("none")
-@dataclasses.dataclass(frozen=True)
 class NoAugmentation(Augmentation):
     """Leave images as they are."""
 

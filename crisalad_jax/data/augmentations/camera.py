@@ -1,6 +1,5 @@
 """What cameras do to a picture: another stand, motion, few pixels, a smudge, noise, JPEG."""
 
-import dataclasses
 import math
 
 import cv2
@@ -14,7 +13,6 @@ _QUALITY = (12, 85)
 
 
 @AUGMENTATIONS.register("camera")
-@dataclasses.dataclass(frozen=True)
 class CameraAugmentConfig(LightAugmentConfig):
     """The light augmentation, and then a cheap camera: for rendered pictures, which lack one."""
 

@@ -4,7 +4,6 @@ Torchvision's `ColorJitter` and `RandomResizedCrop` on tensors from 0 to 1, roun
 end.
 """
 
-import dataclasses
 import math
 
 import cv2
@@ -30,7 +29,6 @@ _Floats = Float32[np.ndarray, "h w 3"]
 
 
 @AUGMENTATIONS.register("colour-crop")
-@dataclasses.dataclass(frozen=True)
 class ColourCropConfig(Augmentation):
     """Changes of colour in random order, then a crop at the size of the image (CosPlace)."""
 

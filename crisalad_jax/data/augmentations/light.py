@@ -1,6 +1,5 @@
 """A light augmentation, for training from scratch on fixed cameras."""
 
-import dataclasses
 import math
 
 import cv2
@@ -19,7 +18,6 @@ _LUMA = np.array([0.299, 0.587, 0.114])
 
 
 @AUGMENTATIONS.register("light")
-@dataclasses.dataclass(frozen=True)
 class LightAugmentConfig(Augmentation):
     """One small warp and mild changes of light, for training from scratch on fixed cameras."""
 

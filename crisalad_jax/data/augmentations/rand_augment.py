@@ -1,6 +1,5 @@
 """RandAugment (Cubuk et al., CVPR Workshops 2020), with torchvision's strengths in Pillow's way."""
 
-import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -21,7 +20,6 @@ _LEVELS = np.arange(256)
 
 
 @AUGMENTATIONS.register("rand-augment")
-@dataclasses.dataclass(frozen=True)
 class RandAugmentConfig(Augmentation):
     """RandAugment (Cubuk et al. 2020), torchvision's 14 operations, GSV-Cities' strength."""
 

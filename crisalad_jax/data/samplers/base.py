@@ -1,7 +1,6 @@
 """Samplers: which places, and which of their images, make the batches of an epoch."""
 
 import abc
-import dataclasses
 import itertools
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
@@ -40,7 +39,6 @@ class Draw(NamedTuple):
     """Their descriptors by the model as it is; NaN for images that cannot be read."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Sampler(Part, abc.ABC):
     """The way batches are drawn from places: a frozen dataclass with its settings as fields.
 

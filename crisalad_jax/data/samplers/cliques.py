@@ -6,7 +6,6 @@ once; here the model that is trained does, when an epoch begins.
 """
 
 import collections
-import dataclasses
 from typing import ClassVar
 
 import numpy as np
@@ -19,7 +18,6 @@ from crisalad_jax.utils.shapes import Float, Int
 
 
 @SAMPLERS.register("cliques")
-@dataclasses.dataclass(frozen=True)
 class Cliques(Sampler):
     """Groups of images within `radius` of each other, and of no image of another group.
 
@@ -111,7 +109,6 @@ class Cliques(Sampler):
 
 
 @SAMPLERS.register("geo-visual")
-@dataclasses.dataclass(frozen=True)
 class GeoVisual(Cliques):
     """Cliques of a neighbourhood that grows greedily from a place that looks like many others.
 

@@ -1,6 +1,5 @@
 """Batches of places that the model confuses."""
 
-import dataclasses
 from typing import ClassVar
 
 import numpy as np
@@ -11,7 +10,6 @@ from crisalad_jax.utils.shapes import Int
 
 
 @SAMPLERS.register("hard-negatives")
-@dataclasses.dataclass(frozen=True)
 class HardNegatives(Sampler):
     """A random place and those that look most like it, by the model when an epoch begins.
 

@@ -1,7 +1,5 @@
 """Random places, of all cities or of one in a batch."""
 
-import dataclasses
-
 import numpy as np
 
 from crisalad_jax.data.places import Places
@@ -10,7 +8,6 @@ from crisalad_jax.utils.shapes import Int
 
 
 @SAMPLERS.register("shuffled")
-@dataclasses.dataclass(frozen=True)
 class Shuffled(Sampler):
     """Places of all cities in random order."""
 
@@ -20,7 +17,6 @@ class Shuffled(Sampler):
 
 
 @SAMPLERS.register("within-city")
-@dataclasses.dataclass(frozen=True)
 class WithinCity(Sampler):
     """City after city in random order, as the public loaders draw.
 

@@ -1,7 +1,6 @@
 """EigenPlaces' classes as places, for losses of pairs (Berton et al., ICCV 2023)."""
 
 import collections
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import ClassVar, Literal
@@ -19,7 +18,6 @@ _SIDES = ("lateral", "frontal")
 
 
 @SAMPLERS.register("viewpoints")
-@dataclasses.dataclass(frozen=True)
 class Viewpoints(Sampler):
     """Images that look at one point, from different positions of a street.
 

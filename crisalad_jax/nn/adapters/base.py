@@ -1,7 +1,6 @@
 """Adapters of a vision transformer's blocks: their interface and registry."""
 
 import abc
-import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -40,7 +39,6 @@ class TokenInfo(NamedTuple):
     (`layers.train_batch_norm`); None takes the stored ones."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Adapter(Part, abc.ABC):
     """Small layers that are added to every block: a frozen dataclass whose fields are its settings.
 
@@ -54,7 +52,6 @@ class Adapter(Part, abc.ABC):
         >>> import jax.numpy as jnp
         >>> from crisalad_jax import ViTConfig, register_adapter
         >>> @register_adapter("shift")
-        ... @dataclasses.dataclass(frozen=True)
         ... class Shift(Adapter):
         ...     def init(self, key, shape):
         ...         return {"shift": jnp.zeros(shape.dim)}
@@ -172,24 +169,7 @@ class Adapter(Part, abc.ABC):
         """Return whether it has one of these methods of its own."""
         return any(getattr(type(self), hook) is not getattr(Adapter, hook) for hook in hooks)
 
-    @property
-    def has_prompts(self) -> bool:
-        """Whether it has `prompts`."""
-        return self.has("prompts")
 
-    @property
-    def can_merge(self) -> bool:
-        """Whether it has a `merge`."""
-        return self.has("merge")
-
-    @property
-    def has_side_path(self) -> bool:
-        """Whether it has a `side_path`."""
-        return self.has("side_path")
-
-
-HOOKS = (
-    *("prompts", "linear_update", "attention_update", "mlp_update", "output_update", "side_path"),
-)
+HOOKS = ("prompts", "linear_update", "attention_update", "mlp_update", "output_update", "side_path")
 """Methods of adapters that change what a block does."""
 ADAPTERS = Registry("adapter", Adapter)

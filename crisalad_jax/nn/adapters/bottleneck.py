@@ -77,7 +77,6 @@ class SerialParallelAdapter:
 
 
 @ADAPTERS.register("none")
-@dataclasses.dataclass(frozen=True)
 class NoAdapter(Adapter):
     """No adapter: the plain backbone."""
 
@@ -114,7 +113,6 @@ class BottleneckAdapter(Adapter):
 
 
 @ADAPTERS.register("depthwise")
-@dataclasses.dataclass(frozen=True)
 class DepthwiseConfig(BottleneckAdapter):
     """The paper's depthwise-separable convolution, parallel to the MLP (section 3.2)."""
 
@@ -149,7 +147,6 @@ class DepthwiseConfig(BottleneckAdapter):
 
 
 @ADAPTERS.register("multi-resolution")
-@dataclasses.dataclass(frozen=True)
 class MultiResolutionConfig(BottleneckAdapter):
     """CricaVPR's multi-resolution convolutions, parallel to the MLP (Lu et al., CVPR 2024)."""
 
@@ -168,7 +165,6 @@ class MultiResolutionConfig(BottleneckAdapter):
 
 
 @ADAPTERS.register("mlp")
-@dataclasses.dataclass(frozen=True)
 class MlpConfig(BottleneckAdapter):
     """A plain MLP with ReLU, parallel to the block's (AdaptFormer: Chen et al., NeurIPS 2022)."""
 
@@ -184,7 +180,6 @@ class MlpConfig(BottleneckAdapter):
 
 
 @ADAPTERS.register("serial-parallel")
-@dataclasses.dataclass(frozen=True)
 class SerialParallelConfig(BottleneckAdapter):
     """SelaVPR's MLPs: one after the attention, of weight 1, one parallel to the MLP (ICLR 2024)."""
 
@@ -207,7 +202,6 @@ class SerialParallelConfig(BottleneckAdapter):
 
 
 @ADAPTERS.register("side")
-@dataclasses.dataclass(frozen=True)
 class SideConfig(BottleneckAdapter):
     """EDTformer's MLPs with GELU, on a path beside all blocks (Jin et al. 2025).
 
@@ -228,7 +222,6 @@ class SideConfig(BottleneckAdapter):
 
 
 @ADAPTERS.register("side-multi-resolution")
-@dataclasses.dataclass(frozen=True)
 class SideMultiResolutionConfig(BottleneckAdapter):
     """SelaVPR++'s convolutions, CricaVPR's on paths beside the blocks (Lu et al. 2025).
 

@@ -3,8 +3,6 @@
 Written from the facts of the public model; the training code is not published.
 """
 
-import dataclasses
-
 from jaxtyping import PRNGKeyArray
 
 from crisalad_jax.config.checks import PositiveInt
@@ -13,7 +11,6 @@ from crisalad_jax.nn.layers import TwoLayer, init_two_layer, powers
 
 
 @ADAPTERS.register("dynamic-power")
-@dataclasses.dataclass(frozen=True)
 class DynamicPowerConfig(Adapter):
     """SAGE's dynamic power after each of the last blocks: x + sign(x) (|x| + 1e-6)^p.
 

@@ -23,7 +23,6 @@ class LowRank:
 
 
 @ADAPTERS.register("lora")
-@dataclasses.dataclass(frozen=True)
 class LoraConfig(Adapter):
     """Updates of low rank to linear layers, W x + alpha / rank B A x (LoRA: Hu et al. 2021).
 

@@ -1,6 +1,5 @@
 """Visual prompts: learnt tokens beside an image's own (Jia et al., ECCV 2022)."""
 
-import dataclasses
 import math
 
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -19,7 +18,6 @@ class Prompts:
 
 
 @ADAPTERS.register("prompts")
-@dataclasses.dataclass(frozen=True)
 class PromptsConfig(Adapter):
     """Prompts in every block (VPT-deep: Jia et al., ECCV 2022), without dropout.
 

@@ -1,6 +1,5 @@
 """Tokens that the backbone itself makes: its class token, or learnt ones that run through it."""
 
-import dataclasses
 from typing import ClassVar
 
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -22,19 +21,16 @@ from crisalad_jax.utils.pytree import pytree_dataclass
 
 
 @AGGREGATORS.register("class-token")
-@dataclasses.dataclass(frozen=True)
 class ClassTokenConfig(Aggregator):
     """The backbone's class token, by itself (Oquab et al. 2023)."""
 
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the class token."""
-        return FeatureSpec(class_token=True)
+    class_token: ClassVar[bool] = True
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of a global token as wide as the backbone."""
         return TokenShape(dim, 0, dim)
 
-    def apply(self, params: None, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: None, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the class token as it is."""
         return Tokens.of_global(at_least_float32(features.class_token))
 
@@ -47,7 +43,6 @@ class AggregationTokens:
 
 
 @AGGREGATORS.register("aggregation-tokens", tiny={"insertion": -2})
-@dataclasses.dataclass(frozen=True)
 class AggregationTokensConfig(Aggregator):
     """ImAge's learnt tokens, which run through the backbone's last blocks (Lu et al., 2025).
 
@@ -91,7 +86,7 @@ class AggregationTokensConfig(Aggregator):
         return params.tokens
 
     def apply(
-        self, params: AggregationTokens, features: Features, grid: Grid, *, key: Keys | None
+        self, params: AggregationTokens, features: Features, grid: Grid, *, key: Keys
     ) -> Tokens:
         """Return the tokens as the backbone's last layer norm leaves them."""
         assert features.inserted is not None

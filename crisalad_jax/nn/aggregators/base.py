@@ -1,7 +1,6 @@
 """Aggregators, which turn an image's features into tokens: their interface and registry."""
 
 import abc
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -39,7 +38,6 @@ class TokenShape(NamedTuple):
     """Width of a local token, and of the cross-image encoder."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Aggregator(Part, abc.ABC):
     """A method that makes tokens of features: a frozen dataclass whose fields are its settings.
 
@@ -49,7 +47,6 @@ class Aggregator(Part, abc.ABC):
     Example:
         >>> from crisalad_jax import ModelConfig, register_aggregator
         >>> @register_aggregator("largest")
-        ... @dataclasses.dataclass(frozen=True)
         ... class Largest(Aggregator):
         ...     power: float = 1.0
         ...
@@ -71,6 +68,11 @@ class Aggregator(Part, abc.ABC):
     """Whether its parameters fit the patches of one image size only."""
     centroid_images: ClassVar[int] = 500
     """Number of training images, at most, whose features' centroids training starts from."""
+    spherical_centroids: ClassVar[bool] = False
+    """Whether k-means compares features with centroids by the angle, not the distance. A centroid
+    is the mean of its features either way."""
+    class_token: ClassVar[bool] = False
+    """Whether it takes the backbone's class token, with the last patches."""
 
     def numbers(self, params: Any) -> Mapping[str, Any]:
         """Return numbers of the parameters that validations log by name; by default none."""
@@ -86,7 +88,7 @@ class Aggregator(Part, abc.ABC):
         Raises:
             InputError: the backbone has too few blocks.
         """
-        return FeatureSpec()
+        return FeatureSpec(class_token=self.class_token)
 
     def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Any:
         """Draw random parameters, a pytree of arrays in float32; by default None.
@@ -106,7 +108,7 @@ class Aggregator(Part, abc.ABC):
         return None
 
     @abc.abstractmethod
-    def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the tokens of one image or of a batch, in float32 at least.
 
         Args:
@@ -149,14 +151,6 @@ class Aggregator(Part, abc.ABC):
         By default there is one for each local token.
         """
         return self.token_shape(dim).tokens
-
-    @property
-    def spherical_centroids(self) -> bool:
-        """Whether k-means compares features with centroids by the angle; by default the distance.
-
-        A centroid is the mean of its features either way.
-        """
-        return False
 
     @property
     def starts_from_centroids(self) -> bool:
@@ -249,9 +243,7 @@ def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
         tokens = jax.eval_shape(outputs, features)
         return TokenShape(tokens.global_token.shape[0], *tokens.local.shape)
 
-    def apply(
-        self: Aggregator, params: Any, features: Features, grid: Any, *, key: Keys | None
-    ) -> Tokens:
+    def apply(self: Aggregator, params: Any, features: Features, grid: Any, *, key: Keys) -> Tokens:
         each = outputs
         for _ in features.class_token.shape[:-1]:
             each = jax.vmap(each)

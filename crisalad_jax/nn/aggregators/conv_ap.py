@@ -1,6 +1,5 @@
 """Conv-AP, the baseline of GSV-Cities (Ali-bey et al., Neurocomputing 2022)."""
 
-import dataclasses
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -29,7 +28,6 @@ class ConvAp:
 
 
 @AGGREGATORS.register("conv-ap", tiny={"channels": 128})
-@dataclasses.dataclass(frozen=True)
 class ConvApConfig(Aggregator):
     """Conv-AP, the baseline of GSV-Cities (Ali-bey et al., Neurocomputing 2022)."""
 
@@ -51,7 +49,7 @@ class ConvApConfig(Aggregator):
         """Draw parameters as torch's convolutions do."""
         return ConvAp(init_linear(key, backbone.dim, self.channels))
 
-    def apply(self, params: ConvAp, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: ConvAp, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return a token for each of side x side regions, row by row.
 
         The published order is convolution, then means. Both are linear and the weights of a mean

@@ -1,8 +1,8 @@
 """Generalised means of patches (GeM): of an image, of a pyramid, and heads with a linear layer."""
 
-import dataclasses
 import itertools
 import math
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from crisalad_jax.nn.aggregators.base import (
     regions,
     require_side,
 )
-from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
+from crisalad_jax.nn.backbones.base import Backbone, Features, Grid, Patches
 from crisalad_jax.nn.layers import Keys, Linear, at_least_float32, init_linear, l2_normalise, linear
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
@@ -38,7 +38,6 @@ class Gem:
 
 
 @AGGREGATORS.register("gem")
-@dataclasses.dataclass(frozen=True)
 class GemConfig(Aggregator):
     """Generalised mean of all patches (Radenovic et al., TPAMI 2018)."""
 
@@ -50,22 +49,19 @@ class GemConfig(Aggregator):
         """Start at an exponent of 3, as public implementations do."""
         return Gem(random_init.full((), START))
 
-    def apply(self, params: Gem, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Gem, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the mean of all patches, a global token as wide as the backbone."""
         return Tokens.of_global(gem(features.patches, params.p))
 
 
 @AGGREGATORS.register("gem-pyramid")
-@dataclasses.dataclass(frozen=True)
 class GemPyramidConfig(GemConfig):
     """CricaVPR's class token and generalised means over 13 regions (Lu et al., CVPR 2024).
 
     All regions have one exponent.
     """
 
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches and the class token."""
-        return FeatureSpec(class_token=True)
+    class_token: ClassVar[bool] = True
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of tokens as wide as the backbone."""
@@ -75,7 +71,7 @@ class GemPyramidConfig(GemConfig):
         """Require a patch in every region."""
         require_side(self.part_name, grid, max(PYRAMID_LEVELS), patch_size)
 
-    def apply(self, params: Gem, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Gem, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the class token, and a generalised mean for each region."""
         means = gem_pyramid(features.patches, params.p, grid)
         return Tokens(at_least_float32(features.class_token), means)
@@ -90,7 +86,6 @@ class CosPlace:
 
 
 @AGGREGATORS.register("cosplace", tiny={"dim": 256})
-@dataclasses.dataclass(frozen=True)
 class CosPlaceConfig(Aggregator):
     """The head of CosPlace (Berton et al., CVPR 2022) and EigenPlaces (ICCV 2023)."""
 
@@ -105,9 +100,7 @@ class CosPlaceConfig(Aggregator):
         """Draw parameters as the public code: an exponent of 3, torch's default linear layer."""
         return CosPlace(random_init.full((), START), init_linear(key, backbone.dim, self.dim))
 
-    def apply(
-        self, params: CosPlace, features: Features, grid: Grid, *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: CosPlace, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return a linear layer of the generalised mean of unit patches.
 
         The descriptor is scaled to unit length later.
@@ -137,7 +130,6 @@ class ApGem:
 
 
 @AGGREGATORS.register("ap-gem", tiny={"dim": 256})
-@dataclasses.dataclass(frozen=True)
 class ApGemConfig(CosPlaceConfig):
     """The head of AP-GeM (Revaud et al., ICCV 2019), with its whitening."""
 
@@ -150,7 +142,7 @@ class ApGemConfig(CosPlaceConfig):
         whitening = Whitening(zeros(self.dim), jnp.diag(ones(self.dim)), ones(self.dim))
         return ApGem(head.p, head.fc, whitening)
 
-    def apply(self, params: ApGem, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: ApGem, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the whitened unit output of a linear layer of the mean of patches as they are.
 
         The whitening is measured, not learnt: no gradient changes it.

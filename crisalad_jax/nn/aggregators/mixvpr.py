@@ -3,7 +3,6 @@
 The parameters fit one grid of patches, so a model describes images of one size only.
 """
 
-import dataclasses
 import math
 from typing import ClassVar
 
@@ -47,7 +46,6 @@ class MixVpr:
 
 
 @AGGREGATORS.register("mixvpr", tiny={"channels": 128})
-@dataclasses.dataclass(frozen=True)
 class MixVprConfig(Aggregator):
     """MixVPR (Ali-bey et al., WACV 2023)."""
 
@@ -87,7 +85,7 @@ class MixVprConfig(Aggregator):
             row_proj=init_linear(rows, patches, self.rows),
         )
 
-    def apply(self, params: MixVpr, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: MixVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return a token of `channels` numbers for each row (paper Eqs. 1 to 4)."""
         maps = features.patches.swapaxes(-2, -1)
         for mixer in params.mix:

@@ -3,9 +3,9 @@
 Written from the papers: the decoder is that of CroCo (Weinzaepfel et al., NeurIPS 2022).
 """
 
-import dataclasses
 import functools
 import math
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -14,7 +14,7 @@ from crisalad_jax.config.checks import PositiveInt, require_field
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, TokenShape
 from crisalad_jax.nn.attention import Attention, attention, cross_attention, init_torch_attention
-from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
+from crisalad_jax.nn.backbones.base import Backbone, Features, Grid, Patches
 from crisalad_jax.nn.backbones.vit import NORM_EPSILON, bicubic_weights, resize_grid
 from crisalad_jax.nn.layers import (
     Keys,
@@ -68,7 +68,6 @@ class PairVpr:
 @AGGREGATORS.register(
     "pair-vpr", tiny={"dim": 64, "width": 64, "layers": 2, "hidden": 32, "positions": 49}
 )
-@dataclasses.dataclass(frozen=True)
 class PairVprConfig(Aggregator):
     """Pair-VPR's class token and its second stage's decoder (Hausler and Moghadam, RA-L 2025).
 
@@ -78,6 +77,7 @@ class PairVprConfig(Aggregator):
         512
     """
 
+    class_token: ClassVar[bool] = True
     dim: PositiveInt = 512
     """Width of the descriptor."""
     width: PositiveInt = 768
@@ -100,10 +100,6 @@ class PairVprConfig(Aggregator):
     def heads(self) -> int:
         """Number of heads of every attention of the decoder."""
         return max(1, self.width // 64)
-
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches and the class token."""
-        return FeatureSpec(class_token=True)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of a global token."""
@@ -135,7 +131,7 @@ class PairVprConfig(Aggregator):
             norm_other=init_layer_norm(width),
         )
 
-    def apply(self, params: PairVpr, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: PairVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the projected class token, and no local token."""
         return Tokens.of_global(at_least_float32(linear(params.reduction, features.class_token)))
 

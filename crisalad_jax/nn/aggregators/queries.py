@@ -4,7 +4,6 @@ Attentions and encoder layers are torch's: `nn.MultiheadAttention` and, with ReL
 feed-forward network of four times the width, `nn.TransformerEncoderLayer`.
 """
 
-import dataclasses
 from typing import ClassVar
 
 import jax
@@ -61,7 +60,6 @@ class Boq:
 
 
 @AGGREGATORS.register("boq", tiny={"channels": 64, "queries": 16, "rows": 8})
-@dataclasses.dataclass(frozen=True)
 class BoqConfig(Aggregator):
     """Bag of queries (Ali-bey et al., CVPR 2024)."""
 
@@ -106,7 +104,7 @@ class BoqConfig(Aggregator):
             fc=init_linear(rows_key, self.layers * self.queries, self.rows),
         )
 
-    def apply(self, params: Boq, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Boq, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return a token of `channels` numbers for each row."""
         patches = features.patches
         maps = patches.reshape(-1, *grid, patches.shape[-1])
@@ -161,7 +159,6 @@ class EdtFormer:
 
 
 @AGGREGATORS.register("edtformer", tiny={"width": 64, "heads": 4, "queries": 16, "channels": 64})
-@dataclasses.dataclass(frozen=True)
 class EdtFormerConfig(Aggregator):
     """EDTformer's decoder (Jin et al., 2025).
 
@@ -171,6 +168,7 @@ class EdtFormerConfig(Aggregator):
         4096
     """
 
+    class_token: ClassVar[bool] = True
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     width: PositiveInt = 768
     """Width of the decoder."""
@@ -188,10 +186,6 @@ class EdtFormerConfig(Aggregator):
         """Check the ranges."""
         fits = self.width % self.heads == 0
         require_field(self, "width", fits, f"a multiple of the {self.heads} heads")
-
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches and the class token."""
-        return FeatureSpec(class_token=True)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the shape of one token for each row."""
@@ -219,9 +213,7 @@ class EdtFormerConfig(Aggregator):
             row_proj=init_linear(rows, self.queries, self.rows),
         )
 
-    def apply(
-        self, params: EdtFormer, features: Features, grid: Grid, *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: EdtFormer, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return a token of `channels` numbers for each row."""
         answers = decode(params, features, self.heads)
         channels = linear(params.channel_proj, answers).swapaxes(-2, -1)

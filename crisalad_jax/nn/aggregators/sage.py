@@ -3,7 +3,6 @@
 Written from the facts of the public model; the training code is not published.
 """
 
-import dataclasses
 from typing import ClassVar
 
 import jax
@@ -13,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from crisalad_jax.config.checks import PositiveInt
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.aggregators.base import AGGREGATORS, Aggregator, FlattenOrder, TokenShape
-from crisalad_jax.nn.backbones.base import Backbone, Features, FeatureSpec, Grid, Patches
+from crisalad_jax.nn.backbones.base import Backbone, Features, Grid, Patches
 from crisalad_jax.nn.layers import (
     Keys,
     TwoLayer,
@@ -43,7 +42,6 @@ class Sage:
 @AGGREGATORS.register(
     "sage", tiny={"clusters": 16, "cluster_dim": 32, "token_dim": 64, "hidden": 128}
 )
-@dataclasses.dataclass(frozen=True)
 class SageConfig(Aggregator):
     """SAGE's aggregation (ICLR 2026).
 
@@ -57,6 +55,7 @@ class SageConfig(Aggregator):
         8448
     """
 
+    class_token: ClassVar[bool] = True
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     clusters: PositiveInt = 64
     cluster_dim: PositiveInt = 128
@@ -66,10 +65,6 @@ class SageConfig(Aggregator):
     """Hidden width of the networks over features."""
     weighting_hidden: PositiveInt = 128
     """Hidden width of the network of a patch's length."""
-
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches and the class token."""
-        return FeatureSpec(class_token=True)
 
     def token_shape(self, dim: int) -> TokenShape:
         """Return the tokens' shape, which does not depend on the backbone."""
@@ -86,7 +81,7 @@ class SageConfig(Aggregator):
             power=init_two_layer(keys[4], self.clusters, self.clusters // 2, 1),
         )
 
-    def apply(self, params: Sage, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Sage, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the global token and the clusters, each L2-normalised, in float32."""
         patches = weighted(params.weighting, features.patches)
         means = pooled(params, patches)

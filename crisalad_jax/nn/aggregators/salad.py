@@ -60,7 +60,6 @@ _TINY = {"clusters": 16, "cluster_dim": 32, "token_dim": 64, "hidden": 128, "dro
 
 
 @AGGREGATORS.register("salad", tiny=_TINY)
-@dataclasses.dataclass(frozen=True)
 class SaladConfig(Aggregator):
     """SALAD aggregation (Izquierdo and Civera, CVPR 2024).
 
@@ -70,6 +69,7 @@ class SaladConfig(Aggregator):
         4352
     """
 
+    class_token: ClassVar[bool] = True
     flatten_order: ClassVar[FlattenOrder] = "dimension-first"
     clusters: PositiveInt = 64
     cluster_dim: PositiveInt = 128
@@ -108,10 +108,6 @@ class SaladConfig(Aggregator):
         """Number of scores of a patch: one for each cluster, and the dustbin's."""
         return self.clusters + self.dustbin.scores
 
-    def features(self, depth: int) -> FeatureSpec:
-        """Request the last patches and the class token."""
-        return FeatureSpec(class_token=True)
-
     def check_grid(self, grid: Grid, patch_size: int) -> None:
         """Require more patches than clusters, where the dustbin's mass is the difference."""
         patches = math.prod(grid)
@@ -132,6 +128,8 @@ class SaladConfig(Aggregator):
         """Draw parameters as the public code: torch's default linears, dustbin score 1."""
         token_key, cluster_key, score_key = random_init.split(key, 3)
         dim, hidden = backbone.dim, self.hidden
+        below = {name: tau for name, tau in self._taus.items() if tau < 1}
+        logits = {name: jnp.full((), math.log(tau / (1 - tau))) for name, tau in below.items()}
         return Salad(
             token_features=init_two_layer(token_key, dim, hidden, self.token_dim),
             cluster_features=init_two_layer(cluster_key, dim, hidden, self.cluster_dim),
@@ -141,22 +139,18 @@ class SaladConfig(Aggregator):
             log_epsilon=jnp.log(jnp.full((), self.epsilon)) if self.learn_epsilon else None,
             step=self.sinkhorn.step.init_params(jax.random.fold_in(key, 4)),
             start=self.sinkhorn.start.init_params(jax.random.fold_in(key, 5)),
-            logit_tau=self._logits() if self.learn_tau else None,
+            logit_tau=logits if self.learn_tau else None,
         )
 
     @property
     def _taus(self) -> dict[str, Any]:
         return {"row_tau": self.row_tau, "column_tau": self.column_tau}
 
-    def _logits(self) -> dict[str, Array]:
-        below = {name: tau for name, tau in self._taus.items() if tau < 1}
-        return {name: jnp.full((), math.log(tau / (1 - tau))) for name, tau in below.items()}
-
     def dustbin_params(self, params: Any, features: Features) -> Any:
         """Return the dustbin's parameters, by default those that are learnt."""
         return params.dust_bin
 
-    def transport(self, params: Any, features: Features, *, key: Keys | None) -> SinkhornResult:
+    def transport(self, params: Any, features: Features, *, key: Keys) -> SinkhornResult:
         """Assign patches to clusters, dustbin last (SALAD's Eqs. 3 to 5), in float32.
 
         Raises:
@@ -176,7 +170,7 @@ class SaladConfig(Aggregator):
             start_params=params.start,
         )
 
-    def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the global token and cluster tokens (paper Eq. 6), each L2-normalised, in float32.
 
         The tokens carry the transport's statistics, without a gradient. A whole batch is faster
@@ -213,7 +207,6 @@ class Fol(Salad):
 
 
 @AGGREGATORS.register("fol", tiny={**_TINY, "local_hidden": 32, "local": 16})
-@dataclasses.dataclass(frozen=True)
 class FolConfig(SaladConfig):
     """FoL's global descriptor: SALAD's with a dustbin of attention (Wang et al., AAAI 2025).
 

@@ -1,7 +1,5 @@
 """SelaVPR: a generalised mean, and local features to re-rank by (Lu et al., ICLR 2024)."""
 
-import dataclasses
-
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -36,7 +34,6 @@ class SelaVpr:
 
 
 @AGGREGATORS.register("selavpr", tiny={"hidden": 32, "local": 16})
-@dataclasses.dataclass(frozen=True)
 class SelaVprConfig(Aggregator):
     """SelaVPR's global and local features (Lu et al., ICLR 2024).
 
@@ -68,7 +65,7 @@ class SelaVprConfig(Aggregator):
             upconv2=init_transposed_conv(second, 3, self.hidden, self.local),
         )
 
-    def apply(self, params: SelaVpr, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: SelaVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the mean of all patches; and in training, for its loss, the local features."""
         tokens = Tokens.of_global(gem(features.patches, params.p))
         if key is None:

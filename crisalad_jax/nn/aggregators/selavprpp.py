@@ -4,8 +4,6 @@ Written from the facts of the public model (Lu et al. 2025, "SelaVPR++: Towards 
 of Foundation Models for Efficient Place Recognition").
 """
 
-import dataclasses
-
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import PositiveInt
@@ -28,7 +26,6 @@ class SelaVprPp:
 
 
 @AGGREGATORS.register("selavprpp", tiny={"dim": 256})
-@dataclasses.dataclass(frozen=True)
 class SelaVprPpConfig(Aggregator):
     """SelaVPR++'s head (Lu et al. 2025).
 
@@ -49,9 +46,7 @@ class SelaVprPpConfig(Aggregator):
         """Start at an exponent of 3, with linear layers as torch's."""
         return init_head(key, backbone.dim, self.dim)
 
-    def apply(
-        self, params: SelaVprPp, features: Features, grid: Grid, *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: SelaVprPp, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the head's output, which is scaled to unit length later."""
         return Tokens.of_global(head(params, features.patches))
 
@@ -67,7 +62,6 @@ class SelaVprPpHash:
 
 
 @AGGREGATORS.register("selavprpp-hash", tiny={"dim": 256, "bits": 128})
-@dataclasses.dataclass(frozen=True)
 class SelaVprPpHashConfig(SelaVprPpConfig):
     """SelaVPR++ with its second path: a short descriptor whose bits are searched, and re-ranking.
 
@@ -98,9 +92,7 @@ class SelaVprPpHashConfig(SelaVprPpConfig):
             init_head(first, backbone.dim, self.dim), init_head(second, backbone.dim, self.bits)
         )
 
-    def apply(
-        self, params: SelaVprPpHash, features: Features, grid: Grid, *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: SelaVprPpHash, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the output of the second path's head, which is scaled to unit length later."""
         return Tokens.of_global(head(params.hash, features.patches))
 

@@ -3,8 +3,6 @@
 Features hold the patches of all levels side by side (`FeatureSpec.levels`).
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -31,7 +29,6 @@ class TransVpr:
 
 
 @AGGREGATORS.register("transvpr", tiny={"levels": 2, "dim": 128})
-@dataclasses.dataclass(frozen=True)
 class TransVprConfig(Aggregator):
     """TransVPR: patches of several layers, weighed by attention (Wang et al., CVPR 2022)."""
 
@@ -58,9 +55,7 @@ class TransVprConfig(Aggregator):
             init_linear(first, wide, self.levels, bias=False), init_linear(second, wide, self.dim)
         )
 
-    def apply(
-        self, params: TransVpr, features: Features, grid: Grid, *, key: Keys | None
-    ) -> Tokens:
+    def apply(self, params: TransVpr, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the global descriptor, and no local token."""
         patches = at_least_float32(features.patches)
         weights = attentions(params, features.patches)

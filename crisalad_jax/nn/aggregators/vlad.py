@@ -61,7 +61,7 @@ class VladConfig(Aggregator):
         move a patch to another cluster.
         """
 
-    def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Any, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the sum of each cluster, and no global token."""
         patches = l2_normalise(at_least_float32(features.patches))
         return Tokens.of_local(self.sums(params, patches))
@@ -81,7 +81,6 @@ class NetVlad:
 
 
 @AGGREGATORS.register("netvlad", tiny={"clusters": 16})
-@dataclasses.dataclass(frozen=True)
 class NetVladConfig(VladConfig):
     """NetVLAD (Arandjelovic et al., CVPR 2016)."""
 
@@ -112,7 +111,6 @@ class SuperVlad:
 
 
 @AGGREGATORS.register("supervlad")
-@dataclasses.dataclass(frozen=True)
 class SuperVladConfig(VladConfig):
     """SuperVLAD (Lu et al., NeurIPS 2024).
 
@@ -168,7 +166,6 @@ class VladBuff:
 
 
 @AGGREGATORS.register("vlad-buff", tiny={"clusters": 16, "reduced": 32})
-@dataclasses.dataclass(frozen=True)
 class VladBuffConfig(VladConfig):
     """VLAD-BuFF (Khaliq et al., ECCV 2024).
 
@@ -225,19 +222,31 @@ class VladBuffConfig(VladConfig):
 
 
 @pytree_dataclass
-class AnyLoc:
+class Words:
     """The visual words."""
 
     words: Centroids
     """k-means centroids of unit features."""
 
 
-@AGGREGATORS.register("anyloc", tiny={"clusters": 16, "layer": -1})
-@dataclasses.dataclass(frozen=True)
-class AnyLocConfig(VladConfig):
-    """AnyLoc: hard VLAD of a facet of one layer, nothing learnt (Keetha et al., RA-L 2023)."""
+class WordsConfig(VladConfig):
+    """What sums by the nearest visual word share: words that k-means alone finds."""
 
     trainable: ClassVar[bool] = False
+
+    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Words:
+        """Draw random unit vectors as words, until a vocabulary is built."""
+        return Words(l2_normalise(random_init.normal(key, (self.clusters, backbone.dim))))
+
+    def from_centroids(self, centroids: Centroids, features: FeatureRows) -> Words:
+        """Use the centroids as words."""
+        return Words(centroids)
+
+
+@AGGREGATORS.register("anyloc", tiny={"clusters": 16, "layer": -1})
+class AnyLocConfig(WordsConfig):
+    """AnyLoc: hard VLAD of a facet of one layer, nothing learnt (Keetha et al., RA-L 2023)."""
+
     clusters: PositiveInt = 32
     """Number of words of the vocabulary, which `crisalad vocabulary` builds."""
     layer: int = -9
@@ -258,20 +267,12 @@ class AnyLocConfig(VladConfig):
         require_range(self, -depth, depth - 1, "layer")
         return FeatureSpec((self.layer % depth + 1,), self.facet, norm=False)
 
-    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> AnyLoc:
-        """Draw random unit vectors as words, until a vocabulary is built."""
-        return AnyLoc(l2_normalise(random_init.normal(key, (self.clusters, backbone.dim))))
-
     @property
     def spherical_centroids(self) -> bool:
         """Whether k-means compares features with centroids by the angle."""
         return self.assignment == "cosine"
 
-    def from_centroids(self, centroids: Centroids, features: FeatureRows) -> AnyLoc:
-        """Use the centroids as words."""
-        return AnyLoc(centroids)
-
-    def sums(self, params: AnyLoc, patches: Patches) -> Float[Array, "*batch cluster dim"]:
+    def sums(self, params: Words, patches: Patches) -> Float[Array, "*batch cluster dim"]:
         """Compute VLAD (Jegou et al. 2010): residuals from the nearest word, intra-normalised.
 
         Residuals are from the words as they are, whatever their lengths. A sum is 0 where no patch

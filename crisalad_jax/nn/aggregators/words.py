@@ -3,7 +3,6 @@
 Patches of zeros are none: an image may have fewer features than there is room for.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -21,37 +20,18 @@ from crisalad_jax.nn.aggregators.base import (
     FeatureRows,
     TokenShape,
 )
-from crisalad_jax.nn.aggregators.vlad import VladConfig, nearest_words, residual_sums
+from crisalad_jax.nn.aggregators.vlad import Words, WordsConfig, nearest_words, residual_sums
 from crisalad_jax.nn.backbones.base import Backbone, Features, Grid, Patches
 from crisalad_jax.nn.layers import Keys, at_least_float32, l2_normalise
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 
-@pytree_dataclass
-class Vlad:
-    """The visual words."""
-
-    words: Centroids
-    """k-means centroids of unit features."""
-
-
 @AGGREGATORS.register("vlad", tiny={"clusters": 16})
-@dataclasses.dataclass(frozen=True)
-class HardVladConfig(VladConfig):
+class HardVladConfig(WordsConfig):
     """VLAD (Jegou et al., CVPR 2010), intra-normalised (Arandjelovic and Zisserman, CVPR 2013)."""
 
-    trainable: ClassVar[bool] = False
-
-    def init(self, key: PRNGKeyArray, backbone: Backbone, grid: Grid) -> Vlad:
-        """Draw random unit vectors as words, until a vocabulary is built."""
-        return Vlad(l2_normalise(random_init.normal(key, (self.clusters, backbone.dim))))
-
-    def from_centroids(self, centroids: Centroids, features: FeatureRows) -> Vlad:
-        """Use the centroids as words."""
-        return Vlad(centroids)
-
-    def sums(self, params: Vlad, patches: Patches) -> Float[Array, "*batch cluster dim"]:
+    def sums(self, params: Words, patches: Patches) -> Float[Array, "*batch cluster dim"]:
         """Sum residuals from the nearest word, each cluster's at length 1.
 
         An image without any has equal numbers.
@@ -72,7 +52,6 @@ class Bow:
 
 
 @AGGREGATORS.register("bow", tiny={"clusters": 100})
-@dataclasses.dataclass(frozen=True)
 class BowConfig(Aggregator):
     """Bags of visual words by tf-idf (Sivic and Zisserman, ICCV 2003)."""
 
@@ -103,7 +82,7 @@ class BowConfig(Aggregator):
         count = np.maximum(np.sum(has, axis=0), 1)
         return Bow(params.words, jnp.log(jnp.asarray(len(images) / count, jnp.float32)))
 
-    def apply(self, params: Bow, features: Features, grid: Grid, *, key: Keys | None) -> Tokens:
+    def apply(self, params: Bow, features: Features, grid: Grid, *, key: Keys) -> Tokens:
         """Return the share of an image's patches that have each word, times the word's weight.
 
         An image without any has equal numbers.

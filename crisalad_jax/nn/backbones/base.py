@@ -105,6 +105,17 @@ class Backbone(Part, abc.ABC):
     """Features that photographs become on the host, in place of pixels: "sift" or "orb"."""
     binary: ClassVar[bool] = False
     """Whether the numbers of its features have two values, as those of visual words then have."""
+    encoded_size: ClassVar[tuple[int, int] | None] = None
+    """Height and width of the bytes of `local_features`; None where it takes pixels."""
+    side_paths: ClassVar[int] = 1
+    """Number of side paths of its adapters; 1 where there are none."""
+    extras: ClassVar[str] = ""
+    """Settings that one line about a model names, each after a comma."""
+    trains: ClassVar[tuple[str, ...]] = ()
+    """Names, or patterns of names, of parameters that are there to be trained.
+
+    They are those of adapters, in the names of `init`, such as "blocks.*.adapter" or "lora". A run
+    that trains none of them is refused, unless it says so (`--trainable head,-adapters`)."""
 
     @abc.abstractmethod
     def init(self, key: PRNGKeyArray) -> Any:
@@ -112,7 +123,7 @@ class Backbone(Part, abc.ABC):
 
     @abc.abstractmethod
     def apply(
-        self, params: Any, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
+        self, params: Any, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, Any]:
         """Return the features of normalised images, and the parameters.
 
@@ -131,30 +142,6 @@ class Backbone(Part, abc.ABC):
         Raises:
             InputError: while tracing, for a request that this backbone cannot meet.
         """
-
-    @property
-    def encoded_size(self) -> tuple[int, int] | None:
-        """Height and width of the bytes of `local_features`; None where it takes pixels."""
-        return None
-
-    @property
-    def side_paths(self) -> int:
-        """Number of side paths of its adapters; 1 where there are none."""
-        return 1
-
-    @property
-    def extras(self) -> str:
-        """Settings that one line about a model names, each after a comma; by default none."""
-        return ""
-
-    @property
-    def trains(self) -> tuple[str, ...]:
-        """Names, or patterns of names, of parameters that are there to be trained; by default none.
-
-        They are those of adapters, in the names of `init`, such as "blocks.*.adapter" or "lora". A
-        run that trains none of them is refused, unless it says so (`--trainable head,-adapters`).
-        """
-        return ()
 
     def split_blocks(self, params: Any, cuts: Sequence[int]) -> Any:
         """Return parameters whose stack `params.blocks` is cut before the blocks of these numbers.

@@ -5,7 +5,6 @@ What differs from DINOv2: patches of 16 x 16, positions by rotation, no bias of 
 layer norms' epsilon.
 """
 
-import dataclasses
 import functools
 from typing import ClassVar
 
@@ -29,7 +28,6 @@ PERIOD_BASE = 100.0
     l14={"dim": 1024, "depth": 24, "heads": 16},
     g14={"dim": 1280, "depth": 32, "heads": 20, "ffn": "swiglu", "mlp_ratio": 6.0},
 )
-@dataclasses.dataclass(frozen=True)
 class DinoV3Config(VisionTransformer):
     """A DINOv3 vision transformer with patches of 16 x 16 (Siméoni et al. 2025).
 

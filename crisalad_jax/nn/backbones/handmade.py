@@ -26,7 +26,6 @@ class HandmadeBackbone(Backbone):
         """Return no parameters."""
 
 
-@dataclasses.dataclass(frozen=True)
 class WholeImageBackbone(HandmadeBackbone):
     """A descriptor of a whole image of one size."""
 
@@ -47,7 +46,7 @@ class WholeImageBackbone(HandmadeBackbone):
         """Return the descriptors of images of `size`."""
 
     def apply(
-        self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
+        self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, None]:
         """Return the descriptor as the class token, and as the only patch."""
         descriptors = self.descriptors(images)

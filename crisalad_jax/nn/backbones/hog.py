@@ -1,6 +1,5 @@
 """Histograms of oriented gradients (Dalal and Triggs, CVPR 2005), a baseline without learning."""
 
-import dataclasses
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -19,7 +18,6 @@ _GREY = (9798, 19235, 3735)
 
 
 @BACKBONES.register("hog")
-@dataclasses.dataclass(frozen=True)
 class HogConfig(WholeImageBackbone):
     """Histograms of oriented gradients of 128 x 128 pixels (Dalal and Triggs, CVPR 2005).
 

@@ -44,7 +44,7 @@ class _LocalFeatureBackbone(HandmadeBackbone):
         """Return unit vectors of the bytes of descriptors."""
 
     def apply(
-        self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid = None
+        self, params: None, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, None]:
         """Return the features as patches, strongest first, and 0 where there are no more.
 
@@ -63,7 +63,6 @@ class _LocalFeatureBackbone(HandmadeBackbone):
 
 
 @BACKBONES.register("sift")
-@dataclasses.dataclass(frozen=True)
 class SiftConfig(_LocalFeatureBackbone):
     """SIFT (Lowe, IJCV 2004) by OpenCV, as RootSIFT (Arandjelovic and Zisserman, CVPR 2012).
 
@@ -82,7 +81,6 @@ class SiftConfig(_LocalFeatureBackbone):
 
 
 @BACKBONES.register("orb")
-@dataclasses.dataclass(frozen=True)
 class OrbConfig(_LocalFeatureBackbone):
     """ORB (Rublee et al., ICCV 2011) by OpenCV.
 

@@ -36,7 +36,6 @@ class Residual:
 
 
 @BACKBONES.register("resnet", tiny={"layers": 18, "stages": 2})
-@dataclasses.dataclass(frozen=True)
 class ResNetConfig(StagedBackbone):
     """A ResNet (He et al., CVPR 2016), for images of any size."""
 
@@ -77,10 +76,6 @@ class ResNetConfig(StagedBackbone):
         width = self.width * 2**stage
         return (width, width) if self.layers == 18 else (width, width, 4 * width)
 
-    def kernels(self) -> tuple[int, ...]:
-        """Return the sides of the kernels of a block's convolutions."""
-        return (3, 3) if self.layers == 18 else (1, 3, 1)
-
     def grid(self, image_size: tuple[int, int]) -> Grid:
         """Return the rows and columns of features: every halving rounds up."""
         height, width = image_size
@@ -103,10 +98,11 @@ class ResNetConfig(StagedBackbone):
 
     def _init_stage(self, key: PRNGKeyArray, stage: int) -> Iterator[Residual]:
         d_in = self.widths(stage - 1)[-1] if stage else self.width
+        kernels = (3, 3) if self.layers == 18 else (1, 3, 1)
         for block_key in random_init.split(key, BLOCKS[self.layers][stage]):
             shortcut_key, *keys = random_init.split(block_key, 4)
             widths = self.widths(stage)
-            shapes = zip(keys, self.kernels(), (d_in, *widths), widths, strict=False)
+            shapes = zip(keys, kernels, (d_in, *widths), widths, strict=False)
             convs = tuple(init_conv_norm(*shape) for shape in shapes)
             changes = d_in != widths[-1]
             shortcut = init_conv_norm(shortcut_key, 1, d_in, widths[-1]) if changes else None

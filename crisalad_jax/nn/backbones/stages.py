@@ -58,13 +58,7 @@ class StagedBackbone(Backbone):
         """Return the output of the stage of this number, from 0, and the stage as `run_stem`."""
 
     def apply(
-        self,
-        params: Stages,
-        images: Pixels,
-        request: FeatureSpec,
-        *,
-        remat: str,
-        valid: Valid = None,
+        self, params: Stages, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, Stages]:
         """Return the last stage's vectors, in row order; there is no class token, and no last norm.
 

@@ -74,7 +74,6 @@ class TetraVit:
 
 
 @BACKBONES.register("tetra-vit", tiny={"dim": 128, "depth": 4, "heads": 4, "position_grid": 7})
-@dataclasses.dataclass(frozen=True)
 class TetraVitConfig(Backbone):
     """TeTRA's ternary vision transformer with patches of 14 x 14 (Grainge et al. 2025).
 
@@ -136,13 +135,7 @@ class TetraVitConfig(Backbone):
         )
 
     def apply(
-        self,
-        params: TetraVit,
-        images: Pixels,
-        request: FeatureSpec,
-        *,
-        remat: str,
-        valid: Valid = None,
+        self, params: TetraVit, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, TetraVit]:
         """Return the last block's tokens; there is no last norm.
 

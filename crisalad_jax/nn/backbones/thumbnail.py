@@ -1,6 +1,5 @@
 """Small grey images, normalised patch by patch: what SeqSLAM compares (Milford and Wyeth 2012)."""
 
-import dataclasses
 from typing import ClassVar
 
 import jax.numpy as jnp
@@ -19,7 +18,6 @@ _LEAST = 0.5
 
 
 @BACKBONES.register("thumbnail")
-@dataclasses.dataclass(frozen=True)
 class ThumbnailConfig(WholeImageBackbone):
     """SeqSLAM's images of 32 x 64 grey pixels (Milford and Wyeth, ICRA 2012).
 

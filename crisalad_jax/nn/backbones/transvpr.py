@@ -74,7 +74,6 @@ class TransVprNet:
 
 
 @BACKBONES.register("transvpr-net", tiny={"dim": 64, "depth": 4})
-@dataclasses.dataclass(frozen=True)
 class TransVprNetConfig(Backbone):
     """TransVPR's convolutions and transformer, without positions (Wang et al., CVPR 2022)."""
 
@@ -122,13 +121,7 @@ class TransVprNetConfig(Backbone):
         )
 
     def apply(
-        self,
-        params: TransVprNet,
-        images: Pixels,
-        request: FeatureSpec,
-        *,
-        remat: str,
-        valid: Valid = None,
+        self, params: TransVprNet, images: Pixels, request: FeatureSpec, *, remat: str, valid: Valid
     ) -> tuple[Features, TransVprNet]:
         """Return the patches of the requested levels side by side, and the last one's class token.
 

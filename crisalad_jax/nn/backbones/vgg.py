@@ -1,6 +1,5 @@
 """VGG-16 (Simonyan and Zisserman, ICLR 2015) up to its last convolution, as NetVLAD has it."""
 
-import dataclasses
 import itertools
 from typing import ClassVar
 
@@ -18,7 +17,6 @@ WIDTHS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512
 
 
 @BACKBONES.register("vgg")
-@dataclasses.dataclass(frozen=True)
 class VggConfig(StagedBackbone):
     """VGG-16 without its last ReLU and maximum (Simonyan and Zisserman, ICLR 2015)."""
 

@@ -156,7 +156,7 @@ class VisionTransformer(Backbone):
         acts = isinstance(adapter, NoAdapter) or adapter.has(*HOOKS)
         require_field(self, "adapter", acts, f"one with a method {', '.join(HOOKS)}")
         words = f"one of all blocks, which {adapter.part_name} with prompts has to be"
-        require_field(self, "adapter", not (few and adapter.has_prompts), words)
+        require_field(self, "adapter", not (few and adapter.has("prompts")), words)
         adapter.check(self.block_shape)
 
     @property
@@ -315,8 +315,10 @@ class VisionTransformer(Backbone):
                     request.inserted, (tokens.shape[0], *request.inserted.shape)
                 )
                 tokens = jnp.concatenate([first.astype(tokens.dtype), tokens], axis=1)
-            else:
-                attended = _class_attention(_block_at(stacks, end), tokens, grid, self)
+            else:  # the block's own attention does not keep its weights: a row is computed again
+                layer = _block_at(stacks, end)
+                shares = self._attention_by(first_token_attention, layer, tokens, grid)
+                attended = shares.sum(axis=-2)[:, 1 + self.registers :]
         if request.norm:
             outputs = [layer_norm(params.norm, x, epsilon=self.norm_epsilon) for x in outputs]
         features = Features(
@@ -334,7 +336,17 @@ class VisionTransformer(Backbone):
         stack, grid = _one_stack(params), self.grid((images.shape[1], images.shape[2]))
         _checked_levels(FeatureSpec(class_attention=True), self)  # the same adapters are refused
         tokens, _ = run_blocks([stack], embed(params, images, self), grid, self, count=block)
-        return _attention_by(attention_weights, _block_at([stack], block), tokens, grid, self)
+        return self._attention_by(attention_weights, _block_at([stack], block), tokens, grid)
+
+    def _attention_by(
+        self, weigh: Callable[..., Array], layer: Block, tokens: TokenBatch, grid: Grid
+    ) -> Array:
+        """Compute weights of a block's attention: of `first_token_attention`, or of all tokens."""
+        with jax.named_scope("blocks"):
+            normed = layer_norm(layer.norm1, tokens, epsilon=self.norm_epsilon)
+            attn, rotation = self.attention_of(layer), self.rotation(grid)
+            update = _update_of(layer, self)
+            return weigh(attn, normed, self.heads, rotation=rotation, update=update)
 
     @property
     def trains(self) -> tuple[str, ...]:
@@ -360,7 +372,7 @@ class VisionTransformer(Backbone):
         """Merge the adapters into the linear layers that they update."""
         adapter = self.adapter
         require(
-            adapter.can_merge,
+            adapter.has("merge"),
             f"merge_adapters: found adapter {adapter.part_name}, expected one of weights, as lora",
         )
 
@@ -395,7 +407,6 @@ class VisionTransformer(Backbone):
 
 
 @BACKBONES.register("vit")
-@dataclasses.dataclass(frozen=True)
 class ViTConfig(VisionTransformer):
     """A DINOv2 vision transformer with patches of 14 x 14 (Oquab et al. 2023).
 
@@ -474,10 +485,10 @@ def _checked_levels(request: FeatureSpec, config: VisionTransformer) -> tuple[in
         "levels or a facet": levels != (config.depth,) or request.facet != "token",
         "inserted tokens": request.inserted is not None,
         "the class token's attention": request.class_attention,
-        "adapters on a side path": config.adapter.has_side_path,
+        "adapters on a side path": config.adapter.has("side_path"),
     }
     if request.class_attention:
-        special["adapters with prompts"] = config.adapter.has_prompts
+        special["adapters with prompts"] = config.adapter.has("prompts")
     found = [name for name, is_asked in special.items() if is_asked]
     require(len(found) < 2, f"features: found {' and '.join(found)}, expected one of these alone")
     return levels
@@ -540,32 +551,6 @@ def _facet(layer: Block, tokens: TokenBatch, config: VisionTransformer, name: st
     return part_of_qkv(config.attention_of(layer), number, normed, _update_of(layer, config))
 
 
-def _class_attention(
-    layer: Block, tokens: TokenBatch, grid: Grid, config: VisionTransformer
-) -> Float[Array, "image patch"]:
-    """Return how much of each patch a block's class token takes, summed over heads.
-
-    The block's own attention does not keep its weights: one row of them is computed a second time.
-    """
-    shares = _attention_by(first_token_attention, layer, tokens, grid, config)
-    return shares.sum(axis=-2)[:, 1 + config.registers :]
-
-
-def _attention_by(
-    weigh: Callable[..., Array],
-    layer: Block,
-    tokens: TokenBatch,
-    grid: Grid,
-    config: VisionTransformer,
-) -> Array:
-    """Compute weights of a block's attention, those of `first_token_attention` or of all tokens."""
-    with jax.named_scope("blocks"):
-        normed = layer_norm(layer.norm1, tokens, epsilon=config.norm_epsilon)
-        attn, rotation = config.attention_of(layer), config.rotation(grid)
-        update = _update_of(layer, config)
-        return weigh(attn, normed, config.heads, rotation=rotation, update=update)
-
-
 def embed(
     params: ViT, images: Float[Array, "*batch height width 3"], config: VisionTransformer
 ) -> Float[Array, "*batch token dim"]:
@@ -615,7 +600,7 @@ def run_blocks(
         (tokens, statistics): the second has a stack of running statistics for each of `stacks`.
     """
     front = 0
-    if config.adapter.has_prompts:
+    if config.adapter.has("prompts"):
         prompts: Any = jax.eval_shape(lambda: config.adapter.prompts(_block_at(stacks, 0).adapter))
         wanted = jax.ShapeDtypeStruct((prompts.shape[0], config.dim), jnp.float32)
         expect_like(f"adapter {config.adapter.part_name}", prompts, wanted)
@@ -657,7 +642,7 @@ def run_blocks(
                 if start >= stop:
                     continue
                 part = dataclasses.replace(stack, adapter=None) if start < first else stack
-                if start == first and config.adapter.has_side_path and side is None:
+                if start == first and config.adapter.has("side_path") and side is None:
                     side = tokens
                 if is_whole:
                     (tokens, side), measured = jax.lax.scan(body, (tokens, side), part)

@@ -1,19 +1,17 @@
 """Sinkhorn's iteration at an epsilon that falls (Schmitzer, SIAM J. Sci. Comput. 2019)."""
 
-import dataclasses
 import math
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
 from crisalad_jax.config.checks import PositiveInt, require_field
 from crisalad_jax.nn.transport.problem import Potentials, Problem
-from crisalad_jax.nn.transport.steps import STEPS, Step, check_balanced, tempered
+from crisalad_jax.nn.transport.steps import STEPS, Moved, Step, check_balanced, tempered
 
 
 @STEPS.register("annealing")
-@dataclasses.dataclass(frozen=True)
 class AnnealingStep(Step):
     """Take Sinkhorn's step at `start` times epsilon first, and at epsilon after `cooling` steps.
 
@@ -32,9 +30,7 @@ class AnnealingStep(Step):
         """Check the range."""
         require_field(self, "start", 1 <= self.start < math.inf, "at least 1")
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Take the two half steps of the smoother problem.
 
         Raises:

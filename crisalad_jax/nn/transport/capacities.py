@@ -1,17 +1,15 @@
 """Transport to columns that take at most their marginals (Benamou et al., 2015)."""
 
-import dataclasses
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
 from crisalad_jax.nn.transport.problem import Potentials, Problem
-from crisalad_jax.nn.transport.steps import STEPS, Step
+from crisalad_jax.nn.transport.steps import STEPS, Moved, Step
 
 
 @STEPS.register("capacities")
-@dataclasses.dataclass(frozen=True)
 class CapacityStep(Step):
     """Treat the columns' marginals as capacities: lower full columns, leave the others.
 
@@ -31,9 +29,7 @@ class CapacityStep(Step):
     free_last: bool = True
     """Whether the last column, the dustbin, takes whatever is left, without a capacity."""
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Lower the columns that are above their marginals, then meet the rows'."""
         column = problem.log_nu - problem.lse_rows(potentials.row)
         column = jnp.where(column < 0, column, 0)

@@ -23,7 +23,6 @@ class Solution(NamedTuple):
     """Whether the tolerance was met; False where there is none."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Gradient(Part):
     """A gradient of the potentials, through which JAX differentiates the plan."""
 

@@ -1,6 +1,5 @@
 """Gradients of a solution: through the iterations, by the optimality conditions, or none."""
 
-import dataclasses
 import math
 from typing import Any, ClassVar
 
@@ -47,7 +46,6 @@ def solve_in_domain(
 
 
 @GRADIENTS.register("unrolled")
-@dataclasses.dataclass(frozen=True)
 class Unrolled(Gradient):
     """Differentiate through the iterations: the exact gradient of their number."""
 
@@ -61,7 +59,6 @@ class Unrolled(Gradient):
 
 
 @GRADIENTS.register("stop")
-@dataclasses.dataclass(frozen=True)
 class Stop(Gradient):
     """Treat the potentials as constants."""
 
@@ -74,7 +71,6 @@ class Stop(Gradient):
 
 
 @GRADIENTS.register("implicit")
-@dataclasses.dataclass(frozen=True)
 class Implicit(Stop):
     """Differentiate the optimality conditions in closed form, without storing iterations."""
 
@@ -128,7 +124,6 @@ def _at_solution_jvp(primals: Any, tangents: Any) -> tuple[Potentials, Potential
 
 
 @GRADIENTS.register("optimistix")
-@dataclasses.dataclass(frozen=True)
 class Optimistix(Gradient):
     """Find the fixed point with a solver of optimistix, and differentiate with its adjoint.
 

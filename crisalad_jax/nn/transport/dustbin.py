@@ -5,7 +5,6 @@ The mass of a dustbin is decided here, in `marginals`: what the clusters leave f
 that it appends is another thing.
 """
 
-import dataclasses
 import math
 from typing import Any, ClassVar, NamedTuple
 
@@ -30,7 +29,6 @@ class Marginals(NamedTuple):
     log_nu: Float[Array, "*#batch columns"]
 
 
-@dataclasses.dataclass(frozen=True)
 class Dustbin(Part):
     """Base class of dustbins, which take the patches that belong to no cluster.
 
@@ -81,7 +79,6 @@ def check_params(params: Any, *shape: int) -> Array:
 
 
 @DUSTBINS.register("none")
-@dataclasses.dataclass(frozen=True)
 class NoDustbin(Dustbin):
     """No dustbin: the clusters share the patches' mass equally."""
 
@@ -92,16 +89,19 @@ class NoDustbin(Dustbin):
         return Marginals(scores, jnp.zeros(rows, scores.dtype), log_nu)
 
 
+class ScalarDustbin(Dustbin):
+    """What dustbins of one learnt number share."""
+
+    def init(self, key: PRNGKeyArray, dim: int) -> Array:
+        """Start at 1: a score as the public implementation's, or a logit, whose share is 0.73."""
+        return jnp.ones(())
+
+
 @DUSTBINS.register("column")
-@dataclasses.dataclass(frozen=True)
-class ColumnDustbin(Dustbin):
+class ColumnDustbin(ScalarDustbin):
     """A column of one learnt score, as published; plain iterations do not depend on the score."""
 
     takes_difference: ClassVar[bool] = True
-
-    def init(self, key: PRNGKeyArray, dim: int) -> Array:
-        """Start at a score of 1, as the public implementation."""
-        return jnp.ones(())
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Append a column of the score."""
@@ -109,13 +109,8 @@ class ColumnDustbin(Dustbin):
 
 
 @DUSTBINS.register("row and column")
-@dataclasses.dataclass(frozen=True)
-class RowAndColumnDustbin(Dustbin):
+class RowAndColumnDustbin(ScalarDustbin):
     """A row and a column of one learnt score, as SuperGlue has them (Sarlin et al., CVPR 2020)."""
-
-    def init(self, key: PRNGKeyArray, dim: int) -> Array:
-        """Start at a score of 1."""
-        return jnp.ones(())
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Append the column, then the row."""
@@ -129,7 +124,6 @@ class RowAndColumnDustbin(Dustbin):
 
 
 @DUSTBINS.register("token")
-@dataclasses.dataclass(frozen=True)
 class TokenDustbin(Dustbin):
     """A score that the score network gives each patch."""
 
@@ -144,13 +138,11 @@ class TokenDustbin(Dustbin):
 
 
 @DUSTBINS.register("mass")
-@dataclasses.dataclass(frozen=True)
-class MassDustbin(Dustbin):
-    """A column of learnt mass, as the logit of its share; clusters share the rest equally."""
+class MassDustbin(ScalarDustbin):
+    """A column of learnt mass, as the logit of its share; clusters share the rest equally.
 
-    def init(self, key: PRNGKeyArray, dim: int) -> Array:
-        """Start at a logit of 1, a share of 0.73; the published one at 224 x 224 is 0.75."""
-        return jnp.ones(())
+    The first share is 0.73; the published one at 224 x 224 is 0.75.
+    """
 
     def marginals(self, params: Any, scores: Array, patches: Array | None) -> Marginals:
         """Append a column of zero scores."""

@@ -1,6 +1,5 @@
 """Nesterov's acceleration of Sinkhorn's iteration."""
 
-import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -21,7 +20,6 @@ class Momentum(NamedTuple):
 
 
 @STEPS.register("nesterov")
-@dataclasses.dataclass(frozen=True)
 class NesterovStep(Step):
     """Sinkhorn's step from extrapolated column potentials, with restarts.
 

@@ -7,13 +7,12 @@ exp(kernel + row + column), where no row potential is above 0, and no column pot
 that all clusters share. The level is such that the total is met.
 """
 
-import dataclasses
 import math
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import require_field
 from crisalad_jax.nn.transport.dustbin import (
@@ -24,11 +23,10 @@ from crisalad_jax.nn.transport.dustbin import (
     check_params,
 )
 from crisalad_jax.nn.transport.problem import EMPTY, Columns, Matrix, Potentials, Problem
-from crisalad_jax.nn.transport.steps import STEPS, Step
+from crisalad_jax.nn.transport.steps import STEPS, Moved, Step
 
 
 @DUSTBINS.register("partial")
-@dataclasses.dataclass(frozen=True)
 class PartialDustbin(Dustbin):
     """The mass that partial transport leaves in the patches; it has no score.
 
@@ -75,7 +73,6 @@ class PartialDustbin(Dustbin):
 
 
 @STEPS.register("partial")
-@dataclasses.dataclass(frozen=True)
 class PartialStep(Step):
     """Move all mass but the last column's marginal, within the marginals of patches and clusters.
 
@@ -86,9 +83,7 @@ class PartialStep(Step):
 
     capacities: ClassVar[bool] = True
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Fill the columns to one level, then lower the rows that give more than they have."""
         sums, log_nu = problem.lse_rows(potentials.row)[..., :-1], problem.log_nu[..., :-1]
         moved = jnp.exp(problem.log_mu).sum(axis=-1) - jnp.exp(problem.log_nu[..., -1])

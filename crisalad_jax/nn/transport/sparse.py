@@ -1,19 +1,17 @@
 """Sparse plans: quadratic transport, and the largest entries of an entropic plan's rows."""
 
-import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
 from crisalad_jax.config.checks import PositiveInt
 from crisalad_jax.nn.transport.problem import EMPTY, Matrix, Potentials, Problem, Rows
-from crisalad_jax.nn.transport.steps import STEPS, SinkhornStep, Step, check_balanced
+from crisalad_jax.nn.transport.steps import STEPS, Moved, SinkhornStep, Step, check_balanced
 
 
 @STEPS.register("quadratic")
-@dataclasses.dataclass(frozen=True)
 class QuadraticStep(Step):
     """Maximise <P, S> - epsilon / 2 * |P|^2, whose plan is sparse (Blondel et al., AISTATS 2018).
 
@@ -27,9 +25,7 @@ class QuadraticStep(Step):
         [[1.0, 0.0], [0.0, 1.0]]
     """
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Meet the columns' marginals, then the rows'.
 
         Raises:
@@ -71,7 +67,6 @@ def simplex_offset(scores: Matrix, mass: Rows) -> Rows:
 
 
 @STEPS.register("top-k")
-@dataclasses.dataclass(frozen=True)
 class TopKStep(SinkhornStep):
     """Sinkhorn's step; of the plan each row keeps its k largest entries, scaled to the row's mass.
 

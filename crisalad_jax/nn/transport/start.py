@@ -1,7 +1,6 @@
 """Where a solver starts: at zeros, at a Gaussian guess, or where a small network says."""
 
 import abc
-import dataclasses
 from typing import Any
 
 import jax
@@ -14,14 +13,12 @@ from crisalad_jax.config.registry import Registry
 from crisalad_jax.nn.transport.problem import Columns, Potentials, Problem, product
 
 
-@dataclasses.dataclass(frozen=True)
 class Start(Part, abc.ABC):
     """Base class of starts: the potentials from which the iterations of any step begin.
 
     Example:
         >>> from crisalad_jax.sinkhorn import SinkhornConfig, register_start, solve
         >>> @register_start("softmax-rows")
-        ... @dataclasses.dataclass(frozen=True)
         ... class SoftmaxRows(Start):
         ...     def potentials(self, problem, params):
         ...         return from_columns(problem, problem.zeros().column)
@@ -68,7 +65,6 @@ def from_columns(problem: Problem, column: Columns) -> Potentials:
 
 
 @STARTS.register("zeros")
-@dataclasses.dataclass(frozen=True)
 class ZeroStart(Start):
     """Start at zeros, as published."""
 
@@ -78,7 +74,6 @@ class ZeroStart(Start):
 
 
 @STARTS.register("gaussian")
-@dataclasses.dataclass(frozen=True)
 class GaussianStart(Start):
     """Start at the potentials of two Gaussians, in closed form from the scores' spectrum.
 
@@ -126,7 +121,6 @@ def _root_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
 
 
 @STARTS.register("network")
-@dataclasses.dataclass(frozen=True)
 class NetworkStart(Start):
     """Start at Sinkhorn's first columns, moved by a small network of each column's statistics.
 

@@ -1,7 +1,6 @@
 """Steps of a transport solver: the interface, the built-in steps and their registry."""
 
 import abc
-import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
@@ -22,8 +21,10 @@ from crisalad_jax.nn.transport.problem import (
     product,
 )
 
+Moved = tuple[Potentials, Any]
+"""The potentials and the state after a step."""
 
-@dataclasses.dataclass(frozen=True)
+
 class Step(Part, abc.ABC):
     """One iteration of a transport solver: a frozen dataclass whose fields are its settings.
 
@@ -110,7 +111,6 @@ STEPS = Registry("step", Step, of_function=_of_function)
 
 
 @STEPS.register("sinkhorn")
-@dataclasses.dataclass(frozen=True)
 class SinkhornStep(Step):
     """Meet the columns' marginals, then the rows' (paper Eq. 5).
 
@@ -127,9 +127,7 @@ class SinkhornStep(Step):
         fits = 1 <= self.relaxation < 2
         require_field(self, "relaxation", fits, "from 1 to less than 2")
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Take both half steps."""
         column = problem.column_tau * (problem.log_nu - problem.lse_rows(potentials.row))
         column = self._further(potentials.column, column, problem.column_tau)
@@ -173,7 +171,6 @@ HOTTEST = 1e12
 
 
 @STEPS.register("newton")
-@dataclasses.dataclass(frozen=True)
 class NewtonStep(Step):
     """Newton's method on the semi-dual, a concave function of the column potentials alone.
 
@@ -192,9 +189,7 @@ class NewtonStep(Step):
         """Return a temperature of 1; the first step finds the one for its potentials."""
         return 0 * problem.log_mu[..., 0] + 1
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Take the best of four steps at the state's temperature.
 
         Raises:
@@ -257,26 +252,20 @@ def _cooled(temperature: Array, newton: Array, error: Array) -> Array:
 
 
 @STEPS.register("softmax")
-@dataclasses.dataclass(frozen=True)
 class SoftmaxStep(Step):
     """Distribute every row by a softmax: a baseline without transport."""
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Meet the rows' marginals, and ignore the columns'."""
         column = problem.zeros().column
         return Potentials(problem.log_mu - problem.lse_columns(column), column), state
 
 
 @STEPS.register("dual-softmax")
-@dataclasses.dataclass(frozen=True)
 class DualSoftmaxStep(Step):
     """Multiply a softmax of the rows by one of the columns: a baseline without transport."""
 
-    def step(
-        self, problem: Problem, potentials: Potentials, state: Any, iteration: Int[Array, ""]
-    ) -> tuple[Potentials, Any]:
+    def step(self, problem: Problem, potentials: Potentials, state: Any, iteration: Array) -> Moved:
         """Normalise rows and columns, independently of each other."""
         row, column = problem.zeros()
         return Potentials(-problem.lse_columns(column), -problem.lse_rows(row)), state

@@ -75,7 +75,6 @@ class LossValue(NamedTuple):
     """Other scalars by name, such as a learnt temperature; each step logs them as `loss.NAME`."""
 
 
-@dataclasses.dataclass(frozen=True)
 class Loss(Part, abc.ABC):
     """A loss of a batch: a frozen dataclass whose fields are its constants.
 
@@ -97,15 +96,14 @@ class Loss(Part, abc.ABC):
 
     of_tuples: ClassVar[bool] = False
     """Whether the loss takes mined tuples alone, where an image is in a single pair."""
+    learning_rate = 1e-2  # without a type, so that a class may make it a field
+    """Learning rate of the loss's own parameters, which have their own Adam optimizer."""
 
+    grouping: ClassVar[ClassesConfig | None] = None
+    """Grouping of images into classes; None where the loss is of pairs of places."""
     reads_tokens: ClassVar[Literal["local", "dense"] | None] = None
     """Field of `Tokens` that the loss compares, besides descriptors: the aggregator's local tokens,
     or local features, which few aggregators have in training."""
-
-    @property
-    def grouping(self) -> ClassesConfig | None:
-        """Grouping of images into classes; None where the loss is of pairs of places."""
-        return None
 
     def init(self, key: PRNGKeyArray, classes: int, dim: int) -> Any:
         """Return the loss's own trainable parameters, a pytree of arrays; by default None.
@@ -116,11 +114,6 @@ class Loss(Part, abc.ABC):
             dim: width of a descriptor.
         """
         return None
-
-    @property
-    def learning_rate(self) -> float:
-        """Learning rate of the loss's own parameters, which have their own Adam optimizer."""
-        return 1e-2
 
     def from_scratch(self) -> "Loss":
         """Return the loss with constants that learn from random weights; by default as it is."""

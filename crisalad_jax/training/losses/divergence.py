@@ -14,7 +14,6 @@ from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 
 
 @LOSSES.register("sinkhorn-divergence")
-@dataclasses.dataclass(frozen=True)
 class SinkhornDivergenceLoss(MultiSimilarityConfig):
     """Multi-similarity loss of the descriptors, and a triplet loss of the images' local tokens.
 

@@ -13,7 +13,6 @@ from crisalad_jax.training.losses.base import LOSSES, Loss, LossBatch, LossValue
 
 
 @LOSSES.register("large-margin-cosine")
-@dataclasses.dataclass(frozen=True)
 class LargeMarginCosineConfig(Loss):
     """Large-margin cosine loss (CosFace, Wang et al., CVPR 2018) over groups of classes.
 

@@ -1,6 +1,5 @@
 """Losses over the pairs of a batch, with the constants of GSV-Cities."""
 
-import dataclasses
 from typing import Any, ClassVar, Literal
 
 import jax
@@ -20,7 +19,6 @@ from crisalad_jax.training.losses.base import (
 
 
 @LOSSES.register("multi-similarity")
-@dataclasses.dataclass(frozen=True)
 class MultiSimilarityConfig(Loss):
     """Multi-similarity loss (Wang et al., CVPR 2019), the constants of GSV-Cities."""
 
@@ -49,7 +47,6 @@ class MultiSimilarityConfig(Loss):
 
 
 @LOSSES.register("contrastive")
-@dataclasses.dataclass(frozen=True)
 class ContrastiveConfig(Loss):
     """Contrastive loss (Hadsell et al., CVPR 2006), the margins of GSV-Cities."""
 
@@ -71,7 +68,6 @@ class ContrastiveConfig(Loss):
 
 
 @LOSSES.register("triplet")
-@dataclasses.dataclass(frozen=True)
 class TripletConfig(Loss):
     """Triplet margin loss (Schroff et al., CVPR 2015), the margin of GSV-Cities."""
 
@@ -107,7 +103,6 @@ class TripletConfig(Loss):
 
 
 @LOSSES.register("supcon")
-@dataclasses.dataclass(frozen=True)
 class SupConConfig(Loss):
     """Supervised contrastive loss (Khosla et al., NeurIPS 2020), GSV-Cities' temperature."""
 
@@ -130,7 +125,6 @@ class SupConConfig(Loss):
 
 
 @LOSSES.register("circle")
-@dataclasses.dataclass(frozen=True)
 class CircleConfig(Loss):
     """Circle loss (Sun et al., CVPR 2020), the constants of GSV-Cities."""
 
@@ -158,7 +152,6 @@ class CircleConfig(Loss):
 
 
 @LOSSES.register("fast-ap")
-@dataclasses.dataclass(frozen=True)
 class FastAPConfig(Loss):
     """FastAP (Cakir et al., CVPR 2019), GSV-Cities' number of bins."""
 
@@ -192,7 +185,6 @@ class FastAPConfig(Loss):
 
 
 @LOSSES.register("selavpr")
-@dataclasses.dataclass(frozen=True)
 class SelaVprLoss(Loss):
     """The loss of Lu et al. (ICLR 2024), whose margin of local features is 0."""
 

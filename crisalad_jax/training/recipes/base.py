@@ -7,7 +7,7 @@ from typing import Any
 from crisalad_jax.config.checks import choose, require, takes
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.plugins import load_entry_points
-from crisalad_jax.config.registry import REGISTRIES
+from crisalad_jax.config.registry import REGISTRIES, add_named
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.nn.aggregators import AGGREGATORS
 from crisalad_jax.nn.backbones import BACKBONES
@@ -48,12 +48,7 @@ def register_recipe(name: str) -> Callable[[Make], Make]:
     """
 
     def decorate(make: Make) -> Make:
-        module = RECIPES.get(name, make).__module__
-        require(
-            module == make.__module__,
-            f"register_recipe {name!r}: found the name taken by {module}, expected another",
-        )
-        RECIPES[name] = make
+        add_named("recipe", RECIPES, name, make)
         return make
 
     return decorate

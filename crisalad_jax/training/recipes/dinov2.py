@@ -48,6 +48,14 @@ MIXVPR_OPTIMISER = OptimiserConfig(
 """That of amaralibey/MixVPR, for 120 places."""
 
 
+_HALF_FLOATS: dict[str, Any] = {
+    "compute_dtype": "bfloat16",
+    "pixels": "floats",
+    "round_to_patch": True,
+}
+"""How several codes compute and prepare images."""
+
+
 def _vit(model: ModelConfig, *, adapter: Adapter | str = "none", **fields: Any) -> Any:
     """Change a preset's backbone; methods other than CriSALAD have no adapter, or their own."""
     return dataclasses.replace(model.backbone, adapter=adapter, **fields)
@@ -149,9 +157,7 @@ def selavprpp(model: ModelConfig, preset: str) -> TrainConfig:
         model=model_of(
             *(model, preset, _vit(model, adapter=adapter), "selavprpp"),
             head={"dim": 4096} if is_large else {},
-            compute_dtype="bfloat16",
-            pixels="floats",
-            round_to_patch=True,
+            **_HALF_FLOATS,
         ),
         optimiser=dataclasses.replace(ADAM_STEP, learning_rate=4e-4),
         places_per_batch=120,
@@ -216,9 +222,7 @@ def image(model: ModelConfig, preset: str) -> TrainConfig:
         preset,
         _vit(model, registers=4, position_resize="plain"),
         "aggregation-tokens",
-        compute_dtype="bfloat16",
-        pixels="floats",
-        round_to_patch=True,
+        **_HALF_FLOATS,
     )
     tokens: Any = config.aggregator
     return dataclasses.replace(
@@ -321,9 +325,7 @@ def megaloc(model: ModelConfig, preset: str) -> TrainConfig:
     whole = model_of(
         *(model, preset, _vit(model), "salad"),
         head={} if preset == "tiny" else {"cluster_dim": 256},
-        compute_dtype="bfloat16",
-        pixels="floats",
-        round_to_patch=True,
+        **_HALF_FLOATS,
     )
     projection = ProjectionConfig(dim=256 if preset == "tiny" else 8448)
     return dataclasses.replace(

@@ -11,7 +11,6 @@ import scipy.special
 from crisalad_jax.nn.aggregators.backbone_tokens import AggregationTokensConfig
 from crisalad_jax.nn.aggregators.vlad import (
     BURST,
-    AnyLoc,
     AnyLocConfig,
     NetVlad,
     NetVladConfig,
@@ -20,6 +19,7 @@ from crisalad_jax.nn.aggregators.vlad import (
     VladBuff,
     VladBuffConfig,
     VladConfig,
+    Words,
     burst_weights,
     scores_from_centroids,
 )
@@ -67,7 +67,7 @@ def test_hard_vlad_takes_the_nearest_word_alone(assignment: Any, far: Any) -> No
     words = np.concatenate([0.3 * CENTROIDS, -9 * PATCHES.sum(axis=(0, 1))[None]])
     words[1] *= 5
     config = AnyLocConfig(clusters=5, assignment=assignment)
-    found = sums_of(config, AnyLoc(jnp.asarray(words)), jnp.asarray(PATCHES))
+    found = sums_of(config, Words(jnp.asarray(words)), jnp.asarray(PATCHES))
     for image, clusters in zip(PATCHES.astype(np.float64), found, strict=True):
         sums = np.zeros((5, 6))
         for patch in map(unit, image):
@@ -178,7 +178,7 @@ def test_a_start_from_features_that_are_all_alike_is_refused() -> None:
 def test_without_features_centroids_are_random_and_unit() -> None:
     for config in (MODEL.aggregator, AnyLocConfig(clusters=3, layer=1)):
         params = config.init(jax.random.key(0), VIT, MODEL.grid)
-        assert isinstance(params, NetVlad | AnyLoc)
+        assert isinstance(params, NetVlad | Words)
         centroids = params.centroids if isinstance(params, NetVlad) else params.words
         assert centroids.shape == (3, 32)
         np.testing.assert_allclose(np.linalg.norm(centroids, axis=1), 1, rtol=1e-6)

@@ -13,7 +13,8 @@ import sklearn.cluster
 import crisalad_jax as cj
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.local_features import encode_local_features
-from crisalad_jax.nn.aggregators.words import Bow, BowConfig, HardVladConfig, Vlad
+from crisalad_jax.nn.aggregators.vlad import Words
+from crisalad_jax.nn.aggregators.words import Bow, BowConfig, HardVladConfig
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.local_features import OrbConfig, SiftConfig
 from crisalad_jax.nn.config import ModelConfig
@@ -59,9 +60,8 @@ def of_image(image: np.ndarray, kind: str) -> np.ndarray:
     """The backbone's features, without the rows that stand for none."""
     config = model(kind, "bow", 2)
     encoded = cj.prepare_image(image, config)[None]
-    patches, _ = config.backbone.apply(
-        None, jnp.asarray(encoded, jnp.float32), config.aggregator.features(1), remat="none"
-    )
+    request, images = config.aggregator.features(1), jnp.asarray(encoded, jnp.float32)
+    patches, _ = config.backbone.apply(None, images, request, remat="none", valid=None)
     (rows,) = np.asarray(patches.patches)
     assert rows.shape == (COUNT, config.backbone.dim)
     kept = rows.any(axis=1)
@@ -131,7 +131,7 @@ def nearest(words: np.ndarray, rows: np.ndarray) -> np.ndarray:
 def test_vlad_is_the_loop_over_features() -> None:
     words, rows = 0.7 * unit(5, 6), unit(30, 6, seed=1)
     config = HardVladConfig(clusters=5)
-    tokens = config.apply(Vlad(jnp.asarray(words)), features(rows), (1, 33), key=None)
+    tokens = config.apply(Words(jnp.asarray(words)), features(rows), (1, 33), key=None)
     expected = np.zeros((5, 6))
     for word, row in zip(nearest(words, rows), rows, strict=True):
         expected[word] += row - words[word]

@@ -4,6 +4,7 @@ parity/test_cnn.py compares outputs and gradients with torch, parity/test_zoo.py
 """
 
 import dataclasses
+import functools
 import itertools
 import math
 from typing import Any
@@ -47,7 +48,10 @@ def macs(backbone: StagedBackbone) -> int:
     """Multiply-accumulates of one image of 224 x 224."""
     params = jax.eval_shape(backbone.init, jax.random.key(0))
     image = jax.ShapeDtypeStruct((1, 224, 224, 3), jnp.float32)
-    apply = lambda p, x: backbone.apply(p, x, FeatureSpec(), remat="none")[0].patches  # noqa: E731
+
+    def apply(p, x):
+        return backbone.apply(p, x, FeatureSpec(), remat="none", valid=None)[0].patches
+
     return count_macs(apply, params, image).total()
 
 
@@ -88,7 +92,10 @@ def test_a_narrower_resnet_has_the_parameters_of_its_widths() -> None:
 def test_the_grid_is_that_of_the_features(backbone: StagedBackbone, size: tuple[int, int]) -> None:
     params = jax.eval_shape(backbone.init, jax.random.key(0))
     images = jax.ShapeDtypeStruct((2, *size, 3), jnp.float32)
-    apply = lambda p, x: backbone.apply(p, x, FeatureSpec(), remat="none")[0]  # noqa: E731
+
+    def apply(p, x):
+        return backbone.apply(p, x, FeatureSpec(), remat="none", valid=None)[0]
+
     features = jax.eval_shape(apply, params, images)
     assert features.patches.shape == (2, math.prod(backbone.grid(size)), backbone.dim)
     assert features.class_token.shape == (2, 0)
@@ -205,11 +212,12 @@ def test_a_batch_in_parts_is_the_whole_batch(monkeypatch: pytest.MonkeyPatch) ->
     found = {}
     for parts in (1, 3, 6):
         monkeypatch.setattr(stages, "parts_for_caches", lambda images, at_once, n=parts: n)
-        apply = jax.jit(lambda p, x: SMALL.backbone.apply(p, x, FeatureSpec(), remat="none")[0])
+        how = {"request": FeatureSpec(), "remat": "none", "valid": None}
+        apply = jax.jit(functools.partial(SMALL.backbone.apply, **how))
         assert apply.trace(params.backbone, images).jaxpr.pretty_print().count(" scan[") == (
             parts > 1
         )
-        found[parts] = apply(params.backbone, images).patches
+        found[parts] = apply(params.backbone, images)[0].patches
     for parts in (3, 6):
         # Float32, of sums of thousands in another order; 1e-6 of the largest is measured.
         largest = np.abs(found[1]).max()

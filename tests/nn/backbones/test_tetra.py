@@ -111,7 +111,7 @@ def test_the_backbone_is_torchs() -> None:
         SMALL.init(jax.random.key(0)),
     )
     images = generator.standard_normal((2, 28, 28, 3)).astype(np.float32)
-    features, _ = SMALL.apply(params, jnp.asarray(images), FeatureSpec(), remat="dots")
+    features, _ = SMALL.apply(params, jnp.asarray(images), FeatureSpec(), remat="dots", valid=None)
     found = np.concatenate([features.class_token[:, None], features.patches], axis=1)
     # Float32 through three blocks: rounding is the same wherever no number is within it of a half.
     np.testing.assert_allclose(found, by_torch(params, images), rtol=1e-4, atol=1e-4)
