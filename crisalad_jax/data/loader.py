@@ -4,7 +4,6 @@ import collections
 import contextlib
 import dataclasses
 import itertools
-import math
 import os
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 import cv2
 import numpy as np
 
-from crisalad_jax.config.checks import check_count, check_types, require_range, takes
+from crisalad_jax.config.checks import NonNegativeInt, check_count, check_types, takes
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.config.short_repr import brief, with_field_docs
 from crisalad_jax.data.images import OnBadImage, read_pixels
@@ -143,7 +142,7 @@ class Reading:
     """Number of images described together."""
     on_bad_image: OnBadImage = "stop"
     """"stop" at an unreadable image, or "skip" it."""
-    threads: int = THREADS
+    threads: NonNegativeInt = THREADS
     """Number of threads that decode ahead; 0 decodes in the caller's thread."""
     cache: ImageCache | None = None
     """Cache of decoded images."""
@@ -154,7 +153,6 @@ class Reading:
         """Check the fields."""
         check_types(self)
         check_count("batch size", self.batch_size)
-        require_range(self, 0, math.inf, "threads")
 
     def fitted(self, images: int) -> Self:
         """Return a smaller batch size where the batches of so few images would be mostly padding.

@@ -4,12 +4,13 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
 
-from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image, from_zero
+from crisalad_jax.config.checks import NonNegativeInt, limited
+from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
 from crisalad_jax.utils.shapes import Bool, Int64, UInt8
 
 MAGNITUDE_BINS = 31
@@ -25,8 +26,8 @@ _LEVELS = np.arange(256)
 class RandAugmentConfig(Augmentation):
     """RandAugment (Cubuk et al. 2020), torchvision's 14 operations, GSV-Cities' strength."""
 
-    operations: int = from_zero(3)
-    magnitude: int = from_zero(9, MAGNITUDE_BINS - 1)
+    operations: NonNegativeInt = 3
+    magnitude: Annotated[int, limited(0, MAGNITUDE_BINS - 1)] = 9
     """Which of 31 bins of strength."""
 
     def apply(
