@@ -14,12 +14,6 @@ from crisalad_jax.retrieval.maps.calibration import CALIBRATION, VERIFIED
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.verification.verify import Verify
 
-COMMON = (
-    "map data precision weights verify matcher split queries layout images radius frames "
-    "batch-size on-bad-image plugin json latex quiet"
-)
-EXAMPLE = "crisalad calibrate --map corridor.map --data corridor-set --precision 0.99"
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Calibrate(ReadFlags, SetFlags, TableFlags):

@@ -9,12 +9,6 @@ import rich.console
 from crisalad_jax.cli.common import echo, find_given, pick, show_tables
 from crisalad_jax.cli.flags import FOLDER, ClusterFlag, ReadFlags, SizeFlags, TableFlags
 
-COMMON = (
-    "test out train methods weights backbone preset seeds epochs image-size grouping batch-size "
-    "rerank reference jobs cluster page json on-bad-image quiet"
-)
-EXAMPLE = "crisalad compare --test pitts30k_test.mat --weights salad megaloc --out compared"
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ComparisonFlags(ReadFlags, SizeFlags, TableFlags, ClusterFlag):

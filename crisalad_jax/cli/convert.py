@@ -19,8 +19,6 @@ _FORMATS = (
     f"{', '.join(FORMATS)}, for a source of this package; by default the one its parts came from "
     "(huggingface if the target is a .safetensors)."
 )
-COMMON = "source target format backbone json"
-EXAMPLE = "crisalad convert dino_salad.ckpt salad.safetensors"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

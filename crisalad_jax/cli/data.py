@@ -18,8 +18,6 @@ from crisalad_jax.config.checks import require
 from crisalad_jax.data.sets import SETS, PublishedSet, check_set, fetch_set, find_set
 from crisalad_jax.utils.errors import few
 
-EXAMPLE = "crisalad data fetch amstertime --to amstertime"
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Data(TableFlags, QuietFlag):

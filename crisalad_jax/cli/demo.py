@@ -8,8 +8,6 @@ from crisalad_jax.cli.common import echo, show_tables
 from crisalad_jax.cli.flags import FOLDER, QuietFlag, TableFlags
 from crisalad_jax.retrieval.grouping import grouping_words
 
-EXAMPLE = "crisalad demo --out demo"
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Demo(TableFlags, QuietFlag):

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
     from crisalad_jax.nn.config import ModelConfig
 
-EXAMPLE = "crisalad export --weights salad --out exported"
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Export(ComputeFlags, PluginFlag, JsonFlag):

@@ -20,14 +20,6 @@ from crisalad_jax.retrieval.maps.build import Indexed, index
 from crisalad_jax.retrieval.maps.metadata import model_config, read_metadata, weights_of
 from crisalad_jax.utils.output import counted
 
-COMMON = (
-    "images out weights fps positions every-metres novelty store dtype pca search image-size "
-    "resize batch-size runtime compute-dtype on-bad-image cluster json quiet"
-)
-EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
-SEVERAL = "quote a pattern; other folders are added by the same command again"
-"""What to do in place of several values of --images."""
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Index(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):

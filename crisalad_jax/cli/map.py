@@ -34,12 +34,6 @@ from crisalad_jax.retrieval.maps.map import Map as OpenMap
 from crisalad_jax.retrieval.maps.metadata import existing_metadata, model_config, weights_of
 from crisalad_jax.utils.output import counted
 
-COMMON = (
-    "action map what names addition day images fps positions weights batch-size runtime "
-    "on-bad-image json quiet"
-)
-EXAMPLE = "crisalad map remove corridor.map 'monday/*'"
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):

@@ -10,8 +10,6 @@ from crisalad_jax.cli.common import echo
 from crisalad_jax.cli.flags import JsonFlag, PluginFlag, QuietFlag
 from crisalad_jax.experiments.publish import publish
 
-EXAMPLE = "crisalad publish runs/b14 --to hf://me/b14 --licence apache-2.0"
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Publish(JsonFlag, PluginFlag, QuietFlag):

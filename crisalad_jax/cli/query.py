@@ -42,13 +42,6 @@ _COLUMNS = 8
 """Largest number of answers to each query in a gallery."""
 
 
-COMMON = (
-    "images map watch camera fps window weights k min-similarity sequence verify json out gallery "
-    "rerun map-images batch-size on-bad-image quiet"
-)
-EXAMPLE = "crisalad query new.jpg --map map --json -"
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Query(ReadFlags, FrameFlags, JsonFlag):
     """Find the images of a map that are most similar to others, and say where they were taken."""

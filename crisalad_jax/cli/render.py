@@ -16,8 +16,6 @@ from crisalad_jax.synthetic import (
 )
 from crisalad_jax.utils.output import counted
 
-EXAMPLE = "crisalad render --out world --scenes 2400"
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Render(JsonFlag, QuietFlag):

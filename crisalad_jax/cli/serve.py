@@ -13,7 +13,6 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_text
 
 _LOCAL = re.compile(r"local(?::([1-9][0-9]{0,2}))?")
-EXAMPLE = "crisalad serve --map corridor.map --port 8000"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

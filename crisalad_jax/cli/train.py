@@ -22,13 +22,6 @@ from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.errors import InputError
 
-COMMON = (
-    "data out place-radius place-frames val weights backbone preset recipe config image-size "
-    "epochs seed places-per-batch images-per-place optimiser.learning-rate trainable "
-    "model.aggregator on-bad-image json"
-)
-EXAMPLE = "crisalad train --data gsv --out runs/a --val pitts30k_val.mat --backbone dinov2-vitb14"
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Train(JsonFlag, PluginFlag, QuietFlag):
