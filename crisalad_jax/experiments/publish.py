@@ -34,8 +34,7 @@ from crisalad_jax.utils.version import VERSION
 WEIGHTS = ("best.safetensors", "last.safetensors")
 """Files of a run's weights; the first that is there is published."""
 CARD, CONFIG = "README.md", "config.json"
-_LIBRARY = "crisalad-jax"
-_TAGS = ["visual-place-recognition", "image-retrieval", "geo-localization", "jax"]
+_TEMPLATE = "card.md"
 
 
 @takes(run=PATH)
@@ -98,7 +97,7 @@ def publish(
             folder = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
         shutil.copyfile(found.weights, folder / HUB_FILE)
         model = to_plain(found.config.model)
-        about = {"library_name": _LIBRARY, "version": VERSION, "model": model}
+        about = {"library_name": "crisalad-jax", "version": VERSION, "model": model}
         write_json(folder / CONFIG, about | {"training": to_plain(found.config)})
         write_text(folder / CARD, card)
         if address is None:
@@ -194,60 +193,27 @@ def _rows(file: str | os.PathLike[str], run: _Run) -> Iterator[_Row]:
 
 def _card(run: _Run, rows: Sequence[_Row], *, name: str, licence: str, data: str | None) -> str:
     """Write the model card: a YAML header for the hub, and a page for people."""
-    config = run.config
-    short = name.rpartition("/")[2].partition("@")[0]
-    header: dict[str, Any] = {
-        "license": licence,
-        "library_name": _LIBRARY,
-        "pipeline_tag": "image-feature-extraction",
-        "tags": _TAGS,
-    }
-    if rows:
-        header["model-index"] = [{"name": short, "results": [_result(row) for row in rows]}]
-    # JSON is YAML too, and quotes all that a name may hold.
-    lines = [f"{key}: {json.dumps(value)}" for key, value in header.items()]
-    losses = dict.fromkeys(each.loss.kind.part_name for each in config.alone)
-    optimiser = config.optimiser
-    parts = [
-        ["---", *lines, "---", "", f"# {short}"],
-        [
-            "A model for visual place recognition: it makes a descriptor of an image, and images "
-            f"of one place have similar ones. Written by crisalad-jax {VERSION}."
-        ],
-        ["## Use", "", "```python", *_example(name), "```"],
-        [f"`pip install 'crisalad-jax[data]'` installs all that this needs. {_limits(config)}"],
-        ["## Model", "", f"- {model_words(config.model)}", f"- {config.model.images_in_words}"],
-        ["## Training", "", f"- Data: {data or _data_words(run.data)}."],
-        ["## Recalls", "", _table(rows)],
-        ["## Licence", "", f"The weights: {licence}. The package is under Apache-2.0."],
-    ]
-    parts[5] += [
-        f"- Loss: {', '.join(losses)}; optimiser {optimiser.kind.part_name}, learning rate "
-        f"{optimiser.learning_rate:g}, schedule {optimiser.schedule.part_name}.",
-        f"- Batches: {config.places_per_batch} places of {config.images_per_place} images; "
-        f"{counted(config.epochs, 'epoch')}; seed {config.seed}; trained: {config.trainable}.",
-        f"- `{CONFIG}` has all settings.",
-    ]
-    return "\n\n".join("\n".join(part) for part in parts) + "\n"
-
-
-def _example(name: str) -> list[str]:
-    return [
-        "import crisalad_jax as cj",
-        "",
-        f'model = cj.load("{name}")',
-        'found = cj.extract(model, "photos", "descriptors.npy")  # a folder of images',
-        "print(cj.search(found.descriptors, found.descriptors, 2).indices)  # who is like whom",
-    ]
-
-
-def _limits(config: TrainConfig) -> str:
+    config, short = run.config, name.rpartition("/")[2].partition("@")[0]
+    limits = "A descriptor depends on its own image alone."
     if config.model.cross_image.attends:
-        return (
+        limits = (
             "Its descriptors depend on the images that are described together "
             "(`docs/evaluation.md`): the recalls below say how they were grouped."
         )
-    return "A descriptor depends on its own image alone."
+    # JSON is YAML too, and quotes all that a name may hold.
+    index = json.dumps([{"name": short, "results": [_result(row) for row in rows]}])
+    page = pathlib.Path(__file__).with_name(_TEMPLATE).read_text(encoding="utf-8")
+    return page.format(
+        quoted=json.dumps(licence),
+        index=f"\nmodel-index: {index}" if rows else "",
+        losses=", ".join(dict.fromkeys(each.loss.kind.part_name for each in config.alone)),
+        epochs=counted(config.epochs, "epoch"),
+        model=model_words(config.model),
+        data=data or _data_words(run.data),
+        recalls=_table(rows),
+        version=VERSION,
+        **{"config": config, "name": name, "short": short, "licence": licence, "limits": limits},
+    )
 
 
 def _data_words(data: Mapping[str, Any] | None) -> str:
