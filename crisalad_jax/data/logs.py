@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from crisalad_jax.data.frames import LOG_SUFFIXES, FrameName, parse_frame, sampled, stored_bytes
+from crisalad_jax.data.frames import LOG_SUFFIXES, FrameName, sampled, stored_bytes
 from crisalad_jax.data.images import decode_image
 from crisalad_jax.data.positions import AXES, Positions
 from crisalad_jax.data.tracks import Track
@@ -429,22 +429,8 @@ def decode_message(
         raise InputError(f"{name}: found {' '.join(error.err.split())}") from error
 
 
-def read_log_frame(
-    path: str | os.PathLike[str], *, enough: tuple[int, int] | None = None
-) -> np.ndarray:
-    """Read the image of a log's frame, in the depth that the log has; see `read_pixels`.
-
-    Raises:
-        InputError: no log, or no such frame in it.
-    """
-    frame = parse_frame(path)
-    assert frame is not None
-    assert frame.topic is not None
-    return open_log(frame.file).read(frame.topic, frame.nanoseconds, enough=enough)
-
-
-def name_log_frame(path: pathlib.Path) -> pathlib.Path:
-    """Name a log's frame by its own stamp: the first at or after the time in `path`.
+def name_log_frame(frame: FrameName) -> pathlib.Path:
+    """Name a log's frame by its own stamp: the first at or after the frame's time.
 
     Returns:
         The name. A time behind the last frame stays, for the reader to report.
@@ -452,8 +438,6 @@ def name_log_frame(path: pathlib.Path) -> pathlib.Path:
     Raises:
         InputError: the log cannot be read, or has no such topic.
     """
-    frame = parse_frame(path)
-    assert frame is not None
     log = open_log(frame.file)
     stamps = log.stamps(log.image_topic(frame.topic))
     at = int(np.searchsorted(stamps, frame.nanoseconds))
