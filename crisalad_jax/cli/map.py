@@ -71,19 +71,14 @@ class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):
     """With replace: frames a second taken of a video, by default 1."""
 
 
-_OF = {
-    "names": ("list",),
-    "addition": ("list", "remove"),
-    "day": ("list", "remove"),
-    "store": ("merge",),
-    "images": ("replace",),
-    "fps": ("replace",),
-    "weights": ("replace",),
-    "positions": ("move",),
-    "start_time": ("move",),
-    "time_offset": ("move",),
+_FLAGS = {
+    "list": ("names", "addition", "day"),
+    "remove": ("addition", "day"),
+    "replace": ("images", "fps", "weights"),
+    "move": ("positions", "start_time", "time_offset"),
+    "merge": ("store",),
 }
-"""Which actions a flag is for."""
+"""The flags of each action that not all of them have."""
 
 
 def needs_jax(arguments: Map) -> bool:
@@ -94,8 +89,8 @@ def needs_jax(arguments: Map) -> bool:
 def run(arguments: Map) -> dict[str, Any]:
     """List or change the map."""
     action = f"map {arguments.action}"
-    others = [name for name, actions in _OF.items() if arguments.action not in actions]
-    refuse_with(action, **pick(arguments, *others))
+    others = {*itertools.chain(*_FLAGS.values())} - {*_FLAGS[arguments.action]}
+    refuse_with(action, **pick(arguments, *sorted(others)))
     if arguments.action in ("replace", "move"):
         require(not arguments.what, f"{action}: found {arguments.what[:1]}, expected no names")
     if arguments.action == "list":
@@ -164,22 +159,23 @@ _CHANGES = {
     "move": _move,
     "merge": lambda given: merge_maps(given.map, *given.what, store=given.store, quiet=given.quiet),
 }
-_DONE = {"remove": "removed", "replace": "replaced", "move": "moved", "merge": "added"}
-_THERE = {
-    "remove": "were removed before",
-    "replace": "have not changed",
-    "move": "have these positions already",
-    "merge": "were there already",
+_DONE = {
+    "remove": ("removed", "were removed before"),
+    "replace": ("replaced", "have not changed"),
+    "move": ("moved", "have these positions already"),
+    "merge": ("added", "were there already"),
 }
+"""Words for images that an action changed, and for those that it had no need to."""
 
 
 def _words(change: MapChange, action: str) -> list[str]:
     """Describe what became of the images in clauses; empty groups are left out."""
-    words = [f"{counted(len(change.names), 'image')} {_DONE[action]}"]
+    done, there = _DONE[action]
+    words = [f"{counted(len(change.names), 'image')} {done}"]
     if not change.names:
         words = ["nothing to do"]
     if change.there:
-        words.append(f"{change.there} {_THERE[action]}")
+        words.append(f"{change.there} {there}")
     if change.stay_out:
         words.append(f"{change.stay_out} were removed from this map and stay out")
     if change.unmatched:
