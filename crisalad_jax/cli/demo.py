@@ -30,16 +30,12 @@ def run(arguments: Demo) -> dict[str, Any]:
     echo(f"A descriptor of this model may depend on its batch: {grouping_words(GROUPINGS)}.")
     echo(
         f"{summary.seconds:.0f} s in all, {summary.training_seconds:.0f} s of it training. "
-        f"Pictures: {', '.join(str(p) for p in summary.pictures)}"
+        f"Pictures: {', '.join(map(str, summary.pictures))}"
     )
     rows = [
         row._asdict() | {"recalls": {f"R@{k}": v for k, v in row.recalls.items()}}
         for row in summary.rows
     ]
-    return {
-        "out": str(arguments.out),
-        "rows": rows,
-        "seconds": summary.seconds,
-        "training_seconds": summary.training_seconds,
-        "pictures": [str(picture) for picture in summary.pictures],
-    }
+    pictures = [str(picture) for picture in summary.pictures]
+    values = {"out": str(arguments.out), "rows": rows, "pictures": pictures}
+    return summary._asdict() | values

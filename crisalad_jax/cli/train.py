@@ -217,9 +217,8 @@ def run(arguments: Train) -> dict[str, Any] | None:
         validation_images=arguments.val_images,
         **pick(arguments, "place_radius", "place_frames", "positions", "fps", "topic"),
         **pick(arguments, "weights", "backbone", "on_bad_image", "num_threads", "shard_state"),
-        cache_gb=arguments.cache_gb,
+        **pick(arguments, "cache_gb", "quiet"),
         callbacks=arguments.callback,
-        quiet=arguments.quiet,
         say=lambda line: console.print(line, soft_wrap=True),
     )
     out, words, best = arguments.out, [f"{result.steps} steps"], None

@@ -304,29 +304,15 @@ def training_batches(
     from crisalad_jax.data.samplers.base import SAMPLERS, epoch_batches, labels_of
 
     sampler = SAMPLERS.resolve(sampler, "sampler")
+    size: Any = {"places_per_batch": places_per_batch, "images_per_place": images_per_place}
     chosen = epoch_batches(
-        places,
-        sampler=sampler,
-        places_per_batch=places_per_batch,
-        images_per_place=images_per_place,
-        seed=seed,
-        epoch=epoch,
-        steps=steps,
-        describe=describe,
+        places, sampler=sampler, seed=seed, epoch=epoch, steps=steps, describe=describe, **size
     )
+    labels, which = labels_of(places, sampler, chosen), {"start_step": start_step, "part": part}
+    how: Any = {"image_size": image_size, "preprocessing": preprocessing}
+    how |= {"on_bad_image": on_bad_image, "threads": threads, "cache": cache} | which
     return batches_of_groups(
-        places,
-        chosen,
-        labels_of(places, sampler, chosen),
-        image_size=image_size,
-        preprocessing=preprocessing,
-        augmentation=augmentation,
-        seed=(seed, epoch),
-        start_step=start_step,
-        part=part,
-        on_bad_image=on_bad_image,
-        threads=threads,
-        cache=cache,
+        places, chosen, labels, augmentation=augmentation, seed=(seed, epoch), **how
     )
 
 

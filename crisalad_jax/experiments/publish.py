@@ -19,7 +19,7 @@ from crisalad_jax.config.io import read_config, to_plain
 from crisalad_jax.data.benchmarks.on_disk import listing
 from crisalad_jax.evaluation.metrics import bootstrap_interval
 from crisalad_jax.evaluation.results import percent
-from crisalad_jax.experiments.tables import Cell, Table, write_text
+from crisalad_jax.experiments.tables import NOTHING, Cell, Table, write_text
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.run_files import DATA
@@ -122,6 +122,13 @@ class _Row(NamedTuple):
     how: str
     recalls: Mapping[str, float]
     intervals: Mapping[str, Sequence[float]]
+
+    def cell(self, name: str) -> Cell:
+        """Format a recall, with its interval where that is known."""
+        if name not in self.recalls:
+            return Cell(NOTHING)
+        ends = "-".join(map(percent, self.intervals.get(name, ())))
+        return Cell(percent(self.recalls[name]), f"[{ends}]" if ends else "")
 
 
 def _read_run(run: pathlib.Path) -> _Run:
@@ -232,31 +239,13 @@ def _table(rows: Sequence[_Row]) -> str:
     if not rows:
         return "The run has no validation, and no evaluation was given."
     names = sorted({name for row in rows for name in row.recalls}, key=lambda n: int(n[2:]))
-    cells = [
-        [
-            Cell(row.benchmark),
-            Cell(row.how),
-            *(
-                Cell(percent(row.recalls[name]), _interval(row, name))
-                if name in row.recalls
-                else Cell("-")
-                for name in names
-            ),
-        ]
-        for row in rows
-    ]
+    cells = [[Cell(each.benchmark), Cell(each.how), *map(each.cell, names)] for each in rows]
     table = Table(["data set", "grouping", *names], cells, labels=2).markdown()
     return (
         f"{table}\nPercent of all queries; in brackets the 95 % interval by bootstrap over the "
         "queries, as if they were independent. A validation chose the weights: its recalls are "
         "high by that."
     )
-
-
-def _interval(row: _Row, name: str) -> str:
-    if name not in row.intervals:
-        return ""
-    return f"[{'-'.join(percent(end) for end in row.intervals[name])}]"
 
 
 def _result(row: _Row) -> dict[str, Any]:
