@@ -12,6 +12,7 @@ import tyro
 
 from crisalad_jax.cli.common import (
     echo,
+    first_of,
     given_positions,
     open_flagged,
     pick,
@@ -171,23 +172,18 @@ _DONE = {
 def _words(change: MapChange, action: str) -> list[str]:
     """Describe what became of the images in clauses; empty groups are left out."""
     done, there = _DONE[action]
-    words = [f"{counted(len(change.names), 'image')} {done}"]
-    if not change.names:
-        words = ["nothing to do"]
-    if change.there:
-        words.append(f"{change.there} {there}")
-    if change.stay_out:
-        words.append(f"{change.stay_out} were removed from this map and stay out")
-    if change.unmatched:
-        words.append(
-            f"{len(change.unmatched)} are not in the map, {change.unmatched[0]!r} the first"
-        )
-    if change.unreadable:
-        words.append(
-            f"{len(change.unreadable)} unreadable stay as they were, {change.unreadable[0]!r} the "
-            "first"
-        )
-    words.append(f"{counted(change.images, 'image')} now")
+    unmatched, unreadable = change.unmatched, change.unreadable
+    fates = (
+        (change.there, there),
+        (change.stay_out, "were removed from this map and stay out"),
+        (len(unmatched), f"are not in the map, {first_of(unmatched)}"),
+        (len(unreadable), f"unreadable stay as they were, {first_of(unreadable)}"),
+    )
+    words = [
+        f"{counted(len(change.names), 'image')} {done}" if change.names else "nothing to do",
+        *(f"{count} {fate}" for count, fate in fates if count),
+        f"{counted(change.images, 'image')} now",
+    ]
     if change.stale_search is not None:
         kind = change.stale_search
         words.append(f"searched exactly until `crisalad index --search {kind}` builds it again")
