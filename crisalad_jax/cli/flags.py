@@ -152,6 +152,19 @@ class ModelFlags(ComputeFlags, QuietFlag):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class MapFlags:
+    """Which map is asked, and by which model."""
+
+    map: pathlib.Path
+    """Folder that `crisalad index` wrote."""
+    weights: pathlib.Path | None = None
+    """The model that made the map, as a file or a published name; by default where it was then."""
+    checksums: bool = True
+    """Check the map's descriptors, and an exported model, against their checksums; --no-checksums
+    skips that, where files are huge."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PositionFlags:
     """Where images were taken."""
 

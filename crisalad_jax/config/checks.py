@@ -55,12 +55,13 @@ def require(condition: bool, message: str) -> None:
 
 
 def check_seed(what: str, seed: int) -> None:
-    """Check that a seed draws other numbers than every other one: JAX drops higher bits.
+    """Check a seed, as `Seed` does.
 
     Raises:
-        InputError: it is negative, or has more than 32 bits.
+        InputError: it is not a whole number, negative, or has more than 32 bits.
     """
-    require(0 <= seed < 2**32, f"{what}: found {seed}, expected at least 0, and less than 2**32")
+    allowed = kind_of(Seed)
+    require(allowed.fits(seed), f"{what}: found {seed!r}, expected {allowed.words}")
 
 
 def check_count(what: str, count: Any) -> None:
@@ -172,6 +173,8 @@ def limited(least: float, most: float = math.inf) -> Kind:
 # Types of fields whose numbers have a range. To all but `check_types` they are int and float.
 PositiveInt = Annotated[int, Kind(lambda value: value >= 1, "a whole number of at least 1")]
 NonNegativeInt = Annotated[int, Kind(lambda value: value >= 0, "a whole number of at least 0")]
+# JAX drops higher bits, and such a seed would draw the numbers of another one.
+Seed = Annotated[int, Kind(lambda value: 0 <= value < 2**32, "at least 0, and less than 2**32")]
 NonNegativeFloat = Annotated[float, limited(0)]
 Share = Annotated[float, limited(0, 1)]
 PositiveFloat = Annotated[

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from crisalad_jax.config.checks import PositiveInt, check_seed, check_types, limited
+from crisalad_jax.config.checks import PositiveInt, Seed, check_types, limited
 from crisalad_jax.synthetic.layouts import (
     Files,
     Shot,
@@ -48,12 +48,11 @@ class SyntheticCityConfig:
     """Number of test places, each with one image in the database and one query."""
     image_size: tuple[int, int] = (126, 168)
     """Height and width in pixels."""
-    seed: int = 0
+    seed: Seed = 0
 
     def __post_init__(self) -> None:
         """Check the types and ranges."""
         check_types(self)
-        check_seed("SyntheticCityConfig.seed", self.seed)
         check_size("SyntheticCityConfig.image_size", self.image_size)
 
     @property

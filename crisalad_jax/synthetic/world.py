@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from crisalad_jax.config.checks import PositiveInt, check_seed, check_types, require
+from crisalad_jax.config.checks import PositiveInt, Seed, check_types, require
 from crisalad_jax.synthetic.layouts import (
     Files,
     Shot,
@@ -66,13 +66,12 @@ class WorldConfig:
     varied: tuple[Variation, ...] = VARIATIONS
     """What changes between the training images of a place. The rest is as in a plain `View`, the
     stand as the scene's camera. Test images change in all of these."""
-    seed: int = 0
+    seed: Seed = 0
 
     def __post_init__(self) -> None:
         """Check the types and ranges."""
         check_types(self)
         require(bool(self.sceneries), "WorldConfig.sceneries: found none, expected at least one")
-        check_seed("WorldConfig.seed", self.seed)
         check_size("WorldConfig.image_size", self.image_size)
 
     @property

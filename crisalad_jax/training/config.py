@@ -13,7 +13,7 @@ from crisalad_jax.config.checks import (
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
-    check_seed,
+    Seed,
     check_types,
     require,
     require_field,
@@ -210,13 +210,12 @@ class TrainConfig:
     """Validations without a better recall after which training stops; None never stops early."""
     save_top_k: PositiveInt = 1
     """So many validations' weights are kept, those of the best recall."""
-    seed: int = 0
+    seed: Seed = 0
     """Draws weights, batches and augmentations."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
         resolve_names(self)
-        check_seed("TrainConfig.seed", self.seed)
         self._check_mixture()
         loss, images, accumulate = self.loss.kind, self.images_per_place, self.optimiser.accumulate
         batch, size = self.places_per_batch * images, 2 + self.mining.negatives

@@ -2,13 +2,11 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 
 from crisalad_jax.config.part import Part
-from crisalad_jax.config.registry import Registry, count_arguments
+from crisalad_jax.config.registry import Registry, with_arguments
 from crisalad_jax.utils.shapes import UInt8
 
 Image = UInt8[np.ndarray, "h w 3"]
@@ -42,17 +40,9 @@ class Augmentation(Part, abc.ABC):
         """
 
 
-def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
-    """Return the methods of an augmentation that is a plain function."""
-    count = count_arguments(function, "image", "generator")
-
-    def apply(_: Augmentation, image: Image, generator: np.random.Generator, **__: Any) -> Image:
-        return function(*(image, generator)[:count])
-
-    return {"apply": apply}
-
-
-AUGMENTATIONS = Registry("augmentation", Augmentation, of_function=_of_function)
+AUGMENTATIONS = Registry(
+    "augmentation", Augmentation, of_function=with_arguments("image", "generator")
+)
 
 
 @AUGMENTATIONS.register("none")

@@ -50,12 +50,10 @@ class CameraAugmentConfig(LightAugmentConfig):
         if generator.random() < self.filters:
             image = _filtered(image, generator)
         image = self.change_light(image, generator)
-        if generator.random() < self.occlusion:
-            image = _covered(image, generator)
-        if generator.random() < self.motion:
-            image = _smeared(image, generator)
-        if generator.random() < self.coarse:
-            image = _coarsened(image, generator)
+        changes = (self.occlusion, _covered), (self.motion, _smeared), (self.coarse, _coarsened)
+        for probability, change in changes:
+            if generator.random() < probability:
+                image = change(image, generator)
         if self.noise > 0:
             deviation = generator.uniform(0, self.noise)
             noise = deviation * generator.standard_normal(image.shape, np.float32)
