@@ -1,6 +1,5 @@
 """`crisalad ablate`."""
 
-import dataclasses
 from typing import Any
 
 import tyro
@@ -8,7 +7,6 @@ import tyro
 from crisalad_jax.cli.compare import ComparisonFlags, names_of, run_comparison
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Ablate(ComparisonFlags):
     """Train CriSALAD with one part changed at a time; what its adapters cost (Tables 2 and 3)."""
 

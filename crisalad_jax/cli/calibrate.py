@@ -1,6 +1,5 @@
 """`crisalad calibrate`."""
 
-import dataclasses
 import pathlib
 from typing import Any
 
@@ -15,7 +14,6 @@ from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.verification.verify import Verify
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Calibrate(ReadFlags, SetFlags, MapFlags, TableFlags):
     """Measure from which similarity on a map's answers are right, and let the map remember it.
 

@@ -1,6 +1,5 @@
 """`crisalad compare`, and what `crisalad ablate` shares with it."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any, Literal
 
@@ -10,7 +9,6 @@ from crisalad_jax.cli.common import echo, find_given, pick, show_tables
 from crisalad_jax.cli.flags import FOLDER, ClusterFlag, ReadFlags, SizeFlags, TableFlags
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ComparisonFlags(ReadFlags, SizeFlags, TableFlags, ClusterFlag):
     """The flags of both commands."""
 
@@ -94,7 +92,6 @@ def run_comparison(
     return as_json(summary)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Compare(ComparisonFlags):
     """Train or load the methods of the paper's Table 1, evaluate them alike, and table that."""
 

@@ -1,7 +1,6 @@
 """`crisalad completion`."""
 
 import argparse
-import dataclasses
 import importlib
 from typing import Annotated, Any, Literal
 
@@ -10,13 +9,13 @@ import tyro
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.cli import help as helping
+from crisalad_jax.cli.flags import Flags
 from crisalad_jax.config.plugins import load_entry_points
 
 Shell = Literal["bash", "zsh", "fish"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Completion:
+class Completion(Flags):
     """Print a script that lets a shell complete commands, flags and choices."""
 
     shell: Annotated[tyro.conf.Positional[Shell], tyro.conf.arg(metavar="{bash,zsh,fish}")]

@@ -1,6 +1,5 @@
 """`crisalad convert`."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any
 
@@ -21,7 +20,6 @@ _FORMATS = (
 )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Convert(PluginFlag, JsonFlag):
     """Convert a public torch checkpoint to a file of this package, or such a file back."""
 

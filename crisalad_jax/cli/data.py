@@ -19,7 +19,6 @@ from crisalad_jax.data.sets import SETS, PublishedSet, check_set, fetch_set, fin
 from crisalad_jax.utils.errors import few
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Data(TableFlags, QuietFlag):
     """List public data sets, download one, or say what a folder is and whether it is whole."""
 

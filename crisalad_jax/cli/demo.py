@@ -1,6 +1,5 @@
 """`crisalad demo`."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any
 
@@ -9,7 +8,6 @@ from crisalad_jax.cli.flags import FOLDER, QuietFlag, TableFlags
 from crisalad_jax.retrieval.grouping import grouping_words
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Demo(TableFlags, QuietFlag):
     """Render a synthetic city, train a tiny model on it, and show Recall@K before and after."""
 

@@ -32,7 +32,6 @@ from crisalad_jax.utils.files import atomic_path, write_json
 from crisalad_jax.utils.locks import staged_folder
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     """Print what a model recalls of an evaluation set under each grouping, and what these leak."""
 

@@ -1,6 +1,5 @@
 """`crisalad export`."""
 
-import dataclasses
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,7 +13,6 @@ if TYPE_CHECKING:
     from crisalad_jax.nn.config import ModelConfig
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Export(ComputeFlags, PluginFlag, JsonFlag):
     """Write a model as a program that runs without this package: StableHLO, ONNX or OpenVINO's."""
 

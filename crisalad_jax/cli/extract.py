@@ -1,6 +1,5 @@
 """`crisalad extract`."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any
 
@@ -19,7 +18,6 @@ from crisalad_jax.retrieval.grouping import GROUPINGS
 from crisalad_jax.utils.output import counted
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Extract(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     """Write a descriptor of every image in a folder, in sorted path order."""
 

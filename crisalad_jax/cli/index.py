@@ -1,6 +1,5 @@
 """`crisalad index`."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any, Literal
 
@@ -21,7 +20,6 @@ from crisalad_jax.retrieval.maps.metadata import model_config, read_metadata, we
 from crisalad_jax.utils.output import counted
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Index(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     """Make a map of a folder of images, or append to it those that it lacks.
 

@@ -12,7 +12,6 @@ from crisalad_jax.training.recipes import recipe
 from crisalad_jax.training.summary import model_summary, summary_json, summary_lines
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Info(SizeFlags, PluginFlag, TableFlags):
     """Print what a model is made of: parameters, what trains, multiply-accumulates an image."""
 

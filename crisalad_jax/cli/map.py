@@ -2,7 +2,6 @@
 
 import bisect
 import collections
-import dataclasses
 import itertools
 import pathlib
 from collections.abc import Sequence
@@ -36,7 +35,6 @@ from crisalad_jax.retrieval.maps.metadata import existing_metadata, model_config
 from crisalad_jax.utils.output import counted
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):
     """List what is in a map, remove, replace or move some of its images, or merge maps.
 

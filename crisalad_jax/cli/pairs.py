@@ -1,7 +1,6 @@
 """`crisalad pairs`."""
 
 import contextlib
-import dataclasses
 import pathlib
 import tempfile
 from typing import Annotated, Any
@@ -14,7 +13,6 @@ from crisalad_jax.retrieval.maps.pairs import check_rules, image_pairs
 from crisalad_jax.utils.output import counted
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Pairs(ReadFlags, JsonFlag):
     """Choose pairs of images to match, for COLMAP and hloc.
 

@@ -15,7 +15,6 @@ from crisalad_jax.retrieval.descriptor_files import MADE_BY, open_npy, read_reco
 from crisalad_jax.retrieval.pca import SAMPLES, PcaConfig, fit_pca, save_pca, shortened
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Pca(JsonFlag, QuietFlag):
     """Fit principal components to descriptors, for shorter ones (extract, evaluate --pca)."""
 

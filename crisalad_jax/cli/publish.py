@@ -1,6 +1,5 @@
 """`crisalad publish`."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any
 
@@ -11,7 +10,6 @@ from crisalad_jax.cli.flags import JsonFlag, PluginFlag, QuietFlag
 from crisalad_jax.experiments.publish import publish
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Publish(JsonFlag, PluginFlag, QuietFlag):
     """Write a run's model with a model card, to a folder or to Hugging Face's hub."""
 

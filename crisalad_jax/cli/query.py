@@ -1,7 +1,6 @@
 """`crisalad query`."""
 
 import contextlib
-import dataclasses
 import importlib
 import pathlib
 import sys
@@ -42,7 +41,6 @@ _COLUMNS = 8
 """Largest number of answers to each query in a gallery."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Query(ReadFlags, FrameFlags, MapFlags, JsonFlag):
     """Find the images of a map that are most similar to others, and say where they were taken."""
 

@@ -17,7 +17,6 @@ from crisalad_jax.synthetic import (
 from crisalad_jax.utils.output import counted
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Render(JsonFlag, QuietFlag):
     """Render a world of streets, corridors and country: places to train on, and others to test."""
 

@@ -1,6 +1,5 @@
 """`crisalad serve`."""
 
-import dataclasses
 import os
 import pathlib
 import re
@@ -15,7 +14,6 @@ from crisalad_jax.utils.files import read_text
 _LOCAL = re.compile(r"local(?::([1-9][0-9]{0,2}))?")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Serve(DecodeFlags, MapFlags):
     """Answer over HTTP, and in a browser, where photographs were taken."""
 

@@ -1,6 +1,5 @@
 """`crisalad train`."""
 
-import dataclasses
 import os
 import pathlib
 import re
@@ -23,7 +22,6 @@ from crisalad_jax.utils import compiler
 from crisalad_jax.utils.errors import InputError
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Train(JsonFlag, PluginFlag, QuietFlag):
     """Train on places, each with several images; go on with the run if OUT holds one."""
 

@@ -1,6 +1,5 @@
 """`crisalad vocabulary`."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any
 
@@ -10,7 +9,6 @@ from crisalad_jax.nn.model import Model
 from crisalad_jax.training.vocabulary import IMAGES, build_vocabulary, start_vocabulary
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Vocabulary(ReadFlags, FrameFlags, SizeFlags, JsonFlag):
     """Build AnyLoc's vocabulary from images, or words of SIFT or ORB: a model; or NetVLAD's."""
 

@@ -139,10 +139,11 @@ def differences(found: Any, expected: Any, prefix: str = "") -> list[str]:
     elif found == expected:
         return []
     elif (names := _names(found)) and names == _names(expected):
-        pairs = zip(names, found, expected, strict=True)
+        both: Any = found, expected
+        pairs = zip(names, *both, strict=True)
     else:
         return [f"{prefix.removeprefix('.')}: found {_word(found)}, expected {_word(expected)}"]
-    return [line for name, *pair in pairs for line in differences(*pair, f"{prefix}.{name}")]
+    return [line for name, a, b in pairs for line in differences(a, b, f"{prefix}.{name}")]
 
 
 def _names(value: Any) -> list[str]:

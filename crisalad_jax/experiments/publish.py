@@ -162,9 +162,10 @@ def _validation(run: _Run) -> Iterator[_Row]:
     recalls = {name: value for name, value in chosen.items() if re.fullmatch(r"R@\d+", name)}
     known = (run.data or {}).get("validation")
     intervals = {}
-    for name, value in recalls.items() if known is not None else ():
-        hits = np.arange(known["queries"]) < round(value * known["queries"])
-        intervals[name] = list(bootstrap_interval(hits.astype(np.int64)))
+    if known is not None:
+        for name, value in recalls.items():
+            hits = np.arange(known["queries"]) < round(value * known["queries"])
+            intervals[name] = list(bootstrap_interval(hits.astype(np.int64)))
     name = known["name"] if known is not None else "the run's validation set"
     yield _Row(name, f"validation at step {chosen['step']:,}, single", recalls, intervals)
 
