@@ -308,12 +308,10 @@ def training_batches(
     chosen = epoch_batches(
         places, sampler=sampler, seed=seed, epoch=epoch, steps=steps, describe=describe, **size
     )
-    labels, which = labels_of(places, sampler, chosen), {"start_step": start_step, "part": part}
-    how: Any = {"image_size": image_size, "preprocessing": preprocessing}
-    how |= {"on_bad_image": on_bad_image, "threads": threads, "cache": cache} | which
-    return batches_of_groups(
-        places, chosen, labels, augmentation=augmentation, seed=(seed, epoch), **how
-    )
+    how: Any = {"image_size": image_size, "preprocessing": preprocessing, "seed": (seed, epoch)}
+    how |= {"augmentation": augmentation, "start_step": start_step, "part": part}
+    how |= {"on_bad_image": on_bad_image, "threads": threads, "cache": cache}
+    return batches_of_groups(places, chosen, labels_of(places, sampler, chosen), **how)
 
 
 def batches_of_groups(
