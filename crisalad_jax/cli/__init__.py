@@ -8,9 +8,11 @@ import dataclasses
 import difflib
 import importlib
 import os
+import pathlib
 import re
 import signal
 import sys
+import tomllib
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -26,35 +28,13 @@ from crisalad_jax.utils.extras import missing_extra
 from crisalad_jax.utils.output import one_line, print_notes, printable
 from crisalad_jax.utils.version import VERSION
 
-_COMMANDS = {
-    "demo": "Render a small city, train a tiny model on it, and show Recall@K before and after.",
-    "render": "Render streets, corridors and country: places to train on, and others to test.",
-    "train": "Train on places, each with several images; go on with the run that is there.",
-    "convert": "Convert a public torch checkpoint to a file of this package, or back.",
-    "models": "List the models that others published, which --weights takes by name.",
-    "data": "List public data sets, download them, and say what a folder of images is.",
-    "evaluate": "Print what a model recalls of an evaluation set under each grouping.",
-    "compare": "Train or load methods, evaluate them alike, and table that (Table 1).",
-    "ablate": "Train CriSALAD with one part changed at a time (Tables 2 and 3).",
-    "extract": "Write the descriptors of a folder of images.",
-    "index": "Make a map of a folder of images, or append to it those that it lacks.",
-    "map": "List what is in a map, remove, replace or move its images, or merge maps.",
-    "calibrate": "Let a map say unknown: from which similarity on its answers are right.",
-    "query": "Ask a map where images were taken.",
-    "pairs": "Choose pairs of images to match, for COLMAP and hloc.",
-    "serve": "Answer over HTTP, and in a browser, where photographs were taken.",
-    "vocabulary": "Build the vocabulary of AnyLoc, NetVLAD, SIFT or ORB from a folder of images.",
-    "export": "Write a model as a program that needs nothing of this package.",
-    "publish": "Write a run's model with a model card, to a folder or to Hugging Face's hub.",
-    "pca": "Fit principal components to descriptors, for shorter ones.",
-    "info": "Print what a model is made of: parameters, what trains, multiply-accumulates.",
-    "completion": "Print a script that lets bash, zsh or fish complete what is typed.",
-}
-"""Summaries of the commands in the order of the help; each command is a module here.
+_COMMANDS: dict[str, dict[str, str]] = tomllib.loads(
+    pathlib.Path(__file__).with_name("commands.toml").read_text(encoding="utf-8")
+)
+"""What the help says of each command, of which commands.toml is the table.
 
-Its function `run` takes the parsed flags, and may return what --json writes or prints. It may also
-have `COMMON`, the flags of the short help; `needs_jax(flags)`; and `SEVERAL`, a hint where a flag
-got several values.
+Each command is a module here, whose function `run` takes the parsed flags, and may return what
+--json writes or prints. It may also have `needs_jax(flags)`.
 """
 
 
@@ -69,7 +49,7 @@ def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
     asked = helping.asked_for(given)
     try:
         if asked == helping.SHORT:
-            print(helping.short_help(name, module, helping.class_of(name, module, given)))
+            print(helping.short_help(name, _COMMANDS[name], helping.class_of(name, module, given)))
             raise SystemExit(0)
         given = [helping.SHORT if each == helping.ALL else each for each in given]
         with refusals(given, wide=asked is None):
@@ -79,7 +59,7 @@ def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
     except InputError as error:
         if isinstance(error.__cause__, OSError):  # the help cannot be printed
             raise
-        several = getattr(module, "SEVERAL", "")
+        several = _COMMANDS[name].get("several", "")
         hint = f" ({several})" if re.match("--images: .* expected one value$", str(error)) else ""
         raise InputError(f"{error}{hint} (see {program} --help)") from error
 
@@ -87,7 +67,7 @@ def _parse(name: str, module: Any, given: Sequence[str]) -> Any:
 def _usage() -> str:
     usage = "usage: crisalad COMMAND [--help | --help-all] ... | help [COMMAND] | --version"
     lines = [usage, "", "commands:"]
-    lines += [f"  {name:<15}{summary}" for name, summary in _COMMANDS.items()]
+    lines += [f"  {name:<15}{about['summary']}" for name, about in _COMMANDS.items()]
     return "\n".join(lines)
 
 

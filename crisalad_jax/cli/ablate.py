@@ -1,22 +1,12 @@
 """`crisalad ablate`."""
 
-import dataclasses
 from typing import Any
 
 import tyro
 
 from crisalad_jax.cli.compare import ComparisonFlags, names_of, run_comparison
 
-COMMON = (
-    "test out train rows row reference jobs cluster backbone preset seeds epochs image-size "
-    "grouping batch-size page json latex on-bad-image quiet"
-)
-EXAMPLE = (
-    "crisalad ablate --test pitts30k_test.mat --train gsv --backbone dinov2-vitb14 --out ablated"
-)
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Ablate(ComparisonFlags):
     """Train CriSALAD with one part changed at a time; what its adapters cost (Tables 2 and 3)."""
 

@@ -1,11 +1,10 @@
 """`crisalad calibrate`."""
 
-import dataclasses
 import pathlib
 from typing import Any
 
 from crisalad_jax.cli.common import echo, find_given, open_set, refuse_without, show_tables
-from crisalad_jax.cli.flags import ReadFlags, SetFlags, TableFlags
+from crisalad_jax.cli.flags import MapFlags, ReadFlags, SetFlags, TableFlags
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.evaluation.calibrate import calibrate, operating_point_of
 from crisalad_jax.evaluation.operating_point import caveats
@@ -14,37 +13,23 @@ from crisalad_jax.retrieval.maps.calibration import CALIBRATION, VERIFIED
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.verification.verify import Verify
 
-COMMON = (
-    "map data precision weights verify matcher split queries layout images radius frames "
-    "batch-size on-bad-image plugin json latex quiet"
-)
-EXAMPLE = "crisalad calibrate --map corridor.map --data corridor-set --precision 0.99"
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Calibrate(ReadFlags, SetFlags, TableFlags):
+class Calibrate(ReadFlags, SetFlags, MapFlags, TableFlags):
     """Measure from which similarity on a map's answers are right, and let the map remember it.
 
     Every image is described independently, at the map's size, by the map's model. The database of
     the set should be the map's places, or about as many like them, and its queries what the map
     will be asked, unknown places among them. `crisalad query` then answers "unknown" to images
-    below that similarity.
+    below that similarity. An earlier calibration is replaced.
     """
 
-    map: pathlib.Path
-    """Folder that `crisalad index` wrote; an earlier calibration in it is replaced."""
     precision: float = 0.99
     """Share of the answers that must be right."""
-    weights: pathlib.Path | None = None
-    """The model that made the map, as a file or a published name; by default where it was then."""
     verify: int | None = None
     """Measure how many inliers the best of so many verified answers must have, in place of a
     similarity (docs/verification.md); remembered apart, for `crisalad query --verify`."""
     matcher: pathlib.Path | None = None
     """ONNX file of the matcher that verifies; by default SIFT."""
-    checksums: bool = True
-    """Check the map's descriptors against their checksums; --no-checksums skips that, where files
-    are huge."""
 
 
 def run(arguments: Calibrate) -> dict[str, Any]:

@@ -140,6 +140,11 @@ def emit_latex(file: pathlib.Path | None, *tables: Table) -> None:
         write_text(file, text)
 
 
+def first_of(names: Sequence[str]) -> str:
+    """Say which is the first of names of which a message has the number."""
+    return f"{names[0]!r} the first" if names else ""
+
+
 def pick(flags: Any, *names: str) -> dict[str, Any]:
     """Return some flags by name, for a function whose arguments have the same names."""
     return {name: getattr(flags, name) for name in names}

@@ -1,6 +1,5 @@
 """`crisalad compare`, and what `crisalad ablate` shares with it."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any, Literal
 
@@ -9,14 +8,7 @@ import rich.console
 from crisalad_jax.cli.common import echo, find_given, pick, show_tables
 from crisalad_jax.cli.flags import FOLDER, ClusterFlag, ReadFlags, SizeFlags, TableFlags
 
-COMMON = (
-    "test out train methods weights backbone preset seeds epochs image-size grouping batch-size "
-    "rerank reference jobs cluster page json on-bad-image quiet"
-)
-EXAMPLE = "crisalad compare --test pitts30k_test.mat --weights salad megaloc --out compared"
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ComparisonFlags(ReadFlags, SizeFlags, TableFlags, ClusterFlag):
     """The flags of both commands."""
 
@@ -100,7 +92,6 @@ def run_comparison(
     return as_json(summary)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Compare(ComparisonFlags):
     """Train or load the methods of the paper's Table 1, evaluate them alike, and table that."""
 

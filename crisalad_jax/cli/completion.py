@@ -1,7 +1,6 @@
 """`crisalad completion`."""
 
 import argparse
-import dataclasses
 import importlib
 from typing import Annotated, Any, Literal
 
@@ -10,15 +9,13 @@ import tyro
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.cli import help as helping
+from crisalad_jax.cli.flags import Flags
 from crisalad_jax.config.plugins import load_entry_points
-
-EXAMPLE = "crisalad completion bash > ~/.local/share/bash-completion/completions/crisalad"
 
 Shell = Literal["bash", "zsh", "fish"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Completion:
+class Completion(Flags):
     """Print a script that lets a shell complete commands, flags and choices."""
 
     shell: Annotated[tyro.conf.Positional[Shell], tyro.conf.arg(metavar="{bash,zsh,fish}")]
@@ -45,12 +42,12 @@ def completion_script(shell: Shell) -> str:
     root.add_argument("-h", "--help", action="help", help="list the commands")
     root.add_argument("--version", action="version", version="", help="print the version")
     commands = root.add_subparsers()
-    for name, summary in _COMMANDS.items():
+    for name, about in _COMMANDS.items():
         try:
             parents = [_parser(name)]
         except ModuleNotFoundError:
             parents = []
-        parser = commands.add_parser(name, help=summary, parents=parents, add_help=False)
+        parser = commands.add_parser(name, help=about["summary"], parents=parents, add_help=False)
         parser.add_argument("-h", helping.SHORT, action="help", help="show the common flags")
         parser.add_argument(helping.ALL, action="help", help="show all flags")
     return shtab.complete(root, shell)

@@ -1,6 +1,5 @@
 """`crisalad convert`."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any
 
@@ -19,11 +18,8 @@ _FORMATS = (
     f"{', '.join(FORMATS)}, for a source of this package; by default the one its parts came from "
     "(huggingface if the target is a .safetensors)."
 )
-COMMON = "source target format backbone json"
-EXAMPLE = "crisalad convert dino_salad.ckpt salad.safetensors"
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Convert(PluginFlag, JsonFlag):
     """Convert a public torch checkpoint to a file of this package, or such a file back."""
 

@@ -18,10 +18,7 @@ from crisalad_jax.config.checks import require
 from crisalad_jax.data.sets import SETS, PublishedSet, check_set, fetch_set, find_set
 from crisalad_jax.utils.errors import few
 
-EXAMPLE = "crisalad data fetch amstertime --to amstertime"
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Data(TableFlags, QuietFlag):
     """List public data sets, download one, or say what a folder is and whether it is whole."""
 

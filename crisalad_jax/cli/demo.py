@@ -1,6 +1,5 @@
 """`crisalad demo`."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any
 
@@ -8,10 +7,7 @@ from crisalad_jax.cli.common import echo, show_tables
 from crisalad_jax.cli.flags import FOLDER, QuietFlag, TableFlags
 from crisalad_jax.retrieval.grouping import grouping_words
 
-EXAMPLE = "crisalad demo --out demo"
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Demo(TableFlags, QuietFlag):
     """Render a synthetic city, train a tiny model on it, and show Recall@K before and after."""
 
@@ -32,16 +28,12 @@ def run(arguments: Demo) -> dict[str, Any]:
     echo(f"A descriptor of this model may depend on its batch: {grouping_words(GROUPINGS)}.")
     echo(
         f"{summary.seconds:.0f} s in all, {summary.training_seconds:.0f} s of it training. "
-        f"Pictures: {', '.join(str(p) for p in summary.pictures)}"
+        f"Pictures: {', '.join(map(str, summary.pictures))}"
     )
     rows = [
         row._asdict() | {"recalls": {f"R@{k}": v for k, v in row.recalls.items()}}
         for row in summary.rows
     ]
-    return {
-        "out": str(arguments.out),
-        "rows": rows,
-        "seconds": summary.seconds,
-        "training_seconds": summary.training_seconds,
-        "pictures": [str(picture) for picture in summary.pictures],
-    }
+    pictures = [str(picture) for picture in summary.pictures]
+    values = {"out": str(arguments.out), "rows": rows, "pictures": pictures}
+    return summary._asdict() | values

@@ -31,14 +31,7 @@ from crisalad_jax.retrieval.reranking import Reranking, parse_reranking
 from crisalad_jax.utils.files import atomic_path, write_json
 from crisalad_jax.utils.locks import staged_folder
 
-COMMON = (
-    "data weights image-size resize grouping batch-size split images queries radius "
-    "precision pca dtype rerank report out json on-bad-image seeds quiet"
-)
-EXAMPLE = "crisalad evaluate --data pitts30k_test.mat --weights salad --report pitts30k"
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Evaluate(ReadFlags, ModelFlags, SetFlags, TableFlags):
     """Print what a model recalls of an evaluation set under each grouping, and what these leak."""
 

@@ -1,6 +1,5 @@
 """`crisalad export`."""
 
-import dataclasses
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,10 +12,7 @@ if TYPE_CHECKING:
 
     from crisalad_jax.nn.config import ModelConfig
 
-EXAMPLE = "crisalad export --weights salad --out exported"
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Export(ComputeFlags, PluginFlag, JsonFlag):
     """Write a model as a program that runs without this package: StableHLO, ONNX or OpenVINO's."""
 

@@ -1,6 +1,5 @@
 """`crisalad extract`."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any
 
@@ -18,16 +17,7 @@ from crisalad_jax.retrieval.extract import check_extraction, extract
 from crisalad_jax.retrieval.grouping import GROUPINGS
 from crisalad_jax.utils.output import counted
 
-COMMON = (
-    "weights images out image-size resize grouping batch-size runtime compute-dtype root pca "
-    "on-bad-image cluster json quiet"
-)
-EXAMPLE = "crisalad extract --weights salad --images photos --out photos.npy"
-SEVERAL = "quote a pattern, or list the images in a .txt"
-"""What to do in place of several values of --images."""
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Extract(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     """Write a descriptor of every image in a folder, in sorted path order."""
 

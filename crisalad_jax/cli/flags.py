@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import pathlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, dataclass_transform
 
 from crisalad_jax.utils.files import check_folder, check_new_folder, check_target
 
@@ -29,15 +29,24 @@ FOLDER = Target(check=check_folder)
 NEW_FOLDER = Target(check=check_new_folder)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class JsonFlag:
+@dataclass_transform(
+    frozen_default=True, kw_only_default=True, field_specifiers=(dataclasses.field,)
+)
+class Flags:
+    """Base class of flags, whose subclasses become frozen dataclasses."""
+
+    def __init_subclass__(cls) -> None:
+        """Make the class a dataclass."""
+        dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+
+
+class JsonFlag(Flags):
     """Where the result goes as JSON."""
 
     json: Annotated[pathlib.Path | None, Target((".json",))] = None
     """File for the result as JSON; - prints it."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class TableFlags(JsonFlag):
     """Where a result with tables goes."""
 
@@ -45,23 +54,20 @@ class TableFlags(JsonFlag):
     """File for the tables as LaTeX (package booktabs); - prints them."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PluginFlag:
+class PluginFlag(Flags):
     """Where custom parts come from."""
 
     plugin: tuple[str, ...] = ()
     """Files FILE.py or modules that register custom parts or models; their code is run."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class QuietFlag:
+class QuietFlag(Flags):
     """Whether progress is shown."""
 
     quiet: bool = False
     """No progress bars."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class DecodeFlags(PluginFlag, QuietFlag):
     """How large an image may be."""
 
@@ -71,7 +77,6 @@ class DecodeFlags(PluginFlag, QuietFlag):
     """Number of images described together."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ReadFlags(DecodeFlags):
     """How images are read."""
 
@@ -86,8 +91,7 @@ class ReadFlags(DecodeFlags):
         return Reading(batch_size=self.batch_size, on_bad_image=self.on_bad_image, quiet=self.quiet)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ClusterFlag:
+class ClusterFlag(Flags):
     """Where the work is done."""
 
     cluster: str | None = None
@@ -95,8 +99,7 @@ class ClusterFlag:
     (docs/how-to/ray.md)."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FrameFlags:
+class FrameFlags(Flags):
     """Which frames of videos and robot logs are taken."""
 
     fps: float | None = None
@@ -105,8 +108,7 @@ class FrameFlags:
     """Topic of images in a robot log (ROS bag), by default the only one."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SizeFlags:
+class SizeFlags(Flags):
     """At which size images are described, and how they get it."""
 
     image_size: tuple[int, int] | None = None
@@ -121,7 +123,6 @@ class SizeFlags:
         return config.resized(self.image_size, self.resize)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ComputeFlags(SizeFlags):
     """At which size and in which type images are described."""
 
@@ -136,7 +137,6 @@ class ComputeFlags(SizeFlags):
         return super().applied_to(config)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelFlags(ComputeFlags, QuietFlag):
     """Which model describes images, and how."""
 
@@ -151,8 +151,19 @@ class ModelFlags(ComputeFlags, QuietFlag):
     """Check all files against their checksums; --no-checksums skips that, where they are huge."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PositionFlags:
+class MapFlags(Flags):
+    """Which map is asked, and by which model."""
+
+    map: pathlib.Path
+    """Folder that `crisalad index` wrote."""
+    weights: pathlib.Path | None = None
+    """The model that made the map, as a file or a published name; by default where it was then."""
+    checksums: bool = True
+    """Check the map's descriptors, and an exported model, against their checksums; --no-checksums
+    skips that, where files are huge."""
+
+
+class PositionFlags(Flags):
     """Where images were taken."""
 
     positions: pathlib.Path | None = None
@@ -166,7 +177,6 @@ class PositionFlags:
     is two hours ahead of UTC."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class PlaceFlags(PositionFlags):
     """Where images were taken, and how far from each other they have to be."""
 
@@ -175,8 +185,7 @@ class PlaceFlags(PositionFlags):
     without a position are taken."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SetFlags:
+class SetFlags(Flags):
     """Which evaluation set, and what is a positive."""
 
     data: pathlib.Path

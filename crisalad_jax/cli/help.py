@@ -1,7 +1,6 @@
 """The help of a command: the flags that people use, or all of them.
 
-A command's module names those of `--help` in `COMMON`, in their order and with spaces between them,
-and shows one call in `EXAMPLE`. Without `COMMON` all flags are common.
+commands.toml names those of `--help`, and has an example.
 """
 
 import argparse
@@ -9,7 +8,7 @@ import re
 import shutil
 import textwrap
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from crisalad_jax.config.flags import plain_metavar
@@ -52,12 +51,12 @@ def flags_parser(kind: type, program: str) -> argparse.ArgumentParser:
     return parser
 
 
-def short_help(name: str, module: Any, kind: type) -> str:
+def short_help(name: str, about: Mapping[str, str], kind: type) -> str:
     """Write the help that fits a screen: usage, summary, common flags and an example.
 
     Args:
         name: the command's.
-        module: the command's.
+        about: what commands.toml says of it.
         kind: the class that its flags are parsed into.
     """
     actions = flags_parser(kind, f"crisalad {name}")._actions
@@ -69,12 +68,12 @@ def short_help(name: str, module: Any, kind: type) -> str:
     shown = argparse.ArgumentParser(
         usage=" ".join(["crisalad", name, *map(_heading, required), "[FLAGS]"]),
         description=(kind.__doc__ or "").partition("\n\n")[0],
-        epilog=f"example: {module.EXAMPLE}\nall flags: crisalad {name} {ALL}",
+        epilog=f"example: {about['example']}\nall flags: crisalad {name} {ALL}",
         add_help=False,
         formatter_class=lambda prog: _Formatter(prog, max_help_position=_COLUMN, width=width),
     )
     group = shown.add_argument_group()
-    for flag in getattr(module, "COMMON", " ".join(named)).split():
+    for flag in about.get("common", " ".join(named)).split():
         group._add_action(named[flag])
     return shown.format_help().rstrip()
 

@@ -1,10 +1,9 @@
 """`crisalad index`."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any, Literal
 
-from crisalad_jax.cli.common import echo, given_positions, open_flagged, pick
+from crisalad_jax.cli.common import echo, first_of, given_positions, open_flagged, pick
 from crisalad_jax.cli.flags import (
     FOLDER,
     ClusterFlag,
@@ -20,16 +19,7 @@ from crisalad_jax.retrieval.maps.build import Indexed, index
 from crisalad_jax.retrieval.maps.metadata import model_config, read_metadata, weights_of
 from crisalad_jax.utils.output import counted
 
-COMMON = (
-    "images out weights fps positions every-metres novelty store dtype pca search image-size "
-    "resize batch-size runtime compute-dtype on-bad-image cluster json quiet"
-)
-EXAMPLE = "crisalad index --weights salad --images photos --positions gps.csv --out map"
-SEVERAL = "quote a pattern; other folders are added by the same command again"
-"""What to do in place of several values of --images."""
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Index(ReadFlags, ClusterFlag, FrameFlags, ModelFlags, PlaceFlags, JsonFlag):
     """Make a map of a folder of images, or append to it those that it lacks.
 
@@ -89,28 +79,22 @@ def run(arguments: Index) -> dict[str, Any]:
 
 def _words(result: Indexed, config: ModelConfig) -> list[str]:
     """Describe the images' fates in clauses; empty groups are left out."""
-    metadata, unmatched = result.metadata, result.unmatched
-    words = [f"{counted(result.added, 'image')} added, {result.positions} with positions"]
-    if result.there:
-        words.append(f"{result.there} were there already")
-    if result.removed:
-        words.append(f"{result.removed} were removed from the map and stay out (--again adds them)")
-    if result.stay:
-        words.append(f"{result.stay} positions given are of such, and stay as they are")
-    if result.near:
-        words.append(f"{result.near} nearer than --every-metres left out")
-    if result.similar:
-        words.append(f"{result.similar} more similar than --novelty left out")
-    if unmatched:
-        words.append(
-            f"{len(unmatched)} positions given are of no image here, {unmatched[0]!r} the first"
-        )
-    if result.unreadable:
-        words.append(
-            f"{len(result.unreadable)} unreadable left out, {result.unreadable[0]} the first"
-        )
+    metadata, unmatched, unreadable = result.metadata, result.unmatched, result.unreadable
+    fates = (
+        (result.there, "were there already"),
+        (result.removed, "were removed from the map and stay out (--again adds them)"),
+        (result.stay, "positions given are of such, and stay as they are"),
+        (result.near, "nearer than --every-metres left out"),
+        (result.similar, "more similar than --novelty left out"),
+        (len(unmatched), f"positions given are of no image here, {first_of(unmatched)}"),
+        (len(unreadable), f"unreadable left out, {first_of(unreadable)}"),
+    )
     length, store = metadata.length_words, metadata.store
-    words.append(f"{counted(result.images, 'descriptor')} of {length} ({store})")
+    words = [
+        f"{counted(result.added, 'image')} added, {result.positions} with positions",
+        *(f"{count} {fate}" for count, fate in fates if count),
+        f"{counted(result.images, 'descriptor')} of {length} ({store})",
+    ]
     if result.recall is not None:
         words.append(
             f"approximate search finds {100 * result.recall:.1f} % of the exact {NEIGHBOURS} "

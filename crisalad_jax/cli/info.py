@@ -11,10 +11,7 @@ from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.training.summary import model_summary, summary_json, summary_lines
 
-EXAMPLE = "crisalad info --preset b14"
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Info(SizeFlags, PluginFlag, TableFlags):
     """Print what a model is made of: parameters, what trains, multiply-accumulates an image."""
 

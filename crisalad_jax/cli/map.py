@@ -2,7 +2,6 @@
 
 import bisect
 import collections
-import dataclasses
 import itertools
 import pathlib
 from collections.abc import Sequence
@@ -12,6 +11,7 @@ import tyro
 
 from crisalad_jax.cli.common import (
     echo,
+    first_of,
     given_positions,
     open_flagged,
     pick,
@@ -34,14 +34,7 @@ from crisalad_jax.retrieval.maps.map import Map as OpenMap
 from crisalad_jax.retrieval.maps.metadata import existing_metadata, model_config, weights_of
 from crisalad_jax.utils.output import counted
 
-COMMON = (
-    "action map what names addition day images fps positions weights batch-size runtime "
-    "on-bad-image json quiet"
-)
-EXAMPLE = "crisalad map remove corridor.map 'monday/*'"
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):
     """List what is in a map, remove, replace or move some of its images, or merge maps.
 
@@ -77,19 +70,14 @@ class Map(ReadFlags, ModelFlags, PositionFlags, JsonFlag):
     """With replace: frames a second taken of a video, by default 1."""
 
 
-_OF = {
-    "names": ("list",),
-    "addition": ("list", "remove"),
-    "day": ("list", "remove"),
-    "store": ("merge",),
-    "images": ("replace",),
-    "fps": ("replace",),
-    "weights": ("replace",),
-    "positions": ("move",),
-    "start_time": ("move",),
-    "time_offset": ("move",),
+_FLAGS = {
+    "list": ("names", "addition", "day"),
+    "remove": ("addition", "day"),
+    "replace": ("images", "fps", "weights"),
+    "move": ("positions", "start_time", "time_offset"),
+    "merge": ("store",),
 }
-"""Which actions a flag is for."""
+"""The flags of each action that not all of them have."""
 
 
 def needs_jax(arguments: Map) -> bool:
@@ -100,8 +88,8 @@ def needs_jax(arguments: Map) -> bool:
 def run(arguments: Map) -> dict[str, Any]:
     """List or change the map."""
     action = f"map {arguments.action}"
-    others = [name for name, actions in _OF.items() if arguments.action not in actions]
-    refuse_with(action, **pick(arguments, *others))
+    others = {*itertools.chain(*_FLAGS.values())} - {*_FLAGS[arguments.action]}
+    refuse_with(action, **pick(arguments, *sorted(others)))
     if arguments.action in ("replace", "move"):
         require(not arguments.what, f"{action}: found {arguments.what[:1]}, expected no names")
     if arguments.action == "list":
@@ -170,34 +158,30 @@ _CHANGES = {
     "move": _move,
     "merge": lambda given: merge_maps(given.map, *given.what, store=given.store, quiet=given.quiet),
 }
-_DONE = {"remove": "removed", "replace": "replaced", "move": "moved", "merge": "added"}
-_THERE = {
-    "remove": "were removed before",
-    "replace": "have not changed",
-    "move": "have these positions already",
-    "merge": "were there already",
+_DONE = {
+    "remove": ("removed", "were removed before"),
+    "replace": ("replaced", "have not changed"),
+    "move": ("moved", "have these positions already"),
+    "merge": ("added", "were there already"),
 }
+"""Words for images that an action changed, and for those that it had no need to."""
 
 
 def _words(change: MapChange, action: str) -> list[str]:
     """Describe what became of the images in clauses; empty groups are left out."""
-    words = [f"{counted(len(change.names), 'image')} {_DONE[action]}"]
-    if not change.names:
-        words = ["nothing to do"]
-    if change.there:
-        words.append(f"{change.there} {_THERE[action]}")
-    if change.stay_out:
-        words.append(f"{change.stay_out} were removed from this map and stay out")
-    if change.unmatched:
-        words.append(
-            f"{len(change.unmatched)} are not in the map, {change.unmatched[0]!r} the first"
-        )
-    if change.unreadable:
-        words.append(
-            f"{len(change.unreadable)} unreadable stay as they were, {change.unreadable[0]!r} the "
-            "first"
-        )
-    words.append(f"{counted(change.images, 'image')} now")
+    done, there = _DONE[action]
+    unmatched, unreadable = change.unmatched, change.unreadable
+    fates = (
+        (change.there, there),
+        (change.stay_out, "were removed from this map and stay out"),
+        (len(unmatched), f"are not in the map, {first_of(unmatched)}"),
+        (len(unreadable), f"unreadable stay as they were, {first_of(unreadable)}"),
+    )
+    words = [
+        f"{counted(len(change.names), 'image')} {done}" if change.names else "nothing to do",
+        *(f"{count} {fate}" for count, fate in fates if count),
+        f"{counted(change.images, 'image')} now",
+    ]
     if change.stale_search is not None:
         kind = change.stale_search
         words.append(f"searched exactly until `crisalad index --search {kind}` builds it again")

@@ -15,10 +15,7 @@ from crisalad_jax.cli.flags import PluginFlag, TableFlags
 from crisalad_jax.cli.tables import fact_lines, models_table
 from crisalad_jax.utils.files import user_cache
 
-EXAMPLE = "crisalad models salad"
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Models(PluginFlag, TableFlags):
     """List the models that others published, which --weights takes by name, or describe one."""
 

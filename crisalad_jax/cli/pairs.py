@@ -1,7 +1,6 @@
 """`crisalad pairs`."""
 
 import contextlib
-import dataclasses
 import pathlib
 import tempfile
 from typing import Annotated, Any
@@ -13,16 +12,7 @@ from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.pairs import check_rules, image_pairs
 from crisalad_jax.utils.output import counted
 
-COMMON = (
-    "map images out root k min-similarity min-gap overlap within weights fps runtime batch-size "
-    "on-bad-image json quiet"
-)
-EXAMPLE = "crisalad pairs --images photos --out pairs.txt --k 10"
-SEVERAL = "quote a pattern, or make a map of all (`crisalad index`)"
-"""What to do in place of several values of --images."""
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Pairs(ReadFlags, JsonFlag):
     """Choose pairs of images to match, for COLMAP and hloc.
 

@@ -14,10 +14,7 @@ from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.descriptor_files import MADE_BY, open_npy, read_record
 from crisalad_jax.retrieval.pca import SAMPLES, PcaConfig, fit_pca, save_pca, shortened
 
-EXAMPLE = "crisalad pca --descriptors photos.npy --dim 512 --out pca.safetensors"
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Pca(JsonFlag, QuietFlag):
     """Fit principal components to descriptors, for shorter ones (extract, evaluate --pca)."""
 

@@ -1,6 +1,5 @@
 """`crisalad publish`."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any
 
@@ -10,10 +9,7 @@ from crisalad_jax.cli.common import echo
 from crisalad_jax.cli.flags import JsonFlag, PluginFlag, QuietFlag
 from crisalad_jax.experiments.publish import publish
 
-EXAMPLE = "crisalad publish runs/b14 --to hf://me/b14 --licence apache-2.0"
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Publish(JsonFlag, PluginFlag, QuietFlag):
     """Write a run's model with a model card, to a folder or to Hugging Face's hub."""
 

@@ -1,7 +1,6 @@
 """`crisalad query`."""
 
 import contextlib
-import dataclasses
 import importlib
 import pathlib
 import sys
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from crisalad_jax.cli.common import STDOUT, echo, find_given, pick, refuse_with, refuse_without
-from crisalad_jax.cli.flags import FrameFlags, JsonFlag, ReadFlags, RuntimeName, Target
+from crisalad_jax.cli.flags import FrameFlags, JsonFlag, MapFlags, ReadFlags, RuntimeName, Target
 from crisalad_jax.config.checks import require
 from crisalad_jax.data.live import Camera, FolderWatch
 from crisalad_jax.retrieval.maps.answer_files import (
@@ -42,15 +41,7 @@ _COLUMNS = 8
 """Largest number of answers to each query in a gallery."""
 
 
-COMMON = (
-    "images map watch camera fps window weights k min-similarity sequence verify json out gallery "
-    "rerun map-images batch-size on-bad-image quiet"
-)
-EXAMPLE = "crisalad query new.jpg --map map --json -"
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Query(ReadFlags, FrameFlags, JsonFlag):
+class Query(ReadFlags, FrameFlags, MapFlags, JsonFlag):
     """Find the images of a map that are most similar to others, and say where they were taken."""
 
     images: Annotated[
@@ -59,8 +50,6 @@ class Query(ReadFlags, FrameFlags, JsonFlag):
     """Images, or folders of them, patterns, lists, tables, videos or robot logs
     (docs/how-to/image-sources.md).
     None with --watch and --camera."""
-    map: pathlib.Path
-    """Folder that `crisalad index` wrote."""
     watch: pathlib.Path | None = None
     """Folder: answer the images that appear in it as they appear, a line of JSON each."""
     camera: str | None = None
@@ -71,8 +60,6 @@ class Query(ReadFlags, FrameFlags, JsonFlag):
     """Frames a second taken of a video or log, by default 1; the most that --camera answers."""
     window: int = 1
     """Frames described together, each with those just before it: a moving camera's."""
-    weights: pathlib.Path | None = None
-    """The model that made the map, as a file or a published name; by default where it was then."""
     runtime: RuntimeName = "jax"
     """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
     for it once; --weights may be an exported folder."""
@@ -122,9 +109,6 @@ class Query(ReadFlags, FrameFlags, JsonFlag):
     """Of the camera that took the map's images, if that was another one."""
     map_depth: pathlib.Path | None = None
     """Folder of PNGs of 16 bits: depth of the map's images in millimetres, under their names."""
-    checksums: bool = True
-    """Check the map's descriptors, and an exported model, against their checksums; --no-checksums
-    skips that, where files are huge."""
 
 
 def needs_jax(arguments: Query) -> bool:

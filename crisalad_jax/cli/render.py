@@ -16,10 +16,7 @@ from crisalad_jax.synthetic import (
 )
 from crisalad_jax.utils.output import counted
 
-EXAMPLE = "crisalad render --out world --scenes 2400"
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Render(JsonFlag, QuietFlag):
     """Render a world of streets, corridors and country: places to train on, and others to test."""
 

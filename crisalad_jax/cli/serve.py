@@ -1,29 +1,22 @@
 """`crisalad serve`."""
 
-import dataclasses
 import os
 import pathlib
 import re
 
 from crisalad_jax.cli.common import echo, find_given, refuse_without
-from crisalad_jax.cli.flags import DecodeFlags
+from crisalad_jax.cli.flags import DecodeFlags, MapFlags
 from crisalad_jax.retrieval.serve import serve_map
 from crisalad_jax.retrieval.verification.verify import Verify
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import read_text
 
 _LOCAL = re.compile(r"local(?::([1-9][0-9]{0,2}))?")
-EXAMPLE = "crisalad serve --map corridor.map --port 8000"
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Serve(DecodeFlags):
+class Serve(DecodeFlags, MapFlags):
     """Answer over HTTP, and in a browser, where photographs were taken."""
 
-    map: pathlib.Path
-    """Folder that `crisalad index` wrote."""
-    weights: pathlib.Path | None = None
-    """The model that made the map, as a file or a published name; by default where it was then."""
     host: str = "127.0.0.1"
     """Name or address to listen at; others than this machine's own need a token."""
     port: int = 8000
@@ -48,9 +41,6 @@ class Serve(DecodeFlags):
     """Bytes that a request may have."""
     max_pixels: int = 2**26
     """Pixels that a picture may have; larger ones are not decoded."""
-    checksums: bool = True
-    """Check the map's descriptors against their checksums; --no-checksums skips that, where files
-    are huge."""
 
 
 def run(arguments: Serve) -> None:

@@ -1,6 +1,5 @@
 """`crisalad train`."""
 
-import dataclasses
 import os
 import pathlib
 import re
@@ -22,15 +21,7 @@ from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.errors import InputError
 
-COMMON = (
-    "data out place-radius place-frames val weights backbone preset recipe config image-size "
-    "epochs seed places-per-batch images-per-place optimiser.learning-rate trainable "
-    "model.aggregator on-bad-image json"
-)
-EXAMPLE = "crisalad train --data gsv --out runs/a --val pitts30k_val.mat --backbone dinov2-vitb14"
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Train(JsonFlag, PluginFlag, QuietFlag):
     """Train on places, each with several images; go on with the run if OUT holds one."""
 
@@ -224,9 +215,8 @@ def run(arguments: Train) -> dict[str, Any] | None:
         validation_images=arguments.val_images,
         **pick(arguments, "place_radius", "place_frames", "positions", "fps", "topic"),
         **pick(arguments, "weights", "backbone", "on_bad_image", "num_threads", "shard_state"),
-        cache_gb=arguments.cache_gb,
+        **pick(arguments, "cache_gb", "quiet"),
         callbacks=arguments.callback,
-        quiet=arguments.quiet,
         say=lambda line: console.print(line, soft_wrap=True),
     )
     out, words, best = arguments.out, [f"{result.steps} steps"], None

@@ -1,6 +1,5 @@
 """`crisalad vocabulary`."""
 
-import dataclasses
 import pathlib
 from typing import Annotated, Any
 
@@ -9,19 +8,7 @@ from crisalad_jax.cli.flags import WEIGHTS, FrameFlags, JsonFlag, ReadFlags, Siz
 from crisalad_jax.nn.model import Model
 from crisalad_jax.training.vocabulary import IMAGES, build_vocabulary, start_vocabulary
 
-COMMON = (
-    "images out weights backbone preset aggregator clusters image-size max-images batch-size "
-    "on-bad-image seed json quiet"
-)
-EXAMPLE = (
-    "crisalad vocabulary --images photos --backbone dinov2-vitg14 --preset "
-    "g14 --out anyloc.safetensors"
-)
-SEVERAL = "quote a pattern, or list the images in a .txt"
-"""What to do in place of several values of --images."""
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Vocabulary(ReadFlags, FrameFlags, SizeFlags, JsonFlag):
     """Build AnyLoc's vocabulary from images, or words of SIFT or ORB: a model; or NetVLAD's."""
 

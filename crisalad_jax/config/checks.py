@@ -6,7 +6,7 @@ import inspect
 import math
 import os
 import types
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import (
     Annotated,
     Any,
@@ -55,12 +55,13 @@ def require(condition: bool, message: str) -> None:
 
 
 def check_seed(what: str, seed: int) -> None:
-    """Check that a seed draws other numbers than every other one: JAX drops higher bits.
+    """Check a seed, as `Seed` does.
 
     Raises:
-        InputError: it is negative, or has more than 32 bits.
+        InputError: it is not a whole number, negative, or has more than 32 bits.
     """
-    require(0 <= seed < 2**32, f"{what}: found {seed}, expected at least 0, and less than 2**32")
+    allowed = kind_of(Seed)
+    require(allowed.fits(seed), f"{what}: found {seed!r}, expected {allowed.words}")
 
 
 def check_count(what: str, count: Any) -> None:
@@ -163,9 +164,19 @@ class Kind(NamedTuple):
     """The type, for a message."""
 
 
+def limited(least: float, most: float = math.inf) -> Kind:
+    """Return a range, both ends included, for the annotation of a number."""
+    words = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
+    return Kind(lambda value: least <= value <= most, words)
+
+
 # Types of fields whose numbers have a range. To all but `check_types` they are int and float.
 PositiveInt = Annotated[int, Kind(lambda value: value >= 1, "a whole number of at least 1")]
 NonNegativeInt = Annotated[int, Kind(lambda value: value >= 0, "a whole number of at least 0")]
+# JAX drops higher bits, and such a seed would draw the numbers of another one.
+Seed = Annotated[int, Kind(lambda value: 0 <= value < 2**32, "at least 0, and less than 2**32")]
+NonNegativeFloat = Annotated[float, limited(0)]
+Share = Annotated[float, limited(0, 1)]
 PositiveFloat = Annotated[
     float, Kind(lambda value: 0 < value < math.inf, "a finite number above 0")
 ]
@@ -216,26 +227,7 @@ def require_field(config: object, name: str, holds: bool, expected: str) -> None
     require(holds, f"{type(config).__name__}.{name}: found {found!r}, expected {expected}")
 
 
-def require_range(config: object, least: float, most: float, *names: str) -> None:
-    """Check that fields are from `least` to `most`, both included."""
-    limits = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
-    _require_each(config, names, lambda value: least <= value <= most, limits)
-
-
-def require_positive(config: object, *names: str) -> None:
-    """Check that fields, of whose types `check_types` takes care, are positive and finite."""
-    _require_each(config, names, lambda value: 0 < value < math.inf, "more than 0, and finite")
-
-
-def require_fraction(config: object, *names: str) -> None:
-    """Check that fields are at least 0 and less than 1."""
-    _require_each(config, names, lambda value: 0 <= value < 1, "at least 0 and less than 1")
-
-
-def _require_each(
-    config: object, names: Iterable[str], is_fit: Callable[[Any], bool], expected: str
-) -> None:
-    for name in names:
-        value = getattr(config, name)
-        # Where None is a value, it stands for no limit.
-        require_field(config, name, value is None or is_fit(value), expected)
+def require_range(config: object, least: float, most: float, name: str) -> None:
+    """Check a field against a range, both ends included, that other settings decide."""
+    allowed = limited(least, most)
+    require_field(config, name, allowed.fits(getattr(config, name)), allowed.words)

@@ -282,8 +282,8 @@ def parse_settings(kind: type, program: str, arguments: Sequence[str], defaults:
     """Parse a command's flags, with one for every field of a configuration and of its parts.
 
     Args:
-        kind: the command's class; its field `settings` takes the configuration. A field
-            `image_size` replaces the model's.
+        kind: the command's class, whose subclasses become dataclasses. Its field `settings` takes
+            the configuration, and a field `image_size` replaces the model's.
         program: the command's name, for messages.
         arguments: the command line's.
         defaults: the configuration that flags start from.
@@ -311,9 +311,5 @@ def with_settings(kind: type, arguments: Sequence[str], defaults: Any) -> type:
     """
     default = flags_of(defaults, arguments, find_flag(arguments, "--preset") or "b14")
     hint = Annotated[type(default), tyro.conf.arg(name="")]
-    field = ("settings", hint, dataclasses.field(default=default))
-    made = dataclasses.make_dataclass(
-        kind.__name__, [field], frozen=True, bases=(kind,), kw_only=True
-    )
-    made.__doc__ = kind.__doc__
-    return made
+    members = {"__doc__": kind.__doc__, "__annotations__": {"settings": hint}, "settings": default}
+    return type(kind.__name__, (kind,), members)

@@ -135,26 +135,21 @@ def differences(found: Any, expected: Any, prefix: str = "") -> list[str]:
     """
     if dataclasses.is_dataclass(found) and type(found) is type(expected):
         fields = min(fields_in_use(found), fields_in_use(expected), key=len)
-        return [
-            line
-            for field in fields
-            for line in differences(
-                getattr(found, field.name), getattr(expected, field.name), f"{prefix}.{field.name}"
-            )
-        ]
-    if found == expected:
+        pairs = [(f.name, getattr(found, f.name), getattr(expected, f.name)) for f in fields]
+    elif found == expected:
         return []
-    if isinstance(found, tuple) and isinstance(expected, tuple):
-        names, others = (
-            [getattr(each, NAME, None) for each in each_of] for each_of in (found, expected)
-        )
-        if names == others and all(names):
-            return [
-                line
-                for name, one, other in zip(names, found, expected, strict=True)
-                for line in differences(one, other, f"{prefix}.{name}")
-            ]
-    return [f"{prefix.removeprefix('.')}: found {_word(found)}, expected {_word(expected)}"]
+    elif (names := _names(found)) and names == _names(expected):
+        both: Any = found, expected
+        pairs = zip(names, *both, strict=True)
+    else:
+        return [f"{prefix.removeprefix('.')}: found {_word(found)}, expected {_word(expected)}"]
+    return [line for name, a, b in pairs for line in differences(a, b, f"{prefix}.{name}")]
+
+
+def _names(value: Any) -> list[str]:
+    """Return the names of the configurations in a tuple, if all have one."""
+    names = [getattr(each, NAME, "") for each in value] if isinstance(value, tuple) else []
+    return names if all(names) else []
 
 
 def _word(value: Any) -> Any:

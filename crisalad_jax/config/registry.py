@@ -262,6 +262,16 @@ def resolve_names(config: Any) -> None:
             object.__setattr__(config, field.name, part)
 
 
+def with_arguments(*offered: str) -> Callable[[Callable[..., Any]], Mapping[str, Any]]:
+    """Return a registry's `of_function` for parts whose method `apply` takes these arguments."""
+
+    def methods(function: Callable[..., Any]) -> Mapping[str, Any]:
+        count = count_arguments(function, *offered)
+        return {"apply": lambda self, *given, **_: function(*given[:count])}
+
+    return methods
+
+
 def count_arguments(function: Callable[..., Any], *offered: str) -> int:
     """Return how many of the offered arguments, in their order, a plain function takes.
 

@@ -104,7 +104,7 @@ def _write(value: Any, width: float) -> str:
     """Write a value in a line of this width, or else in one for each field, or item of a tuple."""
     name, parts = type(value).__qualname__, _fields
     if isinstance(value, tuple) and type(value).__repr__ is tuple.__repr__:
-        name, parts = "", _items
+        name, parts = "", lambda values, each: (_write(item, each) for item in values)
     elif type(value).__repr__ is not concise_repr:
         return repr(value)
     line = f"{name}({', '.join(parts(value, math.inf))})"
@@ -126,11 +126,6 @@ def _fields(value: Any, width: float) -> Iterator[str]:
             yield f"{name}={each.part_name!r}"
         else:
             yield f"{name}={_write(each, width - len(name) - 1)}"
-
-
-def _items(values: tuple[Any, ...], width: float) -> Iterator[str]:
-    """Write the items of a tuple."""
-    return (_write(each, width) for each in values)
 
 
 def _short(value: Any) -> str:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.data.metres import continuous, to_metres
 from crisalad_jax.data.places import Places
@@ -64,6 +65,22 @@ def views_of(places: Places) -> Views:
     return Views(city, east, north, heading % 360, known)
 
 
+def known_views(places: Places, what: str, *, headings: bool) -> Views:
+    """Return the views of images that all have a position, and with `headings` a heading too.
+
+    Raises:
+        InputError: some have none, and `what` needs them; or what `views_of` raises.
+    """
+    views = views_of(places)
+    needed, column = ("headings, or no positions", ",heading") if headings else ("positions", "")
+    require(
+        bool(views.known.all() and not (headings and np.isnan(views.heading).any())),
+        f"{places.root}: found no {needed}, or one position for all images of a city, expected a "
+        f"table name,place,lat,lon{column} or the layout of GSV-Cities, for {what}",
+    )
+    return views
+
+
 class Class(NamedTuple):
     """The images of one class; an image may be of no class."""
 
@@ -110,15 +127,10 @@ def class_groups(
 
 def find_classes(places: Places, config: ClassesConfig, min_images: int) -> list[list[Class]]:
     """Make the sets of classes: one, or the lateral and the frontal one."""
-    views = views_of(places)
     if config.kind == "places":
-        return [_place_classes(places, views, config, min_images)]
-    if np.isnan(views.heading).any() or not views.known.all():
-        raise InputError(
-            f"{places.root}: found no headings, or no positions, or one position for all images of "
-            "a city, expected a table name,place,lat,lon,heading or the layout of GSV-Cities, for "
-            f"loss.kind.classes.kind {config.kind!r}{_ADVICE}"
-        )
+        return [_place_classes(places, views_of(places), config, min_images)]
+    what = f"loss.kind.classes.kind {config.kind!r}{_ADVICE}"
+    views = known_views(places, what, headings=True)
     if config.kind == "cells":
         return [cell_classes(views, config, min_images)]
     return focal_classes(views, config, min_images)

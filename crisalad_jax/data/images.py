@@ -134,10 +134,10 @@ def read_pixels(
     if frame is None:
         return decode_image(read_bytes(path, "an image file"), path, enough=enough)
     if frame.topic is None:
-        return read_frame(path)
-    from crisalad_jax.data.logs import read_log_frame  # which decodes by this module
+        return read_frame(frame)
+    from crisalad_jax.data.logs import open_log  # which decodes by this module
 
-    return read_log_frame(path, enough=enough)
+    return open_log(frame.file).read(frame.topic, frame.nanoseconds, enough=enough)
 
 
 def decode_image(

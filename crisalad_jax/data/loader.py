@@ -4,7 +4,6 @@ import collections
 import contextlib
 import dataclasses
 import itertools
-import math
 import os
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 import cv2
 import numpy as np
 
-from crisalad_jax.config.checks import check_count, check_types, require_range, takes
+from crisalad_jax.config.checks import NonNegativeInt, check_count, check_types, takes
 from crisalad_jax.config.preprocessing import PreprocessingConfig
 from crisalad_jax.config.short_repr import brief, with_field_docs
 from crisalad_jax.data.images import OnBadImage, read_pixels
@@ -143,7 +142,7 @@ class Reading:
     """Number of images described together."""
     on_bad_image: OnBadImage = "stop"
     """"stop" at an unreadable image, or "skip" it."""
-    threads: int = THREADS
+    threads: NonNegativeInt = THREADS
     """Number of threads that decode ahead; 0 decodes in the caller's thread."""
     cache: ImageCache | None = None
     """Cache of decoded images."""
@@ -154,7 +153,6 @@ class Reading:
         """Check the fields."""
         check_types(self)
         check_count("batch size", self.batch_size)
-        require_range(self, 0, math.inf, "threads")
 
     def fitted(self, images: int) -> Self:
         """Return a smaller batch size where the batches of so few images would be mostly padding.
@@ -306,30 +304,14 @@ def training_batches(
     from crisalad_jax.data.samplers.base import SAMPLERS, epoch_batches, labels_of
 
     sampler = SAMPLERS.resolve(sampler, "sampler")
+    size: Any = {"places_per_batch": places_per_batch, "images_per_place": images_per_place}
     chosen = epoch_batches(
-        places,
-        sampler=sampler,
-        places_per_batch=places_per_batch,
-        images_per_place=images_per_place,
-        seed=seed,
-        epoch=epoch,
-        steps=steps,
-        describe=describe,
+        places, sampler=sampler, seed=seed, epoch=epoch, steps=steps, describe=describe, **size
     )
-    return batches_of_groups(
-        places,
-        chosen,
-        labels_of(places, sampler, chosen),
-        image_size=image_size,
-        preprocessing=preprocessing,
-        augmentation=augmentation,
-        seed=(seed, epoch),
-        start_step=start_step,
-        part=part,
-        on_bad_image=on_bad_image,
-        threads=threads,
-        cache=cache,
-    )
+    how: Any = {"image_size": image_size, "preprocessing": preprocessing, "seed": (seed, epoch)}
+    how |= {"augmentation": augmentation, "start_step": start_step, "part": part}
+    how |= {"on_bad_image": on_bad_image, "threads": threads, "cache": cache}
+    return batches_of_groups(places, chosen, labels_of(places, sampler, chosen), **how)
 
 
 def batches_of_groups(

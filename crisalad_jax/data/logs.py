@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from crisalad_jax.data.frames import LOG_SUFFIXES, FrameName, parse_frame, sampled, stored_bytes
+from crisalad_jax.data.frames import LOG_SUFFIXES, FrameName, sampled, stored_bytes
 from crisalad_jax.data.images import decode_image
 from crisalad_jax.data.positions import AXES, Positions
 from crisalad_jax.data.tracks import Track
@@ -40,28 +40,21 @@ _OPEN = 2
 """Number of logs that stay open between frames."""
 _FAR = 30 * 10**9
 """Nanoseconds ahead from which opening a log there beats reading all that is between."""
-_BGR, _BGRA = cv2.COLOR_BGR2RGB, cv2.COLOR_BGRA2RGB
 _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "rgb8": ("u1", 3, None),
-    "bgr8": ("u1", 3, _BGR),
     "rgba8": ("u1", 4, cv2.COLOR_RGBA2RGB),
-    "bgra8": ("u1", 4, _BGRA),
-    "mono8": ("u1", 1, None),
-    "mono16": ("u2", 1, None),
     "rgb16": ("u2", 3, None),
-    "bgr16": ("u2", 3, _BGR),
+    "bgr16": ("u2", 3, cv2.COLOR_BGR2RGB),
+    **dict.fromkeys(("bgr8", "8UC3"), ("u1", 3, cv2.COLOR_BGR2RGB)),
+    **dict.fromkeys(("bgra8", "8UC4"), ("u1", 4, cv2.COLOR_BGRA2RGB)),
+    **dict.fromkeys(("mono8", "8UC1"), ("u1", 1, None)),
+    **dict.fromkeys(("mono16", "16UC1"), ("u2", 1, None)),
     "bayer_rggb8": ("u1", 1, cv2.COLOR_BayerRGGB2RGB),
     "bayer_bggr8": ("u1", 1, cv2.COLOR_BayerBGGR2RGB),
     "bayer_gbrg8": ("u1", 1, cv2.COLOR_BayerGBRG2RGB),
     "bayer_grbg8": ("u1", 1, cv2.COLOR_BayerGRBG2RGB),
-    "yuv422": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
-    "uyvy": ("u1", 2, cv2.COLOR_YUV2RGB_UYVY),
-    "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
-    "yuyv": ("u1", 2, cv2.COLOR_YUV2RGB_YUY2),
-    "8UC1": ("u1", 1, None),
-    "8UC3": ("u1", 3, _BGR),
-    "8UC4": ("u1", 4, _BGRA),
-    "16UC1": ("u2", 1, None),
+    **dict.fromkeys(("yuv422", "uyvy"), ("u1", 2, cv2.COLOR_YUV2RGB_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), ("u1", 2, cv2.COLOR_YUV2RGB_YUY2)),
     "32FC1": ("f4", 1, None),
 }
 """Type of a value, values of a pixel, and OpenCV's conversion to RGB."""
@@ -429,22 +422,8 @@ def decode_message(
         raise InputError(f"{name}: found {' '.join(error.err.split())}") from error
 
 
-def read_log_frame(
-    path: str | os.PathLike[str], *, enough: tuple[int, int] | None = None
-) -> np.ndarray:
-    """Read the image of a log's frame, in the depth that the log has; see `read_pixels`.
-
-    Raises:
-        InputError: no log, or no such frame in it.
-    """
-    frame = parse_frame(path)
-    assert frame is not None
-    assert frame.topic is not None
-    return open_log(frame.file).read(frame.topic, frame.nanoseconds, enough=enough)
-
-
-def name_log_frame(path: pathlib.Path) -> pathlib.Path:
-    """Name a log's frame by its own stamp: the first at or after the time in `path`.
+def name_log_frame(frame: FrameName) -> pathlib.Path:
+    """Name a log's frame by its own stamp: the first at or after the frame's time.
 
     Returns:
         The name. A time behind the last frame stays, for the reader to report.
@@ -452,8 +431,6 @@ def name_log_frame(path: pathlib.Path) -> pathlib.Path:
     Raises:
         InputError: the log cannot be read, or has no such topic.
     """
-    frame = parse_frame(path)
-    assert frame is not None
     log = open_log(frame.file)
     stamps = log.stamps(log.image_topic(frame.topic))
     at = int(np.searchsorted(stamps, frame.nanoseconds))

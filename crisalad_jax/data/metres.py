@@ -63,22 +63,18 @@ class Zone(NamedTuple):
         return east, north + _FALSE_NORTH * self.south
 
 
-def continuous(longitude: Float64[np.ndarray, " point"]) -> Float64[np.ndarray, " point"]:
+def continuous(longitude: _Points) -> _Points:
     """Make longitudes continuous where they lie on both sides of 180 degrees."""
     return longitude[0] + (longitude - longitude[0] + 180) % 360 - 180
 
 
-def to_metres(
-    latitude: Float64[np.ndarray, " point"], longitude: Float64[np.ndarray, " point"]
-) -> tuple[Float64[np.ndarray, " point"], Float64[np.ndarray, " point"]]:
+def to_metres(latitude: _Points, longitude: _Points) -> tuple[_Points, _Points]:
     """Compute east and north in the zone of the median longitude; longitudes are `continuous`."""
     central = 6 * np.floor(np.median(longitude) / 6) + 3
     return transverse_mercator(latitude, longitude - central)
 
 
-def transverse_mercator(
-    latitude: Float64[np.ndarray, " point"], longitude: Float64[np.ndarray, " point"]
-) -> tuple[Float64[np.ndarray, " point"], Float64[np.ndarray, " point"]]:
+def transverse_mercator(latitude: _Points, longitude: _Points) -> tuple[_Points, _Points]:
     """Compute UTM's east and north in metres; north is negative in the south.
 
     Args:

@@ -248,7 +248,7 @@ class _Frames(NamedTuple):
             if not (file.is_dir() and is_log(file)):
                 check_source(file, expected)
             if frame is not None:
-                paths.append(name_frame(path) if frame.topic is None else name_log_frame(path))
+                paths.append(name_frame(frame) if frame.topic is None else name_log_frame(frame))
             elif is_video(path):
                 frames = list_frames(path, rate)
                 taken, there = taken + len(frames), there + count_frames(path)

@@ -14,7 +14,7 @@ import threading
 import cv2
 import numpy as np
 
-from crisalad_jax.data.frames import VIDEO_SUFFIXES, frame_name, parse_frame, sampled
+from crisalad_jax.data.frames import VIDEO_SUFFIXES, FrameName, frame_name, sampled
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import check_source
 from crisalad_jax.utils.shapes import UInt8
@@ -65,11 +65,11 @@ def count_frames(video: str | os.PathLike[str]) -> int:
     return len(_video(video).times)
 
 
-def name_frame(path: pathlib.Path) -> pathlib.Path:
+def name_frame(frame: FrameName) -> pathlib.Path:
     """Name a frame by its own time: of a time between two, the frame that `read_frame` reads.
 
     Args:
-        path: the name of a frame of a video.
+        frame: of a video.
 
     Returns:
         The name. A time behind the video's last frame stays, for the reader to tell.
@@ -77,8 +77,6 @@ def name_frame(path: pathlib.Path) -> pathlib.Path:
     Raises:
         InputError: the video is missing or does not decode.
     """
-    frame = parse_frame(path)
-    assert frame is not None
     times, wanted = _video(frame.file).times, frame.milliseconds
     at = bisect.bisect_left(times, wanted)
     return pathlib.Path(frame_name(frame.file, times[at] if at < len(times) else wanted))
@@ -156,7 +154,7 @@ def _as_of(file: str, size: int, changed: int) -> _Video:
     return _Video(file)
 
 
-def read_frame(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
+def read_frame(frame: FrameName) -> UInt8[np.ndarray, "h w 3"]:
     """Read a frame as 8-bit RGB, upright: the first one at or after the time in its name.
 
     Frames are read in order of time without seeking, so one thread should read a video.
@@ -164,11 +162,9 @@ def read_frame(path: str | os.PathLike[str]) -> UInt8[np.ndarray, "h w 3"]:
     Raises:
         InputError: no video, or no such frame in it.
     """
-    frame = parse_frame(path)
-    assert frame is not None
     video = _video(frame.file)
     with _lock:
         image = video.read(frame.milliseconds)
     if image is None:
-        raise InputError(f"{path}: found no frame there, expected a time in the video")
+        raise InputError(f"{frame}: found no frame there, expected a time in the video")
     return image

@@ -10,7 +10,6 @@ import jax
 
 from crisalad_jax.checkpoints.load import load
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.config.checks import check_types
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 from crisalad_jax.data.benchmarks import open_benchmark
 from crisalad_jax.data.places import read_places
@@ -49,10 +48,6 @@ class DemoConfig:
     train_places: int = 240
     test_places: int = 150
     epochs: int = 18
-
-    def __post_init__(self) -> None:
-        """Check the types."""
-        check_types(self)
 
 
 class DemoSummary(NamedTuple):

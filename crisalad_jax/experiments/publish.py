@@ -19,7 +19,7 @@ from crisalad_jax.config.io import read_config, to_plain
 from crisalad_jax.data.benchmarks.on_disk import listing
 from crisalad_jax.evaluation.metrics import bootstrap_interval
 from crisalad_jax.evaluation.results import percent
-from crisalad_jax.experiments.tables import Cell, Table, write_text
+from crisalad_jax.experiments.tables import NOTHING, Cell, Table, write_text
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.run_files import DATA
@@ -34,8 +34,7 @@ from crisalad_jax.utils.version import VERSION
 WEIGHTS = ("best.safetensors", "last.safetensors")
 """Files of a run's weights; the first that is there is published."""
 CARD, CONFIG = "README.md", "config.json"
-_LIBRARY = "crisalad-jax"
-_TAGS = ["visual-place-recognition", "image-retrieval", "geo-localization", "jax"]
+_TEMPLATE = "card.md"
 
 
 @takes(run=PATH)
@@ -98,7 +97,7 @@ def publish(
             folder = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
         shutil.copyfile(found.weights, folder / HUB_FILE)
         model = to_plain(found.config.model)
-        about = {"library_name": _LIBRARY, "version": VERSION, "model": model}
+        about = {"library_name": "crisalad-jax", "version": VERSION, "model": model}
         write_json(folder / CONFIG, about | {"training": to_plain(found.config)})
         write_text(folder / CARD, card)
         if address is None:
@@ -123,6 +122,13 @@ class _Row(NamedTuple):
     how: str
     recalls: Mapping[str, float]
     intervals: Mapping[str, Sequence[float]]
+
+    def cell(self, name: str) -> Cell:
+        """Format a recall, with its interval where that is known."""
+        if name not in self.recalls:
+            return Cell(NOTHING)
+        ends = "-".join(map(percent, self.intervals.get(name, ())))
+        return Cell(percent(self.recalls[name]), f"[{ends}]" if ends else "")
 
 
 def _read_run(run: pathlib.Path) -> _Run:
@@ -158,9 +164,8 @@ def _validation(run: _Run) -> Iterator[_Row]:
     intervals = {}
     if known is not None:
         for name, value in recalls.items():
-            hits = np.zeros(known["queries"], np.int64)
-            hits[: round(value * known["queries"])] = 1
-            intervals[name] = list(bootstrap_interval(hits))
+            hits = np.arange(known["queries"]) < round(value * known["queries"])
+            intervals[name] = list(bootstrap_interval(hits.astype(np.int64)))
     name = known["name"] if known is not None else "the run's validation set"
     yield _Row(name, f"validation at step {chosen['step']:,}, single", recalls, intervals)
 
@@ -194,60 +199,27 @@ def _rows(file: str | os.PathLike[str], run: _Run) -> Iterator[_Row]:
 
 def _card(run: _Run, rows: Sequence[_Row], *, name: str, licence: str, data: str | None) -> str:
     """Write the model card: a YAML header for the hub, and a page for people."""
-    config = run.config
-    short = name.rpartition("/")[2].partition("@")[0]
-    header: dict[str, Any] = {
-        "license": licence,
-        "library_name": _LIBRARY,
-        "pipeline_tag": "image-feature-extraction",
-        "tags": _TAGS,
-    }
-    if rows:
-        header["model-index"] = [{"name": short, "results": [_result(row) for row in rows]}]
-    # JSON is YAML too, and quotes all that a name may hold.
-    lines = [f"{key}: {json.dumps(value)}" for key, value in header.items()]
-    losses = dict.fromkeys(each.loss.kind.part_name for each in config.alone)
-    optimiser = config.optimiser
-    parts = [
-        ["---", *lines, "---", "", f"# {short}"],
-        [
-            "A model for visual place recognition: it makes a descriptor of an image, and images "
-            f"of one place have similar ones. Written by crisalad-jax {VERSION}."
-        ],
-        ["## Use", "", "```python", *_example(name), "```"],
-        [f"`pip install 'crisalad-jax[data]'` installs all that this needs. {_limits(config)}"],
-        ["## Model", "", f"- {model_words(config.model)}", f"- {config.model.images_in_words}"],
-        ["## Training", "", f"- Data: {data or _data_words(run.data)}."],
-        ["## Recalls", "", _table(rows)],
-        ["## Licence", "", f"The weights: {licence}. The package is under Apache-2.0."],
-    ]
-    parts[5] += [
-        f"- Loss: {', '.join(losses)}; optimiser {optimiser.kind.part_name}, learning rate "
-        f"{optimiser.learning_rate:g}, schedule {optimiser.schedule.part_name}.",
-        f"- Batches: {config.places_per_batch} places of {config.images_per_place} images; "
-        f"{counted(config.epochs, 'epoch')}; seed {config.seed}; trained: {config.trainable}.",
-        f"- `{CONFIG}` has all settings.",
-    ]
-    return "\n\n".join("\n".join(part) for part in parts) + "\n"
-
-
-def _example(name: str) -> list[str]:
-    return [
-        "import crisalad_jax as cj",
-        "",
-        f'model = cj.load("{name}")',
-        'found = cj.extract(model, "photos", "descriptors.npy")  # a folder of images',
-        "print(cj.search(found.descriptors, found.descriptors, 2).indices)  # who is like whom",
-    ]
-
-
-def _limits(config: TrainConfig) -> str:
+    config, short = run.config, name.rpartition("/")[2].partition("@")[0]
+    limits = "A descriptor depends on its own image alone."
     if config.model.cross_image.attends:
-        return (
+        limits = (
             "Its descriptors depend on the images that are described together "
             "(`docs/evaluation.md`): the recalls below say how they were grouped."
         )
-    return "A descriptor depends on its own image alone."
+    # JSON is YAML too, and quotes all that a name may hold.
+    index = json.dumps([{"name": short, "results": [_result(row) for row in rows]}])
+    page = pathlib.Path(__file__).with_name(_TEMPLATE).read_text(encoding="utf-8")
+    return page.format(
+        quoted=json.dumps(licence),
+        index=f"\nmodel-index: {index}" if rows else "",
+        losses=", ".join(dict.fromkeys(each.loss.kind.part_name for each in config.alone)),
+        epochs=counted(config.epochs, "epoch"),
+        model=model_words(config.model),
+        data=data or _data_words(run.data),
+        recalls=_table(rows),
+        version=VERSION,
+        **{"config": config, "name": name, "short": short, "licence": licence, "limits": limits},
+    )
 
 
 def _data_words(data: Mapping[str, Any] | None) -> str:
@@ -266,31 +238,13 @@ def _table(rows: Sequence[_Row]) -> str:
     if not rows:
         return "The run has no validation, and no evaluation was given."
     names = sorted({name for row in rows for name in row.recalls}, key=lambda n: int(n[2:]))
-    cells = [
-        [
-            Cell(row.benchmark),
-            Cell(row.how),
-            *(
-                Cell(percent(row.recalls[name]), _interval(row, name))
-                if name in row.recalls
-                else Cell("-")
-                for name in names
-            ),
-        ]
-        for row in rows
-    ]
+    cells = [[Cell(each.benchmark), Cell(each.how), *map(each.cell, names)] for each in rows]
     table = Table(["data set", "grouping", *names], cells, labels=2).markdown()
     return (
         f"{table}\nPercent of all queries; in brackets the 95 % interval by bootstrap over the "
         "queries, as if they were independent. A validation chose the weights: its recalls are "
         "high by that."
     )
-
-
-def _interval(row: _Row, name: str) -> str:
-    if name not in row.intervals:
-        return ""
-    return f"[{'-'.join(percent(end) for end in row.intervals[name])}]"
 
 
 def _result(row: _Row) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import os
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from crisalad_jax.config.checks import PATH, takes
 from crisalad_jax.data.file_cache import CACHE_GB
@@ -90,23 +91,12 @@ def train(
         >>> train(config, places, folder / "run", quiet=True).steps
         2
     """
-    places, benchmark, initial = read_inputs(
-        config,
-        data,
-        out,
-        images=images,
-        validation=validation,
-        validation_images=validation_images,
-        weights=weights,
-        backbone=backbone,
-        on_bad_image=on_bad_image,
-        quiet=quiet,
-        place_radius=place_radius,
-        place_frames=place_frames,
-        positions=positions,
-        fps=fps,
-        topic=topic,
-    )
+    how: Any = {"on_bad_image": on_bad_image, "quiet": quiet}
+    sets: Any = {"images": images, "validation": validation, "validation_images": validation_images}
+    start: Any = {"weights": weights, "backbone": backbone}
+    grouping: Any = {"place_radius": place_radius, "place_frames": place_frames}
+    grouping |= {"positions": positions, "fps": fps, "topic": topic}
+    places, benchmark, initial = read_inputs(config, data, out, **sets, **start, **how, **grouping)
     if (weights, backbone) == (None, None) and config.trainable != "all":
         say(
             "Note: no --weights or --backbone, so the frozen part of the model "
@@ -127,12 +117,11 @@ def train(
         out,
         validation=benchmark,
         initial=initial,
-        on_bad_image=on_bad_image,
         num_threads=num_threads,
         shard_state=shard_state,
         cache_gb=cache_gb,
         callbacks=callbacks,
-        quiet=quiet,
+        **how,
     )
     if is_primary() and result.steps:
         out = pathlib.Path(out)

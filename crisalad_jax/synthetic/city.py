@@ -4,10 +4,11 @@ import dataclasses
 import math
 import os
 from collections.abc import Iterator
+from typing import Annotated
 
 import numpy as np
 
-from crisalad_jax.config.checks import check_seed, check_types, require_range
+from crisalad_jax.config.checks import PositiveInt, Seed, check_types, limited
 from crisalad_jax.synthetic.layouts import (
     Files,
     Shot,
@@ -41,20 +42,17 @@ _HOURS: tuple[Time, ...] = ("noon", "dusk", "night", "noon")
 class SyntheticCityConfig:
     """Size and seed of a synthetic city."""
 
-    train_places: int = 240
+    train_places: Annotated[int, limited(len(_CITY_NAMES))] = 240
     """Number of training places with four images each, divided between the two training cities."""
-    test_places: int = 150
+    test_places: PositiveInt = 150
     """Number of test places, each with one image in the database and one query."""
     image_size: tuple[int, int] = (126, 168)
     """Height and width in pixels."""
-    seed: int = 0
+    seed: Seed = 0
 
     def __post_init__(self) -> None:
         """Check the types and ranges."""
         check_types(self)
-        require_range(self, len(_CITY_NAMES), math.inf, "train_places")
-        require_range(self, 1, math.inf, "test_places")
-        check_seed("SyntheticCityConfig.seed", self.seed)
         check_size("SyntheticCityConfig.image_size", self.image_size)
 
     @property

@@ -2,12 +2,12 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
 
-from crisalad_jax.config.checks import check_types, require, require_range
+from crisalad_jax.config.checks import check_types, limited, require
 
 Season = Literal["spring", "summer", "autumn", "winter"]
 Time = Literal["noon", "dusk", "night"]
@@ -26,6 +26,7 @@ PITCH = 8.0
 """Degrees by which it looks up."""
 NEAR = 0.4
 """Metres from the camera to the plane behind which nothing is seen."""
+Repaint = Annotated[float, limited(0, 3)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,9 +43,9 @@ class View:
     """Metres from the ground to the camera."""
     pitch: float = PITCH
     """Degrees by which it looks up."""
-    field: float = 80.0
+    field: Annotated[float, limited(10, 150)] = 80.0
     """Degrees from its left border to the right."""
-    repaint: float = 0.0
+    repaint: Repaint = 0.0
     """Standard deviation of a change of every part's log colour: other paint, other light."""
     season: Season = "summer"
     time: Time = "noon"
@@ -53,17 +54,14 @@ class View:
     """Seed of the cars, buses and people in the street; None leaves it empty."""
     exposure: float = 0.0
     """Exposure in stops."""
-    noise: float = 0.0
+    noise: Annotated[float, limited(0, 255)] = 0.0
     """Standard deviation of the sensor noise, in grey levels of 255."""
     seed: int = 0
     """Seed of the sun's position, clouds, rain, lit windows, white balance and noise."""
 
     def __post_init__(self) -> None:
-        """Check the types and ranges."""
+        """Check the fields."""
         check_types(self)
-        require_range(self, 0, 255, "noise")
-        require_range(self, 0, 3, "repaint")
-        require_range(self, 10, 150, "field")
 
 
 def check_size(what: str, size: Sequence[int]) -> None:

@@ -1,14 +1,13 @@
 """A world to learn from: streets, corridors and country, in the layouts of real sets."""
 
 import dataclasses
-import math
 import os
 from collections.abc import Iterator, Sequence
 from typing import Literal, get_args
 
 import numpy as np
 
-from crisalad_jax.config.checks import check_seed, check_types, require, require_range
+from crisalad_jax.config.checks import PositiveInt, Seed, check_types, require
 from crisalad_jax.synthetic.layouts import (
     Files,
     Shot,
@@ -25,6 +24,7 @@ from crisalad_jax.synthetic.view import (
     SEASONS,
     TIMES,
     WEATHERS,
+    Repaint,
     Scenery,
     View,
     check_size,
@@ -51,30 +51,27 @@ _SPACING = 100.0
 class WorldConfig:
     """Size and seed of a world."""
 
-    scenes: int = 2400
+    scenes: PositiveInt = 2400
     """Scenes to train on, of streets, corridors and country in turn."""
-    stations: int = 4
+    stations: PositiveInt = 4
     """Places of a scene, one behind the other: they look alike."""
-    images_per_place: int = 4
-    test_scenes: int = 100
+    images_per_place: PositiveInt = 4
+    test_scenes: PositiveInt = 100
     """Other scenes, with two images of each station: one to find and one to ask with."""
     image_size: tuple[int, int] = (120, 160)
     """Height and width in pixels."""
     sceneries: tuple[Scenery, ...] = SCENERIES
-    repaint: float = 0.3
+    repaint: Repaint = 0.3
     """Largest `View.repaint`."""
     varied: tuple[Variation, ...] = VARIATIONS
     """What changes between the training images of a place. The rest is as in a plain `View`, the
     stand as the scene's camera. Test images change in all of these."""
-    seed: int = 0
+    seed: Seed = 0
 
     def __post_init__(self) -> None:
         """Check the types and ranges."""
         check_types(self)
-        require_range(self, 1, math.inf, "scenes", "stations", "images_per_place", "test_scenes")
-        require_range(self, 0, 3, "repaint")
         require(bool(self.sceneries), "WorldConfig.sceneries: found none, expected at least one")
-        check_seed("WorldConfig.seed", self.seed)
         check_size("WorldConfig.image_size", self.image_size)
 
     @property

@@ -8,11 +8,15 @@ from typing import Any, Literal
 import numpy as np
 
 from crisalad_jax.config.checks import (
-    check_seed,
+    Fraction,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    Seed,
+    check_types,
     require,
     require_field,
-    require_fraction,
-    require_positive,
     require_range,
 )
 from crisalad_jax.config.part import OrName
@@ -41,35 +45,32 @@ class OptimiserConfig:
     kind: OrName[Optimiser] = part_field(OPTIMISERS, "adamw")
     """A registered optimiser or its name, or one of optax by its dotted name, such as
     optax.contrib.muon."""
-    learning_rate: float = 6e-5
+    learning_rate: PositiveFloat = 6e-5
     """Learning rate at its highest: after the warm-up, before it falls."""
     schedule: OrName[Schedule] = part_field(SCHEDULES, "linear")
     """How the learning rate changes after the warm-up; a registered schedule, or its name."""
-    warmup_steps: int = 0
+    warmup_steps: NonNegativeInt = 0
     """Steps of a linear warm-up, of which the last is at the learning rate."""
-    warmup_epochs: int = 0
+    warmup_epochs: NonNegativeInt = 0
     """The same in epochs, in place of `warmup_steps`."""
-    weight_decay: float = 0.01
+    weight_decay: NonNegativeFloat = 0.01
     """Torch's default for AdamW; the paper names none. An optimiser without a weight decay of its
     own gets it through its gradient, as torch's Adam and SGD."""
-    clip_norm: float | None = None
+    clip_norm: PositiveFloat | None = None
     """Largest norm of the whole gradient."""
-    clip_value: float | None = None
+    clip_value: PositiveFloat | None = None
     """Largest absolute value of each number of the gradient, after `clip_norm`."""
-    accumulate: int = 1
+    accumulate: PositiveInt = 1
     """Number of batches whose gradients are averaged for one step of the optimiser. The steps above
     are these. As in Lightning, the last batch of an epoch steps too; the sum of the gradients that
     are left is divided by the same number."""
-    ema: float | None = None
+    ema: Fraction | None = None
     """Decay of an exponential moving average of the weights, such as 0.999, in a step of the
     optimiser; validations and saved weights are of the average. None has no average."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
         resolve_names(self)
-        require_positive(self, "learning_rate", "accumulate", "clip_norm", "clip_value")
-        require_range(self, 0, math.inf, "warmup_steps", "warmup_epochs", "weight_decay")
-        require_fraction(self, "ema")
         one, steps = not (self.warmup_steps and self.warmup_epochs), self.warmup_steps
         require_field(self, "warmup_epochs", one, f"0 with warmup_steps {steps}")
 
@@ -92,26 +93,25 @@ class MiningConfig:
     """What is described: nothing, for training sets of places; the "whole" database, of which each
     query draws candidates of its own, and keeps its last negatives among them (NetVLAD); or a
     "sample" of candidates for all queries of the round, and their positives (MSLS)."""
-    negatives: int = 10
+    negatives: PositiveInt = 10
     """Negatives of a tuple, the nearest of the candidates."""
-    candidates: int = 1000
+    candidates: PositiveInt = 1000
     """Number of database images that are drawn for the negatives."""
-    queries_per_round: int = 1000
+    queries_per_round: PositiveInt = 1000
     """Most queries of a round; the queries of an epoch make rounds of equal size."""
-    queries_per_epoch: int | None = None
+    queries_per_epoch: PositiveInt | None = None
     """Queries of an epoch, drawn anew for each round; None takes every query at most once."""
     positive_radius: float = 10.0
     """Metres within which a database image is a query's positive."""
     negative_radius: float = 25.0
     """Metres within which a database image is no negative."""
-    margin: float | None = None
+    margin: PositiveFloat | None = None
     """Only negatives enter that are at most so much farther than the positive; None takes the
     hardest in any case."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
-        require_positive(self, "negatives", "candidates", "queries_per_round")
-        require_positive(self, "queries_per_epoch", "margin")
+        check_types(self)
         require_range(self, self.negatives, math.inf, "candidates")
         fits = 0 < self.positive_radius <= self.negative_radius < math.inf
         most = f"negative_radius ({self.negative_radius})"
@@ -135,15 +135,14 @@ class MixtureSet:
     """Which of its places make a sub-batch; a registered sampler, or its name."""
     loss: LossConfig = LossConfig()
     """Loss of the sub-batch, of pairs within it alone."""
-    share: int = 1
+    share: PositiveInt = 1
     """Part of the batch's places, relative to the other sets' shares."""
-    weight: float = 1.0
+    weight: PositiveFloat = 1.0
     """Factor of its loss in the sum of all."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
         resolve_names(self)
-        require_positive(self, "share", "weight")
         is_name = self.name.isidentifier() and self.name.isascii()
         require_field(self, "name", is_name, "letters, digits and underscores")
 
@@ -176,9 +175,9 @@ class TrainConfig:
     ones as they are and normalises by them (`eval()`)."""
     augmentation: OrName[Augmentation] = part_field(AUGMENTATIONS, "rand-augment")
     """How training images are changed; a registered augmentation, or its name."""
-    places_per_batch: int = 48
+    places_per_batch: PositiveInt = 48
     """Number of places in a batch; where the loss classifies, of classes."""
-    images_per_place: int = 4
+    images_per_place: PositiveInt = 4
     """Number of images of each of them."""
     micro_batch: int | None = None
     """So many images' activations are in memory at a time: a step takes less of it and a forward
@@ -197,29 +196,26 @@ class TrainConfig:
     their sub-batch. An epoch is one of the first set."""
     cities: tuple[str, ...] | None = None
     """Which cities; None takes all."""
-    epochs: int = 8
+    epochs: PositiveInt = 8
     """Passes over the training set; more than a run in the folder has extend it. The paper
     converged within five, and stopped after three without gain."""
-    validate_every: int = 1
+    validate_every: PositiveInt = 1
     """Epochs from one validation to the next."""
     validation_size: tuple[int, int] | None = None
     """Height and width that validations resize to; None is the model's. The model that is saved has
     its own."""
     monitor: Literal["R@1", "R@5", "R@1+R@5"] = "R@5"
     """Recall of a validation that tells which weights are the best."""
-    patience: int | None = 3
+    patience: PositiveInt | None = 3
     """Validations without a better recall after which training stops; None never stops early."""
-    save_top_k: int = 1
+    save_top_k: PositiveInt = 1
     """So many validations' weights are kept, those of the best recall."""
-    seed: int = 0
+    seed: Seed = 0
     """Draws weights, batches and augmentations."""
 
     def __post_init__(self) -> None:
         """Check the ranges of the fields."""
         resolve_names(self)
-        require_positive(self, "places_per_batch", "images_per_place", "epochs")
-        require_positive(self, "validate_every", "save_top_k", "patience")
-        check_seed("TrainConfig.seed", self.seed)
         self._check_mixture()
         loss, images, accumulate = self.loss.kind, self.images_per_place, self.optimiser.accumulate
         batch, size = self.places_per_batch * images, 2 + self.mining.negatives

@@ -5,12 +5,16 @@ The warm-up comes before them and is the same for all (`optimiser.learning_rate_
 
 import abc
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Any, ClassVar, NamedTuple
 
-from crisalad_jax.config.checks import PositiveFloat, PositiveInt, require_field, require_range
+from crisalad_jax.config.checks import (
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    require_field,
+)
 from crisalad_jax.config.part import Part
 from crisalad_jax.config.registry import Registry, count_arguments
 from crisalad_jax.config.short_repr import brief
@@ -86,14 +90,10 @@ class ConstantSchedule(Schedule):
 class _Decay(Schedule):
     """A decay to a share of the learning rate."""
 
-    end_fraction: float = 0.0
+    end_fraction: NonNegativeFloat = 0.0
     """Share of the learning rate that is left at the end."""
     decay_steps: PositiveInt | None = None
     """Length of the decay, after which the learning rate stays; None is the whole run."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_range(self, 0, math.inf, "end_fraction")
 
     @property
     def spans_run(self) -> bool:

@@ -124,8 +124,8 @@ POSITIONAL = {
 def test_help_lists_every_command_and_flag(capfd):
     out = succeeds(capfd, "--help")
     assert succeeds(capfd, "help") == out
-    for command, summary in crisalad_jax.cli._COMMANDS.items():
-        assert f"{command} {summary}" in out
+    for command, about in crisalad_jax.cli._COMMANDS.items():
+        assert f"{command} {about['summary']}" in out
         help_text = succeeds(capfd, command, "--help-all")
         module = importlib.import_module(f"crisalad_jax.cli.{command}")
         for field in dataclasses.fields(getattr(module, command.capitalize())):

@@ -32,6 +32,10 @@ from tests.conftest import BATCH, MODEL, RECIPE, STEPS
 COMMANDS = list(crisalad_jax.cli._COMMANDS)
 
 
+def example_of(command):
+    return shlex.split(crisalad_jax.cli._COMMANDS[command]["example"].partition(" >")[0])[1:]
+
+
 def module_of(command):
     return importlib.import_module(f"crisalad_jax.cli.{command}")
 
@@ -108,7 +112,7 @@ def test_help_is_short_and_tells_of_an_example_that_parses(capfd, monkeypatch, c
     assert max(map(len, lines[:-3])) <= 100
     assert lines[-1] == f"all flags: crisalad {command} --help-all"
     module = module_of(command)
-    _, verb, *given = shlex.split(module.EXAMPLE.partition(" >")[0])
+    verb, *given = example_of(command)
     assert verb == command
     assert crisalad_jax.cli._parse(command, module, given) is not None
 
@@ -225,7 +229,7 @@ def test_json_is_never_written_under_the_name_of_another_format(capfd, tmp_path,
     monkeypatch.chdir(tmp_path)
     name = "x.csv"
     for command in set(COMMANDS) - {"completion", "serve"}:
-        _, verb, *given = shlex.split(module_of(command).EXAMPLE.partition(" >")[0])
+        verb, *given = example_of(command)
         given = [each for each in given if each not in ("--json", "-")]
         words = (f"--json: found {name}, expected a name that ends in .json",)
         fails(capfd, verb, *given, "--json", name, words=words)

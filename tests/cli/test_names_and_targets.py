@@ -7,6 +7,7 @@ import shutil
 
 import pytest
 
+import crisalad_jax.cli
 from tests.cli.test_cli import extract, fails, files_in, succeeds
 
 
@@ -61,7 +62,7 @@ def test_every_output_is_checked_before_any_work(capfd, tmp_path, monkeypatch, o
     monkeypatch.setattr(module, "run", lambda _: pytest.fail("the work began"))
     suffix = SUFFIXES.get(output, SUFFIXES.get(flag, ".safetensors"))
     target = os.path.join(folder, f"x{suffix}")
-    example = shlex.split(module.EXAMPLE)[1:]
+    example = shlex.split(crisalad_jax.cli._COMMANDS[verb]["example"])[1:]
     given = [*example[:-1], target] if flag == "DST" else [*example, flag, target]
     fails(capfd, *given, words=(f"crisalad: {target}: cannot be made: found {folder[:5]}, exp",))
     assert files_in(tmp_path) == {"file"}

@@ -36,7 +36,7 @@ def test_a_world_that_is_there_stays_and_another_is_refused_by_what_differs(tmp_
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capfd):
     out = tmp_path / "world"
     for flag, value, words in (
-        ("--scenes", "0", "WorldConfig.scenes: found 0, expected at least 1"),
+        ("--scenes", "0", "WorldConfig.scenes: found 0, expected a whole number of at least 1"),
         ("--repaint", "-1", "WorldConfig.repaint: found -1.0, expected 0 to 3"),
         ("--sceneries", "sea", "sea"),
         ("--varied", "sun", "sun"),

@@ -52,7 +52,7 @@ def test_fields_left_out_take_their_defaults():
         ({"model": {"backbone": VIT | {"dim": "32"}}}, ["'32'", "a whole", "backbone.dim"]),
         ({"model": {"backbone": {"dim": 32}}}, ["None", "config.model.backbone"]),
         ({"epochs": 3.7}, ["3.7", "expected a whole number", "config.epochs"]),
-        ({"epochs": 0}, ["epochs", "expected more than 0"]),
+        ({"epochs": 0}, ["epochs", "expected a whole number of at least 1"]),
         ({"cities": "Rome"}, ["'Rome'", "tuple, each text", "config.cities"]),
         ({"loss": {"pml_compat": "no"}}, ["'no'", "True or False", "loss.pml_compat"]),
         ({"model": {"aggregator": {"name": ["gem"]}}}, ["['gem']", "config.model.aggregator"]),

@@ -264,7 +264,11 @@ def test_views_vary_within_the_place(world):
     [
         (SyntheticCityConfig, {"train_places": 1}, "train_places: found 1, expected at least 2"),
         (SyntheticCityConfig, {"seed": -1}, "seed: found -1, expected at least 0"),
-        (WorldConfig, {"stations": -1}, "WorldConfig.stations: found -1, expected at least 1"),
+        (
+            WorldConfig,
+            {"stations": -1},
+            "WorldConfig.stations: found -1, expected a whole number of at least 1",
+        ),
         (WorldConfig, {"repaint": -0.5}, "WorldConfig.repaint: found -0.5, expected 0 to 3"),
         (WorldConfig, {"varied": ("sun",)}, "WorldConfig.varied: found ('sun',), expected a tuple"),
         (WorldConfig, {"sceneries": ()}, "WorldConfig.sceneries: found none, expected at least"),

@@ -206,9 +206,15 @@ def test_several_batches_share_a_step_and_its_learning_rate(epoch: int) -> None:
         ({"kind": "optax.contrib.jax.jit"}, "expected a function of optax that takes a learning"),
         ({"kind": "optax.lbfgs"}, "optimiser optax.lbfgs: cannot step by a gradient and a sched"),
         ({"warmup_steps": 3, "warmup_epochs": 2}, "warmup_epochs: found 2, expected 0 with"),
-        ({"accumulate": 0}, r"OptimiserConfig\.accumulate: found 0, expected more than 0"),
-        ({"clip_value": 0.0}, r"OptimiserConfig\.clip_value: found 0\.0, expected more than 0"),
-        ({"ema": 1.0}, r"OptimiserConfig\.ema: found 1\.0, expected at least 0 and less than 1"),
+        ({"accumulate": 0}, r"OptimiserConfig\.accumulate: found 0, expected a whole number of"),
+        (
+            {"clip_value": 0.0},
+            r"OptimiserConfig\.clip_value: found 0\.0, expected a finite number above 0",
+        ),
+        (
+            {"ema": 1.0},
+            r"OptimiserConfig\.ema: found 1\.0, expected a number of at least 0 and less than 1",
+        ),
     ],
 )
 def test_optimisers_that_do_not_fit_are_refused(fields, words) -> None:

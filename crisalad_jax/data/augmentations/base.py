@@ -1,36 +1,14 @@
 """Augmentations: random changes of training images, and the interface of a new one."""
 
 import abc
-import dataclasses
-import math
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
 
 import numpy as np
 
-from crisalad_jax.config.checks import require_fraction, require_range
 from crisalad_jax.config.part import Part
-from crisalad_jax.config.registry import Registry, count_arguments
+from crisalad_jax.config.registry import Registry, with_arguments
 from crisalad_jax.utils.shapes import UInt8
 
 Image = UInt8[np.ndarray, "h w 3"]
-_CHECK = "check"
-"""Key of a field's check in its metadata."""
-_Number = TypeVar("_Number", int, float)
-
-
-def from_zero(default: _Number, most: float = math.inf) -> _Number:
-    """Return a field of an augmentation whose value is from 0 to `most`."""
-    return _checked(default, lambda config, name: require_range(config, 0, most, name))
-
-
-def fraction(default: float) -> float:
-    """Return a field of an augmentation whose value is at least 0 and less than 1."""
-    return _checked(default, require_fraction)
-
-
-def _checked(default: Any, check: Callable[[object, str], None]) -> Any:
-    return dataclasses.field(default=default, metadata={_CHECK: check})
 
 
 class Augmentation(Part, abc.ABC):
@@ -47,12 +25,6 @@ class Augmentation(Part, abc.ABC):
         'mirrored'
     """
 
-    def __post_init__(self) -> None:
-        """Check the fields that `from_zero` and `fraction` made."""
-        for field in dataclasses.fields(self):
-            if check := field.metadata.get(_CHECK):
-                check(self, field.name)
-
     @abc.abstractmethod
     def apply(
         self, image: Image, generator: np.random.Generator, *, of_place: np.random.Generator
@@ -66,17 +38,9 @@ class Augmentation(Part, abc.ABC):
         """
 
 
-def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
-    """Return the methods of an augmentation that is a plain function."""
-    count = count_arguments(function, "image", "generator")
-
-    def apply(_: Augmentation, image: Image, generator: np.random.Generator, **__: Any) -> Image:
-        return function(*(image, generator)[:count])
-
-    return {"apply": apply}
-
-
-AUGMENTATIONS = Registry("augmentation", Augmentation, of_function=_of_function)
+AUGMENTATIONS = Registry(
+    "augmentation", Augmentation, of_function=with_arguments("image", "generator")
+)
 
 
 @AUGMENTATIONS.register("none")

@@ -5,7 +5,8 @@ import math
 import cv2
 import numpy as np
 
-from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Image, fraction, from_zero
+from crisalad_jax.config.checks import Fraction, NonNegativeFloat, Share
+from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Image
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
 
 _QUALITY = (12, 85)
@@ -16,22 +17,22 @@ _QUALITY = (12, 85)
 class CameraAugmentConfig(LightAugmentConfig):
     """The light augmentation, and then a cheap camera: for rendered pictures, which lack one."""
 
-    perspective: float = fraction(0.04)
+    perspective: Fraction = 0.04
     """Largest shift of a corner, as a share of the side."""
-    texture: float = from_zero(0.25)
+    texture: NonNegativeFloat = 0.25
     """Largest deviation of a multiplied texture of several scales, which rendered walls lack."""
-    filters: float = from_zero(0.3, 1)
+    filters: Share = 0.3
     """Probability of random filters over all colours, which change textures and keep outlines (Xu
     et al., ICLR 2021)."""
-    occlusion: float = from_zero(0.3, 1)
+    occlusion: Share = 0.3
     """Probability that something covers a part."""
-    motion: float = from_zero(0.2, 1)
+    motion: Share = 0.2
     """Probability of motion blur, of up to a sixteenth of the width."""
-    coarse: float = from_zero(0.3, 1)
+    coarse: Share = 0.3
     """Probability of fewer pixels: down to two fifths of the sides."""
-    noise: float = from_zero(8.0)
+    noise: NonNegativeFloat = 8.0
     """Largest deviation of noise, in grey levels."""
-    jpeg: float = from_zero(0.4, 1)
+    jpeg: Share = 0.4
     """Probability of another JPEG."""
 
     def apply(
@@ -47,12 +48,10 @@ class CameraAugmentConfig(LightAugmentConfig):
         if generator.random() < self.filters:
             image = _filtered(image, generator)
         image = self.change_light(image, generator)
-        if generator.random() < self.occlusion:
-            image = _covered(image, generator)
-        if generator.random() < self.motion:
-            image = _smeared(image, generator)
-        if generator.random() < self.coarse:
-            image = _coarsened(image, generator)
+        changes = (self.occlusion, _covered), (self.motion, _smeared), (self.coarse, _coarsened)
+        for probability, change in changes:
+            if generator.random() < probability:
+                image = change(image, generator)
         if self.noise > 0:
             deviation = generator.uniform(0, self.noise)
             noise = deviation * generator.standard_normal(image.shape, np.float32)

@@ -5,17 +5,13 @@ end.
 """
 
 import math
+from typing import Annotated
 
 import cv2
 import numpy as np
 
-from crisalad_jax.data.augmentations.base import (
-    AUGMENTATIONS,
-    Augmentation,
-    Image,
-    fraction,
-    from_zero,
-)
+from crisalad_jax.config.checks import Fraction, NonNegativeFloat, limited
+from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
 from crisalad_jax.data.resize import resize_image
 from crisalad_jax.utils.shapes import Float32
 
@@ -32,15 +28,15 @@ _Floats = Float32[np.ndarray, "h w 3"]
 class ColourCropConfig(Augmentation):
     """Changes of colour in random order, then a crop at the size of the image (CosPlace)."""
 
-    brightness: float = from_zero(0.7)
+    brightness: NonNegativeFloat = 0.7
     """Largest relative change of brightness."""
-    contrast: float = from_zero(0.7)
+    contrast: NonNegativeFloat = 0.7
     """Largest relative change of contrast."""
-    saturation: float = from_zero(0.7)
+    saturation: NonNegativeFloat = 0.7
     """Largest relative change of saturation."""
-    hue: float = from_zero(0.5, 0.5)
+    hue: Annotated[float, limited(0, 0.5)] = 0.5
     """Largest turn of the hue, of 1 for a whole circle."""
-    crop: float = fraction(0.5)
+    crop: Fraction = 0.5
     """Largest share of the area that a crop removes."""
 
     def apply(

@@ -5,13 +5,8 @@ import math
 import cv2
 import numpy as np
 
-from crisalad_jax.data.augmentations.base import (
-    AUGMENTATIONS,
-    Augmentation,
-    Image,
-    fraction,
-    from_zero,
-)
+from crisalad_jax.config.checks import Fraction, NonNegativeFloat, Share
+from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
 
 # ITU-R BT.601 luma.
 _LUMA = np.array([0.299, 0.587, 0.114])
@@ -21,23 +16,23 @@ _LUMA = np.array([0.299, 0.587, 0.114])
 class LightAugmentConfig(Augmentation):
     """One small warp and mild changes of light, for training from scratch on fixed cameras."""
 
-    crop: float = fraction(0.1)
+    crop: Fraction = 0.1
     """Largest share of the side that a crop removes."""
-    shift: float = fraction(0.05)
+    shift: Fraction = 0.05
     """Largest shift, as a share of the side."""
-    rotation: float = from_zero(2.0)
+    rotation: NonNegativeFloat = 2.0
     """Largest rotation in degrees."""
-    flip: float = from_zero(0.0, 1)
+    flip: Share = 0.0
     """Probability of a mirror image. All images of one place in a batch are mirrored alike."""
-    blur: float = from_zero(1.0)
+    blur: NonNegativeFloat = 1.0
     """Largest standard deviation of a Gaussian blur, in pixels."""
-    colour: float = fraction(0.2)
+    colour: Fraction = 0.2
     """Largest relative change of brightness, of contrast and of saturation."""
-    grey: float = from_zero(0.2, 1)
+    grey: Share = 0.2
     """Probability of dropping the colour."""
-    gamma: float = from_zero(0.0)
+    gamma: NonNegativeFloat = 0.0
     """Largest change of the logarithm of an exponent on intensities."""
-    illumination: float = from_zero(0.0)
+    illumination: NonNegativeFloat = 0.0
     """Largest change of log brightness in a smooth field over the image: uneven light."""
 
     def apply(

@@ -3,13 +3,14 @@
 import functools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
 
-from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image, from_zero
-from crisalad_jax.utils.shapes import Bool, Int64, UInt8
+from crisalad_jax.config.checks import NonNegativeInt, limited
+from crisalad_jax.data.augmentations.base import AUGMENTATIONS, Augmentation, Image
+from crisalad_jax.utils.shapes import Int64, UInt8
 
 MAGNITUDE_BINS = 31
 
@@ -23,8 +24,8 @@ _LEVELS = np.arange(256)
 class RandAugmentConfig(Augmentation):
     """RandAugment (Cubuk et al. 2020), torchvision's 14 operations, GSV-Cities' strength."""
 
-    operations: int = from_zero(3)
-    magnitude: int = from_zero(9, MAGNITUDE_BINS - 1)
+    operations: NonNegativeInt = 3
+    magnitude: Annotated[int, limited(0, MAGNITUDE_BINS - 1)] = 9
     """Which of 31 bins of strength."""
 
     def apply(
@@ -71,20 +72,9 @@ def _shown(height: int, width: int, *matrix: float) -> UInt8[np.ndarray, "height
     """Mark with 1 where `_affine` shows a point of the image (cached: matrices are few)."""
     a, b, c, d, e, f = matrix
     x, y = np.arange(width) + 0.5, np.arange(height)[:, None] + 0.5
-    inside = _inside(a * x + (b * y + c), width) & _inside(d * x + (e * y + f), height)
+    column, row = a * x + (b * y + c), d * x + (e * y + f)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     return inside.astype(np.uint8)
-
-
-def _inside(position: np.ndarray, side: int) -> Bool[np.ndarray, "..."]:
-    return (position >= 0) & (position < side)
-
-
-def _shear_x(image: Image, slope: float) -> Image:
-    return _affine(image, 1.0, slope, 0.0, 0.0, 1.0, 0.0)
-
-
-def _shear_y(image: Image, slope: float) -> Image:
-    return _affine(image, 1.0, 0.0, 0.0, slope, 1.0, 0.0)
 
 
 def _translate_x(image: Image, pixels: float) -> Image:
@@ -194,8 +184,8 @@ def _scaled(most: float) -> Callable[[float, int, int], float]:
 
 OPERATIONS: dict[str, Operation] = {
     "Identity": Operation(lambda image, _: image, _scaled(0), signed=False),
-    "ShearX": Operation(_shear_x, _scaled(0.3), signed=True),
-    "ShearY": Operation(_shear_y, _scaled(0.3), signed=True),
+    "ShearX": Operation(lambda i, s: _affine(i, 1, s, 0, 0, 1, 0), _scaled(0.3), signed=True),
+    "ShearY": Operation(lambda i, s: _affine(i, 1, 0, 0, s, 1, 0), _scaled(0.3), signed=True),
     "TranslateX": Operation(_translate_x, lambda level, _, w: 150 / 331 * w * level, signed=True),
     "TranslateY": Operation(_translate_y, lambda level, h, _: 150 / 331 * h * level, signed=True),
     "Rotate": Operation(_rotate, _scaled(30), signed=True),

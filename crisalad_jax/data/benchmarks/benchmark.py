@@ -1,5 +1,6 @@
 """An evaluation set: database, queries, and which database images are right for a query."""
 
+import contextlib
 import dataclasses
 import math
 import pathlib
@@ -115,11 +116,10 @@ def readable_images(
 
 
 def _is_readable(path: pathlib.Path) -> bool:
-    try:
+    with contextlib.suppress(InputError):
         read_image(path)
-    except InputError:
-        return False
-    return True
+        return True
+    return False
 
 
 DEFAULT_RADIUS = 25.0

@@ -21,7 +21,7 @@ from crisalad_jax.data.remote import is_folder
 from crisalad_jax.data.tables import read_table
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
-from crisalad_jax.utils.shapes import Float, Float64
+from crisalad_jax.utils.shapes import Float64
 
 MSLS_CITIES = {
     "val": ("cph", "sf"),
@@ -91,8 +91,8 @@ def read_msls(
         for query in chosen:
             matches = near[query]
             if limit is not None:
-                turn = heading_difference(there.headings[matches], asked.headings[query])
-                matches = matches[turn <= limit]
+                turn = np.abs(there.headings[matches] - asked.headings[query]) % 360
+                matches = matches[np.minimum(turn, 360 - turn) <= limit]
             positives.append(matches + start)
         database.append(there)
         queries.append(_Side(*(part[chosen] for part in asked)))
@@ -147,14 +147,6 @@ def _positions(sides: list[_Side]) -> Float64[np.ndarray, "images axis"]:
     if len(sides) == 1:
         return sides[0].metres
     return on_ellipsoid(*np.concatenate([side.degrees for side in sides]).T)
-
-
-def heading_difference(
-    first: Float[np.ndarray, " n"], second: Float[np.ndarray, " n"] | float
-) -> Float64[np.ndarray, " n"]:
-    """Compute the angle between two compass angles in degrees, from 0 to 180."""
-    turn = np.abs(np.subtract(first, second, dtype=np.float64)) % 360
-    return np.minimum(turn, 360 - turn)
 
 
 def is_msls(root: pathlib.Path) -> bool:

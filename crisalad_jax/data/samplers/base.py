@@ -3,14 +3,14 @@
 import abc
 import itertools
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.config.part import Part
-from crisalad_jax.config.registry import Registry, count_arguments
+from crisalad_jax.config.registry import Registry, with_arguments
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.places import Places
 from crisalad_jax.utils.errors import InputError
@@ -87,17 +87,7 @@ class Sampler(Part, abc.ABC):
         """
 
 
-def _of_function(function: Callable[..., Any]) -> Mapping[str, Any]:
-    """Return the methods of a sampler that is a plain function."""
-    count = count_arguments(function, "places", "draw")
-
-    def apply(_: Sampler, places: Places, draw: Draw) -> np.ndarray:
-        return function(*(places, draw)[:count])
-
-    return {"apply": apply}
-
-
-SAMPLERS = Registry("sampler", Sampler, of_function=_of_function)
+SAMPLERS = Registry("sampler", Sampler, of_function=with_arguments("places", "draw"))
 
 
 def epoch_batches(

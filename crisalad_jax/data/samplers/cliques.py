@@ -10,8 +10,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from crisalad_jax.config.checks import NonNegativeInt, PositiveFloat, PositiveInt, require
-from crisalad_jax.data.class_groups import Views, views_of
+from crisalad_jax.config.checks import NonNegativeInt, PositiveFloat, PositiveInt
+from crisalad_jax.data.class_groups import Views, known_views, views_of
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.samplers.base import SAMPLERS, Draw, Sampler
 from crisalad_jax.utils.shapes import Float, Int
@@ -39,12 +39,7 @@ class Cliques(Sampler):
         Raises:
             InputError: the images have none.
         """
-        require(
-            bool(views_of(places).known.all()),
-            f"{places.root}: found no positions, or one for all images of a city, expected a table "
-            "name,place,lat,lon, names with positions, or the layout of GSV-Cities, for sampler "
-            f"{self.part_name}",
-        )
+        known_views(places, f"sampler {self.part_name}", headings=False)
 
     def apply(self, places: Places, draw: Draw) -> Int[np.ndarray, "steps places images"]:
         """Return as many batches as would take every place once; fewer where some do not fill."""

@@ -7,9 +7,9 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from crisalad_jax.config.checks import PositiveFloat, PositiveInt, require
+from crisalad_jax.config.checks import PositiveFloat, PositiveInt
 from crisalad_jax.config.classes import ClassesConfig
-from crisalad_jax.data.class_groups import Class, find_classes, views_of
+from crisalad_jax.data.class_groups import Class, find_classes, known_views
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.samplers.base import SAMPLERS, Draw, Sampler
 from crisalad_jax.utils.shapes import Int
@@ -43,13 +43,7 @@ class Viewpoints(Sampler):
         Raises:
             InputError: some have none.
         """
-        views = views_of(places)
-        require(
-            bool(views.known.all()) and not np.isnan(views.heading).any(),
-            f"{places.root}: found no headings, or no positions, or one for all images of a city, "
-            "expected a table name,place,lat,lon,heading or the layout of GSV-Cities, for sampler "
-            f"{self.part_name}",
-        )
+        known_views(places, f"sampler {self.part_name}", headings=True)
 
     def apply(self, places: Places, draw: Draw) -> Int[np.ndarray, "steps places images"]:
         """Return batches that take each class once, but for the rest of each group."""

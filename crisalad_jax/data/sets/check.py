@@ -121,7 +121,8 @@ def _openings(root: pathlib.Path, published: PublishedSet | None) -> Sequence[di
         return [
             {"split": split} | ({} if name == "queries" else {"queries": name})
             for split, folder in (sides or {None: root}).items()
-            for name in _folders_of_queries(folder)
+            for name in sorted(path.name for path in folder.glob(f"{QUERIES}*") if path.is_dir())
+            or [QUERIES]
         ]
     files = sorted({*root.glob("*.mat"), *root.glob("datasets/*.mat")})
     if published is not None:  # the .mat files of Pittsburgh 30k and 250k come together
@@ -130,11 +131,6 @@ def _openings(root: pathlib.Path, published: PublishedSet | None) -> Sequence[di
     if not files and len(lists) > 1:
         files = [root / f"{prefix}dbImages.npy" for prefix in lists]
     return [{"root": file} for file in files] or [{}]
-
-
-def _folders_of_queries(folder: pathlib.Path) -> Sequence[str]:
-    there = sorted(path.name for path in folder.glob(f"{QUERIES}*") if path.is_dir())
-    return there or [QUERIES]
 
 
 def _checked(
@@ -188,7 +184,7 @@ def _differences(
     options: dict[str, Any],
 ) -> list[str]:
     """Say how a benchmark differs from the set that it should be, by its folder's name too."""
-    published = published or _named(folder)
+    published = published or SETS.get(real_path(folder).name.lower().replace("_", "-"))
     parts = () if published is None else published.parts
     split = options.get("split")
     if split is not None:  # of a split that the table does not have nothing is known
@@ -199,12 +195,6 @@ def _differences(
         f"found {len(benchmark.database):,} database images and {len(benchmark.queries):,} queries,"
         f" expected those of {published.name}: {' or '.join(part.words for part in parts)}"
     ]
-
-
-def _named(folder: pathlib.Path) -> PublishedSet | None:
-    """Find the set that a folder's name says, as pitts30k or st_lucia; a name may say nothing."""
-    plain = real_path(folder).name.lower().replace("_", "-")
-    return SETS.get(plain)
 
 
 def _unreadable(paths: Sequence[pathlib.Path], *, quiet: bool) -> list[str]:

@@ -106,7 +106,9 @@ def _bring(published: PublishedSet, work: pathlib.Path, *, quiet: bool) -> None:
         target = files / file.into
         shutil.rmtree(target, ignore_errors=True)
         try:
-            _check_digest(file, archive)
+            if file.sha256 is not None and (found := sha256_of(archive)) != file.sha256:
+                words = f"found SHA-256 {found[:12]}..., expected {file.sha256[:12]}..."
+                raise InputError(f"{archive}: {words}")
             _open(file, archive, target, quiet=quiet)
         except InputError:
             archive.unlink(missing_ok=True)  # what is damaged is downloaded again
@@ -133,13 +135,6 @@ def _rsync(address: str, folder: pathlib.Path, *, quiet: bool) -> None:
     if done.returncode:
         said = (done.stderr.strip().splitlines() or ["no words"])[-1]
         raise InputError(f"{address}: found rsync's code {done.returncode} ({said}), expected 0")
-
-
-def _check_digest(file: SetFile, archive: pathlib.Path) -> None:
-    if file.sha256 is not None and (found := sha256_of(archive)) != file.sha256:
-        raise InputError(
-            f"{archive}: found SHA-256 {found[:12]}..., expected {file.sha256[:12]}..."
-        )
 
 
 def _open(file: SetFile, archive: pathlib.Path, target: pathlib.Path, *, quiet: bool) -> None:

@@ -109,27 +109,12 @@ class AdapterCost(NamedTuple):
     """Memory of the same over that of a block without adapter, as the compiler counts it."""
 
 
-NOTES = (
-    "Table 3 at the paper's size (ViT-B/14, 224 x 224 pixels); docs/comparison.md says what the "
-    "paper counts. Time and memory are of a block in training, over those of one without adapter.",
-)
-
-
 _PAPER_PARAMETERS: Mapping[str, int] = {
     "mlp": 590_976,
     "multi-resolution": 761_472,
     "depthwise": 741_504,
 }
 """By the count that docs/comparison.md explains."""
-
-
-class AdapterMeasurements(NamedTuple):
-    """Measurements of a block of a ViT-B/14 in training, by the name of its adapter."""
-
-    seconds: Mapping[str, Sequence[float]]
-    """What `race` returns of `adapter_calls`."""
-    memory: Mapping[str, int]
-    """Bytes of its activations and gradients."""
 
 
 def adapter_calls() -> dict[str, Callable[[], Callable[[], Any]]]:
@@ -148,11 +133,14 @@ def adapter_memory(names: Iterable[str]) -> dict[str, int]:
     return {name: each.temp_size_in_bytes for name, each in analyses.items() if each is not None}
 
 
-def adapter_costs(measured: AdapterMeasurements) -> list[AdapterCost]:
+def adapter_costs(
+    seconds: Mapping[str, Sequence[float]], memory: Mapping[str, int]
+) -> list[AdapterCost]:
     """Compute Table 3, of one adapter at the paper's size, with rows for all other adapters.
 
     Args:
-        measured: with empty mappings where nothing was measured.
+        seconds: what `race` returns of `adapter_calls`; empty where nothing was measured.
+        memory: what `adapter_memory` returns, or empty.
     """
     costs = []
     for name in (*_PAPER_PARAMETERS, *sorted({*ADAPTERS} - {"none", *_PAPER_PARAMETERS})):
@@ -162,7 +150,6 @@ def adapter_costs(measured: AdapterMeasurements) -> list[AdapterCost]:
         macs = None if paper_parameters is None else paper_adapter_macs(model, true_macs)
         if name == "mlp":  # the paper counts each weight twice here, and the biases
             macs = 2 * (macs or 0) + backbone.dim // 2 + backbone.dim
-        seconds, memory = measured
         time = Spread.of(ratios(seconds, name, "none")) if name in seconds else None
         relative = memory[name] / memory["none"] if name in memory else None
         make = functools.partial(backbone.adapter.init, shape=backbone.block_shape)

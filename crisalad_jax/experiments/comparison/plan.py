@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import math
 import pathlib
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -14,7 +13,7 @@ import numpy as np
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.public import read_backbone
 from crisalad_jax.checkpoints.weights import load_weights
-from crisalad_jax.config.checks import check_types, require_range
+from crisalad_jax.config.checks import PositiveInt, check_types
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.part import parts_of
 from crisalad_jax.config.plugins import source_digest
@@ -76,12 +75,12 @@ class ComparisonConfig:
     backbone: str | None = None
     """Backbone that training starts from; None trains from nothing, by the recipe `scratch`."""
     preset: str = "b14"
-    epochs: int | None = None
+    epochs: PositiveInt | None = None
     """Number of epochs; None is the recipe's, or `EPOCHS` from nothing."""
     image_size: tuple[int, int] | None = None
     resize: tuple[str, ...] = ()
     """Words that change how images are resized, as `ModelConfig.resized` takes them."""
-    batch_size: int = 16
+    batch_size: PositiveInt = 16
     """Number of images described together."""
     on_bad_image: OnBadImage = "stop"
     """What to do at an unreadable image. "skip": training masks it out, and the evaluation sets are
@@ -90,7 +89,7 @@ class ComparisonConfig:
     """Groupings between commas; a method without a cross-image encoder needs only one."""
     rerank: int = 20
     """Number of first retrievals that methods with a second stage re-rank."""
-    seeds: int = 3
+    seeds: PositiveInt = 3
     """Number of runs of each method, with seeds from 0."""
     rows: tuple[str, ...] = ()
     """Custom rows of an ablation, as `parse_row` reads them."""
@@ -101,7 +100,6 @@ class ComparisonConfig:
     def __post_init__(self) -> None:
         """Check the types, the ranges, and that nothing comes twice; `prepare` looks names up."""
         check_types(self)
-        require_range(self, 1, math.inf, "batch_size", "seeds", "epochs")
         parse_groupings(self.grouping.split(","))
         _check_distinct(self.flag, self.lines, file_name)
         _check_distinct("--test", self.test, str)

@@ -16,14 +16,7 @@ from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.evaluation.difference import RESAMPLES, Difference, paired_difference
 from crisalad_jax.evaluation.metrics import Interval, bootstrap_interval
-from crisalad_jax.experiments.comparison.costs import (
-    NOTES,
-    AdapterCost,
-    AdapterMeasurements,
-    Spread,
-    adapter_costs,
-    ratios,
-)
+from crisalad_jax.experiments.comparison.costs import AdapterCost, Spread, adapter_costs, ratios
 from crisalad_jax.experiments.comparison.plan import (
     Prepared,
     Variant,
@@ -223,15 +216,16 @@ def summarise(prepared: Prepared, runs: Sequence[Run], speed: Mapping[str, Any])
         require(run.is_done, f"{path}: found none of this run's, expected it until the end")
         results.setdefault(run.variant.run, []).append((run, run.read()))
     rows = [_rows(variant, reference, sets, results, speed) for variant in prepared.variants]
-    measured = AdapterMeasurements(speed["adapters"], speed["adapter_memory"])
-    adapters = adapter_costs(measured) if config.is_papers else []
+    adapters = []
+    if config.is_papers:
+        adapters = adapter_costs(speed["adapters"], speed["adapter_memory"])
     return Summary(
         kind=config.kind,
         headers=("method",) if config.kind == "compare" else ("row", "changed"),
         reference=reference.labels[0],
         sets=sets,
         rows=list(itertools.chain(*rows)),
-        notes=[*_notes(prepared, reference, speed), *(NOTES if adapters else ())],
+        notes=_notes(prepared, reference, speed),
         adapters=adapters,
         settings=to_plain(config),
     )

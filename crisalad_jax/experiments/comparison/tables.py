@@ -34,14 +34,11 @@ def write_tables(summary: Summary, out: pathlib.Path) -> None:
     charts = [_chart(summary, name, out, number) for number, name in enumerate(summary.sets)]
     context = {
         "title": _PAGE_TITLES[summary.kind],
-        "sets": summary.sets,
-        "reference": summary.reference,
         "charts": charts,
         "tables": tables_of(summary),
-        "notes": summary.notes,
         "settings": json.dumps(summary.settings, indent=2),
     }
-    write_text(out / PAGE, render("comparison.html", context))
+    write_text(out / PAGE, render("comparison.html", summary._asdict() | context))
 
 
 def markdown(summary: Summary) -> str:
@@ -145,18 +142,18 @@ def _ratios(times: Sequence[float]) -> str:
 
 def adapter_cells(cost: AdapterCost) -> dict[str, str]:
     """Format the cost of an adapter by its headers."""
-    # The only figure of the paper that no way of counting gives.
-    printed = " (printed: 2,356,080)" if cost.adapter == "mlp" else ""
+    paper = parameters = flops = NOTHING
+    if cost.paper_macs is not None:
+        paper, flops = (f"{count * cost.paper_macs / 1e6:.3f}" for count in (1, 2))
+        # The only figure of the paper that no way of counting gives.
+        printed = " (printed: 2,356,080)" if cost.adapter == "mlp" else ""
+        parameters = f"{cost.paper_parameters:,}{printed}"
     return {
         "adapter": cost.adapter,
-        "parameters, paper": NOTHING
-        if cost.paper_parameters is None
-        else f"{cost.paper_parameters:,}{printed}",
+        "parameters, paper": parameters,
         "parameters here": f"{cost.parameters:,}",
-        "MACs, paper (M)": NOTHING if cost.paper_macs is None else f"{cost.paper_macs / 1e6:.3f}",
-        "FLOPs, paper (M)": NOTHING
-        if cost.paper_macs is None
-        else f"{2 * cost.paper_macs / 1e6:.3f}",
+        "MACs, paper (M)": paper,
+        "FLOPs, paper (M)": flops,
         "true MACs (M)": f"{cost.macs / 1e6:.1f}",
         "time of a block": NOTHING if cost.time is None else _ratios(cost.time),
         "memory of a block": NOTHING if cost.memory is None else f"{cost.memory:.2f} x",

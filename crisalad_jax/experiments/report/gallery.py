@@ -4,7 +4,7 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt8
@@ -265,18 +265,10 @@ def _join(figure: Picture, panels: Sequence[Axes], points: Sequence[np.ndarray])
     for axes, each in zip(panels, points, strict=True):
         axes.plot(*each.T, ".", color=RIGHT, markersize=2)
     every = -(-len(points[0]) // _LINES) or 1
+    look: Any = {"color": RIGHT, "linewidth": 0.4, "alpha": 0.7}
+    axes = [panel.transData for panel in panels]
     for ours, theirs in zip(*(each[::every] for each in points), strict=True):
-        figure.add_artist(
-            ConnectionPatch(
-                ours,
-                theirs,
-                coordsA=panels[0].transData,
-                coordsB=panels[1].transData,
-                color=RIGHT,
-                linewidth=0.4,
-                alpha=0.7,
-            )
-        )
+        figure.add_artist(ConnectionPatch(ours, theirs, *axes, **look))
 
 
 def _draw_tile(axes: Axes, tile: _Tile, image: UInt8[np.ndarray, "h w 3"]) -> None:

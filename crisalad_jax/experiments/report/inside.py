@@ -296,16 +296,9 @@ def show_descriptors(descriptors: Float[np.ndarray, "n d"], places: Sequence[str
             )
         marks.append(axes.scatter(*own.T, s=36, c=colour, marker=mark, linewidths=0, zorder=3))
     axes.set_aspect("equal", adjustable="datalim")
-    legend = axes.legend(
-        marks,
-        [str(name) for name in names],
-        frameon=False,
-        fontsize=8,
-        labelcolor=INK,
-        loc="center left",
-        bbox_to_anchor=(1, 0.5),
-        ncols=math.ceil(len(names) / 18),
-    )
+    look: Any = {"frameon": False, "fontsize": 8, "labelcolor": INK}
+    look |= {"loc": "center left", "bbox_to_anchor": (1, 0.5), "ncols": math.ceil(len(names) / 18)}
+    legend = axes.legend(marks, list(map(str, names)), **look)
     for text in legend.get_texts():
         text.set_parse_math(False)  # a dollar sign in a name starts no formula
     return figure

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -151,19 +151,15 @@ def draw_transport(
     if shares:
         ends = float(np.min(shares)), float(np.max(shares))
         scale_below(figure, panels, HEAT, ends, "share of the patch in the dustbin")
+    look: Any = {"loc": "outside lower center", "ncols": 4, "fontsize": 8, "title_fontsize": 8}
+    look |= {"frameon": False, "handlelength": 1, "columnspacing": 1}
     figure.legend(
         handles=[
             Patch(color=colour, label=f"{number}: {100 * part:.0f} %")
             for colour, (number, part) in zip(CLUSTER_COLOURS, clusters.items(), strict=False)
         ],
         title="cluster: share of what clusters took",
-        title_fontsize=8,
-        loc="outside lower center",
-        ncols=4,
-        fontsize=8,
-        frameon=False,
-        handlelength=1,
-        columnspacing=1,
+        **look,
     )
     return figure
 

@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal
 import jax
 import jax.numpy as jnp
 
-from crisalad_jax.config.checks import require_positive
+from crisalad_jax.config.checks import PositiveFloat
 from crisalad_jax.nn.layers import l2_normalise
 from crisalad_jax.nn.transport.divergence import entropic_cost, log_masses
 from crisalad_jax.training.losses.base import LOSSES, Loss, LossBatch, LossValue
@@ -25,17 +25,12 @@ class SinkhornDivergenceLoss(MultiSimilarityConfig):
 
     reads_tokens: ClassVar[Literal["local", "dense"]] = "local"
 
-    weight: float = 1.0
+    weight: PositiveFloat = 1.0
     """Factor of the triplet loss."""
-    margin: float = 0.1
+    margin: PositiveFloat = 0.1
     """Divergence by which a positive must be nearer than a negative."""
-    epsilon: float = 0.1
+    epsilon: PositiveFloat = 0.1
     """Entropic regularisation, in units of the costs, which are 0 to 4."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        super().__post_init__()
-        require_positive(self, "weight", "margin", "epsilon")
 
     def from_scratch(self) -> Loss:
         """Return base 0.5, as of the multi-similarity loss."""

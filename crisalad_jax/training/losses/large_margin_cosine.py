@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import require_fraction, require_positive
+from crisalad_jax.config.checks import Fraction, PositiveFloat
 from crisalad_jax.config.classes import ClassesConfig
 from crisalad_jax.training.losses.base import LOSSES, Loss, LossBatch, LossValue
 
@@ -19,19 +19,14 @@ class LargeMarginCosineConfig(Loss):
     The constants are CosPlace's (Berton et al., CVPR 2022); see docs/methods.md.
     """
 
-    scale: float = 30.0
+    scale: PositiveFloat = 30.0
     """Factor of the cosines; EigenPlaces' is 100."""
-    margin: float = 0.4
+    margin: Fraction = 0.4
     """Margin subtracted from the cosine of an image's own class."""
-    learning_rate: float = 0.01
+    learning_rate: PositiveFloat = 0.01
     """Learning rate of the classifiers, which train by an Adam of their own, without decay."""
     classes: ClassesConfig = ClassesConfig()
     """Grouping of images into classes."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_positive(self, "scale", "learning_rate")
-        require_fraction(self, "margin")
 
     @property
     def grouping(self) -> ClassesConfig:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import math
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
@@ -10,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from crisalad_jax.config.checks import require, require_field, require_range, takes
+from crisalad_jax.config.checks import NonNegativeFloat, require, require_field, takes
 from crisalad_jax.config.part import OrName
 from crisalad_jax.config.registry import part_field, resolve_names
 from crisalad_jax.config.short_repr import short_repr
@@ -33,7 +32,7 @@ class LossConfig:
     """Registered loss, or its name; by default the paper's multi-similarity loss."""
     miner: Literal["multi-similarity", "none"] = "multi-similarity"
     """Miner of the pairs that enter the loss: the multi-similarity loss's, or none (all pairs)."""
-    miner_margin: float = 0.1
+    miner_margin: NonNegativeFloat = 0.1
     """Similarity margin of the miner, epsilon in its paper."""
     pml_compat: bool = False
     """Whether the loss is 0, as in pytorch-metric-learning, for a batch with at most one positive
@@ -42,7 +41,6 @@ class LossConfig:
     def __post_init__(self) -> None:
         """Check the ranges."""
         resolve_names(self)
-        require_range(self, 0, math.inf, "miner_margin")
         fits = not self.kind.ranks_all or self.miner == "none"
         name = self.kind.part_name
         require_field(self, "miner", fits, f"'none' for loss {name}, which ranks all images")

@@ -1,12 +1,12 @@
 """Losses over the pairs of a batch, with the constants of GSV-Cities."""
 
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from crisalad_jax.config.checks import require_fraction, require_positive, require_range
+from crisalad_jax.config.checks import Fraction, PositiveFloat, PositiveInt, limited
 from crisalad_jax.training.losses.base import (
     LOSSES,
     Loss,
@@ -22,14 +22,10 @@ from crisalad_jax.training.losses.base import (
 class MultiSimilarityConfig(Loss):
     """Multi-similarity loss (Wang et al., CVPR 2019), the constants of GSV-Cities."""
 
-    alpha: float = 1.0
-    beta: float = 50.0
+    alpha: PositiveFloat = 1.0
+    beta: PositiveFloat = 50.0
     base: float = 0.0
     """Similarity around which pairs are weighted. From random weights 0.5 learns where 0 fails."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_positive(self, "alpha", "beta")
 
     def from_scratch(self) -> Loss:
         """Return base 0.5: from random weights base 0 drives all similarities to 0 together."""
@@ -50,14 +46,10 @@ class MultiSimilarityConfig(Loss):
 class ContrastiveConfig(Loss):
     """Contrastive loss (Hadsell et al., CVPR 2006), the margins of GSV-Cities."""
 
-    positive_margin: float = 0.0
+    positive_margin: Annotated[float, limited(0, 2)] = 0.0
     """Distance up to which a pair of one place costs nothing; unit vectors are at most 2 apart."""
-    negative_margin: float = 1.0
+    negative_margin: Annotated[float, limited(0, 2)] = 1.0
     """Distance from which a pair of two places costs nothing."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_range(self, 0, 2, "positive_margin", "negative_margin")
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Average the violations of each margin, without the squares of the paper."""
@@ -71,14 +63,10 @@ class ContrastiveConfig(Loss):
 class TripletConfig(Loss):
     """Triplet margin loss (Schroff et al., CVPR 2015), the margin of GSV-Cities."""
 
-    margin: float = 0.1
+    margin: PositiveFloat = 0.1
     """Distance by which a positive must be nearer than a negative."""
     average: Literal["violating", "all"] = "violating"
     """Triplets that the mean is over: those that violate the margin, or all (NetVLAD's code)."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_positive(self, "margin")
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Average the violations of the margin over triplets of distances.
@@ -106,11 +94,7 @@ class TripletConfig(Loss):
 class SupConConfig(Loss):
     """Supervised contrastive loss (Khosla et al., NeurIPS 2020), GSV-Cities' temperature."""
 
-    temperature: float = 0.07
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_positive(self, "temperature")
+    temperature: PositiveFloat = 0.07
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Compute the cross entropy of each positive among all pairs (L_out of the paper)."""
@@ -128,15 +112,10 @@ class SupConConfig(Loss):
 class CircleConfig(Loss):
     """Circle loss (Sun et al., CVPR 2020), the constants of GSV-Cities."""
 
-    margin: float = 0.4
+    margin: Fraction = 0.4
     """Relaxation margin, the paper's m."""
-    scale: float = 80.0
+    scale: PositiveFloat = 80.0
     """Scale of the similarities, the paper's gamma."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_positive(self, "scale")
-        require_fraction(self, "margin")
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Weigh each similarity by how far it is from its optimum."""
@@ -156,12 +135,8 @@ class FastAPConfig(Loss):
     """FastAP (Cakir et al., CVPR 2019), GSV-Cities' number of bins."""
 
     ranks_all: ClassVar[bool] = True
-    bins: int = 30
+    bins: PositiveInt = 30
     """Number of bins of the histogram of squared distances, from 0 to 4."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_positive(self, "bins")
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Compute 1 - average precision from soft histograms of squared distances."""
@@ -191,12 +166,8 @@ class SelaVprLoss(Loss):
     of_tuples: ClassVar[bool] = True
     reads_tokens: ClassVar[Literal["local", "dense"]] = "dense"
 
-    margin: float = 0.1
+    margin: PositiveFloat = 0.1
     """Distance by which a positive's descriptor must be nearer than a negative's."""
-
-    def __post_init__(self) -> None:
-        """Check the ranges."""
-        require_positive(self, "margin")
 
     def apply(self, params: Any, batch: LossBatch) -> LossValue:
         """Add the mean of the triplets of descriptors and that of local similarities."""

@@ -14,7 +14,6 @@ from crisalad_jax.experiments.comparison import (
     runner,
 )
 from crisalad_jax.experiments.comparison.costs import (
-    AdapterMeasurements,
     Spread,
     adapter_calls,
     adapter_memory,
@@ -29,7 +28,7 @@ from tests.conftest import BATCH
 
 def test_table_3_to_the_unit():
     """Parameters and MACs as printed, and by hand at 768 and 384 wide, 16 x 16 patches."""
-    costs = {cost.adapter: cost for cost in adapter_costs(AdapterMeasurements({}, {}))}
+    costs = {cost.adapter: cost for cost in adapter_costs({}, {})}
     linears = 2 * 768 * 384
     depthwise = 9 * 384 + 384 * 384
     branches = 384 * 192 + 2 * 384 * 24 + (9 + 25) * 24 * 96
@@ -55,10 +54,10 @@ def test_adapters_are_measured_in_float32_in_the_64_bit_mode() -> None:
     assert {*calls} == {*ADAPTERS}
     with jax.enable_x64(True):
         few = {name: calls[name] for name in ("none", "mlp")}
-        measured = AdapterMeasurements(race(few, rounds=1), adapter_memory(few))
-    costs = {cost.adapter: cost for cost in adapter_costs(measured)}
+        measured = race(few, rounds=1), adapter_memory(few)
+    costs = {cost.adapter: cost for cost in adapter_costs(*measured)}
     # Of four images, more than one activation of 384 numbers a token.
-    more = (costs["mlp"].memory - 1) * measured.memory["none"]
+    more = (costs["mlp"].memory - 1) * measured[1]["none"]
     assert 4 * 257 * 384 * 4 < more < 10 * 4 * 257 * 768 * 4
     assert costs["mlp"].time.least > 0
     assert costs["lora"].time is costs["lora"].memory is None

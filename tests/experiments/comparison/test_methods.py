@@ -183,7 +183,7 @@ REFUSED = [
     ),
     ("x: epoch=2", r"--row x: --epoch: found no such flag; did you mean .*--epochs INT"),
     ("x: help=1", "--row x: --help: found no such flag"),
-    ("x: epochs=0", "--row x: TrainConfig.epochs: found 0, expected more than 0"),
+    ("x: epochs=0", "--row x: TrainConfig.epochs: found 0, expected a whole number of at least 1"),
     ("x: loss.kind=tripel", "--row x: loss: found 'tripel', expected one of circle"),
     ("x: seed=1", "--row x: found seed, expected another flag: it is the same for all rows"),
     ("x: recipe=salat", "--row x: recipe: found 'salat', expected one of"),

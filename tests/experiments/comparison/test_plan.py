@@ -51,9 +51,9 @@ def test_a_recipe_from_a_backbone_warms_up_for_a_quarter_too(settings, shared, m
 REFUSED = [
     (("--methods", "crisalad,vlads"), ("--methods: found 'vlads', expected one of", "cricavpr")),
     (("--methods", "salad,salad"), ("--methods: found salad, salad", "each once")),
-    (("--seeds", 0), ("seeds: found 0, expected at least 1",)),
+    (("--seeds", 0), ("seeds: found 0, expected a whole number of at least 1",)),
     (("--jobs", 0), ("--jobs: found 0, expected at least 1",)),
-    (("--epochs", 0), ("epochs: found 0, expected at least 1",)),
+    (("--epochs", 0), ("epochs: found 0, expected a whole number of at least 1",)),
     (("--methods", "crisalad+transvpr"), ("found transvpr:20 over a database of 7 images",)),
     (
         ("--methods", "crisalad+patch-netvlad", "--rerank", 7, "--image-size", 28, 28),
