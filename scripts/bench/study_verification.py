@@ -63,7 +63,7 @@ def study(folder: pathlib.Path, size: tuple[int, int], light: dict, streets: int
         if found.rotation is not None:
             error = degrees(found.rotation, turns[0] @ turns[2].T)
         if located is not None:
-            metres = float(np.linalg.norm(located.pose.position - places[2]))
+            metres = float(np.linalg.norm(located[0].position - places[2]))
         rows.append((found.inliers, found.confidence == 1, error, metres))
     inliers, sure, errors, metres = map(np.array, zip(*rows, strict=True))
     within = [f"{np.mean(errors < 2):.0%}", f"{np.mean(metres < 0.5):.0%}"]
