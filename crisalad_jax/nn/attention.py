@@ -316,7 +316,7 @@ def _mix_rows(
     mask: Bool[Array, "query key"] | None,
     dropout_mask: Float[Array, "*#batch head key query"] | None,
 ) -> Float[Array, "*batch head query dim"]:
-    """Compute `dot_product_attention` such that every product is one in bfloat16: see `row_major`."""
+    """Compute `dot_product_attention` by products that are all in bfloat16 (`row_major`)."""
     weights, totals = _softmax_of_rows(queries, keys, mask)
     used = _dropped(weights, dropout_mask).astype(values.dtype)
     mixed = _product("...ij,...jd->...id", used, values)
