@@ -24,7 +24,7 @@ from crisalad_jax.nn.layers import (
     linear,
     no_update,
 )
-from crisalad_jax.nn.products import product_precision, rule_precision
+from crisalad_jax.nn.products import product_precision, row_major, rule_precision
 from crisalad_jax.utils.pytree import pytree_dataclass
 from crisalad_jax.utils.target import target
 
@@ -228,6 +228,9 @@ def dot_product_attention(
         dropout_mask: factors of the weights, 0 or above 1.
     """
     queries = queries / math.sqrt(queries.shape[-1])
+    if target().platform == "cpu" and queries.dtype == jnp.bfloat16:
+        heads_first = (row_major(jnp.moveaxis(x, -3, -2)) for x in (queries, keys, values))
+        return jnp.moveaxis(_mix_rows(*heads_first, mask, dropout_mask), -2, -3)
     mask = None if mask is None else mask.T
     precision = rule_precision(queries.dtype)
     if target().platform != "cpu":
@@ -303,3 +306,49 @@ def _mix_backward(
 
 
 _mix.defvjp(lambda *inputs: (_mix(*inputs), inputs[:5]), _mix_backward)
+
+
+@jax.custom_vjp
+def _mix_rows(
+    queries: Float[Array, "*batch head query dim"],
+    keys: Float[Array, "*batch head key dim"],
+    values: Float[Array, "*batch head key dim"],
+    mask: Bool[Array, "query key"] | None,
+    dropout_mask: Float[Array, "*#batch head key query"] | None,
+) -> Float[Array, "*batch head query dim"]:
+    """Compute `dot_product_attention` by products that are all in bfloat16 (`row_major`)."""
+    weights, totals = _softmax_of_rows(queries, keys, mask)
+    used = _dropped(weights, dropout_mask).astype(values.dtype)
+    mixed = _product("...ij,...jd->...id", used, values)
+    return (mixed / totals).astype(values.dtype)
+
+
+def _softmax_of_rows(queries: Array, keys: Array, mask: Array | None) -> tuple[Array, Array]:
+    scores = _product("...id,...jd->...ij", queries, keys)
+    if mask is not None:
+        scores = jnp.where(mask, scores, -jnp.inf)
+    weights = jnp.exp(scores - scores.max(axis=-1, keepdims=True))
+    return weights, weights.sum(axis=-1, keepdims=True)
+
+
+def _dropped(weights: Array, dropout_mask: Array | None) -> Array:
+    return weights if dropout_mask is None else weights * dropout_mask.swapaxes(-2, -1)
+
+
+def _mix_rows_backward(inputs: tuple[Any, ...], change: Array) -> tuple[Any, ...]:
+    queries, keys, values, mask, dropout_mask = inputs
+    weights, totals = _softmax_of_rows(queries, keys, mask)
+    change = row_major((change / totals).astype(values.dtype))
+    to_weights = _dropped(_product("...id,...jd->...ij", change, values), dropout_mask)
+    mean = (weights * to_weights).sum(axis=-1, keepdims=True) / totals
+    to_scores = (weights * (to_weights - mean)).astype(keys.dtype)
+    used = _dropped(weights, dropout_mask).astype(values.dtype)
+    to_values = _product("...ji,...id->...jd", row_major(used.swapaxes(-2, -1)), change)
+    to_queries = _product("...ij,...jd->...id", to_scores, keys)
+    to_keys = _product("...ji,...id->...jd", row_major(to_scores.swapaxes(-2, -1)), queries)
+    nothing = None if dropout_mask is None else jnp.zeros_like(dropout_mask)
+    found = (part.astype(queries.dtype) for part in (to_queries, to_keys, to_values))
+    return *found, None, nothing
+
+
+_mix_rows.defvjp(lambda *inputs: (_mix_rows(*inputs), inputs), _mix_rows_backward)

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.experimental.layout import Layout, with_layout_constraint
 from jaxtyping import Array, Float
 
 from crisalad_jax.utils.target import target
@@ -27,9 +28,20 @@ def rule_precision(dtype: Any) -> str | None:
     return None if target().platform == "cpu" else jax.config.jax_default_matmul_precision  # pyright: ignore
 
 
+def row_major(x: Array) -> Array:
+    """Lay an array out in the order of its axes.
+
+    XLA's library for CPUs takes a bfloat16 product whose left side ends with the axis that is
+    summed over, where both sides are laid out so; others are computed in float32.
+    """
+    return with_layout_constraint(x, Layout(tuple(range(x.ndim))))
+
+
 def matmul(rows: Float[Array, "row d_in"], weight: Float[Array, "d_in d_out"]) -> Array:
     """Multiply rows by a weight, which is cast to their type."""
     dtype = rows.dtype
+    if dtype == jnp.bfloat16 and target().platform == "cpu":
+        return _narrow_matmul(rows, weight)
     multiply = functools.partial(jnp.matmul, precision=product_precision(dtype))
 
     def product(rows: Array, weight: Array) -> Array:
@@ -40,6 +52,34 @@ def matmul(rows: Float[Array, "row d_in"], weight: Float[Array, "d_in d_out"]) -
         return multiply(rows.T, change, preferred_element_type=weight.dtype)
 
     return _with_wide_gradient(product, weight_gradient, rows, weight)
+
+
+@jax.custom_vjp
+def _narrow_matmul(rows: Array, weight: Array) -> Array:
+    """Multiply in bfloat16 in both directions: JAX's own rule takes the float32 cotangent as it is.
+
+    It is rounded to the type of the result, which `linear` rounds too.
+    """
+    return jnp.matmul(rows, weight.astype(rows.dtype), preferred_element_type=jnp.float32)
+
+
+def _narrow_forward(rows: Any, weight: Any) -> tuple[Array, tuple[Array | None, Array]]:
+    kept = rows.value if weight.perturbed else None  # which a frozen weight's gradient needs
+    return _narrow_matmul(rows.value, weight.value), (kept, weight.value)
+
+
+def _narrow_backward(kept: tuple[Array | None, Array], change: Array) -> tuple[Array, Array | None]:
+    rows, weight = kept
+    change = change.astype(jnp.bfloat16)
+    multiply = functools.partial(jnp.einsum, preferred_element_type=jnp.float32)
+    narrow = row_major(weight.astype(change.dtype))
+    to_rows = multiply("ro,io->ri", change, narrow).astype(change.dtype)
+    if rows is None:
+        return to_rows, None
+    return to_rows, multiply("ir,ro->io", row_major(rows.T), change).astype(weight.dtype)
+
+
+_narrow_matmul.defvjp(_narrow_forward, _narrow_backward, symbolic_zeros=True)
 
 
 def convolve(
