@@ -15,6 +15,7 @@ from crisalad_jax.retrieval.maps.approximate import choose_search
 from crisalad_jax.retrieval.maps.build import Indexed, index
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.query import query
+from crisalad_jax.retrieval.maps.removed import Removed
 from crisalad_jax.retrieval.neighbours import Neighbours
 from crisalad_jax.retrieval.pca import fit_pca, save_pca
 from crisalad_jax.utils.errors import InputError
@@ -131,6 +132,24 @@ def test_candidates_come_from_the_index(grown, monkeypatch):
         np.testing.assert_array_equal(
             places.search(QUERIES, 3).indices, places.search(QUERIES, 3, exact=True).indices
         )
+
+
+@pytest.mark.parametrize(("is_served", "expected"), [(False, 20), (True, 16)])
+def test_more_candidates_take_the_place_of_what_was_removed(is_served, expected, grown):
+    """A graph is asked for 16 at least, of 40; of 32 that are left it looks at a quarter more. A
+    server looks among what is left by itself."""
+    build(grown, "hnsw")
+    asked = []
+    with Map.open(grown) as places:
+        approximate = places._approximate
+
+        def ask(queries, k, count, removed):
+            asked.append(k)
+            return approximate.ask(queries, k, count, removed)
+
+        counted = approximate._replace(ask=ask, is_served=is_served)
+        counted.search(QUERIES, 3, 40, Removed(np.arange(8)))
+    assert asked == [expected]
 
 
 @pytest.mark.parametrize("kind", ["hnsw", "ivf-rabitq"])
