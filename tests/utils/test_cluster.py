@@ -143,9 +143,11 @@ def test_node_of_another_version(tmp_path, version, expected):
     (package / "__init__.py").touch()
     (package / "utils" / "__init__.py").touch()
     (package / "utils" / "version.py").write_text(version)
+    (folder := tmp_path / "there").mkdir()
     with ray_nodes(environments=[{}, {"PYTHONPATH": str(tmp_path)}]) as nodes:
         done = subprocess.run(
-            [sys.executable, "-c", MAPPING, nodes.address, str(tmp_path)],
+            [sys.executable, "-c", MAPPING, nodes.address, str(folder)],
+            cwd=folder,  # which workers look for modules in first
             env=dict(nodes.environment),
             capture_output=True,
             text=True,
@@ -163,7 +165,7 @@ def test_node_without_the_files(tmp_path):
     """The second node has another file system where the folder is."""
     mounts = 'mount -t tmpfs none "$0" && exec "$@"'
     before = [[], ["unshare", "-m", "sh", "-c", mounts, str(tmp_path)]]
-    (tmp_path / "there").touch()
+    (tmp_path / "there").mkdir()
     with ray_nodes(before=before) as nodes:
         done = subprocess.run(
             [sys.executable, "-c", MAPPING, nodes.address, str(tmp_path / "there")],
