@@ -77,6 +77,7 @@ def test_descriptors_and_gradients(backbone: Backbone, aggregator: Aggregator) -
         assert error < BOUND * np.linalg.norm(gradient) + 1e-14, name
 
 
+@pytest.mark.slow
 def test_a_training_batch_is_normalised_as_torch_does() -> None:
     """Descriptors, gradients through the batch's statistics, and the running ones after it."""
     config = ModelConfig(

@@ -30,6 +30,7 @@ def expected(params: Crisalad) -> np.ndarray:
     return np.asarray(describe(params, pictures(2), MODEL, mask=self_mask(2)))
 
 
+@pytest.mark.slow
 def test_python_with_onnxruntime(params: Crisalad, tmp_path: pathlib.Path):
     """Pictures of the model's size, stored without loss: the same pixels, so the same numbers."""
     write_export(tmp_path / "export", Model(params, MODEL), ExportConfig(format="onnx"))

@@ -411,6 +411,7 @@ CHOSEN = (
 NAMES = ("plugins/learnt_epsilon", "plugins/learnt_dustbin", "loss")
 
 
+@pytest.mark.slow
 def test_a_step_a_dustbin_and_a_loss_are_trained_saved_and_told(
     tmp_path: pathlib.Path, shared: pathlib.Path, capfd: Capture
 ) -> None:

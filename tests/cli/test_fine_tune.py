@@ -62,6 +62,7 @@ def test_a_part_that_the_recipe_puts_in_place_is_told_not_ignored(shared, tmp_pa
     fails(capfd, "train", "--data", shared / "city", *flags, words=words)
 
 
+@pytest.mark.slow
 def test_python_tells_of_weights_for_other_images(shared, tmp_path, weights):
     params, _ = load_weights(weights)
     file, city = tmp_path / "w.safetensors", shared / "city"

@@ -47,6 +47,7 @@ def test_batches_of_batches_are_described_by_vmap(params) -> None:
         np.testing.assert_allclose(found, describe(params, images, CONFIG), atol=TOLERANCE)
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_those_of_differences() -> None:
     """Of a mean that pixels are scaled by; forward mode is refused, as the docstring says."""
     with jax.enable_x64(True):

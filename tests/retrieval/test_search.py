@@ -220,6 +220,7 @@ print(most() - before)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads Linux's account of memory")
 def test_memory_does_not_grow_with_the_database(tmp_path):
     """10,000 and 100,000 rows of 1 KiB, of which a program that kept them would have 102 MB."""

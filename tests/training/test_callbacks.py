@@ -82,6 +82,7 @@ def test_a_run_that_callbacks_stop_resumes_to_the_same_bits(
         assert rows == [{key: str(value) for key, value in each.items()} for each in expected]
 
 
+@pytest.mark.slow
 def test_a_run_whose_batches_depend_on_the_model_resumes_to_the_same_bits(
     places, params, tmp_path
 ) -> None:

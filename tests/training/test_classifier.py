@@ -150,6 +150,7 @@ class Scaled(Loss):
         return LossValue(loss, numbers={"scale": params["scale"]})
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("own_parts")
 def test_weight_files_have_what_a_loss_learnt(tmp_path, places, benchmark):
     """A step logs the scale that it begins with, so the first after a save logs the saved one."""

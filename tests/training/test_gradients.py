@@ -72,6 +72,7 @@ def test_norms_are_those_of_jax_grad(gradient, trainable, parts, of_block) -> No
     assert found == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_squares_add_up_to_those_of_a_steps_gradient() -> None:
     """With the step's dropout, whose key is folded with the step's number."""
     config, key = dataclasses.replace(CONFIG, trainable="adapters,head"), jax.random.key(1)

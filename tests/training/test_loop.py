@@ -518,6 +518,7 @@ def test_a_step_that_does_not_fit_is_told_before_the_first_file(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_step_that_fits_is_compiled_once(tmp_path, places, params, monkeypatch, caplog):
     monkeypatch.setattr(trainer, "memory_limit", lambda devices: 2**34)
     jax.clear_caches()

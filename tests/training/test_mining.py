@@ -385,6 +385,7 @@ def test_training_reads_the_set_as_configured(street, tmp_path, monkeypatch):
     read.assert_called_once_with(tmp_path / "set.mat", **radii, images=street, on_bad_image="stop")
 
 
+@pytest.mark.slow
 def test_unreadable_images_are_told_in_mining(tmp_path, capfd):
     root = write_street(tmp_path / "street")
     broken = sorted((root / "images" / "train" / "database").iterdir())[:3]

@@ -102,6 +102,7 @@ for note in notes:
 """
 
 
+@pytest.mark.slow
 def test_a_step_exchanges_what_it_must_and_no_more() -> None:
     """Gathers of labels, of each layer's keys and values, and of descriptors; then gradients.
 

@@ -48,6 +48,7 @@ def test_table_3_to_the_unit():
     assert (costs["prompts"].parameters, costs["prompts"].paper_macs) == (7680, None)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error:Explicitly requested dtype float64")
 def test_adapters_are_measured_in_float32_in_the_64_bit_mode() -> None:
     calls = adapter_calls()

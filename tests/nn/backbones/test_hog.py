@@ -111,6 +111,7 @@ def test_recall_on_photographs(name, expected):
         assert 100 * result.recalls[k] == pytest.approx(recall, abs=2)
 
 
+@pytest.mark.slow
 def test_its_name_is_taken_by_every_verb_that_describes(
     shared: pathlib.Path, tmp_path: pathlib.Path, capfd: Capture
 ):

@@ -63,6 +63,7 @@ def test_it_nears_the_linear_programme_as_epsilon_falls() -> None:
     assert errors[1] < 0.5 * errors[0]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_batches_symmetry_zero_masses_and_equal_sets() -> None:
     each = [sets(seed) for seed in range(3)]
@@ -83,6 +84,7 @@ def test_batches_symmetry_zero_masses_and_equal_sets() -> None:
     np.testing.assert_array_equal(slope[2], 0)
 
 
+@pytest.mark.slow
 def test_half_precision_is_widened_and_default_masses_are_equal() -> None:
     x, y = (each.astype(jnp.bfloat16) for each in sets()[:2])
     found = sinkhorn_divergence(x, y)

@@ -89,6 +89,7 @@ def test_bad_numbers_raise(options: Any, message: str) -> None:
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.slow
 def test_salad_learns_its_taus() -> None:
     """From the ones that are below 1; the plan is that of fixed ones, and has a gradient."""
     fields: dict[str, Any] = {"clusters": 3, "cluster_dim": 4, "token_dim": 4, "hidden": 8}

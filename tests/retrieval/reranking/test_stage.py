@@ -318,6 +318,7 @@ def test_a_full_disk_is_one_line(first_stage, benchmark, monkeypatch) -> None:
         rerank(reranking("transvpr", 3), first_stage, benchmark.database, benchmark.queries)
 
 
+@pytest.mark.slow
 def test_tokens_are_compared_by_their_divergence_as_otts(benchmark) -> None:
     """In float16 tokens: unit vectors to 5e-4, and their costs, of 0 to 4, to 4e-3 at most."""
     own, config = model_of("sinkhorn-divergence")

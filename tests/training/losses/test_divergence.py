@@ -103,6 +103,7 @@ def test_what_it_cannot_compare_is_told() -> None:
     assert KIND.from_scratch() == dataclasses.replace(KIND, base=0.5)
 
 
+@pytest.mark.slow
 def test_a_step_trains_the_tokens() -> None:
     """SALAD's clusters; the global token has no gradient of the triplets, whose margin is large."""
     loss = LossConfig(kind=SinkhornDivergenceLoss(weight=1e3, margin=10.0), miner="none")
