@@ -96,7 +96,7 @@ def groupings_of(texts: Sequence[str], benchmark: Benchmark) -> list[Grouping]:
 
 
 def _expanded(texts: Sequence[str], size_of: Callable[[str], int]) -> Iterator[str]:
-    """Yield groupings, with those that a published name stands for in its place."""
+    """Yield groupings; a published name gives those that it is short for."""
     for text in texts:
         if text.startswith(PREFIX):
             size = size_of(text.removeprefix(PREFIX))

@@ -272,11 +272,15 @@ def _softmax(
 ) -> tuple[Float[Array, "*batch head token query"], Float[Array, "*batch head 1 query"]]:
     """Compute the scores' exponentials, with keys down the columns, and each column's total."""
     formula = f"{axes.keys},{axes.queries}->{axes.weights}"
-    scores = _product(formula, keys, queries, precision)
+    return _exponentials(_product(formula, keys, queries, precision), mask, axis=-2)
+
+
+def _exponentials(scores: Array, mask: Array | None, *, axis: int) -> tuple[Array, Array]:
+    """Compute the exponentials of scores, 0 where masked, and their totals over the keys."""
     if mask is not None:
         scores = jnp.where(mask, scores, -jnp.inf)
-    weights = jnp.exp(scores - scores.max(axis=-2, keepdims=True))
-    return weights, weights.sum(axis=-2, keepdims=True)
+    weights = jnp.exp(scores - scores.max(axis=axis, keepdims=True))
+    return weights, weights.sum(axis=axis, keepdims=True)
 
 
 def _beside_queries(totals: Float[Array, "*batch head 1 query"], axes: _Axes) -> Array:
@@ -324,11 +328,7 @@ def _mix_rows(
 
 
 def _softmax_of_rows(queries: Array, keys: Array, mask: Array | None) -> tuple[Array, Array]:
-    scores = _product("...id,...jd->...ij", queries, keys)
-    if mask is not None:
-        scores = jnp.where(mask, scores, -jnp.inf)
-    weights = jnp.exp(scores - scores.max(axis=-1, keepdims=True))
-    return weights, weights.sum(axis=-1, keepdims=True)
+    return _exponentials(_product("...id,...jd->...ij", queries, keys), mask, axis=-1)
 
 
 def _dropped(weights: Array, dropout_mask: Array | None) -> Array:

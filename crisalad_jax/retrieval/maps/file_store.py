@@ -105,7 +105,7 @@ class FileStore:
         """Find the k nearest of numbers below `count`, exactly.
 
         They are compared by inner product, packed bits by those that are equal. Of equal
-        similarities the lower number stands first, also at the k-th place.
+        similarities the lower number comes first, also at the k-th place.
 
         Args:
             queries: as they are compared.
