@@ -22,6 +22,7 @@ import jaxtyping
 import numpy as np
 import pytest
 
+from crisalad_jax.checkpoints import runtime
 from crisalad_jax.checkpoints.formats import families
 from crisalad_jax.checkpoints.published import PUBLISHED
 from crisalad_jax.checkpoints.weights import save_weights
@@ -75,6 +76,7 @@ RECIPE = TrainConfig(
     patience=2,
     seed=5,
 )
+_HAS_ACCELERATOR = runtime._has_accelerator
 STEPS = 6
 CITIES, PLACES_PER_CITY, IMAGES_PER_PLACE = ("Aston", "Brill"), 4, 3
 BATCH = 4
@@ -293,3 +295,15 @@ def describe_single(model: Model, paths: Sequence[pathlib.Path]) -> np.ndarray:
     describer = describer_of(model)
     tokens = TokenSet(describer, paths, Reading(batch_size=BATCH, quiet=True))
     return tokens.describe(tokens.batches("single", None))
+
+
+@pytest.fixture(autouse=True)
+def jax_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Describe queries by JAX, as where it has an accelerator: an export takes seconds."""
+    monkeypatch.setattr(runtime, "_has_accelerator", lambda: True)
+
+
+@pytest.fixture
+def engines_by_default(monkeypatch: pytest.MonkeyPatch, jax_by_default: None) -> None:
+    """Undo `jax_by_default`."""
+    monkeypatch.setattr(runtime, "_has_accelerator", _HAS_ACCELERATOR)

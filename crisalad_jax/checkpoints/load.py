@@ -166,8 +166,7 @@ def open_model(
         quiet: no progress of a download.
 
     Raises:
-        InputError: what `find_weights`, `load_weights` and `open_runtime` raise, or `changed`; or
-            a model of float64 for another engine.
+        InputError: what `find_weights`, `load_weights` and `open_runtime` raise, or `changed`.
     """
     file = find_weights(weights, engine=engine, quiet=quiet)
     short = f"{file.parent.name}/{file.name}" if file.parent.name else file.name
@@ -183,11 +182,6 @@ def open_model(
     from crisalad_jax.checkpoints.runtime import open_runtime, read_model
 
     config = changed(read_model(file))
-    if config.compute_dtype == "float64":
-        raise InputError(f"--runtime: found {engine} with a model of float64, expected jax")
-    if config.backbone.local_features is not None:
-        found = f"{engine} with backbone {config.backbone.part_name}"
-        raise InputError(f"--runtime: found {found}, whose features no engine finds, expected jax")
     attends = config.cross_image.attends
     model = open_runtime(
         file,

@@ -4,15 +4,18 @@ Of a file of weights the export is made once, and kept in the user's cache.
 """
 
 import concurrent.futures
+import contextlib
 import dataclasses
 import functools
 import hashlib
+import importlib.metadata
+import importlib.util
 import json
 import os
 import pathlib
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -20,13 +23,14 @@ from crisalad_jax.checkpoints.engines import READS, EngineName, Precision, Progr
 from crisalad_jax.checkpoints.safetensors_io import read_header
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.io import from_plain
+from crisalad_jax.config.plugins import loaded_plugins
 from crisalad_jax.config.preprocessing import PreprocessingConfig, Size
 from crisalad_jax.config.short_repr import brief
 from crisalad_jax.data.loader import ImageBatch
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.utils.checksums import ChangedFileError, sha256_of
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import read_json, user_cache
+from crisalad_jax.utils.files import atomic_path, read_json, user_cache
 from crisalad_jax.utils.locks import lock
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.version import VERSION
@@ -37,6 +41,12 @@ if TYPE_CHECKING:
 FORMAT = "crisalad-jax export 1"
 MANIFEST = "manifest.json"
 _EXPECTED = "the manifest of `crisalad export`"
+_CHANGED = ("image_size", "preprocessing", "compute_dtype")
+"""Of a model's configuration, what may be other than its export's."""
+ONCE: Sequence[EngineName] = ("onnxruntime", "openvino")
+"""Engines by how soon they describe a first image, the soonest first (docs/performance.md)."""
+LASTING: Sequence[EngineName] = ("openvino", "onnxruntime")
+"""Engines by how many images a second they describe one by one."""
 DESCRIBE, TOKENS, ATTEND = "describe", "tokens", "attend"
 """Names of programs: of images to descriptors, or of the two halves of that."""
 
@@ -199,8 +209,9 @@ def open_runtime(
     """
     choose("runtime", engine, READS)
     path = pathlib.Path(source)
-    names = ("image_size", "preprocessing", "compute_dtype")
-    changes = {} if config is None else {name: config[name] for name in names}
+    changes = {} if config is None else {name: config[name] for name in _CHANGED}
+    if changes.get("compute_dtype") == "float64":
+        raise InputError(f"{path}: found a model of float64 for {engine}, expected jax")
     if not path.is_dir():
         path = _exported(path, engine, changes, any_grouping)
     manifest = read_json(path / MANIFEST, _EXPECTED)
@@ -231,6 +242,61 @@ def open_runtime(
         _first=first,
         _second=second[0] if second else None,
     )
+
+
+def first_engine(
+    order: Sequence[EngineName],
+    source: str | os.PathLike[str],
+    config: Mapping[str, Any],
+    *,
+    any_grouping: bool = False,
+) -> EngineName | Literal["jax"]:
+    """Return the first engine of an order that computes the descriptors of JAX.
+
+    It has to be installed, and to differ from JAX by less than 1e-5, which the export measures that
+    is made here the first time. The answer depends on the model and on what is installed alone. It
+    is "jax" where JAX has an accelerator, for images in bfloat16 or of sizes of their own, and for
+    parts of plugins.
+
+    Args:
+        order: names of engines, such as `ONCE` or `LASTING`.
+        source: a file of weights, or an exported folder.
+        config: a `ModelConfig` as JSON values, as `open_runtime` takes it.
+        any_grouping: see `open_runtime`.
+
+    Raises:
+        InputError: an exported folder of a program that no installed engine reads.
+    """
+    installed: list[EngineName] = [
+        name for name in order if importlib.util.find_spec(name) is not None
+    ]
+    path = pathlib.Path(source)
+    if path.is_dir():
+        kind = read_json(path / MANIFEST, _EXPECTED).get("program_format")
+        for engine in installed:
+            if kind in READS[engine]:
+                return engine
+        readers = " or ".join(name for name in READS if kind in READS[name])
+        raise InputError(
+            f"{path}: found a program of format {kind}, and nothing installed that reads it, "
+            f"expected {readers or 'one of format onnx or openvino'}"
+        )
+    fits = config["compute_dtype"] == "float32" and config["preprocessing"]["size_rule"] == "fixed"
+    if not fits or loaded_plugins() or _has_accelerator():
+        return "jax"
+    for engine in installed:
+        with contextlib.suppress(InputError, ModuleNotFoundError, OSError):
+            _exported(path, engine, {name: config[name] for name in _CHANGED}, any_grouping)
+            return engine
+    return "jax"
+
+
+def _has_accelerator() -> bool:
+    """Return whether JAX may have another platform than CPUs, without importing it."""
+    if os.environ.get("JAX_PLATFORMS") == "cpu":
+        return False
+    plugins = importlib.metadata.entry_points(group="jax_plugins")
+    return bool(plugins) or importlib.util.find_spec("libtpu") is not None
 
 
 def _opened(files: Mapping[str, bytes], engine: EngineName, model: Mapping[str, Any]) -> Runtime:
@@ -318,11 +384,19 @@ def _exported(
     settings = {"weights": header["model_sha256"], "model": model, **how, "version": VERSION}
     key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
     folder = user_cache() / "exports" / key[:32]
+    refusal = folder.with_suffix(".txt")
     if not (folder / MANIFEST).is_file():
         _check_fixed(weights, model["preprocessing"]["size_rule"])
         with lock(folder.parent, wait=3600):
+            if refusal.is_file():  # or each query would try again, for seconds
+                raise InputError(refusal.read_text("utf-8"))
             if not (folder / MANIFEST).is_file():
-                _export(weights, model, how, folder)
+                try:
+                    _export(weights, model, how, folder)
+                except InputError as error:
+                    with atomic_path(refusal) as staged:
+                        staged.write_text(str(error), "utf-8")
+                    raise
     return folder
 
 
@@ -333,8 +407,13 @@ def _export(
     from crisalad_jax.checkpoints.weights import load_weights
     from crisalad_jax.nn.config import ModelConfig
 
-    warn(f"{weights}: exporting it for --runtime, once; into {folder}")
     config = from_plain(ModelConfig, model, source=str(weights))
+    if config.backbone.local_features is not None:
+        raise InputError(
+            f"{weights}: found backbone {config.backbone.part_name}, whose features no engine "
+            "finds, expected --runtime jax"
+        )
+    warn(f"{weights}: exporting it for --runtime, once; into {folder}")
     write_export(folder, load_weights(weights)._replace(config=config), ExportConfig(**how))
 
 

@@ -34,7 +34,8 @@ _COMMANDS: dict[str, dict[str, str]] = tomllib.loads(
 """What the help says of each command, of which commands.toml is the table.
 
 Each command is a module here, whose function `run` takes the parsed flags, and may return what
---json writes or prints. It may also have `needs_jax(flags)`.
+--json writes or prints. It may also have `needs_jax(flags)`; where that is false, and JAX computes
+after all, the command calls `common.Jax.set_up`.
 """
 
 
@@ -92,7 +93,7 @@ def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
     require("" not in arguments, "arguments: found an empty one, expected a value")
     _limit_pixels(arguments)
     load_entry_points()
-    from crisalad_jax.cli.common import emit_json, prepare_output
+    from crisalad_jax.cli.common import Jax, emit_json, prepare_output
     from crisalad_jax.config.flags import flag_values
 
     for plugins in flag_values(arguments, "--plugin"):
@@ -110,12 +111,9 @@ def _run(name: str, arguments: list[str], keep_programs: bool) -> None:
             abs(number) <= 2**40, f"--{flag}: found {number}, expected a number of at most 2**40"
         )
     prepare_output(chosen)
+    Jax.keeps_programs = keep_programs and not loaded_plugins()
     if not hasattr(module, "needs_jax") or module.needs_jax(chosen):
-        from crisalad_jax.utils import compiler, executable_cache
-
-        compiler.configure()
-        if keep_programs and not loaded_plugins():
-            executable_cache.cache_executables()
+        Jax.set_up()
     values = module.run(chosen)
     if values is not None:
         emit_json(chosen.json, values)

@@ -5,7 +5,7 @@ import json
 import pathlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, get_type_hints
 
 import rich.console
 import rich.table
@@ -14,7 +14,7 @@ from crisalad_jax.checkpoints.load import OpenedModel, find_weights, open_model
 from crisalad_jax.cli.flags import (
     ModelFlags,
     PositionFlags,
-    RuntimeName,
+    QueryRuntimeName,
     SetFlags,
     SizeFlags,
     Target,
@@ -108,6 +108,22 @@ def prepare_output(flags: Any) -> None:
             target.check(path)
 
 
+class Jax:
+    """What a command sets up before JAX computes."""
+
+    keeps_programs: ClassVar[bool] = False
+    """Whether compiled programs are stored; see `executable_cache.cache_executables`."""
+
+    @classmethod
+    def set_up(cls) -> None:
+        """Set up devices and caches, as `compiler.set_up` says."""
+        from crisalad_jax.utils import compiler, executable_cache
+
+        compiler.configure()
+        if cls.keeps_programs:
+            executable_cache.cache_executables()
+
+
 def emit_json(file: pathlib.Path | None, value: Mapping[str, Any]) -> None:
     """Write a command's result as JSON, or print it where the file is `STDOUT`; None does neither.
 
@@ -178,7 +194,7 @@ def _given(flags: Mapping[str, Any]) -> list[str]:
 
 
 def find_given(
-    weights: pathlib.Path | None, *, runtime: RuntimeName = "jax", quiet: bool = False
+    weights: pathlib.Path | None, *, runtime: QueryRuntimeName = "jax", quiet: bool = False
 ) -> pathlib.Path | None:
     """Return the file that an optional flag means, as `find_weights` does; None where not given.
 

@@ -13,6 +13,7 @@ if TYPE_CHECKING:  # commands that load no model of a file start without these
     from crisalad_jax.nn.config import ModelConfig
 
 RuntimeName = Literal["jax", "onnxruntime", "openvino"]
+QueryRuntimeName = Literal["auto", "jax", "onnxruntime", "openvino"]
 """What computes a model: JAX, or another engine (`checkpoints.engines.EngineName`)."""
 
 

@@ -9,8 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from crisalad_jax.cli.common import STDOUT, echo, find_given, pick, refuse_with, refuse_without
-from crisalad_jax.cli.flags import FrameFlags, JsonFlag, MapFlags, ReadFlags, RuntimeName, Target
+from crisalad_jax.checkpoints.engines import EngineName
+from crisalad_jax.checkpoints.runtime import LASTING, ONCE
+from crisalad_jax.cli.common import STDOUT, Jax, echo, find_given, pick, refuse_with, refuse_without
+from crisalad_jax.cli.flags import (
+    FrameFlags,
+    JsonFlag,
+    MapFlags,
+    QueryRuntimeName,
+    ReadFlags,
+    Target,
+)
 from crisalad_jax.config.checks import require
 from crisalad_jax.data.live import Camera, FolderWatch
 from crisalad_jax.retrieval.maps.answer_files import (
@@ -60,9 +69,10 @@ class Query(ReadFlags, FrameFlags, MapFlags, JsonFlag):
     """Frames a second taken of a video or log, by default 1; the most that --camera answers."""
     window: int = 1
     """Frames described together, each with those just before it: a moving camera's."""
-    runtime: RuntimeName = "jax"
-    """What computes the model: jax, onnxruntime or openvino (docs/export.md). Weights are exported
-    for it once; --weights may be an exported folder."""
+    runtime: QueryRuntimeName = "auto"
+    """What computes the model: jax, onnxruntime or openvino (docs/export.md); auto is the fastest
+    that is installed and agrees with jax. Weights are exported for it once; --weights may be an
+    exported folder."""
     k: int = 5
     """Answers to each query."""
     min_similarity: float | None = None
@@ -124,7 +134,7 @@ def run(arguments: Query) -> None:
     refuse_without("--camera", None, rate=arguments.rate)
     _check_files(arguments)
     sequence, where = _sequence_of(arguments), _where_of(arguments)
-    with _opened(arguments) as places:
+    with _opened(arguments, ONCE) as (places, by):
         if arguments.out is not None:
             check_positions(arguments.out, places.axes, places.zone)
         answers = query(
@@ -142,7 +152,7 @@ def run(arguments: Query) -> None:
     unknown = _unknown_words(answers, places)
     file, gallery = arguments.json, arguments.gallery
     if file is None:
-        echo(f"{arguments.map}, {images}{unknown}")
+        echo(f"{arguments.map}, {images}; {by}{unknown}")
         echo("\n".join(answer_lines(answers)))
     elif file == STDOUT:
         for line in json_lines(answers):
@@ -170,7 +180,7 @@ def run(arguments: Query) -> None:
                 staged.enter_context(atomic_path(path)).write_text(text, "utf-8", newline="")
                 written[path] = asked if count == len(answers.queries) else f"{count} of {asked}"
     for path, words in written.items():
-        echo(f"{path}: {words} in a map of {images}{unknown}")
+        echo(f"{path}: {words} in a map of {images}; {by}{unknown}")
 
 
 def _check_files(arguments: Query) -> None:
@@ -227,18 +237,23 @@ def _verify_of(arguments: Query) -> Verify | None:
 
 
 @contextlib.contextmanager
-def _opened(arguments: Query) -> Iterator[Map]:
-    """Open the map, and its model in the engine that the flags ask for."""
+def _opened(arguments: Query, order: Sequence[EngineName]) -> Iterator[tuple[Map, str]]:
+    """Open the map, and its model in the engine that the flags ask for, or in the first of these.
+
+    Yields:
+        (map, words that name the engine).
+    """
     verify, runtime = arguments.checksums, arguments.runtime
     calibrated = arguments.min_similarity is None
+    groupings = ["single" if arguments.window == 1 else "window"]
     with Map.open(arguments.map, verify=verify, calibrated=calibrated) as places:
-        places.load_model(
-            find_given(arguments.weights, runtime=runtime, quiet=arguments.quiet),
-            engine=runtime,
-            groupings=["single" if arguments.window == 1 else "window"],
-            verify=verify,
-        )
-        yield places
+        file = find_given(arguments.weights, runtime=runtime, quiet=arguments.quiet)
+        if runtime == "auto":
+            runtime = places.first_engine(order, file, groupings=groupings)
+            if runtime == "jax":
+                Jax.set_up()
+        places.load_model(file, engine=runtime, groupings=groupings, verify=verify)
+        yield places, f"by {runtime}"
 
 
 def _unknown_words(answers: Answers, places: Map) -> str:
@@ -326,7 +341,7 @@ def _run_live(arguments: Query) -> None:
             rate = 1.0 if arguments.rate is None else arguments.rate
             source = stack.enter_context(Camera(arguments.camera, rate=rate, **more))
             words = f"taking frames from {source.name}"
-        places = stack.enter_context(_opened(arguments))
+        places, by = stack.enter_context(_opened(arguments, LASTING))
         latencies: list[float] = []
         state = stack.enter_context(defer_signals())
         recording = None
@@ -335,7 +350,7 @@ def _run_live(arguments: Query) -> None:
 
         def ready() -> None:
             state.has_work = True  # the summary
-            _log(f"ready, {words}")
+            _log(f"ready, {words}; {by}")
 
         answers = query_live(
             places,

@@ -5,7 +5,7 @@ import pathlib
 import re
 
 from crisalad_jax.cli.common import echo, find_given, refuse_without
-from crisalad_jax.cli.flags import DecodeFlags, MapFlags
+from crisalad_jax.cli.flags import DecodeFlags, MapFlags, QueryRuntimeName
 from crisalad_jax.retrieval.serve import serve_map
 from crisalad_jax.retrieval.verification.verify import Verify
 from crisalad_jax.utils.errors import InputError
@@ -27,6 +27,8 @@ class Serve(DecodeFlags, MapFlags):
     """Let requests add images to the map; no other process can append meanwhile."""
     map_images: pathlib.Path | None = None
     """Folder of the map's pictures, if they are not where they were."""
+    runtime: QueryRuntimeName = "auto"
+    """What computes the model; see `crisalad query`."""
     k: int = 5
     """Answers to a picture, where the request names no number."""
     tiles: str | None = None
@@ -51,15 +53,16 @@ def run(arguments: Serve) -> None:
     else:
         token = read_text(arguments.token_file, "a token in one line").strip()
 
-    def ready(address: str) -> None:
+    def ready(address: str, engine: str) -> None:
         needs = " with the token" if token else ""
         appends = ", and adds images to it" if arguments.append else ""
-        echo(f"{address}{needs}: answers for {arguments.map}{appends}; Ctrl-C ends it")
+        echo(f"{address}{needs}: answers for {arguments.map}{appends}; by {engine}; Ctrl-C ends it")
 
-    given = vars(arguments) | {"token": token, "ready": ready}
-    given["weights"] = find_given(arguments.weights, quiet=arguments.quiet)
+    given = vars(arguments) | {"token": token, "ready": ready, "engine": arguments.runtime}
+    runtime = arguments.runtime
+    given["weights"] = find_given(arguments.weights, runtime=runtime, quiet=arguments.quiet)
     given |= {"rerank": _verify_of(arguments), "verify": arguments.checksums}
-    for name in ("token_file", "plugin", "checksums"):
+    for name in ("token_file", "plugin", "checksums", "runtime"):
         del given[name]
     serve_map(given.pop("map"), **given)
 

@@ -165,7 +165,7 @@ def test_no_command_prints_the_usage(capfd):
         ("train --data d --out o --preset", "--preset: found none, expected a value"),
         ("evaluate --data d --image-size 1 x", "--image-size: found '1 x', expected 2 whole numb"),
         ("train --data d --out o --model.image-size 9 9 9", "found '9 9 9', expected 2 values"),
-        ("query a --map m --runtime tvm", "--runtime: found 'tvm', expected one of jax, onnxrunt"),
+        ("query a --map m --runtime tvm", "--runtime: found 'tvm', expected one of auto, jax, onn"),
         ("index --images a b --out m", r"--images: found 'a b', expected one value \(quote"),
         ("extract --images a --out m --quiet no", "--quiet: found 'no', expected no value"),
         ("index --image a --out m", "--image: found no such flag; missing --images PATH"),

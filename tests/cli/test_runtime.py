@@ -1,21 +1,29 @@
 """`--runtime` of the commands: the answers of JAX, and for every bad input one line."""
 
+import importlib.util
 import json
 import pathlib
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 
 import jax
 import numpy as np
 import pytest
 
+from crisalad_jax.checkpoints import runtime as runtimes
+from crisalad_jax.checkpoints import starter
+from crisalad_jax.checkpoints.engines import EngineName
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
-from crisalad_jax.checkpoints.runtime import open_runtime
+from crisalad_jax.checkpoints.runtime import LASTING, ONCE, first_engine, open_runtime
+from crisalad_jax.checkpoints.safetensors_io import read_header
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
+from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import read_image
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
 from crisalad_jax.retrieval.describe import prepare_image
+from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
 from tests.cli.test_cli import Capture, fails, runs
@@ -23,7 +31,7 @@ from tests.conftest import MODEL
 
 pytestmark = pytest.mark.usefixtures("symbolic_shapes")
 
-ENGINES = ("onnxruntime", "openvino")
+ENGINES: Sequence[EngineName] = ("onnxruntime", "openvino")
 SLOW = pytest.mark.slow
 # As of exports: the same operations, rounded in another order.
 TOLERANCE = 2e-6
@@ -91,6 +99,72 @@ def test_a_map_of_one_runtime_answers_another(shared, tmp_path, capfd, weights):
         lines = map(json.loads, said.read_text().splitlines())
         answers.append([[each["name"] for each in line["neighbours"]] for line in lines])
     assert answers[0] == answers[1] == answers[2] != []
+
+
+@pytest.mark.usefixtures("engines_by_default")
+def test_a_query_takes_the_fastest_engine_that_is_installed(
+    shared, town_map, tmp_path, capfd, monkeypatch
+):
+    asked = ("query", town(shared) / "queries", "--map", town_map, "--k", "3", "--quiet")
+
+    def answers(*flags):
+        out = tmp_path / "answers.jsonl"
+        said = succeeds(capfd, *asked, "--json", out, *flags)
+        lines = map(json.loads, out.read_text().splitlines())
+        found = [[each["similarity"] for each in line["neighbours"]] for line in lines]
+        return said.split("; by ")[1].split(";")[0], found
+
+    by, found = answers()
+    assert by == "onnxruntime"
+    expected = answers("--runtime", "jax")[1]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE)
+    with Map.open(town_map) as places:
+        assert places.first_engine(LASTING) == "openvino"
+    real = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name in ENGINES else real(name)
+    )
+    assert answers() == ("jax", expected)
+
+
+@pytest.mark.usefixtures("engines_by_default")
+def test_where_jax_describes_although_engines_are_there(weights, monkeypatch):
+    plain = to_plain(MODEL)
+    assert first_engine(ONCE, weights, plain) == "onnxruntime"
+    assert first_engine(ONCE, weights, plain | {"compute_dtype": "bfloat16"}) == "jax"
+    native = to_plain(MODEL.resized(None, ["native"]))
+    assert first_engine(ONCE, weights, native) == "jax"
+    features = starter.FILES["hog"]
+    assert first_engine(ONCE, features, read_header(features)["config"]) == "jax"
+    monkeypatch.setattr(
+        runtimes.importlib.metadata, "entry_points", lambda group: ["cuda"] if group else []
+    )
+    assert first_engine(ONCE, weights, plain) == "jax"
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    assert first_engine(ONCE, weights, plain) == "onnxruntime"
+
+
+@pytest.mark.usefixtures("engines_by_default")
+def test_a_model_that_no_engine_computes_is_tried_once(weights, tmp_path, monkeypatch):
+    monkeypatch.setenv("CRISALAD_CACHE", str(tmp_path))
+    tried = []
+
+    def refuse(*given: object) -> None:
+        tried.append(given)
+        raise InputError("its descriptors differ")
+
+    monkeypatch.setattr(runtimes, "_export", refuse)
+    for _ in range(2):
+        assert first_engine(["onnxruntime"], weights, to_plain(MODEL)) == "jax"
+    assert len(tried) == 1
+    with pytest.raises(InputError, match="its descriptors differ"):
+        open_runtime(weights, "onnxruntime")
+
+
+def test_a_folder_that_nothing_installed_reads(exported, tmp_path):
+    assert first_engine(LASTING, exported, {}) == "openvino"
+    with pytest.raises(InputError, match=r"format onnx, .* expected onnxruntime or openvino"):
+        first_engine([], exported, {})
 
 
 def printed_by(program: str) -> str:

@@ -196,7 +196,7 @@ def test_a_camera_of_a_video(town_map, tmp_path, capfd):
     lines = [json.loads(line) for line in out.splitlines()]
     assert (lines[-1]["query"], lines[-1]["time"]) == ("walk.avi#t=0.400", 0.4)
     ready, summary = error.splitlines()
-    assert ready == f"crisalad: ready, taking frames from {video}"
+    assert ready == f"crisalad: ready, taking frames from {video}; by jax"
     assert summary.startswith(f"crisalad: {len(lines)} answers, latency median ")
 
 
@@ -217,7 +217,7 @@ def test_a_bag_is_replayed_and_no_frame_is_lost(town_map, tmp_path, capfd):
         assert line["latency_ms"] > 0
     assert lines[-1]["time"] == (BEGIN + 39 * step) / SECOND
     ready, summary = error.splitlines()
-    assert ready == f"crisalad: ready, taking frames from {bag}"
+    assert ready == f"crisalad: ready, taking frames from {bag}; by jax"
     assert summary.startswith(f"crisalad: {len(lines)} answer")
     passed = 40 - len(lines)
     words = {0: " ms", 1: "; 1 frame passed over"}

@@ -9,7 +9,7 @@ import os
 import pathlib
 import socket
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Literal
 
 import h11
 import uvicorn
@@ -17,6 +17,8 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from crisalad_jax.checkpoints.engines import EngineName
+from crisalad_jax.checkpoints.runtime import LASTING
 from crisalad_jax.config.checks import check_count, require
 from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.map import Map
@@ -50,6 +52,7 @@ def serve_map(
     folder: str | os.PathLike[str],
     *,
     weights: str | os.PathLike[str] | None = None,
+    engine: EngineName | Literal["jax", "auto"] = "auto",
     host: str = "127.0.0.1",
     port: int = 8000,
     token: str | None = None,
@@ -64,7 +67,7 @@ def serve_map(
     rerank: Verify | None = None,
     verify: bool = True,
     quiet: bool = False,
-    ready: Callable[[str], object] = lambda _: None,
+    ready: Callable[[str, str], object] = lambda address, engine: None,
 ) -> None:
     """Serve a map over HTTP, with a page for browsers, until a signal ends it.
 
@@ -73,6 +76,7 @@ def serve_map(
     Args:
         folder: the map.
         weights: the model that made it; None is where it was then.
+        engine: "jax", "onnxruntime" or "openvino"; or "auto", the first of `LASTING` that does.
         host: name or address to listen at. Others than this machine's own need a token.
         port: port to listen at; 0 is any that is free.
         token: what requests have to bring as `Authorization: Bearer ...`; None is nothing.
@@ -88,7 +92,7 @@ def serve_map(
         rerank: how the best answers are verified by local features; None does not.
         verify: whether to compare the map's descriptors with their checksums.
         quiet: whether to show no progress bar.
-        ready: called with the service's address once it answers.
+        ready: called with the service's address and the engine once it answers.
 
     Raises:
         InputError: a number out of range; an address that is not this machine's or in use; one that
@@ -115,7 +119,9 @@ def serve_map(
         listener = stack.enter_context(contextlib.closing(_bound(host, port)))
         places = stack.enter_context(_opened(folder, append=append, verify=verify))
         behind = None if tiles is None else open_tiles(tiles, tiles_attribution, places)
-        places.load_model(weights)
+        if engine == "auto":
+            engine = places.first_engine(LASTING, weights)
+        places.load_model(weights, engine=engine)
         worker = MapWorker(places, places.describer(), batch_size=batch_size)
         stack.enter_context(contextlib.closing(worker))
         worker.compile(quiet=quiet)
@@ -126,7 +132,7 @@ def serve_map(
         shown: dict[str, Any] = {"map_images": map_images, "tiles": behind, "rerank": rerank}
         app = make_app(worker, **access, **limits, **shown)
         address = f"http://{bracketed(host)}:{listener.getsockname()[1]}"
-        Server(app, stop, lambda: ready(address), behind).run([listener])
+        Server(app, stop, lambda: ready(address, engine), behind).run([listener])
 
 
 class _Connection(H11Protocol):
