@@ -17,6 +17,10 @@ Program = Callable[..., np.ndarray]
 """A loaded program: its inputs, in their order, to its output."""
 
 
+class NotExportableError(InputError):
+    """A model that an engine cannot compute as JAX does: another try would end alike."""
+
+
 class ProgramFormat(NamedTuple):
     """The files of a program that engines run, and the engine that they are of."""
 
@@ -37,7 +41,10 @@ FORMATS: Mapping[str, ProgramFormat] = {
         "openvino", (".xml", ".bin"), "openvino.Core().compile_model({file!r}, 'CPU')(images)"
     ),
 }
-READS: Mapping[str, tuple[str, ...]] = {"onnxruntime": ("onnx",), "openvino": ("openvino", "onnx")}
+READS: Mapping[EngineName, tuple[str, ...]] = {
+    "onnxruntime": ("onnx",),
+    "openvino": ("openvino", "onnx"),
+}
 """Formats that an engine reads, its own first."""
 _TOOLS = "openvino.tools.ovc"
 _CAPABILITIES = "OPTIMIZATION_CAPABILITIES"

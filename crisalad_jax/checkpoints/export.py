@@ -358,7 +358,7 @@ def _write_onnx(
         files[name] = {"program": _file(file), "weights": _file(data) if beside else None}
     difference = _difference(folder, list(files), model, how)
     if calibration is None and not difference <= TOLERANCE:
-        raise InputError(
+        raise engines.NotExportableError(
             f"{out}: found descriptors of {form.engine} that differ from those of `describe` by "
             f"{difference:.2g}, expected at most {TOLERANCE:g}: nothing was written"
         )

@@ -71,7 +71,7 @@ def find_weights(
     Args:
         weights: a path, or a name of `crisalad models`, or None; or hf://OWNER/NAME, where a file
             is at Hugging Face's hub; or a folder as there are at the hub.
-        engine: any but "jax" takes a folder too, of an exported model.
+        engine: any but "jax" takes a folder too, of an exported model; "auto" only if it is one.
         quiet: no progress bar.
 
     Returns:
@@ -101,8 +101,13 @@ def find_weights(
         address = parse_hub(name)
         address = dataclasses.replace(address, file=address.file or HUB_FILE)
         return download_file(address, quiet=quiet)
-    if (path.suffix and os.path.isfile(path)) or (engine != "jax" and path.is_dir()):
+    if path.suffix and os.path.isfile(path):
         return path
+    if engine != "jax" and path.is_dir():
+        from crisalad_jax.checkpoints.runtime import MANIFEST
+
+        if engine != "auto" or (path / MANIFEST).is_file():
+            return path
     # Imported here: a file needs no table of published models.
     from crisalad_jax.checkpoints.published import PUBLISHED, nearest_names
 
@@ -179,9 +184,10 @@ def open_model(
 
         model = read_weights(file, verify=verify).model
         return OpenedModel(model._replace(config=changed(model.config)), name, file)
-    from crisalad_jax.checkpoints.runtime import open_runtime, read_model
+    from crisalad_jax.checkpoints.runtime import check_takes_photographs, open_runtime, read_model
 
     config = changed(read_model(file))
+    check_takes_photographs(config, file)
     attends = config.cross_image.attends
     model = open_runtime(
         file,

@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import importlib
 import importlib.metadata
 import importlib.util
 import json
@@ -19,7 +20,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from crisalad_jax.checkpoints.engines import READS, EngineName, Precision, Program, load_program
+from crisalad_jax.checkpoints.engines import (
+    READS,
+    EngineName,
+    NotExportableError,
+    Precision,
+    Program,
+    load_program,
+)
 from crisalad_jax.checkpoints.safetensors_io import read_header
 from crisalad_jax.config.checks import choose
 from crisalad_jax.config.io import from_plain
@@ -43,10 +51,6 @@ MANIFEST = "manifest.json"
 _EXPECTED = "the manifest of `crisalad export`"
 _CHANGED = ("image_size", "preprocessing", "compute_dtype")
 """Of a model's configuration, what may be other than its export's."""
-ONCE: Sequence[EngineName] = ("onnxruntime", "openvino")
-"""Engines by how soon they describe a first image, the soonest first (docs/performance.md)."""
-LASTING: Sequence[EngineName] = ("openvino", "onnxruntime")
-"""Engines by how many images a second they describe one by one."""
 DESCRIBE, TOKENS, ATTEND = "describe", "tokens", "attend"
 """Names of programs: of images to descriptors, or of the two halves of that."""
 
@@ -244,22 +248,17 @@ def open_runtime(
     )
 
 
-def first_engine(
-    order: Sequence[EngineName],
-    source: str | os.PathLike[str],
-    config: Mapping[str, Any],
-    *,
-    any_grouping: bool = False,
+def fastest_engine(
+    source: str | os.PathLike[str], config: Mapping[str, Any], *, any_grouping: bool = False
 ) -> EngineName | Literal["jax"]:
-    """Return the first engine of an order that computes the descriptors of JAX.
+    """Choose the engine that describes single images fastest, of those that compute what JAX does.
 
-    It has to be installed, and to differ from JAX by less than 1e-5, which the export measures that
-    is made here the first time. The answer depends on the model and on what is installed alone. It
-    is "jax" where JAX has an accelerator, for images in bfloat16 or of sizes of their own, and for
-    parts of plugins.
+    ONNX Runtime is before OpenVINO, which starts later and is as fast then (docs/performance.md).
+    Either has to be installed, and is exported for the first time; the export compares its
+    descriptors with JAX's. JAX is chosen where it may have an accelerator, for images in bfloat16
+    or of sizes of their own, for parts of plugins, and where no engine can be used.
 
     Args:
-        order: names of engines, such as `ONCE` or `LASTING`.
         source: a file of weights, or an exported folder.
         config: a `ModelConfig` as JSON values, as `open_runtime` takes it.
         any_grouping: see `open_runtime`.
@@ -267,14 +266,13 @@ def first_engine(
     Raises:
         InputError: an exported folder of a program that no installed engine reads.
     """
-    installed: list[EngineName] = [
-        name for name in order if importlib.util.find_spec(name) is not None
-    ]
+    installed: list[EngineName] = [name for name in READS if importlib.util.find_spec(name)]
     path = pathlib.Path(source)
+    narrow = config["compute_dtype"] == "bfloat16"
     if path.is_dir():
         kind = read_json(path / MANIFEST, _EXPECTED).get("program_format")
         for engine in installed:
-            if kind in READS[engine]:
+            if kind in READS[engine] and not (narrow and engine == "onnxruntime"):
                 return engine
         readers = " or ".join(name for name in READS if kind in READS[name])
         raise InputError(
@@ -285,8 +283,10 @@ def first_engine(
     if not fits or loaded_plugins() or _has_accelerator():
         return "jax"
     for engine in installed:
-        with contextlib.suppress(InputError, ModuleNotFoundError, OSError):
-            _exported(path, engine, {name: config[name] for name in _CHANGED}, any_grouping)
+        # Whatever stands against an export, JAX can answer; its errors then are the user's.
+        with contextlib.suppress(Exception):
+            changes = {name: config[name] for name in _CHANGED}
+            _exported(path, engine, changes, any_grouping, wait=0)
             return engine
     return "jax"
 
@@ -371,13 +371,24 @@ def _load(
         finally:  # a changed file explains best why an engine cannot load it
             for file, digest in zip(files, digests, strict=False):
                 if digest != files[file]:
-                    raise ChangedFileError(file)
+                    if user_cache() not in folder.parents:
+                        raise ChangedFileError(file)
+                    advice = f"remove {folder}, and the same command makes it again"
+                    raise InputError(f"{ChangedFileError(file)}; {advice}")
 
 
 def _exported(
-    weights: pathlib.Path, engine: EngineName, changes: Mapping[str, Any], any_grouping: bool
+    weights: pathlib.Path,
+    engine: EngineName,
+    changes: Mapping[str, Any],
+    any_grouping: bool,
+    *,
+    wait: float = 3600,
 ) -> pathlib.Path:
-    """Return the exported folder of a file of weights in the cache; export it the first time."""
+    """Return the exported folder of a file of weights in the cache; export it the first time.
+
+    `wait` is for another process that exports, in seconds.
+    """
     header = read_header(weights)
     model = header["config"] | changes | {"compute_dtype": "float32"}
     how = {"grouping": "any" if any_grouping else "single", "format": READS[engine][0]}
@@ -385,36 +396,50 @@ def _exported(
     key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
     folder = user_cache() / "exports" / key[:32]
     refusal = folder.with_suffix(".txt")
+    if refusal.is_file():  # or each query would try again, for seconds
+        raise NotExportableError(f"{refusal.read_text('utf-8')} (kept in {refusal})")
     if not (folder / MANIFEST).is_file():
         _check_fixed(weights, model["preprocessing"]["size_rule"])
-        with lock(folder.parent, wait=3600):
-            if refusal.is_file():  # or each query would try again, for seconds
-                raise InputError(refusal.read_text("utf-8"))
+        with lock(folder.parent, wait=wait):
             if not (folder / MANIFEST).is_file():
                 try:
-                    _export(weights, model, how, folder)
-                except InputError as error:
-                    with atomic_path(refusal) as staged:
+                    _export(weights, model, how, folder, engine)
+                except NotExportableError as error:
+                    with contextlib.suppress(OSError), atomic_path(refusal) as staged:
                         staged.write_text(str(error), "utf-8")
                     raise
     return folder
 
 
 def _export(
-    weights: pathlib.Path, model: Mapping[str, Any], how: Any, folder: pathlib.Path
+    weights: pathlib.Path,
+    model: Mapping[str, Any],
+    how: Any,
+    folder: pathlib.Path,
+    engine: EngineName,
 ) -> None:
+    importlib.import_module("onnx")  # before the note, where it is not installed
     from crisalad_jax.checkpoints.export import ExportConfig, write_export
     from crisalad_jax.checkpoints.weights import load_weights
     from crisalad_jax.nn.config import ModelConfig
 
     config = from_plain(ModelConfig, model, source=str(weights))
+    check_takes_photographs(config, weights)
+    warn(f"{weights}: exporting it for {engine}, once (--runtime jax needs none); into {folder}")
+    write_export(folder, load_weights(weights)._replace(config=config), ExportConfig(**how))
+
+
+def check_takes_photographs(config: "ModelConfig", source: object) -> None:
+    """Check that a model's program takes photographs, not features of them.
+
+    Raises:
+        InputError: it takes features.
+    """
     if config.backbone.local_features is not None:
-        raise InputError(
-            f"{weights}: found backbone {config.backbone.part_name}, whose features no engine "
+        raise NotExportableError(
+            f"{source}: found backbone {config.backbone.part_name}, whose features no engine "
             "finds, expected --runtime jax"
         )
-    warn(f"{weights}: exporting it for --runtime, once; into {folder}")
-    write_export(folder, load_weights(weights)._replace(config=config), ExportConfig(**how))
 
 
 def read_model(source: str | os.PathLike[str]) -> "ModelConfig":

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from crisalad_jax.checkpoints.engines import EngineName
-from crisalad_jax.checkpoints.runtime import LASTING, ONCE
 from crisalad_jax.cli.common import STDOUT, Jax, echo, find_given, pick, refuse_with, refuse_without
 from crisalad_jax.cli.flags import (
     FrameFlags,
@@ -134,7 +132,7 @@ def run(arguments: Query) -> None:
     refuse_without("--camera", None, rate=arguments.rate)
     _check_files(arguments)
     sequence, where = _sequence_of(arguments), _where_of(arguments)
-    with _opened(arguments, ONCE) as (places, by):
+    with _opened(arguments) as (places, by):
         if arguments.out is not None:
             check_positions(arguments.out, places.axes, places.zone)
         answers = query(
@@ -237,8 +235,8 @@ def _verify_of(arguments: Query) -> Verify | None:
 
 
 @contextlib.contextmanager
-def _opened(arguments: Query, order: Sequence[EngineName]) -> Iterator[tuple[Map, str]]:
-    """Open the map, and its model in the engine that the flags ask for, or in the first of these.
+def _opened(arguments: Query) -> Iterator[tuple[Map, str]]:
+    """Open the map, and its model in the engine that the flags ask for, or in the fastest.
 
     Yields:
         (map, words that name the engine).
@@ -249,7 +247,7 @@ def _opened(arguments: Query, order: Sequence[EngineName]) -> Iterator[tuple[Map
     with Map.open(arguments.map, verify=verify, calibrated=calibrated) as places:
         file = find_given(arguments.weights, runtime=runtime, quiet=arguments.quiet)
         if runtime == "auto":
-            runtime = places.first_engine(order, file, groupings=groupings)
+            runtime = places.fastest_engine(file, groupings=groupings)
             if runtime == "jax":
                 Jax.set_up()
         places.load_model(file, engine=runtime, groupings=groupings, verify=verify)
@@ -341,7 +339,7 @@ def _run_live(arguments: Query) -> None:
             rate = 1.0 if arguments.rate is None else arguments.rate
             source = stack.enter_context(Camera(arguments.camera, rate=rate, **more))
             words = f"taking frames from {source.name}"
-        places, by = stack.enter_context(_opened(arguments, LASTING))
+        places, by = stack.enter_context(_opened(arguments))
         latencies: list[float] = []
         state = stack.enter_context(defer_signals())
         recording = None

@@ -162,7 +162,7 @@ def _resampler(values: int, once: bool) -> Callable[..., None]:
     """Return what resamples so many more values: numpy while they are few, or machine code.
 
     Loading numba takes half a second, a third of the time from a start to a first answer
-    (docs/performance.md). Without numba, numpy resamples all images.
+    (docs/performance-studies.md). Without numba, numpy resamples all images.
 
     Args:
         values: number of values of the image.

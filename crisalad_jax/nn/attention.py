@@ -196,14 +196,12 @@ class _Axes(NamedTuple):
 
     queries: str
     keys: str
-    weights: str
 
 
-# With the heads in front every product is a plain batched matmul. Queries and outputs are columns,
-# and the softmax runs down columns, which is faster on a CPU.
-_COLUMNS = _Axes("...di", "...jd", "...ji")
+# Every product is a plain batched one in the order of memory, which the CPU's libraries take.
+_HEADS_FIRST = _Axes("...hid", "...hjd")
 # As the linear layer leaves them: an accelerator's compiler has no use for the copies.
-_ROWS = _Axes("...ihd", "...jhd", "...hji")
+_HEADS_LAST = _Axes("...ihd", "...jhd")
 
 
 def dot_product_attention(
@@ -216,9 +214,8 @@ def dot_product_attention(
 ) -> Float[Array, "*batch query head dim"]:
     """Average the values for every query, weighted by its scores' softmax times the dropout mask.
 
-    The gradient is a custom rule. JAX's own would recompute the result, and order the product for
-    the queries' cotangent such that it takes twice as long on a CPU. There is no forward mode
-    (`jax.jvp`).
+    The gradient is a custom rule. JAX's own would recompute the result, and order products such
+    that they take twice as long on a CPU. There is no forward mode (`jax.jvp`).
 
     Args:
         queries: not yet divided by the root of their width.
@@ -228,17 +225,12 @@ def dot_product_attention(
         dropout_mask: factors of the weights, 0 or above 1.
     """
     queries = queries / math.sqrt(queries.shape[-1])
-    if target().platform == "cpu" and queries.dtype == jnp.bfloat16:
-        heads_first = (row_major(jnp.moveaxis(x, -3, -2)) for x in (queries, keys, values))
-        return jnp.moveaxis(_mix_rows(*heads_first, mask, dropout_mask), -2, -3)
-    mask = None if mask is None else mask.T
+    dropped = None if dropout_mask is None else dropout_mask.swapaxes(-2, -1)
     precision = rule_precision(queries.dtype)
     if target().platform != "cpu":
-        return _mix(queries, keys, values, mask, dropout_mask, _ROWS, precision)
-    queries = jnp.moveaxis(queries, -3, -1)
-    keys, values = jnp.moveaxis(keys, -3, -2), jnp.moveaxis(values, -3, -2)
-    mixed = _mix(queries, keys, values, mask, dropout_mask, _COLUMNS, precision)
-    return jnp.moveaxis(mixed, -1, -3)
+        return _mix(queries, keys, values, mask, dropped, _HEADS_LAST, precision)
+    heads_first = (row_major(jnp.moveaxis(x, -3, -2)) for x in (queries, keys, values))
+    return jnp.moveaxis(_mix(*heads_first, mask, dropped, _HEADS_FIRST, precision), -2, -3)
 
 
 def _product(formula: str, a: Array, b: Array, precision: Any = None) -> Array:
@@ -250,16 +242,16 @@ def _mix_values(
     queries: Float[Array, "..."],
     keys: Float[Array, "..."],
     values: Float[Array, "..."],
-    mask: Bool[Array, "token query"] | None,
-    dropout_mask: Float[Array, "*batch head token query"] | None,
+    mask: Bool[Array, "query key"] | None,
+    dropout_mask: Float[Array, "*#batch head query key"] | None,
     axes: _Axes,
     precision: str | None,
 ) -> Float[Array, "..."]:
     """Compute `dot_product_attention`; queries have `axes.queries`, keys and values `axes.keys`."""
     weights, totals = _softmax(queries, keys, mask, axes, precision)
-    weights = weights if dropout_mask is None else weights * dropout_mask
-    to_queries = f"{axes.keys},{axes.weights}->{axes.queries}"
-    mixed = _product(to_queries, values, weights.astype(values.dtype), precision)
+    used = weights if dropout_mask is None else weights * dropout_mask
+    formula = f"...hij,{axes.keys}->{axes.queries}"
+    mixed = _product(formula, used.astype(values.dtype), values, precision)
     # Do the softmax's division here, on the smaller array.
     return (mixed / _beside_queries(totals, axes)).astype(values.dtype)
 
@@ -269,22 +261,17 @@ _mix = jax.custom_vjp(_mix_values, nondiff_argnums=(5, 6))
 
 def _softmax(
     queries: Array, keys: Array, mask: Array | None, axes: _Axes, precision: str | None
-) -> tuple[Float[Array, "*batch head token query"], Float[Array, "*batch head 1 query"]]:
-    """Compute the scores' exponentials, with keys down the columns, and each column's total."""
-    formula = f"{axes.keys},{axes.queries}->{axes.weights}"
-    return _exponentials(_product(formula, keys, queries, precision), mask, axis=-2)
-
-
-def _exponentials(scores: Array, mask: Array | None, *, axis: int) -> tuple[Array, Array]:
-    """Compute the exponentials of scores, 0 where masked, and their totals over the keys."""
+) -> tuple[Float[Array, "*batch head query key"], Float[Array, "*batch head query 1"]]:
+    """Compute the scores' exponentials, 0 where masked, and their totals over the keys."""
+    scores = _product(f"{axes.queries},{axes.keys}->...hij", queries, keys, precision)
     if mask is not None:
         scores = jnp.where(mask, scores, -jnp.inf)
-    weights = jnp.exp(scores - scores.max(axis=axis, keepdims=True))
-    return weights, weights.sum(axis=axis, keepdims=True)
+    weights = jnp.exp(scores - scores.max(axis=-1, keepdims=True))
+    return weights, weights.sum(axis=-1, keepdims=True)
 
 
-def _beside_queries(totals: Float[Array, "*batch head 1 query"], axes: _Axes) -> Array:
-    return totals if axes == _COLUMNS else jnp.moveaxis(totals, -1, -3)
+def _beside_queries(totals: Float[Array, "*batch head query 1"], axes: _Axes) -> Array:
+    return totals if axes == _HEADS_FIRST else jnp.moveaxis(totals, -3, -2)
 
 
 def _mix_backward(
@@ -292,63 +279,26 @@ def _mix_backward(
 ) -> tuple[Any, ...]:
     queries, keys, values, mask, dropout_mask = inputs
     product = functools.partial(_product, precision=precision)
+    order = row_major if axes == _HEADS_FIRST else lambda x: x
     weights, totals = _softmax(queries, keys, mask, axes, precision)
-    change = (change / _beside_queries(totals, axes)).astype(values.dtype)
-    to_weights = product(f"{axes.keys},{axes.queries}->{axes.weights}", values, change)
+    change = order((change / _beside_queries(totals, axes)).astype(values.dtype))
+    to_weights = product(f"{axes.queries},{axes.keys}->...hij", change, values)
     used = weights
     if dropout_mask is not None:
         to_weights, used = to_weights * dropout_mask, weights * dropout_mask
-    over_queries = f"{axes.weights},{axes.queries}->{axes.keys}"
-    to_values = product(over_queries, used.astype(values.dtype), change)
-    mean = (weights * to_weights).sum(axis=-2, keepdims=True) / totals
-    to_scores = (weights * (to_weights - mean)).astype(keys.dtype)
-    to_queries = product(f"{axes.keys},{axes.weights}->{axes.queries}", keys, to_scores)
-    to_keys = product(over_queries, to_scores, queries).astype(keys.dtype)
-    nothing = None if dropout_mask is None else jnp.zeros_like(dropout_mask)
-    to_queries, to_values = to_queries.astype(queries.dtype), to_values.astype(values.dtype)
-    return to_queries, to_keys, to_values, None, nothing
-
-
-_mix.defvjp(lambda *inputs: (_mix(*inputs), inputs[:5]), _mix_backward)
-
-
-@jax.custom_vjp
-def _mix_rows(
-    queries: Float[Array, "*batch head query dim"],
-    keys: Float[Array, "*batch head key dim"],
-    values: Float[Array, "*batch head key dim"],
-    mask: Bool[Array, "query key"] | None,
-    dropout_mask: Float[Array, "*#batch head key query"] | None,
-) -> Float[Array, "*batch head query dim"]:
-    """Compute `dot_product_attention` by products that are all in bfloat16 (`row_major`)."""
-    weights, totals = _softmax_of_rows(queries, keys, mask)
-    used = _dropped(weights, dropout_mask).astype(values.dtype)
-    mixed = _product("...ij,...jd->...id", used, values)
-    return (mixed / totals).astype(values.dtype)
-
-
-def _softmax_of_rows(queries: Array, keys: Array, mask: Array | None) -> tuple[Array, Array]:
-    return _exponentials(_product("...id,...jd->...ij", queries, keys), mask, axis=-1)
-
-
-def _dropped(weights: Array, dropout_mask: Array | None) -> Array:
-    return weights if dropout_mask is None else weights * dropout_mask.swapaxes(-2, -1)
-
-
-def _mix_rows_backward(inputs: tuple[Any, ...], change: Array) -> tuple[Any, ...]:
-    queries, keys, values, mask, dropout_mask = inputs
-    weights, totals = _softmax_of_rows(queries, keys, mask)
-    change = row_major((change / totals).astype(values.dtype))
-    to_weights = _dropped(_product("...id,...jd->...ij", change, values), dropout_mask)
     mean = (weights * to_weights).sum(axis=-1, keepdims=True) / totals
     to_scores = (weights * (to_weights - mean)).astype(keys.dtype)
-    used = _dropped(weights, dropout_mask).astype(values.dtype)
-    to_values = _product("...ji,...id->...jd", row_major(used.swapaxes(-2, -1)), change)
-    to_queries = _product("...ij,...jd->...id", to_scores, keys)
-    to_keys = _product("...ji,...id->...jd", row_major(to_scores.swapaxes(-2, -1)), queries)
+
+    def over_queries(by_query: Array, x: Array) -> Array:
+        by_key = order(by_query.swapaxes(-2, -1))
+        return product(f"...hji,{axes.queries}->{axes.keys}", by_key, x)
+
+    to_values = over_queries(used.astype(values.dtype), change)
+    to_queries = product(f"...hij,{axes.keys}->{axes.queries}", to_scores, keys)
+    to_keys = over_queries(to_scores, queries)
     nothing = None if dropout_mask is None else jnp.zeros_like(dropout_mask)
     found = (part.astype(queries.dtype) for part in (to_queries, to_keys, to_values))
     return *found, None, nothing
 
 
-_mix_rows.defvjp(lambda *inputs: (_mix_rows(*inputs), inputs), _mix_rows_backward)
+_mix.defvjp(lambda *inputs: (_mix(*inputs), inputs[:5]), _mix_backward)

@@ -41,7 +41,7 @@ def shards_batch(trainable: str) -> bool:
 
     Each device holds its own copy of what trains, of the gradient and of the moments. If all
     parameters train, these copies take most of the memory, which a CPU's devices share; `tiny`
-    saves no time by sharding (docs/performance.md).
+    saves no time by sharding (docs/performance-studies.md).
     """
     return trainable != ALL or target().platform != "cpu"
 

@@ -11,7 +11,7 @@ from jax.extend.core import get_opaque_trace_state
 
 from crisalad_jax.utils.executable_cache import cached_executable
 from crisalad_jax.utils.files import user_cache
-from crisalad_jax.utils.host import usable_cores
+from crisalad_jax.utils.host import processor_flags, usable_cores
 from crisalad_jax.utils.output import counted, warn
 from crisalad_jax.utils.target import lowering_platforms, machine, over_devices_of, target
 
@@ -22,6 +22,12 @@ _LEAST_MEMORY: dict[str, bool | str] = {
 }
 """By default XLA copies all weights of a layer out of their stack before the layer runs: half as
 much memory again, and 3 to 5 % slower (`scripts/bench/study_compiler.py`)."""
+_AMX = "amx_tile"
+_BY_EIGEN: dict[str, bool | str] = {
+    "xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_REDUCE"
+}
+"""Products of float32 by Eigen, and by YNN sums alone: on Intel's processors with AMX faster than
+jaxlib's choice of YNN for all, on AMD's slower (docs/performance-studies.md)."""
 _AT_REST = get_opaque_trace_state()
 """What JAX traces while it traces nothing."""
 _TESTED = ((0, 10), (0, 12))
@@ -36,15 +42,20 @@ if jax.__version_info__[:2] not in _TESTED:  # before a crash, whichever way the
     )
 
 
-def compiler_options(*, runs_long: bool = False) -> dict[str, bool | str]:
+def compiler_options(
+    *, runs_long: bool = False, compute_dtype: str | None = None
+) -> dict[str, bool | str]:
     """Return XLA's options for a program: none but on a CPU, with a tested version of JAX.
 
     Another version may lack an option, or crash with it; without any a program is as right, and
-    slower at most. A program that `runs_long`, such as a training step, has none: the order of the
-    least memory takes it 6 % longer.
+    slower at most. A program that `runs_long`, such as a training step, is not ordered for the
+    least memory, which takes it 6 % longer. They depend on the processor, and on the
+    `compute_dtype` of the program's model, None without one.
     """
-    tested = jax.__version_info__[:2] in _TESTED
-    return _LEAST_MEMORY if target().platform == "cpu" and tested and not runs_long else {}
+    if target().platform != "cpu" or jax.__version_info__[:2] not in _TESTED:
+        return {}
+    by_eigen = compute_dtype == "float32" and _AMX in processor_flags()
+    return ({} if runs_long else _LEAST_MEMORY) | (_BY_EIGEN if by_eigen else {})
 
 
 class Jitted(Protocol[_P, _R]):
@@ -73,8 +84,12 @@ def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) 
     def with_options(chosen: tuple[tuple[str, bool | str], ...]) -> Any:
         return jax.jit(function, compiler_options=dict(chosen), **options) if chosen else inner
 
-    def outermost() -> Any:
-        return with_options(tuple(compiler_options(runs_long=runs_long).items()))
+    def outermost(leaves: Sequence[Any]) -> Any:
+        dtypes = (getattr(leaf, "compute_dtype", None) for leaf in leaves)
+        dtype = next((each for each in dtypes if isinstance(each, str)), None)
+        return with_options(
+            tuple(compiler_options(runs_long=runs_long, compute_dtype=dtype).items())
+        )
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -83,7 +98,7 @@ def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) 
             with number_types(leaves), _precision_of(leaves):
                 return inner(*args, **kwargs)
         with number_types(leaves), _precision_of(leaves), over_devices_of(leaves):
-            jitted = outermost()
+            jitted = outermost(leaves)
             if not runs_long and target() == machine():
                 static = options.get("static_argnames", ())
                 program = cached_executable(function, jitted, args, kwargs, static)
@@ -94,7 +109,7 @@ def jit(function: Callable[_P, _R], *, runs_long: bool = False, **options: Any) 
     def lower(*args: Any, **kwargs: Any) -> Any:
         leaves = jax.tree.leaves((args, kwargs))
         with number_types(leaves), _precision_of(leaves), over_devices_of(leaves):
-            traced = outermost().trace(*args, **kwargs)
+            traced = outermost(leaves).trace(*args, **kwargs)
             return traced.lower(lowering_platforms=lowering_platforms())
 
     call.__dict__["lower"] = lower

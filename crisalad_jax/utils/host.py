@@ -1,6 +1,7 @@
 """The share of the machine that this process may use."""
 
 import contextlib
+import functools
 import os
 import pathlib
 import re
@@ -12,6 +13,16 @@ def usable_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+@functools.cache
+def processor_flags() -> frozenset[str]:
+    """Return the names of what the processor can, as Linux lists them; nothing elsewhere."""
+    with contextlib.suppress(OSError):
+        lines = pathlib.Path("/proc/cpuinfo").read_text(encoding="utf-8")
+        found = re.search(r"^flags\s*:(.*)$", lines, re.MULTILINE)
+        return frozenset(found[1].split() if found else ())
+    return frozenset()
 
 
 def available_memory() -> int:

@@ -1,26 +1,63 @@
 #!/usr/bin/env bash
-# Sets up what is missing, then times descriptors and training beside torch and other engines, a folder of photographs
-# from end to end, the start of a program, and bfloat16 beside float32, and says where our time goes;
-# then what training at the paper's size takes, and search. Writes the tables and pictures of
-# docs/performance.md, docs/training.md and docs/search.md. For figures that mean something, on a
-# machine with nothing else to do. Flags go to the first two, such as
+# Sets up what is missing, then times this package beside torch and other engines, on a machine with nothing else to do.
+#
+#     bench_all.sh               all tables and pictures of docs/performance.md, its studies, docs/training.md
+#                                and docs/search.md: hours
+#     bench_all.sh --processor   descriptors, training steps, products and answers alone, in both types, for a
+#                                processor that is not in docs/performance.md: 40 minutes on two cores
+#     bench_all.sh --gpu         on a GPU that both torch and jax find, into docs/performance-gpu.md: 15 minutes
+#
+# --processor and --gpu replace the tables that are there. --small after one of them tries it out in small sizes,
+# as on a CPU, and leaves the tables in a folder of its own.
+# Flags that follow go to the benches of descriptors and training steps, such as
 #     --presets b14 --batches 256 --dtypes bfloat16
 set -euo pipefail
 cd "$(dirname "$0")/../.."
+mode=all
+case "${1:-}" in --processor | --gpu) mode=${1#--}; shift ;; esac
+small=
+if [ "${1:-}" = --small ] && [ $mode != all ]; then small=1; shift; fi
 source scripts/environment.sh "[dev,bench]"
-page=(--page docs/performance.md)
-python scripts/bench/bench_describe.py "${page[@]}" "$@"
-python scripts/bench/bench_published.py "${page[@]}"
-python scripts/bench/bench_train.py "${page[@]}" "$@"
-python scripts/bench/bench_extract.py "${page[@]}"
-python scripts/bench/bench_start.py "${page[@]}"
-python scripts/bench/bench_query.py "${page[@]}"
-python scripts/bench/bench_modes.py "${page[@]}"
-python scripts/bench/bench_profile.py "${page[@]}"
-page=(--page docs/training.md)
-python scripts/bench/bench_index.py "${page[@]}"
-python scripts/bench/bench_loader.py "${page[@]}"
-python scripts/bench/bench_overlap.py "${page[@]}"
-python scripts/bench/bench_memory.py "${page[@]}" --take
+bench() { python "scripts/bench/bench_$1.py" "${@:2}"; }
+if [ "$mode" = gpu ]; then
+  to=(--out docs/performance-gpu --page docs/performance-gpu.md)
+  [ -z "$small" ] || to=(--out "$(mktemp -d)")
+  describe=(--presets b14 --batches 1 64 256 --dtypes float32 bfloat16) train=(--presets b14 --batches 192 --dtypes float32 bfloat16)
+  folder=(--presets b14 --images 4000 --batch 256) memory=(--preset b14 --images 192) sinkhorn=()
+  if [ "$small" ]; then
+    describe=(--presets tiny --batches 8 --rounds 1) train=("${describe[@]}")
+    folder=(--presets tiny --images 40 --batch 8 --rounds 1) memory=(--preset tiny --images 8 --micro-batches 4)
+    sinkhorn=(--images 2 --patches 256 --iterations 3 --errors 1e-3 --rounds 1 --calls 2 --batches 1)
+  fi
+  bench describe "${to[@]}" "${describe[@]}" "$@"
+  bench train "${to[@]}" "${train[@]}" "$@"
+  bench sinkhorn "${to[@]}" "${sinkhorn[@]}"
+  bench extract "${to[@]}" "${folder[@]}"
+  bench memory "${to[@]}" "${memory[@]}"
+  exit
+fi
+to=(--page docs/performance.md --page docs/performance-studies.md)
+if [ "$mode" = processor ]; then
+  sizes=(--presets tiny s14 b14 --dtypes float32 bfloat16)
+  [ -z "$small" ] || sizes=(--presets tiny --rounds 1) to=(--out "$(mktemp -d)")
+  bench describe "${to[@]}" "${sizes[@]}" --batches 1 8 "$@"
+  bench train "${to[@]}" "${sizes[@]}" --batches 8 "$@"
+  [ "$small" ] || bench modes "${to[@]}" bench_products
+  [ "$small" ] || bench query "${to[@]}"
+  exit
+fi
+bench describe "${to[@]}" "$@"
+bench published "${to[@]}"
+bench train "${to[@]}" "$@"
+bench extract "${to[@]}"
+bench start "${to[@]}"
+bench query "${to[@]}"
+bench modes "${to[@]}"
+bench profile "${to[@]}"
+to=(--page docs/training.md)
+bench index "${to[@]}"
+bench loader "${to[@]}"
+bench overlap "${to[@]}"
+bench memory "${to[@]}" --take
 # A million descriptors take 34 GB of the folder for temporary files.
-python scripts/bench/bench_search.py --page docs/search.md
+bench search --page docs/search.md

@@ -1,6 +1,6 @@
 """What bfloat16 gains and loses beside float32, and why there is no int8, in one run.
 
-    python scripts/bench/bench_modes.py [--out docs/performance] [--page docs/performance.md]
+    python scripts/bench/bench_modes.py [--page docs/performance-studies.md]
         [--presets s14 b14] [--batch 8] [--weights demo/run/last.safetensors --data demo/city/test]
 
 Three tables. One product of matrices, of the size of `b14`'s widest: its rate by type and by the
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from libraries import LIBRARIES
-from tables import Study, Table, bars, count, flags, leave, read
+from tables import Study, Table, bars, count, flags, leave, read_some
 from timing import measured, race, ratio, times
 
 # After timing, which says how many devices there are.
@@ -163,16 +163,16 @@ def main() -> None:
         "--weights", type=pathlib.Path, default=pathlib.Path("demo/run/last.safetensors")
     )
     parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("demo/city/test"))
-    arguments = read(parser, "bench_products", "bench_bfloat16", "bench_recall")
-    studies = {"bench_products": products, "bench_bfloat16": speed}
-    if arguments.weights.exists():
-        if not arguments.data.is_dir():
-            parser.error(f"{arguments.data}: found no folder, expected an evaluation set")
-        studies["bench_recall"] = recall
-    else:
-        print(f"{arguments.weights}: not there, so no recall is compared; scripts/demo.sh makes it")
-    for name, study in studies.items():
-        leave(name, study(arguments), arguments)
+    studies = {"bench_products": products, "bench_bfloat16": speed, "bench_recall": recall}
+    arguments = read_some(parser, studies)
+    for name in arguments.studies:
+        if name == "bench_recall" and not (arguments.weights.exists() and arguments.data.is_dir()):
+            print(
+                f"{arguments.weights}, {arguments.data}: not there, so no recall is compared; "
+                "scripts/demo.sh makes both"
+            )
+            continue
+        leave(name, studies[name](arguments), arguments)
 
 
 if __name__ == "__main__":

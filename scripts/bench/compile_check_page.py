@@ -12,7 +12,7 @@ import pathlib
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 
-from tables import Table, splice
+from tables import Table, markdown, put
 
 from scripts.compile_check import ProgramCheck, read_check
 from scripts.compile_check.tables import (
@@ -130,7 +130,7 @@ def main() -> None:
     if len(larger) == 1:  # nothing larger than the reference was compiled
         del tables["grown"]
     for name, table in tables.items():
-        splice(arguments.page, f"compile_check {name}", table)
+        put(arguments.page, f"compile_check {name}", markdown(table))
 
 
 if __name__ == "__main__":

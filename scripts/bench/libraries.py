@@ -3,6 +3,7 @@
 _FUSIONS = "xla_cpu_experimental_ynn_fusion_type"
 LIBRARIES: dict[str, dict[str, bool | str]] = {
     "Eigen": {_FUSIONS: ""},
+    "Eigen, sums by YNN": {_FUSIONS: "LIBRARY_FUSION_TYPE_REDUCE"},
     # Its programs cannot be stored in the compile cache.
     "oneDNN": {
         _FUSIONS: "",

@@ -1,9 +1,10 @@
 """What a study leaves: a table in Markdown, its numbers, a picture; and the page that shows it."""
 
 import argparse
+import contextlib
 import json
 import pathlib
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
@@ -61,9 +62,13 @@ def save(name: str, study: Study, out: pathlib.Path) -> None:
             study.figure.savefig(temporary, format="png", dpi=120, facecolor="white")
 
 
-def splice(page: pathlib.Path, name: str, table: Table) -> None:
-    """Put the table in the page; raises as `put`."""
-    put(page, name, markdown(table))
+def page_of(pages: Sequence[pathlib.Path], name: str) -> pathlib.Path:
+    """The first page that has the comments of this name; the last where none has."""
+    for page in pages[:-1]:
+        with contextlib.suppress(InputError):
+            split_markers(page, name)
+            return page
+    return pages[-1]
 
 
 def put(page: pathlib.Path, name: str, text: str) -> None:
@@ -80,7 +85,8 @@ def flags(description: str, out: str) -> argparse.ArgumentParser:
     """A parser of where what a study leaves goes: folder `out` by default, and a page if asked."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path(out))
-    parser.add_argument("--page", type=pathlib.Path, help="also put what is tabled into this page")
+    words = "also put what is tabled into this page; of several, into the one with a place for it"
+    parser.add_argument("--page", type=pathlib.Path, action="append", help=words)
     return parser
 
 
@@ -119,7 +125,7 @@ def _check_places(
             for path in files_of(name, arguments.out):
                 check_target(path)
             if arguments.page is not None:
-                split_markers(arguments.page, name)
+                split_markers(page_of(arguments.page, name), name)
     except (InputError, OSError) as error:
         parser.error(str(error))
 
@@ -128,7 +134,7 @@ def leave(name: str, study: Study, arguments: argparse.Namespace) -> None:
     """Put a study where the arguments of `flags` say, and on the terminal."""
     save(name, study, arguments.out)
     if arguments.page is not None:
-        splice(arguments.page, name, study.table)
+        put(page_of(arguments.page, name), name, markdown(study.table))
     print(markdown(study.table), flush=True)
 
 

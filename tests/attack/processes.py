@@ -111,15 +111,15 @@ def apart(found: pathlib.Path, expected: pathlib.Path) -> tuple[float, float]:
     scale = np.where(theirs == 0, 1, np.abs(theirs))
     arrays: list[Mapping[str, Any]] = [trained(found), trained(expected)]
     of_arrays = [
-        float(np.linalg.norm(array - arrays[1][name]) / np.linalg.norm(arrays[1][name]))
+        float(np.linalg.norm(array - arrays[1][name]) / (np.linalg.norm(arrays[1][name]) or 1))
         for name, array in arrays[0].items()
     ]
     return float((np.abs(ours - theirs) / scale).max()), max(of_arrays)
 
 
-TOLERANCE = 1e-3
+TOLERANCE = 1e-4
 """Relative, of every logged number and array: gradients of two or four parts are summed in another
-order, and forty steps of Adam carry that on."""
+order, and forty steps of Adam carry that on. Three runs differed by 2.4e-6 at most."""
 
 
 def attack_processes(bench: Bench, scale: float) -> list[Row]:
@@ -131,7 +131,7 @@ def attack_processes(bench: Bench, scale: float) -> list[Row]:
     )
     of_ends = Row(
         "kills of one of four processes: the rest in four, two or one",
-        "the losses and weights of one process left alone, within 1e-3",
+        "the losses and weights of one process left alone, within 1e-4",
     )
     whole, out = bench.folder / "whole", bench.folder / "run"
 

@@ -6,6 +6,8 @@ import pathlib
 import shutil
 import subprocess
 import sys
+import unittest.mock
+import warnings
 from collections.abc import Sequence
 
 import jax
@@ -14,10 +16,10 @@ import pytest
 
 from crisalad_jax.checkpoints import runtime as runtimes
 from crisalad_jax.checkpoints import starter
-from crisalad_jax.checkpoints.engines import EngineName
+from crisalad_jax.checkpoints.engines import EngineName, NotExportableError
 from crisalad_jax.checkpoints.export import ExportConfig, write_export
-from crisalad_jax.checkpoints.runtime import LASTING, ONCE, first_engine, open_runtime
-from crisalad_jax.checkpoints.safetensors_io import read_header
+from crisalad_jax.checkpoints.load import HUB_FILE, find_weights
+from crisalad_jax.checkpoints.runtime import fastest_engine, open_runtime
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import read_image
@@ -26,6 +28,7 @@ from crisalad_jax.retrieval.describe import prepare_image
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import write_json
+from crisalad_jax.utils.locks import lock
 from tests.cli.test_cli import Capture, fails, runs
 from tests.conftest import MODEL
 
@@ -118,53 +121,99 @@ def test_a_query_takes_the_fastest_engine_that_is_installed(
     assert by == "onnxruntime"
     expected = answers("--runtime", "jax")[1]
     np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE)
-    with Map.open(town_map) as places:
-        assert places.first_engine(LASTING) == "openvino"
-    real = importlib.util.find_spec
+    real, absent = importlib.util.find_spec, ["onnxruntime"]
     monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name in ENGINES else real(name)
+        importlib.util, "find_spec", lambda name: None if name in absent else real(name)
     )
+    with Map.open(town_map) as places:
+        assert places.fastest_engine() == "openvino"
+    absent.append("openvino")
     assert answers() == ("jax", expected)
 
 
 @pytest.mark.usefixtures("engines_by_default")
-def test_where_jax_describes_although_engines_are_there(weights, monkeypatch):
+def test_where_jax_describes_although_engines_are_there(weights, tmp_path, monkeypatch):
     plain = to_plain(MODEL)
-    assert first_engine(ONCE, weights, plain) == "onnxruntime"
-    assert first_engine(ONCE, weights, plain | {"compute_dtype": "bfloat16"}) == "jax"
+    assert fastest_engine(weights, plain) == "onnxruntime"
+    assert fastest_engine(weights, plain | {"compute_dtype": "bfloat16"}) == "jax"
     native = to_plain(MODEL.resized(None, ["native"]))
-    assert first_engine(ONCE, weights, native) == "jax"
-    features = starter.FILES["hog"]
-    assert first_engine(ONCE, features, read_header(features)["config"]) == "jax"
+    assert fastest_engine(weights, native) == "jax"
     monkeypatch.setattr(
         runtimes.importlib.metadata, "entry_points", lambda group: ["cuda"] if group else []
     )
-    assert first_engine(ONCE, weights, plain) == "jax"
+    assert fastest_engine(weights, plain) == "jax"
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
-    assert first_engine(ONCE, weights, plain) == "onnxruntime"
+    assert fastest_engine(weights, plain) == "onnxruntime"
+    # Without a home there is no cache for an export, and before onnx is installed none can be made.
+    monkeypatch.delenv("CRISALAD_CACHE", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(pathlib.Path, "home", unittest.mock.Mock(side_effect=RuntimeError))
+    assert fastest_engine(weights, plain) == "jax"
+    monkeypatch.setenv("CRISALAD_CACHE", str(tmp_path / "new"))
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # no note of an export
+        assert fastest_engine(weights, plain) == "jax"
+
+
+@pytest.mark.usefixtures("engines_by_default")
+def test_another_process_that_exports_is_not_waited_for(weights, tmp_path, monkeypatch):
+    monkeypatch.setenv("CRISALAD_CACHE", str(tmp_path))
+    with lock(tmp_path / "exports"):
+        assert fastest_engine(weights, to_plain(MODEL)) == "jax"
 
 
 @pytest.mark.usefixtures("engines_by_default")
 def test_a_model_that_no_engine_computes_is_tried_once(weights, tmp_path, monkeypatch):
     monkeypatch.setenv("CRISALAD_CACHE", str(tmp_path))
-    tried = []
+    tried, failure = [], NotExportableError
 
     def refuse(*given: object) -> None:
         tried.append(given)
-        raise InputError("its descriptors differ")
+        raise failure("its descriptors differ")
 
     monkeypatch.setattr(runtimes, "_export", refuse)
     for _ in range(2):
-        assert first_engine(["onnxruntime"], weights, to_plain(MODEL)) == "jax"
-    assert len(tried) == 1
+        assert fastest_engine(weights, to_plain(MODEL)) == "jax"
+    assert len(tried) == len(ENGINES)
     with pytest.raises(InputError, match="its descriptors differ"):
         open_runtime(weights, "onnxruntime")
+    monkeypatch.setenv("CRISALAD_CACHE", str(tmp_path / "again"))
+    tried.clear()
+    failure = InputError  # as of a full disk, which may pass
+    for _ in range(2):
+        assert fastest_engine(weights, to_plain(MODEL)) == "jax"
+    assert len(tried) == 2 * len(ENGINES)
 
 
-def test_a_folder_that_nothing_installed_reads(exported, tmp_path):
-    assert first_engine(LASTING, exported, {}) == "openvino"
+def test_an_exported_folder_takes_an_engine_that_reads_it(exported, tmp_path, monkeypatch):
+    plain = to_plain(MODEL)
+    assert fastest_engine(exported, plain) == "onnxruntime"
+    assert fastest_engine(exported, plain | {"compute_dtype": "bfloat16"}) == "openvino"
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"format onnx, .* expected onnxruntime or openvino"):
-        first_engine([], exported, {})
+        fastest_engine(exported, plain)
+
+
+def test_what_is_no_exported_folder_is_what_its_name_means(tmp_path, monkeypatch, weights):
+    """A folder of `crisalad publish`, and one that happens to have a published model's name."""
+    published = tmp_path / "published"
+    published.mkdir()
+    shutil.copy(weights, published / HUB_FILE)
+    assert find_weights(published, engine="auto") == published / HUB_FILE
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "starter").mkdir()
+    assert find_weights("starter", engine="auto") == starter.FILES["starter"]
+
+
+def test_a_damaged_export_says_what_to_remove(weights, tmp_path, monkeypatch):
+    monkeypatch.setenv("CRISALAD_CACHE", str(tmp_path))
+    folder = open_runtime(weights, "onnxruntime").folder
+    file = folder / "describe.onnx.data"
+    data = file.read_bytes()
+    file.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    with pytest.raises(InputError, match=f"remove {folder}, and the same command makes it again"):
+        open_runtime(weights, "onnxruntime")
 
 
 def printed_by(program: str) -> str:

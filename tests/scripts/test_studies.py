@@ -264,11 +264,27 @@ def test_a_table_goes_between_its_comments(scripts: Any, tmp_path: pathlib.Path)
     page = tmp_path / "page.md"
     page.write_text("above\n<!-- x -->\nold\n<!-- end of x -->\nbelow\n")
     table = tables.Table(("what", "number"), [("a", "1"), ("b", "2")], "Caption.")
-    tables.splice(page, "x", table)
+    tables.put(page, "x", tables.markdown(table))
     expected = "Caption.\n\n| what | number |\n| --- | ---: |\n| a | 1 |\n| b | 2 |\n"
     assert page.read_text() == f"above\n<!-- x -->\n{expected}<!-- end of x -->\nbelow\n"
     with pytest.raises(InputError, match=r"page\.md: found no <!-- y -->"):
-        tables.splice(page, "y", table)
+        tables.put(page, "y", tables.markdown(table))
+    other = tmp_path / "other.md"
+    other.write_text("<!-- y -->\n<!-- end of y -->\n")
+    assert [tables.page_of([page, other], name) for name in "xyz"] == [page, other, other]
+
+
+def test_studies_may_follow_the_page(scripts: Any, tmp_path: pathlib.Path, monkeypatch) -> None:
+    tables = scripts("tables")
+    given = ["study", "--out", str(tmp_path), "one"]
+    monkeypatch.setattr(sys, "argv", given)
+    parser = tables.flags("", "docs")
+    assert tables.read_some(parser, ["one", "two"]).studies == ["one"]
+    page = tmp_path / "page.md"
+    page.write_text("<!-- one -->\n<!-- end of one -->\n")
+    monkeypatch.setattr(sys, "argv", [*given[:3], "--page", str(page), "one"])
+    asked = tables.read_some(tables.flags("", "docs"), ["one", "two"])
+    assert (asked.studies, asked.page) == (["one"], [page])
 
 
 def snippets() -> list[str]:

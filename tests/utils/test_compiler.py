@@ -1,5 +1,6 @@
 """Compiler options, virtual devices, the compile cache: what is asked of JAX, and what it does."""
 
+import dataclasses
 import os
 import pathlib
 import subprocess
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.utils import compiler
 from crisalad_jax.utils.target import CPU, GPU, PORTABLE, TPU, Target, lowering_for
 
@@ -57,14 +59,40 @@ def test_an_untested_jax_is_said_in_one_line(
 @pytest.mark.parametrize("chosen", [CPU, GPU, TPU, PORTABLE], ids=lambda chosen: chosen.platform)
 @pytest.mark.parametrize("version", [(0, 10, 2), (0, 11, 2), (0, 12, 0, 1), (0, 13, 0)])
 @pytest.mark.parametrize("runs_long", [False, True])
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16", None])
+@pytest.mark.parametrize("flags", [{"avx2"}, {"avx2", "amx_tile"}], ids=str)
 def test_only_a_cpu_with_a_tested_jax_has_options(
-    monkeypatch: pytest.MonkeyPatch, chosen: Target, version: tuple[int, ...], runs_long: bool
+    monkeypatch: pytest.MonkeyPatch,
+    chosen: Target,
+    version: tuple[int, ...],
+    runs_long: bool,
+    dtype: str | None,
+    flags: set[str],
 ) -> None:
     monkeypatch.setattr(jax, "__version_info__", version)
+    monkeypatch.setattr(compiler, "processor_flags", lambda: flags)
     with lowering_for(chosen):
-        options = compiler.compiler_options(runs_long=runs_long)
-    expected = chosen == CPU and version[1] in (10, 12) and not runs_long
-    assert bool(options) == expected
+        options = compiler.compiler_options(runs_long=runs_long, compute_dtype=dtype)
+    here = chosen == CPU and version[1] in (10, 12)
+    assert ("xla_cpu_scheduler_type" in options) == (here and not runs_long)
+    by_eigen = here and dtype == "float32" and "amx_tile" in flags
+    assert ("xla_cpu_experimental_ynn_fusion_type" in options) == by_eigen
+    assert len(options) <= 2
+
+
+def test_the_options_are_those_of_the_configuration_s_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def options(**given: Any) -> dict[str, Any]:
+        asked.append(given["compute_dtype"])
+        return {}
+
+    monkeypatch.setattr(compiler, "compiler_options", options)
+    function = compiler.jit(lambda x, config=None: x + 1, static_argnames="config")
+    tiny = PRESETS["tiny"]
+    for config in (None, tiny, dataclasses.replace(tiny, compute_dtype="bfloat16")):
+        function(jnp.ones(3), config=config)
+    assert asked == [None, "float32", "bfloat16"]
 
 
 def test_the_options_reach_the_compiler(monkeypatch: pytest.MonkeyPatch) -> None:

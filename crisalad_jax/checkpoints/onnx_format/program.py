@@ -10,10 +10,10 @@ import numpy as np
 import onnx
 from onnx import external_data_helper, numpy_helper
 
+from crisalad_jax.checkpoints.engines import NotExportableError
 from crisalad_jax.checkpoints.onnx_format.convert import convert
 from crisalad_jax.checkpoints.onnx_format.graph import OPSET as OPSET
 from crisalad_jax.checkpoints.onnx_format.graph import Graph, Value, is_known
-from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import wrap_os_errors
 
 _PAGE = 4096
@@ -60,7 +60,7 @@ def write_onnx(
     arguments = [Value.of(leaf) for leaf in jax.tree.leaves(weights)]
     (result,) = convert(graph, traced, [*arguments, *values])
     if result.missing:
-        raise InputError(
+        raise NotExportableError(
             f"format onnx or openvino: found the operation {result.missing}, which is not "
             "converted, expected format stablehlo or a model without it (docs/export.md)"
         )

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, cast
 import numpy as np
 
 from crisalad_jax.checkpoints.engines import EngineName
-from crisalad_jax.checkpoints.runtime import Runtime, first_engine, open_runtime
+from crisalad_jax.checkpoints.runtime import Runtime, fastest_engine, open_runtime
 from crisalad_jax.config.checks import PATH, check_count, takes
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.config.part import with_non_semantic_fields_of
@@ -521,26 +521,27 @@ class Map:
             **({"verified": True} if verify else {}),
         }
 
-    def first_engine(
+    def fastest_engine(
         self,
-        order: Sequence[EngineName],
         weights: str | os.PathLike[str] | None = None,
         *,
         groupings: Sequence[str] = ("single",),
     ) -> EngineName | Literal["jax"]:
-        """Return the first engine of an order that computes what JAX does; see `first_engine`.
+        """Choose the engine that describes single images fastest, of those that agree with JAX.
+
+        It is ONNX Runtime or OpenVINO where one is installed, computes what JAX does, and JAX has
+        no accelerator. Weights are exported for it the first time.
 
         Args:
-            order: names of engines, such as `ONCE` or `LASTING`.
             weights: as of `load_model`, which takes the answer.
             groupings: the groupings that queries will be described in.
 
         Raises:
-            InputError: there is no such file, or what `first_engine` raises.
+            InputError: there is no such file; or an exported folder that nothing installed reads.
         """
         file = weights_of(self.metadata, self.folder) if weights is None else weights
         any_grouping = set(groupings) != {"single"}
-        return first_engine(order, file, self.metadata.config, any_grouping=any_grouping)
+        return fastest_engine(file, self.metadata.config, any_grouping=any_grouping)
 
     def load_model(
         self,

@@ -18,7 +18,6 @@ from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from crisalad_jax.checkpoints.engines import EngineName
-from crisalad_jax.checkpoints.runtime import LASTING
 from crisalad_jax.config.checks import check_count, require
 from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.map import Map
@@ -76,7 +75,8 @@ def serve_map(
     Args:
         folder: the map.
         weights: the model that made it; None is where it was then.
-        engine: "jax", "onnxruntime" or "openvino"; or "auto", the first of `LASTING` that does.
+        engine: "jax", "onnxruntime" or "openvino"; or "auto", the one that `Map.fastest_engine`
+            chooses.
         host: name or address to listen at. Others than this machine's own need a token.
         port: port to listen at; 0 is any that is free.
         token: what requests have to bring as `Authorization: Bearer ...`; None is nothing.
@@ -97,8 +97,8 @@ def serve_map(
     Raises:
         InputError: a number out of range; an address that is not this machine's or in use; one that
             others can reach without a token; no such folder; tiles for a map in neither degrees nor
-            a known zone of UTM; or what `Map.open`, `Map.load_model` and `open_for_appending`
-            raise.
+            a known zone of UTM; another model than the map's, to append by; or what `Map.open`,
+            `Map.fastest_engine`, `Map.load_model` and `open_for_appending` raise.
 
     Example:
         >>> serve_map("city.map", host="0.0.0.0")
@@ -120,8 +120,11 @@ def serve_map(
         places = stack.enter_context(_opened(folder, append=append, verify=verify))
         behind = None if tiles is None else open_tiles(tiles, tiles_attribution, places)
         if engine == "auto":
-            engine = places.first_engine(LASTING, weights)
-        places.load_model(weights, engine=engine)
+            engine = places.fastest_engine(weights)
+        places.load_model(weights, engine=engine, verify=verify)
+        found, expected = places.describer().digest, places.metadata.model
+        if append and found != expected:  # an int8 program may ask a map, not extend it
+            raise InputError(f"{weights}: found model {found}, expected {expected} with append")
         worker = MapWorker(places, places.describer(), batch_size=batch_size)
         stack.enter_context(contextlib.closing(worker))
         worker.compile(quiet=quiet)
