@@ -41,10 +41,7 @@ FORMATS: Mapping[str, ProgramFormat] = {
         "openvino", (".xml", ".bin"), "openvino.Core().compile_model({file!r}, 'CPU')(images)"
     ),
 }
-READS: Mapping[EngineName, tuple[str, ...]] = {
-    "onnxruntime": ("onnx",),
-    "openvino": ("openvino", "onnx"),
-}
+READS: Mapping[str, tuple[str, ...]] = {"onnxruntime": ("onnx",), "openvino": ("openvino", "onnx")}
 """Formats that an engine reads, its own first."""
 _TOOLS = "openvino.tools.ovc"
 _CAPABILITIES = "OPTIMIZATION_CAPABILITIES"

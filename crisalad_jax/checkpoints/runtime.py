@@ -16,7 +16,7 @@ import os
 import pathlib
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -266,7 +266,8 @@ def fastest_engine(
     Raises:
         InputError: an exported folder of a program that no installed engine reads.
     """
-    installed: list[EngineName] = [name for name in READS if importlib.util.find_spec(name)]
+    names: tuple[EngineName, ...] = get_args(EngineName)  # in their order
+    installed: list[EngineName] = [name for name in names if importlib.util.find_spec(name)]
     path = pathlib.Path(source)
     narrow = config["compute_dtype"] == "bfloat16"
     if path.is_dir():
