@@ -47,7 +47,7 @@ def train(trial, city, runs):
         cj.read_places(city / "train"),
         runs / tune.get_context().get_trial_id(),
         validation=cj.open_benchmark(city / "test"),
-        callbacks=[report_to_tune(), "csv"],
+        callbacks=["csv", report_to_tune()],  # Tune may end the trial as it is told
         quiet=True,
     )
 

@@ -127,7 +127,8 @@ def start(
         subprocess.Popen(
             [
                 *(sys.executable, "-c", COMMAND_LINE, "train", "--config", str(config)),
-                *("--data", str(shared / "city"), "--val", str(shared / "town")),
+                *(() if index == 1 and "--data" in more else ("--data", str(shared / "city"))),
+                *("--val", str(shared / "town")),
                 *("--out", str(out), "--coordinator-address", meet),
                 *("--num-processes", "2", "--process-id", str(index), "--quiet", *both),
                 *(more if index == 1 else ()),
