@@ -35,8 +35,8 @@ def test_a_map_is_calibrated_and_says_unknown(folder, shared, tmp_path, capfd, q
     unknown = 5 - value["answered"]
     assert [line["known"] for line in lines].count(False) == unknown
     assert said == (
-        f"{answers}: 5 queries in a map of 7 images; {unknown} of 5 unknown, below similarity "
-        f"{least:.9g} (rests on {value['answered']} answers)"
+        f"{answers}: 5 queries in a map of 7 images; by jax; {unknown} of 5 unknown, below "
+        f"similarity {least:.9g} (rests on {value['answered']} answers)"
     )
     # What a flag says stands before what the map remembers.
     table = succeeds(capfd, *query(folder, queries, "--min-similarity", -1))

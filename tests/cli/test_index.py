@@ -63,7 +63,7 @@ def test_a_map_is_made_grown_and_asked(shared, database, queries, tmp_path, capf
 
     answers = tmp_path / "answers.jsonl"
     said = succeeds(capfd, *query(out, queries, "--k", 3, "--json", answers))
-    assert said == f"{answers}: 5 queries in a map of 7 images"
+    assert said == f"{answers}: 5 queries in a map of 7 images; by jax"
     lines = [json.loads(line) for line in answers.read_text().splitlines()]
     assert [line["query"] for line in lines] == [p.name for p in list_images(queries)]
     found = [[answer["name"] for answer in line["neighbours"]] for line in lines]
@@ -87,7 +87,7 @@ def test_answers_are_a_table_json_or_a_gallery(folder, queries, tmp_path, capfd)
 
     picture = tmp_path / "gallery.png"
     said = succeeds(capfd, *query(folder, queries, "--gallery", picture))
-    assert said.endswith(f"{picture}: 5 queries in a map of 7 images")
+    assert said.endswith(f"{picture}: 5 queries in a map of 7 images; by jax")
     assert said.count("@@@database") == 5 * 5  # the table, too
     # A query and five answers, each 204 pixels wide.
     assert cv2.imread(str(picture)).shape[1] > 6 * 204
@@ -120,7 +120,7 @@ def test_answers_are_positions_of_a_new_map(shared, folder, queries, tmp_path, c
     """What `query --out` writes, `index --positions` reads; GeoJSON has the same in degrees."""
     table, layer = tmp_path / "a.csv", tmp_path / "a.geojson"
     said = succeeds(capfd, *query(folder, queries, "--k", 1, "--out", table))
-    assert said.endswith(f"{table}: 5 queries in a map of 7 images")
+    assert said.endswith(f"{table}: 5 queries in a map of 7 images; by jax")
     succeeds(capfd, *index(shared, queries, tmp_path / "new", "--positions", table))
     lines, _ = runs(capfd, *query(folder, queries, "--json", "-", "--out", layer))
     best = {row["query"]: row["neighbours"][0] for row in map(json.loads, lines.splitlines())}
@@ -135,7 +135,7 @@ def test_answers_are_positions_of_a_new_map(shared, folder, queries, tmp_path, c
     unknown = int(np.diff(likeness).argmax()) + 1
     least = likeness[unknown - 1 : unknown + 1].mean()
     said = succeeds(capfd, *query(folder, queries, "--out", table, "--min-similarity", least))
-    words = f"{5 - unknown} of 5 queries in a map of 7 images; {unknown} of 5 unknown"
+    words = f"{5 - unknown} of 5 queries in a map of 7 images; by jax; {unknown} of 5 unknown"
     assert f"{table}: {words}" in said
 
 
