@@ -116,6 +116,7 @@ def test_no_number_of_a_program_is_float64() -> None:
     assert "f64" in str(truly)
 
 
+@pytest.mark.slow
 def test_a_training_step_is_the_same() -> None:
     """With Adam's own numbers, and those of an optimiser of JAX's default types."""
 

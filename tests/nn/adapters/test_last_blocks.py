@@ -67,8 +67,11 @@ def pixels() -> jax.Array:
 
 @pytest.mark.parametrize(
     "request_",
-    [FeatureSpec(class_token=True), FeatureSpec(levels=(2, 4, 5)), FeatureSpec(levels=(2,))],
-    ids=["whole", "levels", "before them"],
+    [
+        pytest.param(FeatureSpec(class_token=True), id="whole", marks=pytest.mark.slow),
+        pytest.param(FeatureSpec(levels=(2, 4, 5)), id="levels"),
+        pytest.param(FeatureSpec(levels=(2,)), id="before them"),
+    ],
 )
 def test_features_and_gradients_are_those_of_adapters_that_add_0(request_) -> None:
     full, partial, whole, few = pair(cj.make_part("adapter", "depthwise"), ".up")
@@ -119,7 +122,14 @@ def model(adapter: Any) -> cj.ModelConfig:
     )
 
 
-@pytest.mark.parametrize("trainable", ["adapters,head", "last-3-blocks,norm,adapters,head", "all"])
+@pytest.mark.parametrize(
+    "trainable",
+    [
+        "adapters,head",
+        pytest.param("last-3-blocks,norm,adapters,head", marks=pytest.mark.slow),
+        pytest.param("all", marks=pytest.mark.slow),
+    ],
+)
 def test_they_train_and_are_joined_again(trainable) -> None:
     config = model(DynamicPowerConfig(last=LAST, hidden=4))
     params = cj.init_crisalad(jax.random.key(0), config)

@@ -57,7 +57,7 @@ def convolved(t: Any, z: torch.Tensor, *, trains: bool) -> torch.Tensor:
     return (passed + hidden) @ t.up.weight + t.up.bias
 
 
-@pytest.mark.parametrize("trains", [False, True])
+@pytest.mark.parametrize("trains", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_two_paths_equal_torchs(trains: bool) -> None:
     params = drawn(0)
     bare = dataclasses.replace(params.blocks, adapter=None)

@@ -63,7 +63,10 @@ def test_dropout_stands_before_relu_of_the_two_local_networks(monkeypatch) -> No
     assert (0.0, None) in calls  # the global token's network
 
 
-@pytest.mark.parametrize("dustbin", ["none", "column", "row and column", "token", "mass"])
+@pytest.mark.parametrize(
+    "dustbin",
+    [pytest.param("none", marks=pytest.mark.slow), "column", "row and column", "token", "mass"],
+)
 def test_a_batch_is_its_images_under_every_dustbin(dustbin: str) -> None:
     config = dataclasses.replace(CONFIG, dustbin=dustbin)
     params = init_salad(config)
