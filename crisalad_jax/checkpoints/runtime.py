@@ -49,8 +49,6 @@ if TYPE_CHECKING:
 FORMAT = "crisalad-jax export 1"
 MANIFEST = "manifest.json"
 _EXPECTED = "the manifest of `crisalad export`"
-_CHANGED = ("image_size", "preprocessing", "compute_dtype")
-"""Of a model's configuration, what may be other than its export's."""
 DESCRIBE, TOKENS, ATTEND = "describe", "tokens", "attend"
 """Names of programs: of images to descriptors, or of the two halves of that."""
 
@@ -213,7 +211,7 @@ def open_runtime(
     """
     choose("runtime", engine, READS)
     path = pathlib.Path(source)
-    changes = {} if config is None else {name: config[name] for name in _CHANGED}
+    changes = {} if config is None else _changes(config)
     if changes.get("compute_dtype") == "float64":
         raise InputError(f"{path}: found a model of float64 for {engine}, expected jax")
     if not path.is_dir():
@@ -269,27 +267,30 @@ def fastest_engine(
     names: tuple[EngineName, ...] = get_args(EngineName)  # in their order
     installed: list[EngineName] = [name for name in names if importlib.util.find_spec(name)]
     path = pathlib.Path(source)
-    narrow = config["compute_dtype"] == "bfloat16"
+    dtype = config["compute_dtype"]
     if path.is_dir():
         kind = read_json(path / MANIFEST, _EXPECTED).get("program_format")
         for engine in installed:
-            if kind in READS[engine] and not (narrow and engine == "onnxruntime"):
+            if kind in READS[engine] and not (dtype == "bfloat16" and engine == "onnxruntime"):
                 return engine
         readers = " or ".join(name for name in READS if kind in READS[name])
         raise InputError(
             f"{path}: found a program of format {kind}, and nothing installed that reads it, "
             f"expected {readers or 'one of format onnx or openvino'}"
         )
-    fits = config["compute_dtype"] == "float32" and config["preprocessing"]["size_rule"] == "fixed"
+    fits = dtype == "float32" and config["preprocessing"]["size_rule"] == "fixed"
     if not fits or loaded_plugins() or _has_accelerator():
         return "jax"
     for engine in installed:
-        # Whatever stands against an export, JAX can answer; its errors then are the user's.
-        with contextlib.suppress(Exception):
-            changes = {name: config[name] for name in _CHANGED}
-            _exported(path, engine, changes, any_grouping, wait=0)
+        with contextlib.suppress(Exception):  # JAX answers then, and its errors are the user's
+            _exported(path, engine, _changes(config), any_grouping, wait=0)
             return engine
     return "jax"
+
+
+def _changes(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what of a configuration may be other than in the file that is exported."""
+    return {name: config[name] for name in ("image_size", "preprocessing", "compute_dtype")}
 
 
 def _has_accelerator() -> bool:

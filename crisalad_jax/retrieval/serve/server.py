@@ -122,10 +122,11 @@ def serve_map(
         if engine == "auto":
             engine = places.fastest_engine(weights)
         places.load_model(weights, engine=engine, verify=verify)
-        found, expected = places.describer().digest, places.metadata.model
-        if append and found != expected:  # an int8 program may ask a map, not extend it
-            raise InputError(f"{weights}: found model {found}, expected {expected} with append")
-        worker = MapWorker(places, places.describer(), batch_size=batch_size)
+        describer, expected = places.describer(), places.metadata.model
+        if append and describer.digest != expected:  # an int8 program may ask a map, not extend it
+            found = f"model {describer.digest}"
+            raise InputError(f"{weights}: found {found}, expected {expected} with append")
+        worker = MapWorker(places, describer, batch_size=batch_size)
         stack.enter_context(contextlib.closing(worker))
         worker.compile(quiet=quiet)
         stop.check()
