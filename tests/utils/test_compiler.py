@@ -60,17 +60,17 @@ def test_an_untested_jax_is_said_in_one_line(
 @pytest.mark.parametrize("version", [(0, 10, 2), (0, 11, 2), (0, 12, 0, 1), (0, 13, 0)])
 @pytest.mark.parametrize("runs_long", [False, True])
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16", None])
-@pytest.mark.parametrize("flags", [{"avx2"}, {"avx2", "amx_tile"}], ids=str)
+@pytest.mark.parametrize("flags", [("avx2",), ("avx2", "amx_tile")], ids="+".join)
 def test_only_a_cpu_with_a_tested_jax_has_options(
     monkeypatch: pytest.MonkeyPatch,
     chosen: Target,
     version: tuple[int, ...],
     runs_long: bool,
     dtype: str | None,
-    flags: set[str],
+    flags: tuple[str, ...],
 ) -> None:
     monkeypatch.setattr(jax, "__version_info__", version)
-    monkeypatch.setattr(compiler, "processor_flags", lambda: flags)
+    monkeypatch.setattr(compiler, "processor_flags", lambda: frozenset(flags))
     with lowering_for(chosen):
         options = compiler.compiler_options(runs_long=runs_long, compute_dtype=dtype)
     here = chosen == CPU and version[1] in (10, 12)
