@@ -10,7 +10,9 @@ stamp=".venv/installed${extras}"
 if [ ! -f "$stamp" ] || [ pyproject.toml -nt "$stamp" ]; then
   echo "Installing crisalad-jax${extras} into .venv; the first time takes some minutes." >&2
   # Torch first, by itself: its exact version may be at hand as a smaller CPU build.
-  case "$extras" in *dev*) python -m pip install --quiet "$(grep -o 'torch==[0-9.]*' pyproject.toml)" ;; esac
-  python -m pip install --quiet --editable ".${extras}"
+  # Modules are compiled when they are first imported: most of them never are.
+  install=(python -m pip install --quiet --no-compile)
+  case "$extras" in *dev*) "${install[@]}" "$(grep -o 'torch==[0-9.]*' pyproject.toml)" ;; esac
+  "${install[@]}" --editable ".${extras}"
   touch "$stamp"
 fi

@@ -1,12 +1,13 @@
 """What bfloat16 gains and loses beside float32, and why there is no int8, in one run.
 
     python scripts/bench/bench_modes.py [--page docs/performance-studies.md]
-        [--presets s14 b14] [--batch 8] [--weights demo/run/last.safetensors --data demo/city/test]
+        [--presets s14 b14] [--batch 8] [--run demo/run] [--city demo/city]
 
-Three tables. One product of matrices, of the size of `b14`'s widest: its rate by type and by the
+Four tables. One product of matrices, of the size of `b14`'s widest: its rate by type and by the
 library that XLA gives it to. Descriptors of a batch, images spread over the devices: times as fast
 as float32, and the cosine of each to its own in float32; parameters are those of the parity checks,
-random. And a trained model, by default the demo's, if it is there: cosines, and Recall@K in both.
+random. And of a trained model, by default the demo's, if it is there: cosines of descriptors, and
+Recall@K, in both; and the cosine of each part's gradient, of batches of its training images.
 `timing.py` says how contenders are timed.
 """
 
@@ -21,20 +22,26 @@ from typing import Any
 import numpy as np
 from libraries import LIBRARIES
 from tables import Study, Table, bars, count, flags, leave, read_some
-from timing import measured, race, ratio, times
+from timing import machine, measured, race, ratio, times
 
 # After timing, which says how many devices there are.
 import jax  # isort: skip
 import jax.numpy as jnp  # isort: skip
 
 from crisalad_jax.checkpoints.weights import load_weights
+from crisalad_jax.config.io import read_config
 from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.model import Crisalad, Model, describe
 from crisalad_jax.retrieval.describe import describe_files
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.step import init_train_state, loss_and_gradient, step_config
 from crisalad_jax.utils.devices import devices_for
+from crisalad_jax.utils.pytree import named_leaves
 from parity.cases.case import build, convert, random
 
 TYPES = {"float32": "float32", "bfloat16": "float32", "int8": "int32"}
@@ -116,8 +123,8 @@ def speed(arguments: argparse.Namespace) -> Study:
 
 
 def recall(arguments: argparse.Namespace) -> Study:
-    params, config = load_weights(arguments.weights)
-    benchmark = open_benchmark(arguments.data)
+    params, config = load_weights(arguments.run / "last.safetensors")
+    benchmark = open_benchmark(arguments.city / "test")
     values, rows, descriptors = [], [], {}
     for dtype in ("float32", "bfloat16"):
         typed = in_type(config, dtype)
@@ -153,24 +160,67 @@ def recall(arguments: argparse.Namespace) -> Study:
     return Study(Table(header, rows, caption, 2), values, figure)
 
 
+def gradients(arguments: argparse.Namespace) -> Study:
+    params, model = load_weights(arguments.run / "last.safetensors")
+    config = read_config(TrainConfig, arguments.run / "config.json")
+    places = read_places(arguments.city / "train", min_images=config.images_per_place)
+    many, images = config.places_per_batch, config.images_per_place
+    labels, valid = np.repeat(np.arange(many), images), np.ones(many * images, bool)
+    found: dict[str, dict[str, list[np.ndarray]]] = {}
+    for dtype in ("float32", "bfloat16"):
+        step = step_config(dataclasses.replace(config, model=in_type(model, dtype)), steps=1)
+        gradient = jax.jit(functools.partial(loss_and_gradient, key=None, config=step))
+        state, frozen = init_train_state(params, config.trainable, step)
+        for first in range(0, arguments.batches * many, many):
+            numbers = [
+                number
+                for start in places.place_start[first : first + many]
+                for number in range(start, start + images)
+            ]
+            pixels = np.stack([read_image(places.path(number)) for number in numbers])
+            _, (whole, _) = gradient(state, frozen, pixels, labels, valid)
+            parts: dict[str, list[np.ndarray]] = {}
+            for name, leaf in named_leaves(whole).items():
+                for part in ("all", "adapters" if "adapter" in name else name.split(".")[0]):
+                    parts.setdefault(part, []).append(np.ravel(leaf))
+            for part, leaves in parts.items():
+                one = np.concatenate(leaves).astype(np.float64)
+                by_type = found.setdefault(part, {"float32": [], "bfloat16": []})
+                by_type[dtype].append(one / np.linalg.norm(one))
+    values, rows = [], []
+    for part, by_type in found.items():
+        alike = cosines(np.stack(by_type["bfloat16"]), np.stack(by_type["float32"]))
+        size = len(by_type["float32"][0])
+        values.append({"part": part, "numbers": size, "cosine": alike.tolist()})
+        rows.append((part, f"{size}", f"{alike.mean():.5f}", f"{alike.min():.5f}"))
+    caption = (
+        f"Gradients of {arguments.batches} batches of {many} places x {images} images at a trained "
+        f"model, in bfloat16 beside float32, {machine()}."
+    )
+    header = ("part", "parameters", "mean cosine", "least cosine")
+    return Study(Table(header, rows, caption), values)
+
+
 def main() -> None:
     parser = flags(__doc__ or "", "docs/performance")
     parser.add_argument("--presets", nargs="+", default=["s14", "b14"], choices=PRESETS)
     parser.add_argument("--batch", type=count, default=8)
     parser.add_argument("--rounds", type=count, default=5)
     parser.add_argument("--calls", type=count, default=2)
-    parser.add_argument(
-        "--weights", type=pathlib.Path, default=pathlib.Path("demo/run/last.safetensors")
-    )
-    parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("demo/city/test"))
-    studies = {"bench_products": products, "bench_bfloat16": speed, "bench_recall": recall}
+    parser.add_argument("--run", type=pathlib.Path, default=pathlib.Path("demo/run"))
+    parser.add_argument("--city", type=pathlib.Path, default=pathlib.Path("demo/city"))
+    parser.add_argument("--batches", type=count, default=5, help="of gradients")
+    studies = {
+        "bench_products": products,
+        "bench_bfloat16": speed,
+        "bench_recall": recall,
+        "bench_gradients": gradients,
+    }
     arguments = read_some(parser, studies)
     for name in arguments.studies:
-        if name == "bench_recall" and not (arguments.weights.exists() and arguments.data.is_dir()):
-            print(
-                f"{arguments.weights}, {arguments.data}: not there, so no recall is compared; "
-                "scripts/demo.sh makes both"
-            )
+        of_trained = name in ("bench_recall", "bench_gradients")
+        if of_trained and not (arguments.run.is_dir() and arguments.city.is_dir()):
+            print(f"{arguments.run}, {arguments.city}: not there; scripts/demo.sh makes both")
             continue
         leave(name, studies[name](arguments), arguments)
 

@@ -14,12 +14,10 @@ import pytest
 
 from tests.attack.world import ROOT
 
-SOME = (
+SOME = (("inputs", 0, "a sample", 16),)
+ALL = (
     # In a container root may not mount, and writes into any folder: three tries then.
     ("disks", 0, "convert", 3),
-    ("inputs", 0, "a sample", 16),
-)
-ALL = (
     ("damage", 1, "", 4800),
     ("disks", 1, "", 200),
     ("disks", 0.6, "train limited, evaluate limited, extract .h5 limited, index limited", 24),

@@ -21,6 +21,7 @@ from crisalad_jax.checkpoints.export import ExportConfig, write_export
 from crisalad_jax.checkpoints.load import HUB_FILE, find_weights
 from crisalad_jax.checkpoints.runtime import fastest_engine, open_runtime
 from crisalad_jax.checkpoints.weights import model_hash, save_weights
+from crisalad_jax.cli import main
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.images import read_image
 from crisalad_jax.nn.model import Crisalad, Model, init_crisalad
@@ -329,6 +330,12 @@ def test_an_int8_program_is_a_model_of_its_own(params, shared, tmp_path, capfd, 
     query = ("query", photographs, "--quiet")
     _, notes = runs(capfd, *query, "--map", of_floats, "--weights", eight, *engine)
     assert f"{eight}: an int8 program of the model that made {of_floats}" in notes
+    appends = ("serve", "--map", of_floats, "--weights", eight, *engine, "--append", "--port", "0")
+    assert main([str(each) for each in appends]) == 2
+    refused = (
+        f"{eight}: found model {manifest['model_sha256']}, expected {model_hash(params, MODEL)}"
+    )
+    assert f"crisalad: {refused} with append" in capfd.readouterr().err
     fails(capfd, *query, "--map", of_bytes, "--weights", weights, words=(of_bytes, "made by model"))
     _, notes = runs(capfd, *query, "--map", of_bytes, "--weights", eight, *engine)
     assert "int8" not in notes

@@ -21,7 +21,7 @@ BLOCKS = {"image": 2, "vlad-buff": 4}
 """Number of blocks that train, of tiny's four."""
 
 
-@pytest.mark.parametrize("name", BLOCKS)
+@pytest.mark.parametrize("name", ["image", pytest.param("vlad-buff", marks=pytest.mark.slow)])
 def test_a_recipe_trains_its_own_parts_from_its_own_start(
     name: str, shared: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:

@@ -69,7 +69,7 @@ def pixels() -> jax.Array:
     "request_",
     [
         pytest.param(FeatureSpec(class_token=True), id="whole", marks=pytest.mark.slow),
-        pytest.param(FeatureSpec(levels=(2, 4, 5)), id="levels"),
+        pytest.param(FeatureSpec(levels=(2, 4, 5)), id="levels", marks=pytest.mark.slow),
         pytest.param(FeatureSpec(levels=(2,)), id="before them"),
     ],
 )

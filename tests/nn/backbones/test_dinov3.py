@@ -99,6 +99,7 @@ def test_sides_are_multiples_of_16() -> None:
         DinoV3Config(dim=12, depth=1, heads=2)
 
 
+@pytest.mark.slow
 def test_a_step_moves_the_last_block_and_no_bias_of_keys() -> None:
     """In a model with adapters beside its blocks."""
     backbone = dataclasses.replace(CONFIG, adapter="mlp")

@@ -182,7 +182,10 @@ REQUESTS = {
     "class attention": FeatureSpec(class_attention=True),
     "inserted tokens": FeatureSpec(insertion=1, inserted=INSERTED),
 }
-KINDS = ("depthwise", "multi-resolution", "serial-parallel", "side", "none")
+KINDS = {
+    "depthwise": (),
+    **dict.fromkeys(("multi-resolution", "serial-parallel", "side", "none"), pytest.mark.slow),
+}
 
 
 def fresh(config: VisionTransformer) -> ViT:
@@ -201,7 +204,10 @@ def fresh(config: VisionTransformer) -> ViT:
     ("config", "name"),
     [
         *((HALF, name) for name in REQUESTS),
-        *((dataclasses.replace(HALF, adapter=kind), "the last tokens") for kind in KINDS),
+        *(
+            pytest.param(dataclasses.replace(HALF, adapter=kind), "the last tokens", marks=marks)
+            for kind, marks in KINDS.items()
+        ),
         (dataclasses.replace(HALF, registers=3), "inserted tokens"),
         (DinoV3Config(dim=32, depth=2, heads=2), "the last tokens"),
         (DinoV3Config(dim=32, depth=2, heads=2), "keys"),
@@ -228,7 +234,13 @@ def test_padding_for_cudnn_changes_no_feature(
         np.testing.assert_allclose(ours, theirs, atol=0.04 * np.abs(theirs).max())
 
 
-@pytest.mark.parametrize("name", ["the last tokens", "inserted tokens", "class attention"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "the last tokens",
+        *(pytest.param(x, marks=pytest.mark.slow) for x in ("inserted tokens", "class attention")),
+    ],
+)
 def test_a_tpus_kernel_changes_no_feature(interpreted: list[Any], name: str) -> None:
     """Where 13 tokens are padded to 16, and 15 to as many."""
     config = dataclasses.replace(HALF, dim=128)

@@ -293,7 +293,10 @@ def test_newton_at_the_sharpest_scores_is_the_linear_programme(masses: str) -> N
         assert -1e-6 * mu.sum() < lost < epsilon * mu.sum() * np.log(found.size)
 
 
-@pytest.mark.parametrize("gradient", ["unrolled", "implicit", "optimistix"])
+@pytest.mark.parametrize(
+    "gradient",
+    ["implicit", *(pytest.param(x, marks=pytest.mark.slow) for x in ("unrolled", "optimistix"))],
+)
 def test_newton_from_a_temperature_has_the_converged_plan_and_its_gradient(gradient: Any) -> None:
     """Scores so sharp that it starts above 1: ott-jax's plan, and the implicit gradient."""
     at = inputs(std=2.0, epsilon=0.05)

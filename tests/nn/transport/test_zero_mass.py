@@ -90,11 +90,9 @@ WAYS: dict[str, Way] = {
 QUICK = {
     "published",
     "published, log",
-    "unrolled, newton",
     "unrolled, nesterov",
     "unrolled, quadratic",
     "unrolled, softmax",
-    "unrolled, tau, relaxation",
     "implicit",
     "implicit, anderson",
     "implicit, newton",

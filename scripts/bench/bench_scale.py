@@ -1,0 +1,131 @@
+"""How time and memory grow with the batch, the image and the clusters, beside torch.
+
+    python scripts/bench/bench_scale.py [--out docs/performance]
+        [--page docs/performance-studies.md] [--preset s14] [--rounds 3]
+
+One of the three grows at a time; the others stay at 4 images of 224 x 224 with 64 clusters
+(clusters grow at 322 x 322, where there are patches enough for 256). Time and operations are of one
+image, over those of the least of the same row. Nothing here should grow faster than operations.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from bench_describe import TOLERANCES, by_torch, by_us, check, sides
+from matplotlib.figure import Figure
+from tables import COLOURS, GREY, Study, Table, count, flags, leave, panels, read
+from timing import Timed, machine, megabytes, race, ratio, times
+
+from crisalad_jax.nn.aggregators.salad import SaladConfig
+from crisalad_jax.nn.config import PRESETS, ModelConfig
+from crisalad_jax.nn.costs import part_costs
+
+IMAGES, SIZE, WIDE = 4, 224, 322
+BATCHES, SIZES, CLUSTERS = (1, 4, 16, 64), (224, 322, 420, 518), (16, 64, 128, 256)
+
+
+class Point(NamedTuple):
+    grows: str
+    value: int
+    batch: int
+    config: ModelConfig
+
+
+def points(preset: str) -> Iterator[Point]:
+    config = PRESETS[preset]
+    head = config.aggregator
+    if not isinstance(head, SaladConfig):
+        raise TypeError(f"{preset}: found {type(head).__name__}, expected SALAD")
+
+    def at(size: int, clusters: int = head.clusters) -> ModelConfig:
+        aggregator = dataclasses.replace(head, clusters=clusters)
+        return dataclasses.replace(config, image_size=(size, size), aggregator=aggregator)
+
+    yield from (Point("images in a batch", n, n, at(SIZE)) for n in BATCHES)
+    yield from (Point("pixels a side", n, IMAGES, at(n)) for n in SIZES)
+    yield from (Point("clusters", n, IMAGES, at(WIDE, n)) for n in CLUSTERS)
+
+
+def measure(point: Point, rounds: int) -> dict[str, Any]:
+    """Time ours and torch's, a device each, in turn."""
+    both = sides(point.config, point.grows, point.batch, "float32")
+    ours, theirs = by_us(both, False), by_torch(both, False)
+    check([ours, theirs], TOLERANCES["float32"])
+    timed = race({one.name: one.call for one in (ours, theirs)}, rounds, 1)
+    return {
+        "grows": point.grows,
+        "value": point.value,
+        "operations": 2 * sum(cost.macs for cost in part_costs(point.config, images=point.batch)),
+        "ours": [ms / point.batch for ms in timed[ours.name].rounds],
+        "theirs": [ms / point.batch for ms in timed[theirs.name].rounds],
+        "faster": ratio(timed[theirs.name], timed[ours.name]),
+        "memory": ours.memory(),
+        "their memory": theirs.memory(),
+    }
+
+
+def grown(values: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Put what each value is over the first of its row beside it."""
+    first = {value["grows"]: value for value in reversed(values)}
+    found = []
+    for value in values:
+        least = first[value["grows"]]
+        of = {"operations": value["operations"] / least["operations"]}
+        for name in ("ours", "theirs"):
+            of[name] = Timed(value[name]).median / Timed(least[name]).median
+        found.append({**value, "grown": of})
+    return found
+
+
+def table(values: list[dict[str, Any]], caption: str) -> Table:
+    header = (
+        *("what grows", "to", "operations an image", "our time an image", "torch's"),
+        *("ours: times torch's speed", "our memory, MB", "torch's, MB"),
+    )
+    rows = []
+    for value in values:
+        of = value["grown"]
+        sizes = megabytes(value["memory"]), megabytes(value["their memory"])
+        growth = (f"{of[name]:.2f}" for name in ("operations", "ours", "theirs"))
+        rows.append((value["grows"], f"{value['value']}", *growth, times(value["faster"]), *sizes))
+    return Table(header, rows, caption)
+
+
+def draw(values: list[dict[str, Any]]) -> Figure:
+    kinds = list(dict.fromkeys(value["grows"] for value in values))
+    figure, axes = panels(len(kinds), tuple(kinds), width=3.2, height=2.9, sharey=False)
+    lines = {"operations": (GREY, "--"), "ours": (COLOURS[0], "-"), "theirs": (COLOURS[1], "-")}
+    names = {"operations": "operations", "ours": "time, ours", "theirs": "time, torch"}
+    for one, kind in zip(axes, kinds, strict=True):
+        chosen = [value for value in values if value["grows"] == kind]
+        sizes = [value["value"] for value in chosen]
+        for name, (colour, dashes) in lines.items():
+            heights = [value["grown"][name] for value in chosen]
+            one.plot(sizes, heights, dashes, color=colour, marker=".", label=names[name])
+        one.set_xscale("log")
+        one.set_xticks(sizes, [str(size) for size in sizes])
+        one.minorticks_off()
+        one.set_ylim(0, 1.15 * max(max(value["grown"].values()) for value in chosen))
+    axes[0].set_ylabel("of one image, over the least", fontsize=9)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower left", ncols=3, frameon=False, fontsize=9)
+    return figure
+
+
+def main() -> None:
+    parser = flags(__doc__ or "", "docs/performance")
+    with_salad = [n for n, each in PRESETS.items() if isinstance(each.aggregator, SaladConfig)]
+    parser.add_argument("--preset", choices=with_salad, default="s14")
+    parser.add_argument("--rounds", type=count, default=3)
+    arguments = read(parser, "bench_scale")
+    values = grown([measure(point, arguments.rounds) for point in points(arguments.preset)])
+    caption = (
+        f"`{arguments.preset}` in float32, time and operations of one image over those of the "
+        f"least: {machine()}; medians and ranges of {arguments.rounds} rounds."
+    )
+    leave("bench_scale", Study(table(values, caption), values, draw(values)), arguments)
+
+
+if __name__ == "__main__":
+    main()
