@@ -10,7 +10,7 @@ stamp=".venv/installed${extras}"
 if [ ! -f "$stamp" ] || [ pyproject.toml -nt "$stamp" ]; then
   echo "Installing crisalad-jax${extras} into .venv; the first time takes some minutes." >&2
   # Torch first, by itself: its exact version may be at hand as a smaller CPU build.
-  # Modules are compiled when they are first imported: most of them never are.
+  # Modules are compiled when they are first imported; most are never imported.
   install=(python -m pip install --quiet --no-compile)
   case "$extras" in *dev*) "${install[@]}" "$(grep -o 'torch==[0-9.]*' pyproject.toml)" ;; esac
   "${install[@]}" --editable ".${extras}"

@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.host import usable_cores
 from crisalad_jax.utils.output import warn
 
 EngineName = Literal["onnxruntime", "openvino"]
@@ -54,6 +55,8 @@ def _onnxruntime(path: pathlib.Path, precision: Precision) -> Program:
         raise InputError(f"compute dtype: found {precision} with onnxruntime, expected float32")
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
+    # Left to itself it takes the machine's cores, however few this process may use.
+    options.intra_op_num_threads = usable_cores()
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     names = [each.name for each in session.get_inputs()]
     return lambda *inputs: np.asarray(session.run(None, dict(zip(names, inputs, strict=True)))[0])

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from crisalad_jax.nn import attention_fused, random_init
@@ -24,7 +23,7 @@ from crisalad_jax.nn.layers import (
     linear,
     no_update,
 )
-from crisalad_jax.nn.products import product_precision, row_major, rule_precision
+from crisalad_jax.nn.products import keep, product_precision, row_major, rule_precision
 from crisalad_jax.utils.pytree import pytree_dataclass
 from crisalad_jax.utils.target import target
 
@@ -82,7 +81,7 @@ def attention(
     tokens = x.shape[-2]
     length = tokens if length is None else length
     projected = adapted_linear("qkv", params.qkv, x, update)
-    qkv = split_heads(checkpoint_name(projected, "qkv"), 3 * heads)
+    qkv = split_heads(keep(projected, "qkv"), 3 * heads)
     parts = jnp.split(qkv, 3, axis=-2)
     if rotation is not None:
         parts[:2] = (rotate(part, rotation, length=length) for part in parts[:2])

@@ -40,6 +40,7 @@ from crisalad_jax.utils import compiler
 from crisalad_jax.utils.devices import IMAGE, image_mesh, over_images
 from crisalad_jax.utils.errors import few
 from crisalad_jax.utils.pytree import check_drawn, expect_like, named_leaves, pytree_dataclass
+from crisalad_jax.utils.target import widens_slices
 
 _ONLY_MULTIPLIED = re.compile(r"backbone\.blocks\..*(attn|mlp)\.\w+\.weight")
 """Names of linear layers' weights, which `layers.linear` casts to the type of its input."""
@@ -163,8 +164,9 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
     """Cast the weights of the backbone's large linear layers to the type of their products.
 
     Otherwise every call casts them. Descriptors stay the same to the bit. In bfloat16 the weights
-    take half the memory, and no longer train. In float64 all parameters are cast, so that none of
-    their sums is rounded to float32.
+    take half the memory, and no longer train; where XLA would widen them again in every call
+    (`widens_slices`), they stay float32. In float64 all parameters are cast, so that none of their
+    sums is rounded to float32.
 
     Args:
         params: the parameters, or a tree of these with some left out.
@@ -176,12 +178,16 @@ def cast_params(params: Any, config: ModelConfig) -> Any:
     Example:
         >>> import jax
         >>> from crisalad_jax import PRESETS
+        >>> from crisalad_jax.utils.target import GPU, lowering_for
         >>> config = dataclasses.replace(PRESETS["tiny"], compute_dtype="bfloat16")
-        >>> params = cast_params(init_crisalad(jax.random.key(0), config), config)
+        >>> with lowering_for(GPU):
+        ...     params = cast_params(init_crisalad(jax.random.key(0), config), config)
         >>> params.backbone.blocks.mlp.fc1.weight.dtype
         dtype(bfloat16)
     """
     dtype = jnp.dtype(config.compute_dtype)
+    if dtype == jnp.bfloat16 and widens_slices():
+        return params
 
     def cast(path: Any, leaf: Any) -> Any:
         name = jax.tree_util.keystr(path, simple=True, separator=".")

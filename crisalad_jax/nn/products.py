@@ -6,10 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 from jax.experimental.layout import Layout, with_layout_constraint
 from jaxtyping import Array, Float
 
-from crisalad_jax.utils.target import target
+from crisalad_jax.utils.target import target, widens_slices
 
 
 def product_precision(dtype: Any) -> jax.lax.Precision | None:
@@ -35,6 +36,27 @@ def row_major(x: Array) -> Array:
     summed over, where both sides are laid out so; others are computed in float32.
     """
     return with_layout_constraint(x, Layout(tuple(range(x.ndim))))
+
+
+def keep(x: Array, name: str) -> Array:
+    """Name a result that a policy of `jax.checkpoint` keeps for the gradient.
+
+    Where XLA would widen all that is kept in bfloat16 (`widens_slices`), its bits are kept.
+    """
+    if x.dtype == jnp.bfloat16 and widens_slices():
+        return _keep_bits(x, name)
+    return checkpoint_name(x, name)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _keep_bits(x: Array, name: str) -> Array:
+    return x
+
+
+@_keep_bits.defjvp
+def _keep_bits_jvp(name: str, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    bits = jax.lax.bitcast_convert_type(*primals, jnp.uint16)
+    return jax.lax.bitcast_convert_type(checkpoint_name(bits, name), jnp.bfloat16), tangents[0]
 
 
 def matmul(rows: Float[Array, "row d_in"], weight: Float[Array, "d_in d_out"]) -> Array:

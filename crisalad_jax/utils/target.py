@@ -78,6 +78,14 @@ def machine() -> Target:
     return {"cpu": CPU, "tpu": TPU}.get(platform, PORTABLE)
 
 
+def widens_slices() -> bool:
+    """Return whether XLA widens a stack of bfloat16 arrays, all of it, before a loop slices it.
+
+    A CPU's compiler of jax before 0.11 does (docs/performance-studies.md, Choices by processor).
+    """
+    return target().platform == "cpu" and jax.__version_info__ < (0, 11)
+
+
 def absent_platforms(error: Exception | None = None) -> str | None:
     """Describe which platforms `JAX_PLATFORMS` names that this JAX lacks; None where it has them.
 

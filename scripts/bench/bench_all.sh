@@ -3,7 +3,7 @@
 #
 #     bench_all.sh               all tables and pictures of docs/performance.md, its studies, docs/training.md
 #                                and docs/search.md: hours
-#     bench_all.sh --processor   descriptors, training steps, products and answers alone, in both types, for a
+#     bench_all.sh --processor   descriptors, training steps, products and answers alone, for a
 #                                processor that is not in docs/performance.md: 40 minutes on two cores, by reckoning
 #     bench_all.sh --gpu         on a GPU that both torch and jax find, into docs/performance-gpu.md: 15 minutes, not timed yet
 #
@@ -27,7 +27,7 @@ if [ "$mode" = gpu ]; then
   if [ "$small" ]; then
     describe=(--presets tiny --batches 8 --rounds 1) train=("${describe[@]}")
     folder=(--presets tiny --images 40 --batch 8 --rounds 1) memory=(--preset tiny --images 8 --micro-batches 4)
-    sinkhorn=(--images 2 --patches 256 --iterations 3 --errors 1e-3 --rounds 1 --calls 2 --batches 1)
+    sinkhorn=(--images 2 --patches 64 --clusters 8 --iterations 3 --errors 1e-2 --rounds 1 --calls 2 --batches 1)
   fi
   bench describe "${to[@]}" "${describe[@]}" "$@"
   bench train "${to[@]}" "${train[@]}" "$@"
@@ -38,12 +38,17 @@ if [ "$mode" = gpu ]; then
 fi
 to=(--page docs/performance.md --page docs/performance-studies.md)
 if [ "$mode" = processor ]; then
-  sizes=(--presets tiny s14 b14 --dtypes float32 bfloat16)
-  [ -z "$small" ] || sizes=(--presets tiny --rounds 1) to=(--out "$(mktemp -d)")
-  bench describe "${to[@]}" "${sizes[@]}" --batches 1 8 "$@"
-  bench train "${to[@]}" "${sizes[@]}" --batches 8 "$@"
-  [ "$small" ] || bench modes "${to[@]}" bench_products
-  [ "$small" ] || bench query "${to[@]}"
+  describe=(--presets tiny s14 b14 resnet50 --batches 1 8 --dtypes float32 bfloat16)
+  train=(--presets tiny s14 b14 --batches 8 --dtypes float32 bfloat16) start=()
+  if [ "$small" ]; then
+    to=(--out "$(mktemp -d)") describe=(--presets tiny --batches 1 8 --rounds 1)
+    train=(--presets tiny --batches 8 --rounds 1) start=(--preset tiny --rounds 1)
+  fi
+  bench describe "${to[@]}" "${describe[@]}" "$@"
+  bench train "${to[@]}" "${train[@]}" "$@"
+  bench modes "${to[@]}" bench_products
+  bench query "${to[@]}" "${start[@]}"
+  bench locate "${to[@]}" "${start[@]}"
   exit
 fi
 bench describe "${to[@]}" "$@"
@@ -52,6 +57,8 @@ bench train "${to[@]}" "$@"
 bench extract "${to[@]}"
 bench start "${to[@]}"
 bench query "${to[@]}"
+bench locate "${to[@]}"
+bench scale "${to[@]}"
 bench modes "${to[@]}"
 bench profile "${to[@]}"
 to=(--page docs/training.md)

@@ -1,13 +1,16 @@
-"""How long `Map.locate` takes on some cores, by JAX and by the engines that `--runtime auto` takes.
+"""Latency of `Map.locate` on some cores, by JAX and by the engines that `--runtime auto` takes.
 
-    python scripts/bench/bench_locate.py [--out docs/performance] [--page docs/performance.md]
-        [--presets tiny s14 b14] [--cores 1 2 4] [--rounds 5]
+    python scripts/bench/bench_locate.py [--out docs/performance]
+        [--page docs/performance-studies.md] [--preset tiny s14 b14]
+        [--runtime jax onnxruntime openvino] [--cores 1 2 4] [--rounds 5]
 
-A program of its own asks a map of 64 images where one camera's frame was taken, over and over, as a
-robot does. It may use the first so many cores, and takes as many threads. Numbers of cores that
-this machine does not have are left out. Ratios are to the fastest of the same row.
+Each run is a process of its own on the first N cores. It asks a map of 64 images where one camera's
+frame was taken, over and over, as a robot does; the engines' first answers have to be the same.
+Numbers of cores that this machine does not have are left out. Ratios are to the fastest engine on
+as many cores, and to the same engine on the fewest.
 """
 
+import json
 import pathlib
 import sys
 import tempfile
@@ -29,74 +32,82 @@ SCRIPT = """
 import os, sys
 places, weights, engine, image, cores = sys.argv[1:]
 os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:int(cores)])  # before threads are made
-import statistics, time
+import json, statistics, time
 from crisalad_jax import Map, read_image
 here = Map.open(places)
 here.load_model(weights, engine=engine)
 pixels = read_image(image)
-end, found = time.perf_counter() + 1, []
-while time.perf_counter() < end or len(found) < 3:
-    here.locate(pixels)
-    found.append(0)
-found, end = [], time.perf_counter() + 2
-while time.perf_counter() < end or len(found) < 5:
-    started = time.perf_counter()
-    here.locate(pixels)
-    found.append(time.perf_counter() - started)
-print(1e3 * statistics.median(found))
+def timed(seconds, least):
+    end, found = time.perf_counter() + seconds, []
+    while time.perf_counter() < end or len(found) < least:
+        started = time.perf_counter()
+        answers = here.locate(pixels)
+        found.append(time.perf_counter() - started)
+    return 1e3 * statistics.median(found), answers[0].image.name
+timed(1, 3)
+print(json.dumps(timed(2, 5)))
 """
 ENGINES = ("jax", "onnxruntime", "openvino")
 
 
-def measure(preset: str, cores: list[int], rounds: int) -> list[dict[str, Any]]:
-    """Make a map of random weights, and ask it by each engine in turn."""
+def measure(
+    preset: str, engines: list[str], cores: list[int], rounds: int
+) -> dict[tuple[int, str], Timed]:
+    """Make a map with random weights, and ask it by each engine in turn.
+
+    Raises:
+        RuntimeError: the engines answer differently.
+    """
     with tempfile.TemporaryDirectory(prefix="bench-locate-") as name:
         folder = pathlib.Path(name)
-        photographs, weights, places = (folder / part for part in ("images", "w", "map"))
-        weights = weights.with_suffix(".safetensors")
+        photographs, weights, places = (folder / x for x in ("images", "w.safetensors", "map"))
         write_photographs(photographs)
         config = PRESETS[preset]
         model = Model(init_crisalad(jax.random.key(0), config), config)
         save_weights(weights, model)
         index(model, photographs, places, weights=weights, reading=Reading(quiet=True))
-        timed = {(n, engine): Timed([]) for n in cores for engine in ENGINES}
+        timed = {(n, engine): Timed([]) for n in cores for engine in engines}
         image, cache = photographs / "007.jpg", {"XDG_CACHE_HOME": str(folder / "cache")}
         for _ in range(rounds):
             for (n, engine), one in timed.items():
                 asked = [str(places), str(weights), engine, str(image), str(n)]
                 _, printed = run_program([sys.executable, "-c", SCRIPT, *asked], cache)
-                one.rounds.append(float(printed))
-    found = []
-    for n in cores:
-        row = {engine: timed[n, engine] for engine in ENGINES}
-        best = min(row.values(), key=lambda one: one.median)
-        for engine, one in row.items():
-            of_one = ratio(timed[cores[0], engine], one)
-            kept = {"model": preset, "cores": n, "contender": engine, "ms": one.rounds}
-            found.append({**kept, "slower": ratio(one, best), "of the first": of_one})
-    return found
+                milliseconds, found = json.loads(printed)
+                if found != image.name:
+                    raise RuntimeError(f"{preset}, {engine}: found {found}, expected {image.name}")
+                one.rounds.append(milliseconds)
+    return timed
 
 
 def main() -> None:
     parser = flags(__doc__ or "", "docs/performance")
-    parser.add_argument("--presets", nargs="+", default=["tiny", "s14", "b14"], choices=PRESETS)
+    parser.add_argument("--preset", nargs="+", default=["tiny", "s14", "b14"], choices=PRESETS)
+    parser.add_argument("--runtime", nargs="+", default=list(ENGINES), choices=ENGINES)
     parser.add_argument("--cores", nargs="+", type=count, default=[1, 2, 4])
     parser.add_argument("--rounds", type=count, default=5)
     arguments = read(parser, "bench_locate")
     cores = [n for n in sorted(set(arguments.cores)) if n <= usable_cores()]
-    values = [
-        value for preset in arguments.presets for value in measure(preset, cores, arguments.rounds)
-    ]
+    if not cores:
+        parser.error(f"found {usable_cores()} cores, expected as many as one of --cores")
+    values: list[dict[str, Any]] = []
     rows = []
-    for one in values:
-        relative = (times(one[name]) for name in ("slower", "of the first"))
-        rows.append((one["model"], f"{one['cores']}", one["contender"], *relative))
-    header = ("model", "cores", "engine", "time over the fastest's", "speed over fewest cores'")
+    for preset in arguments.preset:
+        timed = measure(preset, arguments.runtime, cores, arguments.rounds)
+        for (n, engine), one in timed.items():
+            best = min((timed[n, each] for each in arguments.runtime), key=lambda x: x.median)
+            slower, more = ratio(one, best), ratio(timed[cores[0], engine], one)
+            kept = {"model": preset, "cores": n, "contender": engine, "ms": one.rounds}
+            values.append({**kept, "slower": slower, "over the fewest cores": more})
+            rows.append((preset, f"{n}", engine, f"{one.median:.1f}", times(slower), times(more)))
+    header = (
+        *("model", "cores", "engine", "ms", "time over the fastest's"),
+        f"speed over {cores[0]} core{'s' * (cores[0] > 1)}",
+    )
     words = measured(arguments.rounds, *packages())
-    caption = f"`Map.locate` of one image, the model loaded: {words}."
+    caption = f"`Map.locate` of one image of 640 x 480, the model loaded: {words}."
     figure = bars(
         values,
-        lambda value: f"{value['model']}, {value['cores']} cores",
+        lambda value: f"{value['model']}, {value['cores']} core{'s' * (value['cores'] > 1)}",
         "slower",
         "time over the fastest's",
     )

@@ -36,12 +36,13 @@ from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.nn.config import PRESETS, ModelConfig
-from crisalad_jax.nn.model import Crisalad, Model, describe
-from crisalad_jax.retrieval.describe import describe_files
+from crisalad_jax.nn.model import Crisalad, Model, cast_params, describe
+from crisalad_jax.retrieval.describe import describe_files, prepare_image
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.step import init_train_state, loss_and_gradient, step_config
 from crisalad_jax.utils.devices import devices_for
 from crisalad_jax.utils.pytree import named_leaves
+from crisalad_jax.utils.target import GPU, lowering_for
 from parity.cases.case import build, convert, random
 
 TYPES = {"float32": "float32", "bfloat16": "float32", "int8": "int32"}
@@ -153,52 +154,85 @@ def recall(arguments: argparse.Namespace) -> Study:
             )
     caption = (
         f"Recall@K of a trained model on {benchmark.name}, {len(benchmark.queries)} queries; the "
-        "cosine of the queries' descriptors (single) to the same in float32."
+        f"cosine of the queries' descriptors (single) to the same in float32. {machine()}."
     )
     header = ("type", "grouping", "R@1", "R@5", "R@10", "mean cosine", "least cosine")
     figure = bars(values, lambda v: v["grouping"], "R@1", "Recall@1")
     return Study(Table(header, rows, caption, 2), values, figure)
 
 
+def rounded(params: Crisalad, config: ModelConfig) -> Crisalad:
+    """Round the weights of the backbone's linear layers to bfloat16, and keep them in float32."""
+    with lowering_for(GPU):  # which casts them with any version of jax
+        narrow = cast_params(params, in_type(config, "bfloat16"))
+    return jax.tree.map(lambda new, old: new.astype(old.dtype), narrow, params)
+
+
+def directions(
+    params: Crisalad, config: TrainConfig, batches: list[np.ndarray]
+) -> dict[str, np.ndarray]:
+    """The gradient of each batch's loss as a unit vector, by part of the model."""
+    many, images = config.places_per_batch, config.images_per_place
+    labels, valid = np.repeat(np.arange(many), images), np.ones(many * images, bool)
+    step = step_config(config, steps=1)
+    state, frozen = init_train_state(params, config.trainable, step)
+    gradient = jax.jit(functools.partial(loss_and_gradient, key=None, config=step))
+    found: dict[str, list[np.ndarray]] = {}
+    for pixels in batches:
+        _, (whole, _) = gradient(state, frozen, pixels, labels, valid)
+        parts: dict[str, list[np.ndarray]] = {}
+        for name, leaf in named_leaves(whole).items():
+            for part in ("all", "adapters" if "adapter" in name else name.split(".")[0]):
+                parts.setdefault(part, []).append(np.ravel(leaf))
+        for part, leaves in parts.items():
+            one = np.concatenate(leaves).astype(np.float64)
+            found.setdefault(part, []).append(one / np.linalg.norm(one))
+    return {part: np.stack(rows) for part, rows in found.items()}
+
+
 def gradients(arguments: argparse.Namespace) -> Study:
     params, model = load_weights(arguments.run / "last.safetensors")
     config = read_config(TrainConfig, arguments.run / "config.json")
-    places = read_places(arguments.city / "train", min_images=config.images_per_place)
-    many, images = config.places_per_batch, config.images_per_place
-    labels, valid = np.repeat(np.arange(many), images), np.ones(many * images, bool)
-    found: dict[str, dict[str, list[np.ndarray]]] = {}
-    for dtype in ("float32", "bfloat16"):
-        step = step_config(dataclasses.replace(config, model=in_type(model, dtype)), steps=1)
-        gradient = jax.jit(functools.partial(loss_and_gradient, key=None, config=step))
-        state, frozen = init_train_state(params, config.trainable, step)
-        for first in range(0, arguments.batches * many, many):
-            numbers = [
-                number
-                for start in places.place_start[first : first + many]
-                for number in range(start, start + images)
-            ]
-            pixels = np.stack([read_image(places.path(number)) for number in numbers])
-            _, (whole, _) = gradient(state, frozen, pixels, labels, valid)
-            parts: dict[str, list[np.ndarray]] = {}
-            for name, leaf in named_leaves(whole).items():
-                for part in ("all", "adapters" if "adapter" in name else name.split(".")[0]):
-                    parts.setdefault(part, []).append(np.ravel(leaf))
-            for part, leaves in parts.items():
-                one = np.concatenate(leaves).astype(np.float64)
-                by_type = found.setdefault(part, {"float32": [], "bfloat16": []})
-                by_type[dtype].append(one / np.linalg.norm(one))
-    values, rows = [], []
-    for part, by_type in found.items():
-        alike = cosines(np.stack(by_type["bfloat16"]), np.stack(by_type["float32"]))
-        size = len(by_type["float32"][0])
-        values.append({"part": part, "numbers": size, "cosine": alike.tolist()})
-        rows.append((part, f"{size}", f"{alike.mean():.5f}", f"{alike.min():.5f}"))
-    caption = (
-        f"Gradients of {arguments.batches} batches of {many} places x {images} images at a trained "
-        f"model, in bfloat16 beside float32, {machine()}."
+    # A miner's choice of pairs jumps; and one step is no warm-up.
+    config = dataclasses.replace(
+        config,
+        loss=dataclasses.replace(config.loss, miner="none"),
+        optimiser=dataclasses.replace(config.optimiser, warmup_steps=0),
     )
-    header = ("part", "parameters", "mean cosine", "least cosine")
-    return Study(Table(header, rows, caption), values)
+    many, images = config.places_per_batch, config.images_per_place
+    places = read_places(arguments.city / "train", min_images=images)
+    starts = places.place_start[:-1]
+    batches = [
+        np.stack(
+            [
+                prepare_image(read_image(places.path(start + i)), model)
+                for start in starts[first : first + many]
+                for i in range(images)
+            ]
+        )
+        for first in range(0, len(starts) - many + 1, many)
+    ][: arguments.batches]
+    narrow = dataclasses.replace(config, model=in_type(model, "bfloat16"))
+    exact = directions(params, config, batches)
+    found = {
+        "bfloat16": directions(params, narrow, batches),
+        "weights rounded": directions(rounded(params, model), config, batches),
+    }
+    values, rows = [], []
+    for part, whole in exact.items():
+        alike = {name: cosines(each[part], whole) for name, each in found.items()}
+        values.append({"part": part, **{name: each.tolist() for name, each in alike.items()}})
+        numbers = (f(each) for each in alike.values() for f in (np.median, np.min))
+        rows.append((part, *(f"{x:.5f}" for x in numbers)))
+    height, width = model.image_size
+    caption = (
+        f"Cosines of gradients to those in float32: {len(batches)} batches of {many} places x "
+        f"{images} images of {height} x {width} at a trained model, all pairs in the loss; medians "
+        f"and least, {machine()}."
+    )
+    of_weights = "float32, the backbone's weights rounded"
+    names = (f"{what}: {of}" for what in ("bfloat16", of_weights) for of in ("median", "least"))
+    return Study(Table(("part of the gradient", *names), rows, caption), values)
 
 
 def main() -> None:
@@ -220,7 +254,9 @@ def main() -> None:
     for name in arguments.studies:
         of_trained = name in ("bench_recall", "bench_gradients")
         if of_trained and not (arguments.run.is_dir() and arguments.city.is_dir()):
-            print(f"{arguments.run}, {arguments.city}: not there; scripts/demo.sh makes both")
+            print(
+                f"{name}: found no {arguments.run} or {arguments.city}; scripts/demo.sh makes both"
+            )
             continue
         leave(name, studies[name](arguments), arguments)
 

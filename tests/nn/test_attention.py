@@ -239,7 +239,6 @@ def test_what_a_tpus_kernel_does_not_take_is_computed_all_the_same(
     np.testing.assert_allclose(found, expected, atol=tolerance)
 
 
-@pytest.mark.slow
 def test_an_accelerators_products_are_the_cpus() -> None:
     """In float32 a GPU has no fused attention; the order of the axes is another."""
     params, x = make()
@@ -324,7 +323,6 @@ def test_only_fused_attention_wants_padding() -> None:
             assert padded_length(257, dtype, 768, heads) == expected
 
 
-@pytest.mark.slow
 def test_a_tpus_kernel_sees_no_padding(interpreted: list[Any]) -> None:
     x = sample(50, 128)
     more = jnp.pad(x, ((0, 0), (0, 6), (0, 0)), constant_values=100)

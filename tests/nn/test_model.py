@@ -22,6 +22,7 @@ from crisalad_jax.nn.model import (
 )
 from crisalad_jax.nn.pixels import normalise
 from crisalad_jax.utils.errors import InputError
+from crisalad_jax.utils.target import CPU, GPU, lowering_for
 from tests.conftest import MODEL as CONFIG
 from tests.conftest import assert_equal, random_params
 
@@ -223,10 +224,21 @@ def test_a_mask_of_another_shape_is_refused(params, shape):
         describe(params, pictures(3), CONFIG, mask=np.ones(shape, bool))
 
 
+@pytest.mark.parametrize("version", [(0, 10, 2), (0, 11, 0)])
+def test_an_old_compiler_for_cpus_gets_no_weights_to_widen(params, monkeypatch, version) -> None:
+    monkeypatch.setattr(jax, "__version_info__", version)
+    config = dataclasses.replace(CONFIG, compute_dtype="bfloat16")
+    with lowering_for(CPU):
+        cast = cast_params(params, config)
+    expected = "float32" if version < (0, 11) else "bfloat16"
+    assert cast.backbone.blocks.mlp.fc1.weight.dtype == expected
+
+
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_weights_cast_once_change_no_bit(params, dtype: str) -> None:
     config = dataclasses.replace(CONFIG, compute_dtype=dtype)  # pyright: ignore
-    cast = cast_params(params, config)
+    with lowering_for(GPU):  # as on a CPU from jax 0.11 on
+        cast = cast_params(params, config)
     assert cast.backbone.blocks.mlp.fc1.weight.dtype == dtype
     assert cast.backbone.blocks.mlp.fc1.bias.dtype == jnp.float32
     found, expected = (describe(each, pictures(4), config) for each in (cast, params))

@@ -6,10 +6,12 @@ import dataclasses
 import itertools
 import json
 import pathlib
+import re
 import sys
 from types import ModuleType
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from crisalad_jax.config.preprocessing import IMAGENET_DEVIATION, IMAGENET_MEAN
 from crisalad_jax.data.augmentations.rand_augment import RandAugmentConfig
 from crisalad_jax.data.images import read_image
 from crisalad_jax.data.places import read_places
+from crisalad_jax.nn.attention import dot_product_attention
 from crisalad_jax.nn.costs import part_costs
 from crisalad_jax.training.recipes import recipe
 from parity.reference.model import Crisalad as TorchCrisalad
@@ -201,7 +204,7 @@ def test_operations_of_a_step_are_those_of_what_trains(scripts: Any) -> None:
 
 
 PROGRAM = """
-  %dot.7 = f32[9]{0} dot(%a, %b), metadata={op_name="jit(f)/jvp()/...jd,...di->...ji/dot_general"}
+  %dot.7 = f32[9]{0} dot(%a, %b), metadata={op_name="jit(f)/...hid,...hjd->...hij/dot_general"}
   ROOT %dot.8 = f32[9]{0} dot(%a, %b), metadata={op_name="jit(f)/jvp()/dot_general"}
   %copy_bitcast_fusion.1 = f32[9]{0} fusion(%a), metadata={op_name="jit(f)/transpose"}
   %bitcast_dynamic-update-slice_fusion = f32[9]{0} fusion(%a, %b)
@@ -233,6 +236,39 @@ def test_operations_of_a_trace_are_told_apart(scripts: Any) -> None:
         "copies": 0.004 + 0.008,
         "numbers one by one, sums": 0.016 + 0.064 + 1.024,
     }
+
+
+def test_attentions_products_are_told_by_the_compiled_program(scripts: Any) -> None:
+    bench = scripts("bench_profile")
+    x = jnp.ones((2, 9, 2, 8))
+    gradient = jax.grad(lambda q, k, v: dot_product_attention(q, k, v).sum(), argnums=(0, 1, 2))
+    program = jax.jit(gradient).lower(x, x, x).compile().as_text() or ""
+    products = {
+        name: bench.kind(name, made_of)
+        for name, made_of in bench.INSTRUCTION.findall(program)
+        if re.match(r"dot", name)
+    }
+    # Scores again, to weights, values, queries and keys.
+    assert list(products.values()) == ["attention's products"] * 5
+
+
+def test_growth_is_over_the_least_of_what_grows(scripts: Any) -> None:
+    bench = scripts("bench_scale")
+
+    def point(grows: str, value: int, operations: int, ours: float, theirs: float) -> Any:
+        found = {"grows": grows, "value": value, "operations": operations, "faster": (1.0,) * 3}
+        return found | {"ours": [ours], "theirs": [theirs], "memory": 10**6, "their memory": 10**7}
+
+    values = [point("images", 1, 8, 4.0, 6.0), point("images", 4, 8, 3.0, 3.0)]
+    values += [point("clusters", 16, 10, 2.0, 2.0), point("clusters", 64, 20, 5.0, 3.0)]
+    table = bench.table(bench.grown(values), "Growth.")
+    faster = "1.00 (1.00 to 1.00)"
+    assert table.rows == [
+        ("images", "1", "1.00", "1.00", "1.00", faster, "1.0", "10.0"),
+        ("images", "4", "1.00", "0.75", "0.50", faster, "1.0", "10.0"),
+        ("clusters", "16", "1.00", "1.00", "1.00", faster, "1.0", "10.0"),
+        ("clusters", "64", "2.00", "2.50", "1.50", faster, "1.0", "10.0"),
+    ]
 
 
 def test_a_tree_of_the_size_of_gsv_cities_is_one(scripts: Any, tmp_path: pathlib.Path) -> None:
@@ -296,7 +332,9 @@ def test_the_search_is_measured(
         ("bench_describe", "--sizes 99x99", "image size: found 99 x 99, expected sides that are"),
         ("bench_train", "--page missing.md", "missing.md: found no such file, expected a page"),
         ("bench_extract", "--images none", "argument --images: found 'none'"),
+        ("bench_locate", "--cores 0", "argument --cores: found '0', expected a whole number"),
         ("bench_profile", "--out pyproject.toml", "expected a folder that can be written to"),
+        ("bench_scale", "--page README.md", "README.md: found no <!-- bench_scale -->"),
         ("bench_start", "--page README.md", "README.md: found no <!-- bench_start -->"),
         ("bench_modes", "--page CONTRIBUTING.md", "found no <!-- bench_products -->"),
         ("bench_index", "--images 10", "found 10 images of 46000 places, expected at least 48"),

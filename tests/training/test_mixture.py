@@ -310,11 +310,14 @@ def write_streets(root: pathlib.Path) -> pathlib.Path:
     ("name", "places", "size", "moved"),
     [
         ("sage", 4, (28, 42), {"aggregator", "backbone.blocks.adapter"}),
-        ("salad-cm", 4, (70, 70), {"aggregator", "backbone.norm"}),
-        ("megaloc", 12, (70, 70), {"aggregator", "projection"}),
+        pytest.param(
+            *("salad-cm", 4, (70, 70), {"aggregator", "backbone.norm"}), marks=pytest.mark.slow
+        ),
+        pytest.param(
+            *("megaloc", 12, (70, 70), {"aggregator", "projection"}), marks=pytest.mark.slow
+        ),
     ],
 )
-@pytest.mark.slow
 def test_a_published_mixture_trains_and_resumes(
     name: str,
     places: int,

@@ -40,6 +40,7 @@ from crisalad_jax.training.step import (
 from crisalad_jax.training.trainable import merge_params, split_params
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.pytree import named_leaves
+from crisalad_jax.utils.target import GPU, lowering_for
 from tests.conftest import MODEL as CONFIG
 from tests.conftest import assert_equal, random_params
 from tests.nn.test_model import pictures
@@ -452,7 +453,8 @@ def test_frozen_weights_in_half_the_memory_change_no_bit() -> None:
     results = []
     for change in (lambda frozen, _: frozen, cast_params):
         state, frozen = init_train_state(random_params(model), "adapters,head", config)
-        frozen = change(frozen, model)
+        with lowering_for(GPU):  # as on a CPU from jax 0.11 on
+            frozen = change(frozen, model)
         results.append(take_step(state, frozen, config=config))
     kinds = {name: leaf.dtype for name, leaf in named_leaves(frozen).items()}
     assert kinds["backbone.blocks.1.mlp.fc1.weight"] == jnp.bfloat16

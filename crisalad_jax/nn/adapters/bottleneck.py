@@ -12,7 +12,6 @@ from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
-from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import PositiveFloat, PositiveInt, require_field
@@ -32,6 +31,7 @@ from crisalad_jax.nn.layers import (
     init_linear,
     linear,
 )
+from crisalad_jax.nn.products import keep
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 BATCH_NORM_EPSILON = 1e-3
@@ -282,7 +282,7 @@ def _init_conv_norm(kernel_size: int, d_in: int, d_out: int) -> ConvNorm:
 def _project_down(
     params: Linear, tokens: AnyTokens, activation: Callable[[Array], Array] = jax.nn.relu
 ) -> Float[Array, "*batch token width"]:
-    return activation(checkpoint_name(linear(params, tokens), "down"))
+    return activation(keep(linear(params, tokens), "down"))
 
 
 def _mlp(
@@ -314,7 +314,7 @@ def _on_patches(
 def _separable(params: DepthwiseAdapter, x: Map) -> Map:
     # No activation between the two convolutions, as in Xception.
     filtered = jax.vmap(functools.partial(depthwise_conv, params.depthwise))(x)
-    return jax.nn.relu(checkpoint_name(linear(params.pointwise, filtered), "mixed"))
+    return jax.nn.relu(keep(linear(params.pointwise, filtered), "mixed"))
 
 
 def _multi_resolution(

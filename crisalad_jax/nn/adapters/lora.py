@@ -4,13 +4,13 @@ import dataclasses
 from typing import Literal
 
 import jax.numpy as jnp
-from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from crisalad_jax.config.checks import PositiveFloat, PositiveInt, require_field
 from crisalad_jax.nn import random_init
 from crisalad_jax.nn.adapters.base import ADAPTERS, Adapter, BlockShape
 from crisalad_jax.nn.layers import Linear, init_linear, linear
+from crisalad_jax.nn.products import keep
 from crisalad_jax.utils.pytree import pytree_dataclass
 
 
@@ -58,7 +58,7 @@ class LoraConfig(Adapter):
         """Return x A B, scaled: neither A B nor a gradient of its size is computed."""
         if name not in params:
             return None
-        hidden = checkpoint_name(linear(params[name].down, x), "down")
+        hidden = keep(linear(params[name].down, x), "down")
         return self.alpha / self.rank * linear(params[name].up, hidden)
 
     def merge(self, params: dict[str, LowRank], name: str, layer: Linear) -> Linear:

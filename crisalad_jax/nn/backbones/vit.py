@@ -15,7 +15,6 @@ from typing import Any, ClassVar, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from crisalad_jax.config.checks import (
@@ -66,6 +65,7 @@ from crisalad_jax.nn.layers import (
     no_update,
     split_statistics,
 )
+from crisalad_jax.nn.products import keep
 from crisalad_jax.utils.pytree import expect_like, pytree_dataclass
 
 NORM_EPSILON = 1e-6
@@ -700,7 +700,7 @@ def block(
     with jax.named_scope("adapter"):
         extra = adapter.attention_update(params.adapter, attended, info)
         attended = _added(attended, extra, config)
-    tokens = checkpoint_name(_residual(tokens, params.ls1, attended), "attended")
+    tokens = keep(_residual(tokens, params.ls1, attended), "attended")
     normed = layer_norm(params.norm2, tokens, epsilon=config.norm_epsilon)
     update = feed_forward(params.mlp, normed, linear_update)
     with jax.named_scope("adapter"):
@@ -767,10 +767,10 @@ def feed_forward(
     """
     rows = x.reshape(-1, x.shape[-1])
     if isinstance(params, Mlp):
-        hidden = checkpoint_name(adapted_linear("fc1", params.fc1, rows, update), "hidden")
+        hidden = keep(adapted_linear("fc1", params.fc1, rows, update), "hidden")
         y = adapted_linear("fc2", params.fc2, gelu(hidden), update)
     else:
-        hidden = checkpoint_name(adapted_linear("w12", params.w12, rows, update), "hidden")
+        hidden = keep(adapted_linear("w12", params.w12, rows, update), "hidden")
         gate, value = jnp.split(hidden, 2, axis=-1)
         y = adapted_linear("w3", params.w3, jax.nn.silu(gate) * value, update)
     return y.reshape(x.shape)

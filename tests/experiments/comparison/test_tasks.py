@@ -74,7 +74,7 @@ def test_jobs_without_ray_are_one_line(flags, capfd, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow  # tests/retrieval/test_on_cluster.py starts a cluster too
+@pytest.mark.slow
 def test_tasks_end_once_each_and_a_lost_worker_is_replaced(tmp_path, monkeypatch):
     """Calls in workers: in the driver's folder, with its plug-ins; one dies at first."""
     monkeypatch.chdir(tmp_path)

@@ -99,11 +99,13 @@ GATED = ("qkv", "w12", "w3")
     "backbone",
     [
         dataclasses.replace(MODEL.backbone, adapter=LORA),
-        DinoV3Config(dim=32, depth=2, heads=2, ffn="swiglu", adapter=LoraConfig(layers=GATED)),
+        pytest.param(
+            DinoV3Config(dim=32, depth=2, heads=2, ffn="swiglu", adapter=LoraConfig(layers=GATED)),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["vit", "dinov3"],
 )
-@pytest.mark.slow  # test_last_blocks.py merges too
 def test_a_merged_model_has_the_same_descriptors(backbone: VisionTransformer) -> None:
     model, images = adapted(backbone)
     merged = cj.merge_adapters(model)
