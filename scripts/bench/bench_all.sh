@@ -4,7 +4,7 @@
 #     bench_all.sh               all tables and pictures of docs/performance.md, its studies, docs/training.md
 #                                and docs/search.md: hours
 #     bench_all.sh --processor   descriptors, training steps, products and answers alone, for a
-#                                processor that is not in docs/performance.md: 40 minutes on two cores, by reckoning
+#                                processor that is not in docs/performance.md: an hour or more on two cores
 #     bench_all.sh --gpu         on a GPU that both torch and jax find, into docs/performance-gpu.md: 15 minutes, not timed yet
 #
 # --processor and --gpu replace the tables that are there. --small after one of them tries it out in small sizes,

@@ -98,7 +98,7 @@ KERNELS: Mapping[str, Callable[..., Array] | None] = {
 def main() -> None:
     """Print a row for each kernel."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--target", default="v5e-1")
+    parser.add_argument("--target", choices=("v5e-1", "v6e-1"), default="v5e-1")
     parser.add_argument("--program", choices=("describe", "train"), default="describe")
     parser.add_argument("--images", type=int, default=192)
     given = parser.parse_args()

@@ -248,7 +248,7 @@ def test_attentions_products_are_told_by_the_compiled_program(scripts: Any) -> N
         for name, made_of in bench.INSTRUCTION.findall(program)
         if re.match(r"dot", name)
     }
-    # Scores again, to weights, values, queries and keys.
+    # The scores again, and the gradients of weights, values, queries and keys.
     assert list(products.values()) == ["attention's products"] * 5
 
 
