@@ -203,6 +203,10 @@ _HEADS_FIRST = _Axes("...hid", "...hjd")
 _HEADS_LAST = _Axes("...ihd", "...jhd")
 
 
+_LONG = 512
+"""Keys from which a CPU computes one head at a time: the scores of all do not fit its cache."""
+
+
 def dot_product_attention(
     queries: Float[Array, "*batch query head dim"],
     keys: Float[Array, "*batch key head dim"],
@@ -228,8 +232,19 @@ def dot_product_attention(
     precision = rule_precision(queries.dtype)
     if target().platform != "cpu":
         return _mix(queries, keys, values, mask, dropped, _HEADS_LAST, precision)
-    heads_first = (row_major(jnp.moveaxis(x, -3, -2)) for x in (queries, keys, values))
-    return jnp.moveaxis(_mix(*heads_first, mask, dropped, _HEADS_FIRST, precision), -2, -3)
+    mix = functools.partial(_mix, axes=_HEADS_FIRST, precision=precision)
+    # Old compilers slice no stack of bfloat16 (`widens_slices`).
+    if keys.shape[-3] < _LONG or queries.dtype == jnp.bfloat16:
+        heads_first = (row_major(jnp.moveaxis(x, -3, -2)) for x in (queries, keys, values))
+        return jnp.moveaxis(mix(*heads_first, mask, dropped), -2, -3)
+
+    def one(head: tuple[Array, ...]) -> Array:
+        queries, keys, values, *dropped = (jnp.expand_dims(x, -3) for x in head)
+        return mix(queries, keys, values, mask, *dropped or [None]).squeeze(-3)
+
+    heads = [jnp.moveaxis(x, -2, 0) for x in (queries, keys, values)]
+    heads += [] if dropped is None else [jnp.moveaxis(dropped, -3, 0)]
+    return jnp.moveaxis(jax.lax.map(one, tuple(heads)), 0, -2)
 
 
 def _product(formula: str, a: Array, b: Array, precision: Any = None) -> Array:

@@ -19,7 +19,7 @@ from typing import Any
 import jax
 from bench_query import write_photographs
 from engines import packages
-from tables import Study, Table, bars, count, flags, leave, read
+from tables import Study, Table, count, flags, leave, read
 from timing import Timed, measured, ratio, run_program, times
 
 from crisalad_jax import Reading, index
@@ -105,13 +105,7 @@ def main() -> None:
     )
     words = measured(arguments.rounds, *packages())
     caption = f"`Map.locate` of one image of 640 x 480, the model loaded: {words}."
-    figure = bars(
-        values,
-        lambda value: f"{value['model']}, {value['cores']} core{'s' * (value['cores'] > 1)}",
-        "slower",
-        "time over the fastest's",
-    )
-    leave("bench_locate", Study(Table(header, rows, caption, 3), values, figure), arguments)
+    leave("bench_locate", Study(Table(header, rows, caption, 3), values), arguments)
 
 
 if __name__ == "__main__":

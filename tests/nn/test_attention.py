@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from crisalad_jax.nn import attention as attention_module
 from crisalad_jax.nn import attention_pallas
 from crisalad_jax.nn.attention import (
     Attention,
@@ -321,6 +322,31 @@ def test_only_fused_attention_wants_padding() -> None:
     ):
         with lowering_for(chosen):
             assert padded_length(257, dtype, 768, heads) == expected
+
+
+@pytest.mark.parametrize("batch", [(), (2,)])
+@pytest.mark.parametrize("masked", [False, True])
+def test_long_sequences_are_computed_by_heads_to_the_same_values(
+    monkeypatch: pytest.MonkeyPatch, batch: tuple[int, ...], masked: bool
+) -> None:
+    q, k, v = (jax.random.normal(jax.random.key(i), (*batch, 7, 3, 4)) for i in range(3))
+    mask = jnp.tri(7, dtype=bool) if masked else None
+    dropped = None
+    if masked:
+        dropped = jax.random.bernoulli(jax.random.key(4), 0.8, (*batch, 3, 7, 7)) / 0.8
+
+    def loss(*parts: jax.Array) -> jax.Array:
+        return jnp.sin(dot_product_attention(*parts, mask=mask, dropout_mask=dropped)).sum()
+
+    results = []
+    with lowering_for(CPU):
+        for least in (100, 7):
+            monkeypatch.setattr(attention_module, "_LONG", least)
+            results.append(jax.value_and_grad(loss, argnums=(0, 1, 2))(q, k, v))
+    # Sums of seven numbers of order 1, in float32.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), *results)
+    text = jax.jit(loss).lower(q, k, v).as_text()
+    assert "while" in text
 
 
 def test_a_tpus_kernel_sees_no_padding(interpreted: list[Any]) -> None:
