@@ -63,7 +63,8 @@ def splash(qkv: Array, heads: int, length: int, *_: Any) -> Array:
     valid = (jnp.arange(padded) < length).astype(jnp.int32)
     each = functools.partial(kernel, segment_ids=kernels.SegmentIds(valid, valid))
     scaled = queries * queries.shape[-1] ** -0.5
-    return _side_by_side(jax.vmap(each)(scaled, keys, values), qkv)
+    mixed: Any = jax.vmap(each)(scaled, keys, values)
+    return _side_by_side(mixed, qkv)
 
 
 def _heads_first(qkv: Array, heads: int) -> tuple[int, Array, Array, Array]:
