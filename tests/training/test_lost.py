@@ -14,7 +14,7 @@ ABORTED = """
 import os, sys
 from crisalad_jax.training.lost import filter_aborts
 filter_aborts()
-print("a result")
+print("a result", flush=True)  # which an abort would lose in its buffer
 print("a note", file=sys.stderr)
 os.write(1, b"[Gloo] Rank 0 is connected to 3 peer ranks. Expected ... is : 3\\n")
 os.write(2, b"what OpenCV says\\n")
