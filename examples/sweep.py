@@ -47,7 +47,7 @@ def train(trial, city, runs):
         cj.read_places(city / "train"),
         runs / tune.get_context().get_trial_id(),
         validation=cj.open_benchmark(city / "test"),
-        callbacks=["csv", report_to_tune()],  # Tune may end the trial as it is told
+        callbacks=["csv", report_to_tune()],  # Tune may end the trial in the second
         quiet=True,
     )
 

@@ -238,13 +238,13 @@ def dot_product_attention(
         heads_first = (row_major(jnp.moveaxis(x, -3, -2)) for x in (queries, keys, values))
         return jnp.moveaxis(mix(*heads_first, mask, dropped), -2, -3)
 
-    def one(head: tuple[Array, ...]) -> Array:
-        queries, keys, values, *dropped = (jnp.expand_dims(x, -3) for x in head)
-        return mix(queries, keys, values, mask, *dropped or [None]).squeeze(-3)
+    def one(head: tuple[Any, ...]) -> Array:
+        queries, keys, values, dropped = jax.tree.map(lambda x: jnp.expand_dims(x, -3), head)
+        return mix(queries, keys, values, mask, dropped).squeeze(-3)
 
-    heads = [jnp.moveaxis(x, -2, 0) for x in (queries, keys, values)]
-    heads += [] if dropped is None else [jnp.moveaxis(dropped, -3, 0)]
-    return jnp.moveaxis(jax.lax.map(one, tuple(heads)), 0, -2)
+    heads = (jnp.moveaxis(x, -2, 0) for x in (queries, keys, values))
+    dropped = None if dropped is None else jnp.moveaxis(dropped, -3, 0)
+    return jnp.moveaxis(jax.lax.map(one, (*heads, dropped)), 0, -2)
 
 
 def _product(formula: str, a: Array, b: Array, precision: Any = None) -> Array:

@@ -185,7 +185,7 @@ def directions(
 def gradients(arguments: argparse.Namespace) -> Study:
     params, model = load_weights(arguments.run / "last.safetensors")
     config = read_config(TrainConfig, arguments.run / "config.json")
-    # A miner's choice of pairs jumps; and one step is no warm-up.
+    # Rounding may flip which pairs are mined, and a run of one step has no warm-up.
     config = dataclasses.replace(
         config,
         loss=dataclasses.replace(config.loss, miner="none"),

@@ -1,4 +1,4 @@
-"""How time and memory grow with the batch, the image and the clusters, beside torch.
+"""Measure how time and memory grow with batch, image and clusters, beside torch.
 
     python scripts/bench/bench_scale.py [--out docs/performance]
         [--page docs/performance-studies.md] [--preset s14] [--rounds 3]
@@ -66,7 +66,7 @@ def measure(point: Point, rounds: int) -> dict[str, Any]:
 
 
 def grown(values: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Put what each value is over the first of its row beside it."""
+    """Add how much each value has grown over the first of what grows."""
     first = {value["grows"]: value for value in reversed(values)}
     found = []
     for value in values:

@@ -1,4 +1,4 @@
-"""Estimate JAX's own attention kernels for TPUs beside ours; nothing runs.
+"""Compare JAX's attention kernels for TPUs with ours by libtpu's estimate; nothing is executed.
 
     python scripts/bench/study_kernels.py [--target v5e-1] [--program describe] [--images 192]
 
