@@ -23,7 +23,14 @@ from crisalad_jax.nn.layers import (
     linear,
     no_update,
 )
-from crisalad_jax.nn.products import keep, product_precision, row_major, rule_precision
+from crisalad_jax.nn.products import (
+    keep,
+    map_first_axis,
+    product_precision,
+    row_major,
+    rule_precision,
+)
+from crisalad_jax.utils.devices import image_mesh
 from crisalad_jax.utils.pytree import pytree_dataclass
 from crisalad_jax.utils.target import target
 
@@ -195,16 +202,19 @@ class _Axes(NamedTuple):
 
     queries: str
     keys: str
+    scores: str
 
 
 # Every product is a plain batched one in the order of memory, which the CPU's libraries take.
-_HEADS_FIRST = _Axes("...hid", "...hjd")
+_HEADS_FIRST = _Axes("h...id", "h...jd", "h...ij")
 # As the linear layer leaves them: an accelerator's compiler has no use for the copies.
-_HEADS_LAST = _Axes("...ihd", "...jhd")
+_HEADS_LAST = _Axes("...ihd", "...jhd", "...hij")
 
 
-_LONG = 512
-"""Keys from which a CPU computes one head at a time: the scores of all do not fit its cache."""
+_SCORES = 2**20
+"""Most scores that a CPU computes at once: more do not stay in its cache. b14 describes batches of
+8 images 1.03 to 1.24 times as fast so, s14 images of 518 x 518 1.5 to 2.2 times
+(docs/performance-studies.md, Growth)."""
 
 
 def dot_product_attention(
@@ -232,19 +242,10 @@ def dot_product_attention(
     precision = rule_precision(queries.dtype)
     if target().platform != "cpu":
         return _mix(queries, keys, values, mask, dropped, _HEADS_LAST, precision)
-    mix = functools.partial(_mix, axes=_HEADS_FIRST, precision=precision)
-    # Old compilers slice no stack of bfloat16 (`widens_slices`).
-    if keys.shape[-3] < _LONG or queries.dtype == jnp.bfloat16:
-        heads_first = (row_major(jnp.moveaxis(x, -3, -2)) for x in (queries, keys, values))
-        return jnp.moveaxis(mix(*heads_first, mask, dropped), -2, -3)
-
-    def one(head: tuple[Any, ...]) -> Array:
-        queries, keys, values, dropped = jax.tree.map(lambda x: jnp.expand_dims(x, -3), head)
-        return mix(queries, keys, values, mask, dropped).squeeze(-3)
-
-    heads = (jnp.moveaxis(x, -2, 0) for x in (queries, keys, values))
-    dropped = None if dropped is None else jnp.moveaxis(dropped, -3, 0)
-    return jnp.moveaxis(jax.lax.map(one, (*heads, dropped)), 0, -2)
+    heads_first = (row_major(jnp.moveaxis(x, -2, 0)) for x in (queries, keys, values))
+    if dropped is not None:
+        dropped = jnp.moveaxis(jnp.expand_dims(dropped, range(queries.ndim - dropped.ndim)), -3, 0)
+    return jnp.moveaxis(_mix(*heads_first, mask, dropped, _HEADS_FIRST, precision), 0, -2)
 
 
 def _product(formula: str, a: Array, b: Array, precision: Any = None) -> Array:
@@ -257,17 +258,44 @@ def _mix_values(
     keys: Float[Array, "..."],
     values: Float[Array, "..."],
     mask: Bool[Array, "query key"] | None,
-    dropout_mask: Float[Array, "*#batch head query key"] | None,
+    dropout_mask: Float[Array, "..."] | None,
     axes: _Axes,
     precision: str | None,
 ) -> Float[Array, "..."]:
-    """Compute `dot_product_attention`; queries have `axes.queries`, keys and values `axes.keys`."""
-    weights, totals = _softmax(queries, keys, mask, axes, precision)
-    used = weights if dropout_mask is None else weights * dropout_mask
-    formula = f"...hij,{axes.keys}->{axes.queries}"
-    mixed = _product(formula, used.astype(values.dtype), values, precision)
-    # Do the softmax's division here, on the smaller array.
-    return (mixed / _beside_queries(totals, axes)).astype(values.dtype)
+    """Compute `dot_product_attention` of arrays with `axes`; on a CPU some scores at a time."""
+
+    def mix(queries: Array, keys: Array, values: Array, dropped: Array | None) -> Array:
+        weights, totals = _softmax(queries, keys, mask, axes, precision)
+        used = weights if dropped is None else weights * dropped
+        formula = f"{axes.scores},{axes.keys}->{axes.queries}"
+        mixed = _product(formula, used.astype(values.dtype), values, precision)
+        # Do the softmax's division here, on the smaller array.
+        return (mixed / _beside_queries(totals, axes)).astype(values.dtype)
+
+    mesh = image_mesh()
+    # Of a device, where the heads are first.
+    count = math.prod(queries.shape[:-1]) * keys.shape[-2] // (mesh.size if mesh else 1)
+    if axes == _HEADS_LAST or count <= _SCORES:
+        return mix(queries, keys, values, dropout_mask)
+
+    def mix_head(*parts: Array | None) -> Array:
+        return mix(*jax.tree.map(lambda part: part[None], parts))[0]
+
+    # A batch may be spread over devices and stays whole: a head's queries are cut instead.
+    cut = max(1, count // len(queries) // _SCORES)
+    if cut == 1 or mask is not None or dropout_mask is not None:
+        parts = queries, keys, values, dropout_mask
+        return map_first_axis(lambda parts: mix_head(*parts), parts)
+    *outer, rows, dim = queries.shape
+    around = [(0, 0)] * len(outer) + [(0, -rows % cut), (0, 0)]
+    tiles = jnp.moveaxis(jnp.pad(queries, around).reshape(*outer, cut, -1, dim), -3, 1)
+
+    def mix_tiles(head: tuple[Array, Array, Array]) -> Array:
+        tiles, keys, values = head
+        return map_first_axis(lambda tile: mix_head(tile, keys, values, None), tiles)
+
+    mixed = jnp.moveaxis(map_first_axis(mix_tiles, (tiles, keys, values)), 1, -3)
+    return mixed.reshape(*outer, -1, dim)[..., :rows, :]
 
 
 _mix = jax.custom_vjp(_mix_values, nondiff_argnums=(5, 6))
@@ -275,9 +303,9 @@ _mix = jax.custom_vjp(_mix_values, nondiff_argnums=(5, 6))
 
 def _softmax(
     queries: Array, keys: Array, mask: Array | None, axes: _Axes, precision: str | None
-) -> tuple[Float[Array, "*batch head query key"], Float[Array, "*batch head query 1"]]:
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Compute the scores' exponentials, 0 where masked, and their totals over the keys."""
-    scores = _product(f"{axes.queries},{axes.keys}->...hij", queries, keys, precision)
+    scores = _product(f"{axes.queries},{axes.keys}->{axes.scores}", queries, keys, precision)
     if mask is not None:
         scores = jnp.where(mask, scores, -jnp.inf)
     weights = jnp.exp(scores - scores.max(axis=-1, keepdims=True))
@@ -296,7 +324,7 @@ def _mix_backward(
     order = row_major if axes == _HEADS_FIRST else lambda x: x
     weights, totals = _softmax(queries, keys, mask, axes, precision)
     change = order((change / _beside_queries(totals, axes)).astype(values.dtype))
-    to_weights = product(f"{axes.queries},{axes.keys}->...hij", change, values)
+    to_weights = product(f"{axes.queries},{axes.keys}->{axes.scores}", change, values)
     used = weights
     if dropout_mask is not None:
         to_weights, used = to_weights * dropout_mask, weights * dropout_mask
@@ -305,10 +333,11 @@ def _mix_backward(
 
     def over_queries(by_query: Array, x: Array) -> Array:
         by_key = order(by_query.swapaxes(-2, -1))
-        return product(f"...hji,{axes.queries}->{axes.keys}", by_key, x)
+        turned = f"{axes.scores[:-2]}ji"
+        return product(f"{turned},{axes.queries}->{axes.keys}", by_key, x)
 
     to_values = over_queries(used.astype(values.dtype), change)
-    to_queries = product(f"...hij,{axes.keys}->{axes.queries}", to_scores, keys)
+    to_queries = product(f"{axes.scores},{axes.keys}->{axes.queries}", to_scores, keys)
     to_keys = over_queries(to_scores, queries)
     nothing = None if dropout_mask is None else jnp.zeros_like(dropout_mask)
     found = (part.astype(queries.dtype) for part in (to_queries, to_keys, to_values))

@@ -59,6 +59,27 @@ def _keep_bits_jvp(name: str, primals: tuple[Array], tangents: tuple[Array]) -> 
     return jax.lax.bitcast_convert_type(checkpoint_name(bits, name), jnp.bfloat16), tangents[0]
 
 
+def map_first_axis(function: Callable[[Any], Array], stacks: Any) -> Array:
+    """Call a function for every index of the first axis of a tree of arrays, one after the other.
+
+    Where XLA would widen a stack of bfloat16 (`widens_slices`), the loop reads and writes its bits.
+    There is no derivative.
+    """
+
+    def bits(x: Array) -> Array:
+        narrow = x.dtype == jnp.bfloat16 and widens_slices()
+        return jax.lax.bitcast_convert_type(x, jnp.uint16) if narrow else x
+
+    def number(x: Array) -> Array:
+        is_bits = x.dtype == jnp.uint16
+        return jax.lax.bitcast_convert_type(x, jnp.bfloat16) if is_bits else x
+
+    def each(slices: Any) -> Array:
+        return bits(function(jax.tree.map(number, slices)))
+
+    return number(jax.lax.map(each, jax.tree.map(bits, stacks)))
+
+
 def matmul(rows: Float[Array, "row d_in"], weight: Float[Array, "d_in d_out"]) -> Array:
     """Multiply rows by a weight, which is cast to their type."""
     dtype = rows.dtype

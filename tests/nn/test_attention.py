@@ -324,29 +324,35 @@ def test_only_fused_attention_wants_padding() -> None:
             assert padded_length(257, dtype, 768, heads) == expected
 
 
-@pytest.mark.parametrize("batch", [(), (2,)])
-@pytest.mark.parametrize("masked", [False, True])
-def test_long_sequences_are_computed_by_heads_to_the_same_values(
-    monkeypatch: pytest.MonkeyPatch, batch: tuple[int, ...], masked: bool
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+@pytest.mark.parametrize("batch", [(), (2,)], ids=["one", "batch"])
+@pytest.mark.parametrize("masked", [False, True], ids=["plain", "masked"])
+def test_a_cpu_computes_many_scores_in_parts_to_the_same_values(
+    monkeypatch: pytest.MonkeyPatch, batch: tuple[int, ...], masked: bool, dtype: str
 ) -> None:
-    q, k, v = (jax.random.normal(jax.random.key(i), (*batch, 7, 3, 4)) for i in range(3))
+    keys = jax.random.split(jax.random.key(0), 3)
+    parts = [jax.random.normal(key, (*batch, 7, 3, 4), jnp.dtype(dtype)) for key in keys]
     mask = jnp.tri(7, dtype=bool) if masked else None
     dropped = None
     if masked:
         dropped = jax.random.bernoulli(jax.random.key(4), 0.8, (*batch, 3, 7, 7)) / 0.8
 
     def loss(*parts: jax.Array) -> jax.Array:
-        return jnp.sin(dot_product_attention(*parts, mask=mask, dropout_mask=dropped)).sum()
+        mixed = dot_product_attention(*parts, mask=mask, dropout_mask=dropped)
+        return jnp.sin(mixed.astype(jnp.float32)).sum()
 
-    results = []
+    results, loops = [], []
+    of_head = 49 * (*batch, 1)[0]
     with lowering_for(CPU):
-        for least in (100, 7):
-            monkeypatch.setattr(attention_module, "_LONG", least)
-            results.append(jax.value_and_grad(loss, argnums=(0, 1, 2))(q, k, v))
-    # Sums of seven numbers of order 1, in float32.
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), *results)
-    text = jax.jit(loss).lower(q, k, v).as_text()
-    assert "while" in text
+        for most in (1000, of_head, of_head // 3):  # whole, head by head, a third of a head
+            monkeypatch.setattr(attention_module, "_SCORES", most)
+            results.append(jax.value_and_grad(loss, argnums=(0, 1, 2))(*parts))
+            program = jax.jit(lambda *parts: loss(*parts)).lower(*parts).as_text()
+            loops.append(program.count("stablehlo.while"))
+    assert loops == [0, 1, 1 if masked else 2]
+    # Sums of seven numbers of order 1; bfloat16 rounds the same ones.
+    for found in results[1:]:
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), results[0], found)
 
 
 def test_a_tpus_kernel_sees_no_padding(interpreted: list[Any]) -> None:
