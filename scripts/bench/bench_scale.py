@@ -10,7 +10,8 @@ torch. Nothing here should grow faster than the operations.
 """
 
 import dataclasses
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from bench_describe import TOLERANCES, by_torch, by_us, check, sides
@@ -47,22 +48,28 @@ def points(preset: str) -> Iterator[Point]:
     yield from (Point("clusters", n, IMAGES, at(WIDE, n)) for n in CLUSTERS)
 
 
-def measure(point: Point, rounds: int) -> dict[str, Any]:
-    """Time ours and torch's, a device each, in turn."""
-    both = sides(point.config, point.grows, point.batch, "float32")
-    ours, theirs = by_us(both, False), by_torch(both, False)
-    check([ours, theirs], TOLERANCES["float32"])
-    timed = race({one.name: one.call for one in (ours, theirs)}, rounds, 1)
-    return {
-        "grows": point.grows,
-        "value": point.value,
-        "operations": 2 * sum(cost.macs for cost in part_costs(point.config, images=point.batch)),
-        "ours": [ms / point.batch for ms in timed[ours.name].rounds],
-        "theirs": [ms / point.batch for ms in timed[theirs.name].rounds],
-        "faster": ratio(timed[theirs.name], timed[ours.name]),
-        "memory": ours.memory(),
-        "their memory": theirs.memory(),
-    }
+def measure(points: Sequence[Point], rounds: int) -> Iterator[dict[str, Any]]:
+    """Time ours and torch's at all points in turn: other users of a machine slow all alike."""
+    found = []
+    for point in points:
+        both = sides(point.config, point.grows, point.batch, "float32")
+        found.append((by_us(both, False), by_torch(both, False)))
+        check(found[-1], TOLERANCES["float32"])
+    calls = {(i, one.name): one.call for i, pair in enumerate(found) for one in pair}
+    timed = race(calls, rounds, 1)
+    for number, (point, (ours, theirs)) in enumerate(zip(points, found, strict=True)):
+        mine, others = (timed[number, one.name] for one in (ours, theirs))
+        macs = sum(cost.macs for cost in part_costs(point.config, images=point.batch))
+        yield {
+            "grows": point.grows,
+            "value": point.value,
+            "operations": 2 * macs,
+            "ours": [ms / point.batch for ms in mine.rounds],
+            "theirs": [ms / point.batch for ms in others.rounds],
+            "faster": ratio(others, mine),
+            "memory": ours.memory(),
+            "their memory": theirs.memory(),
+        }
 
 
 def grown(values: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -119,7 +126,9 @@ def main() -> None:
     parser.add_argument("--preset", choices=with_salad, default="s14")
     parser.add_argument("--rounds", type=count, default=3)
     arguments = read(parser, "bench_scale")
-    values = grown([measure(point, arguments.rounds) for point in points(arguments.preset)])
+    together = itertools.groupby(points(arguments.preset), lambda point: point.grows)
+    values = [each for _, some in together for each in measure([*some], arguments.rounds)]
+    values = grown(values)
     caption = (
         f"`{arguments.preset}` in float32, time and operations of one image over those of the "
         f"least, on one device: {machine()}; medians and ranges of {arguments.rounds} rounds."

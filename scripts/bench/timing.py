@@ -15,8 +15,8 @@ import statistics
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, NamedTuple, TypeVar
 
 from crisalad_jax.utils.host import usable_cores
 
@@ -29,6 +29,7 @@ import jax
 import torch
 
 # First calls are from nothing, whatever ran before.
+_Name = TypeVar("_Name", bound=Hashable)
 _KERNELS = tempfile.TemporaryDirectory(prefix="inductor-")
 os.environ["TORCHINDUCTOR_CACHE_DIR"] = _KERNELS.name
 
@@ -48,7 +49,9 @@ class Timed(NamedTuple):
         return statistics.median(self.rounds)
 
 
-def race(contenders: Mapping[str, Callable[[], Any]], rounds: int, calls: int) -> dict[str, Timed]:
+def race(
+    contenders: Mapping[_Name, Callable[[], Any]], rounds: int, calls: int
+) -> dict[_Name, Timed]:
     """The contenders' times by their names; each does the whole of the work and waits for it."""
     timed = {name: Timed([]) for name in contenders}
     for _ in range(rounds):
