@@ -43,6 +43,7 @@ from .evaluation.operating_point import operating_point as operating_point
 from .evaluation.record import evaluation_record as evaluation_record
 from .experiments.comparison import ComparisonConfig as ComparisonConfig
 from .experiments.comparison import compare as compare
+from .experiments.distil import distil as distil
 from .experiments.publish import publish as publish
 from .experiments.report import show_attention as show_attention
 from .experiments.report import show_descriptors as show_descriptors

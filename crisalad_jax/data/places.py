@@ -25,7 +25,7 @@ from crisalad_jax.data.named_places import (
     read_named_places,
 )
 from crisalad_jax.data.remote import address_of, check_address, is_file, is_folder
-from crisalad_jax.data.sources import check_frames, open_source
+from crisalad_jax.data.sources import ImageSource, check_frames, open_source
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
 from crisalad_jax.utils.output import warn
@@ -191,6 +191,37 @@ def read_places(
     else:
         root, names, found = read_named_places(root, on_bad_image)
     return _places(root, names or (real_path(root).name,), found, min_images)
+
+
+def places_of_images(sources: Sequence[ImageSource]) -> Places:
+    """Make a training set of which each image is a place of its own, for a loss without labels.
+
+    Args:
+        sources: of `open_sources`.
+
+    Returns:
+        The images; of several sources under the names that they have in a common folder.
+
+    Raises:
+        InputError: sources that have no folder in common.
+    """
+    roots = [source.root for source in sources]
+    try:
+        root = pathlib.Path(os.path.commonpath(roots))
+    except ValueError:
+        listed = ", ".join(map(address_of, roots))
+        raise InputError(f"--images: found {listed}, expected folders with one in common") from None
+    paths = dict.fromkeys(path for source in sources for path in source.paths)
+    files = tuple(path.relative_to(root).as_posix() for path in paths)
+    count = len(files)
+    return Places(
+        root=root,
+        cities=(real_path(root).name,),
+        files=files,
+        place_start=np.arange(count + 1, dtype=np.int64),
+        place_city=np.zeros(count, np.int32),
+        names=files,
+    )
 
 
 def _places(

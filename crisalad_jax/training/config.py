@@ -223,16 +223,19 @@ class TrainConfig:
         micro_batch = batch if self.micro_batch is None else self.micro_batch
         divides = micro_batch > 0 and batch % micro_batch == 0
         classifies, terms = loss.grouping is not None, terms_of(self.trainable)
+        alone = classifies or loss.reads_targets
         adapts = ADAPTERS not in terms or has_adapters(self.model)
         draws_places = not (self.sampler.describes or self.sampler.regroups)
         classified = f"for loss {loss.part_name}, which classifies"
+        taught = f"for loss {loss.part_name}, which learns from a teacher"
         tuples = f"'whole' or 'sample' for loss {loss.part_name}, which takes mined tuples"
         for config, name, fits, expected in (
-            (self, "images_per_place", images >= 2 or classifies, "at least 2: losses need pairs"),
+            (self, "images_per_place", images >= 2 or alone, "at least 2: losses need pairs"),
             (self, "micro_batch", divides, f"a divisor of the batch's {batch} images, or None"),
             (self.optimiser, "accumulate", accumulate == 1 or not classifies, f"1 {classified}"),
             (self.mining, "kind", not (classifies and self.mines), f"'none' {classified}"),
             (self.mining, "kind", self.mines or not loss.of_tuples, tuples),
+            (self.mining, "kind", not (loss.reads_targets and self.mines), f"'none' {taught}"),
             (self, "sampler", draws_places or not classifies, f"another {classified}"),
             (self, "images_per_place", is_tuple, f"{size} with mined tuples"),
             (self, "min_images", self.min_images >= images or self.mines, f"at least {images}"),
@@ -266,7 +269,7 @@ class TrainConfig:
             require_field(config, name, fits, expected)
         for each, alone in zip(self.mixture, self.alone, strict=True):
             kind = alone.loss.kind
-            fits = kind.grouping is None and kind.reads_tokens is None
+            fits = not (kind.grouping or kind.reads_tokens or kind.reads_targets)
             with locate_errors(f"mixture.{each.name}: "):
                 require_field(alone.loss, "kind", fits, "a loss of pairs of descriptors")
 

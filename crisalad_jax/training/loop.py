@@ -47,6 +47,7 @@ from crisalad_jax.training.validation import Validator
 from crisalad_jax.utils.errors import Interrupted
 from crisalad_jax.utils.files import user_cache
 from crisalad_jax.utils.progress import Bar, progress_bar
+from crisalad_jax.utils.shapes import Float
 from crisalad_jax.utils.signals import SignalState, defer_signals, watch
 
 STATUS_STEPS = 5
@@ -84,6 +85,7 @@ def fit(
     cache_gb: float = CACHE_GB,
     callbacks: Sequence[Callback | str] = (),
     quiet: bool = False,
+    targets: Float[np.ndarray, "image target"] | None = None,
 ) -> FitResult:
     """Train, or resume the run that `out` holds, and leave its files there.
 
@@ -116,6 +118,8 @@ def fit(
             names of registered ones. `StopTraining` of one ends the run, and the same call resumes
             it.
         quiet: no progress bar.
+        targets: a teacher's unit descriptor of each image of `places`, perhaps a memory map, for a
+            loss that learns from them.
 
     Returns:
         How the run ended.
@@ -147,13 +151,21 @@ def fit(
     require(threads >= 0, f"num_threads: found {threads}, expected at least 0")
     require(0 <= cache_gb < math.inf, f"--cache-gb: found {cache_gb:g}, expected at least 0")
     called = Callbacks(callbacks)
+    images = sum(len(each.files) for each in sets_of(places))
+    taught = config.loss.kind.reads_targets
+    found = 0 if targets is None else len(targets)
+    require(
+        found == (images if taught else 0),
+        f"targets: found {found} descriptors for loss {config.loss.kind.part_name}, expected "
+        + (f"one for each of {images} images (`distil` makes them)" if taught else "none"),
+    )
     if initial is None:
         initial = init_crisalad(run_keys(config.seed)[0], config.model)
     checksums = {
         "places": checksum_of_places(places),
         "validation": 0 if validation is None else checksum_of_benchmark(validation),
         "weights": checksum(jax.tree.leaves(initial)),
-    }
+    } | ({} if targets is None else {"targets": checksum(targets)})
     # What does not fit raises in all processes, before the first file is written.
     part = jax.process_index(), jax.process_count()
     configuration = checksum_of_config(config)
@@ -170,7 +182,7 @@ def fit(
     data: Batches = make(
         config, places, part=part, on_bad_image=on_bad_image, threads=threads, cache=cache
     )
-    trainer = Trainer(config, data, initial, shard_state=shard_state)
+    trainer = Trainer(config, data, initial, shard_state=shard_state, targets=targets)
     del initial  # the trainer has copied what it needs
     record = RunRecord(checksums, {name: [*source] for name, source in sources_of(config).items()})
     files = RunFiles(pathlib.Path(out), config, record)

@@ -279,9 +279,9 @@ def make_train_step(config: StepConfig) -> Callable[..., tuple[TrainState, Metri
         config: of `step_config`, as `init_train_state` takes it.
 
     Returns:
-        `step(state, frozen, images, labels, key, valid=None) -> (state, metrics)`; see
-        `train_step`. The state that goes in is used up. It raises InputError for labels of 2^31 or
-        more, a state of another configuration, or images that are no array of pixels.
+        `step(state, frozen, images, labels, key, valid=None, targets=None) -> (state, metrics)`;
+        see `train_step`. The state that goes in is used up. It raises InputError for labels of 2^31
+        or more, a state of another configuration, or images that are no array of pixels.
 
     Example:
         >>> import jax, numpy as np, optax
@@ -304,10 +304,12 @@ def make_train_step(config: StepConfig) -> Callable[..., tuple[TrainState, Metri
         labels: Int[Array | np.ndarray, " image"],
         key: PRNGKeyArray,
         valid: Bool[Array | np.ndarray, " image"] | None = None,
+        targets: Float[Array | np.ndarray, "image target"] | None = None,
     ) -> tuple[TrainState, Metrics]:
         images, labels = checked_batch(images, labels, config.model)
         mask = jnp.ones(len(labels), bool) if valid is None else jnp.asarray(valid)
-        return train_step(state, frozen, images, labels, mask, key, config)
+        taught = None if targets is None else jnp.asarray(targets)
+        return train_step(state, frozen, images, labels, mask, key, config, targets=taught)
 
     return step
 
@@ -337,6 +339,7 @@ def train_step(
     key: PRNGKeyArray,
     config: StepConfig,
     proceed: Bool[Array, ""] | bool = True,
+    targets: Float[Array, "image target"] | None = None,
 ) -> tuple[TrainState, Metrics]:
     """Take one step of the optimiser on the loss of a batch, or add its gradient up for one.
 
@@ -350,10 +353,12 @@ def train_step(
     If the loss or the gradient is not finite, or no image is valid, the state is returned as it was
     and `Metrics.updated` is False. Passed to the next step as `proceed`, it skips that step too. So
     a loop may read metrics one step late, and still have the state before the failed step.
+
+    A loss that learns from a teacher takes its descriptors of the images as `targets`.
     """
     dropout_key = jax.random.fold_in(key, state.step)
     (result, transport, statistics, all_valid), (gradient, classifier_gradient) = loss_and_gradient(
-        state, frozen, images, labels, valid, dropout_key, config
+        state, frozen, images, labels, valid, dropout_key, config, targets
     )
     norm = optax.tree.norm((gradient, classifier_gradient))
     learning_rate = config.learning_rate(state.step)
@@ -409,6 +414,7 @@ def loss_and_gradient(
     valid: Bool[Array, " image"],
     key: PRNGKeyArray | None,
     config: StepConfig,
+    targets: Float[Array, "image target"] | None = None,
 ) -> tuple[BatchLoss, tuple[PyTree, PyTree]]:
     """Compute the loss of a batch, and its gradient, in a trace; see `train_step`.
 
@@ -420,6 +426,7 @@ def loss_and_gradient(
         valid: see `train_step`.
         key: draws the dropout; None is without.
         config: the step's.
+        targets: a teacher's descriptors, for a loss that reads them.
 
     Returns:
         What the forward pass gave, and the gradients of the trainable parameters and of the loss's.
@@ -452,7 +459,8 @@ def loss_and_gradient(
         compute = functools.partial(_loss, config=config)
         if len(all_labels) <= WHOLE_LOSS:
             compute = devices.whole_on_each(compute)
-        result = compute(descriptors, local, all_labels, all_valid, classifier, group)
+        taught = None if targets is None else devices.gather_images(targets)
+        result = compute(descriptors, local, all_labels, all_valid, classifier, group, taught)
         updated = measured if updates_statistics else statistics
         return result.loss, (result, tokens.transport, updated)
 
@@ -486,6 +494,7 @@ def _loss(
     valid: Bool[Array, " image"],
     classifier: PyTree,
     group: Int[Array, ""],
+    targets: Float[Array, "image target"] | None,
     config: StepConfig,
 ) -> LossResult:
     """Compute the loss of a batch, of places or of mined tuples, or of its sub-batches."""
@@ -500,6 +509,7 @@ def _loss(
         classes=jnp.asarray(config.classes)[group] if config.classes else None,
         pairs=tuple_pairs(labels, valid=valid) if config.tuples else None,
         tokens=tokens,
+        targets=targets,
     )
 
 

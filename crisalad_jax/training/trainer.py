@@ -30,8 +30,8 @@ from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
 
 _T = TypeVar("_T")
-Batch = tuple[jax.Array, jax.Array, jax.Array]
-"""Images, labels, and which images are valid, on the devices."""
+Batch = tuple[jax.Array, jax.Array, jax.Array, jax.Array | None]
+"""Images, labels, which images are valid, and a teacher's descriptors of them, on the devices."""
 
 
 class LossNotFiniteError(InputError):
@@ -42,14 +42,20 @@ class Trainer:
     """What trains, on the devices; a step is started before the one before is finished."""
 
     def __init__(
-        self, config: TrainConfig, data: Batches, initial: Crisalad, *, shard_state: bool
+        self,
+        config: TrainConfig,
+        data: Batches,
+        initial: Crisalad,
+        *,
+        shard_state: bool,
+        targets: np.ndarray | None = None,
     ) -> None:
         """Make the state before the first step; see `fit` for the arguments.
 
         Raises:
             InputError: the configuration does not fit the model or the devices.
         """
-        self._config, self._devices = config, _choose_devices(config)
+        self._config, self._devices, self._targets = config, _choose_devices(config), targets
         mesh = self._devices.mesh
         if shard_state and mesh.size == 1:
             raise InputError(
@@ -84,8 +90,7 @@ class Trainer:
 
     def on_devices(self, batches: Iterator[ImageBatch]) -> Generator[Batch, None, None]:
         """Return batches on the devices, each copied while they compute the one before."""
-        placed = (self._batch(batch.images, batch.labels, batch.valid) for batch in batches)
-        return one_ahead(placed)
+        return one_ahead(self._batch(batch) for batch in batches)
 
     def start_step(self, batch: Batch | None, waited: float) -> None:
         """Start a step, while the devices may still compute the one before.
@@ -98,11 +103,12 @@ class Trainer:
         """
         if not self._running:
             self._finished_at = time.monotonic() - waited
-        batch = batch or self._no_images()
-        arguments = self.state, self._frozen_on_devices, *batch, self._step_key, self._step_config
-        self.state, metrics = train_step(*arguments, self._proceed)
+        images, labels, valid, targets = batch or self._no_images()
+        arguments = self.state, self._frozen_on_devices, images, labels, valid
+        how = self._step_key, self._step_config, self._proceed, targets
+        self.state, metrics = train_step(*arguments, *how)
         self._proceed = metrics.updated
-        self._running.append((metrics, len(batch[0]), waited))
+        self._running.append((metrics, len(images), waited))
 
     def finish_steps(self, *, leave: int = 0) -> Iterator[dict[str, float]]:
         """Wait for the steps that were started but for the last ones.
@@ -150,15 +156,17 @@ class Trainer:
             trainable = self.gather(self.state.averaged)
         return merge_params(trainable, jax.tree.map(jnp.asarray, self._frozen), self._config.model)
 
-    def _batch(self, *parts: np.ndarray) -> Batch:
-        images, labels, valid = map(self._devices.shard_batch, parts)
-        return images, labels, valid
+    def _batch(self, batch: ImageBatch) -> Batch:
+        place = self._devices.shard_batch
+        targets = None if self._targets is None else place(self._targets[batch.indices])
+        return place(batch.images), place(batch.labels), place(batch.valid), targets
 
     def _no_images(self) -> Batch:
         """Return a batch of images that are not valid."""
         own = self._config.places_per_batch * self._config.images_per_place // jax.process_count()
         images = np.zeros((own, *self._config.model.input_size, 3), np.uint8)
-        return self._batch(images, np.full(own, -1, np.int32), np.zeros(own, bool))
+        none = np.full(own, -1, np.int32)
+        return self._batch(ImageBatch(images, none, np.zeros(own, bool), none.astype(np.int64)))
 
     def _check_memory(self) -> None:
         """Check that a step fits the devices, by the compiler's analysis of its program.
@@ -169,10 +177,10 @@ class Trainer:
         limit = memory_limit(self._devices.mesh.local_devices)
         if limit is None:
             return
-        state, batch = self._place(self.state), self._no_images()
+        state, (*batch, targets) = self._place(self.state), self._no_images()
         arguments = state, self._frozen_on_devices, *batch, self._step_key, self._step_config
         try:
-            needed = memory_of(train_step.lower(*arguments, self._proceed).compile())
+            needed = memory_of(train_step.lower(*arguments, self._proceed, targets).compile())
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error):
                 raise

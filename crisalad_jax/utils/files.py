@@ -85,7 +85,7 @@ def user_cache() -> pathlib.Path:
 
     It is what `CRISALAD_CACHE` names, else `crisalad-jax` in the user's cache, which
     `XDG_CACHE_HOME` may name; a relative name there is ignored, as the XDG Base Directory
-    Specification has it. Its folders are models, exports, programs, xla and numba.
+    Specification has it. Its folders are models, exports, programs, teachers, xla and numba.
 
     Raises:
         RuntimeError: the user has no home folder.

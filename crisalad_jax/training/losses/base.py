@@ -45,6 +45,8 @@ class LossBatch:
     """Number of classes, where the loss has a vector for each."""
     tokens: Float[Array, "image token dim"] | None = None
     """The field of `Tokens` that the loss's `reads_tokens` names."""
+    targets: Float[Array, "image target"] | None = None
+    """A teacher's unit descriptors of the images, for a loss that `reads_targets`."""
 
     @functools.cached_property
     def similarities(self) -> Similarities:
@@ -104,6 +106,9 @@ class Loss(Part, abc.ABC):
     reads_tokens: ClassVar[Literal["local", "dense"] | None] = None
     """Field of `Tokens` that the loss compares, besides descriptors: the aggregator's local tokens,
     or local features, which few aggregators have in training."""
+
+    reads_targets: ClassVar[bool] = False
+    """Whether the loss compares descriptors with a teacher's; then images need no places."""
 
     def init(self, key: PRNGKeyArray, classes: int, dim: int) -> Any:
         """Return the loss's own trainable parameters, a pytree of arrays; by default None.

@@ -69,6 +69,7 @@ def metric_loss(
     classes: Int[Array, ""] | int | None = None,
     pairs: Pairs | None = None,
     tokens: Float[Array, "image token dim"] | None = None,
+    targets: Float[Array, "image target"] | None = None,
 ) -> LossResult:
     """Compute the loss `config.kind` over the pairs that `config.miner` chooses.
 
@@ -83,13 +84,14 @@ def metric_loss(
         classes: number of classes, where `params` have a vector for each and more.
         pairs: the pairs to choose from, such as `tuple_pairs`; None means `all_pairs`.
         tokens: local tokens or features of each image, for a loss that compares them.
+        targets: a teacher's unit descriptors of the images, for a loss that compares them.
 
     Returns:
         The loss and what is logged beside it.
 
     Raises:
         InputError: a loss returns something else than a number, or lacks its parameters, local
-            features or tuples.
+            features, tuples or targets.
 
     Example:
         >>> import jax.numpy as jnp
@@ -113,6 +115,7 @@ def metric_loss(
             f"tokens, expected the aggregator's Tokens.{kind.reads_tokens}",
         ),
         (learns, "params, expected those of its init"),
+        (kind.reads_targets and targets is None, "targets, expected a teacher's descriptors"),
     ):
         require(not lacks, f"{name}: found no {what}")
     wide = descriptors.astype(jnp.promote_types(descriptors.dtype, jnp.float32))
@@ -121,7 +124,7 @@ def metric_loss(
     else:  # what takes no part may be NaN
         wide = jnp.where(valid[:, None], wide, 0)
     every = all_pairs(labels, valid=valid) if pairs is None else pairs
-    batch = LossBatch(wide, labels, valid, every, classes, tokens)
+    batch = LossBatch(wide, labels, valid, every, classes, tokens, targets)
     similarities = jax.lax.stop_gradient(batch.similarities)
     mined = mine(similarities, every, margin=config.miner_margin)
     chosen = every if config.miner == "none" else mined

@@ -5,6 +5,7 @@ from crisalad_jax.training.recipes import (  # noqa: F401, they register theirs
     classification,
     convolutional,
     dinov2,
+    distil,
     netvlad,
     paper,
 )

@@ -1,0 +1,207 @@
+"""A student that learns a teacher's descriptors: what it learns, its cache, its resumption."""
+
+import dataclasses
+import pathlib
+
+import jax
+import numpy as np
+import pytest
+
+from crisalad_jax.checkpoints.load import load
+from crisalad_jax.cli import main
+from crisalad_jax.data.places import places_of_images, read_places
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.data.sources import open_sources
+from crisalad_jax.experiments import distil as module
+from crisalad_jax.experiments.distil import distil, teachers_descriptors
+from crisalad_jax.nn.config import PRESETS
+from crisalad_jax.nn.model import Model, describe, init_crisalad
+from crisalad_jax.retrieval.extract import extract
+from crisalad_jax.training.callbacks import Callback, StopTraining
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.log import read_metrics
+from crisalad_jax.training.loop import fit
+from crisalad_jax.training.losses import LossConfig
+from crisalad_jax.training.losses.distil import DistilConfig
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import MODEL, RECIPE, assert_equal, random_params
+
+STUDENT = dataclasses.replace(
+    RECIPE,
+    model=dataclasses.replace(MODEL, cross_image="none"),
+    loss=LossConfig(kind="distil"),
+    places_per_batch=8,
+    images_per_place=1,
+    min_images=1,
+)
+TERMS = ("loss.cosine", "loss.relations", "loss.neighbours")
+QUIET = Reading(quiet=True, batch_size=8)
+
+
+@pytest.fixture(scope="module")
+def teacher() -> Model:
+    return Model(random_params(MODEL), MODEL)
+
+
+def test_a_student_comes_near_its_teacher(shared, teacher, tmp_path) -> None:
+    """It has the teacher's own form here, so that it can."""
+    config = dataclasses.replace(STUDENT, epochs=12, augmentation="none", model=teacher.config)
+    images = shared / "city" / "Images"
+    result = distil(config, teacher, images, tmp_path / "run", reading=QUIET)
+    assert result.steps == 36  # 24 images, 8 a step
+    steps = read_metrics(tmp_path / "run" / "metrics.jsonl")
+    for name in TERMS:
+        first, last = (np.mean([step[name] for step in part]) for part in (steps[:3], steps[-3:]))
+        assert last < 0.75 * first, name
+    total = sum(steps[0][name] for name in TERMS)
+    assert steps[0]["loss"] == pytest.approx(total, rel=1e-5)  # a sum in float32
+
+
+def test_targets_follow_their_images(shared, teacher, monkeypatch, tmp_path) -> None:
+    """Those of a step are the teacher's descriptors of its images."""
+    places = places_of_images(open_sources(shared / "city" / "Images"))
+    targets = teachers_descriptors(teacher, places, reading=QUIET)
+    paths = [places.path(image) for image in range(len(places.files))]
+    expected = extract(teacher, paths, reading=QUIET).descriptors
+    np.testing.assert_array_equal(targets, expected)
+    seen = []
+    from crisalad_jax.training import trainer
+
+    step = trainer.train_step
+
+    def spy(*arguments):
+        seen.append((np.asarray(arguments[2]), np.asarray(arguments[-1])))
+        return step(*arguments)
+
+    monkeypatch.setattr(trainer, "train_step", spy)
+    config = dataclasses.replace(
+        STUDENT,
+        epochs=1,
+        augmentation="none",
+        loss=LossConfig(kind=DistilConfig(teacher_dim=targets.shape[1])),
+    )
+    fit(config, places, tmp_path / "run", targets=targets, quiet=True)
+    for pixels, given in seen:
+        # Cross-image attention relates the images of a batch, so each is described by itself.
+        alone = [describe(teacher.params, pixels[i : i + 1], teacher.config)[0] for i in range(8)]
+        np.testing.assert_allclose(given, alone, atol=1e-5)  # unit vectors, float32
+
+
+def test_a_resumed_run_has_the_same_bits(shared, teacher, tmp_path) -> None:
+    class Stop(Callback):
+        def on_step(self, values):
+            if values["step"] == 4:
+                raise StopTraining
+
+    images = shared / "city" / "Images"
+    whole = distil(STUDENT, teacher, images, tmp_path / "whole", reading=QUIET)
+    distil(STUDENT, teacher, images, tmp_path / "parts", reading=QUIET, callbacks=[Stop()])
+    parts = distil(STUDENT, teacher, images, tmp_path / "parts", reading=QUIET)
+    assert parts.steps == whole.steps == 9
+    assert_equal(parts.params, whole.params)
+
+
+def test_the_teacher_describes_once(shared, teacher, monkeypatch) -> None:
+    places = places_of_images(open_sources(shared / "city" / "Images" / "Aston"))
+    first = np.array(teachers_descriptors(teacher, places, reading=QUIET))
+
+    def refuse(*_, **__):
+        raise AssertionError("described again")
+
+    monkeypatch.setattr(module, "extract", refuse)
+    np.testing.assert_array_equal(teachers_descriptors(teacher, places, reading=QUIET), first)
+    other = Model(init_crisalad(jax.random.key(9), MODEL), MODEL)
+    with pytest.raises(AssertionError, match="described again"):
+        teachers_descriptors(other, places, reading=QUIET)
+
+
+def test_an_image_that_changed_is_described_again(city, teacher) -> None:
+    folder = city / "Images" / "Aston"
+    places = places_of_images(open_sources(folder))
+    before = np.array(teachers_descriptors(teacher, places, reading=QUIET))
+    picture, other = (folder / name for name in (places.files[0], places.files[5]))
+    picture.write_bytes(other.read_bytes())
+    after = teachers_descriptors(teacher, places, reading=QUIET)
+    np.testing.assert_array_equal(after[0], before[5])
+    np.testing.assert_array_equal(after[1:], before[1:])
+
+
+def test_an_unreadable_image_is_skipped_by_both(city, teacher, tmp_path) -> None:
+    folder = city / "Images" / "Aston"
+    broken = sorted(folder.iterdir())[2]
+    broken.write_bytes(b"no picture")
+    with pytest.raises(InputError, match=broken.name):
+        distil(STUDENT, teacher, folder, tmp_path / "run", reading=QUIET)
+    assert not (tmp_path / "run").exists()
+    skip = dataclasses.replace(QUIET, on_bad_image="skip")
+    config = dataclasses.replace(STUDENT, epochs=1, places_per_batch=12)
+    result = distil(config, teacher, folder, tmp_path / "run", reading=skip)
+    assert result.skipped_images == 1
+
+
+def test_labels_count_with_places(shared, teacher, tmp_path) -> None:
+    kind = DistilConfig(labels=1.0)
+    config = dataclasses.replace(
+        STUDENT, loss=LossConfig(kind=kind), places_per_batch=4, images_per_place=2, min_images=2
+    )
+    config = dataclasses.replace(config, epochs=1)
+    distil(config, teacher, None, tmp_path / "run", data=shared / "city", reading=QUIET)
+    steps = read_metrics(tmp_path / "run" / "metrics.jsonl")
+    assert all(step["loss.labels"] > 0 for step in steps)
+
+
+def test_what_does_not_fit_is_refused(shared, teacher, tmp_path) -> None:
+    images, out = shared / "city" / "Images", tmp_path / "run"
+    with pytest.raises(InputError, match="--images, --data: expected one of the two"):
+        distil(STUDENT, teacher, images, out, data=shared / "city")
+    with pytest.raises(InputError, match="loss: found multi-similarity, expected distil"):
+        distil(RECIPE, teacher, images, out)
+    places = read_places(shared / "city", min_images=2)
+    with pytest.raises(InputError, match="targets: found 0 descriptors for loss distil, expected "):
+        fit(STUDENT, places, out)
+    with pytest.raises(InputError, match=r"targets: found 24 descriptors .*, expected none"):
+        fit(RECIPE, places, out, targets=np.zeros((24, 3), np.float32))
+    with pytest.raises(InputError, match=r"TrainConfig\.images_per_place: found 1"):
+        dataclasses.replace(STUDENT, loss=RECIPE.loss)
+    assert not out.exists()
+
+
+def test_the_command(shared, tmp_path, capsys) -> None:
+    images, out = str(shared / "city" / "Images"), tmp_path / "run"
+    call = ["distil", "--teacher", "hog", "--student", "tiny", "--out", str(out), "--quiet"]
+    taught = [*call, "--images", images, "--epochs", "1", "--validate-every", "1"]
+    taught += ["--places-per-batch", "8"]
+    assert main([*taught, "--val", str(shared / "town")]) == 0
+    said = capsys.readouterr().out
+    assert "24 images; the student has" in said
+    assert "3 steps, best R@5" in said
+    student = load(out / "last.safetensors")
+    assert student.config == dataclasses.replace(PRESETS["tiny"], cross_image="none")
+    assert main(taught) == 2
+    assert "the run started from other validation than are given now" in capsys.readouterr().err
+    assert main(call) == 2
+    assert "--images, --data: expected one of the two" in capsys.readouterr().err
+
+
+def test_a_student_starts_from_weights(shared, teacher, tmp_path) -> None:
+    images, weights = str(shared / "city" / "Images"), str(shared / "weights.safetensors")
+    call = ["distil", "--teacher", "hog", "--student", weights, "--images", images, "--quiet"]
+    call += ["--out", str(tmp_path / "run"), "--epochs", "1", "--places-per-batch", "8"]
+    assert main([*call, "--optimiser.learning-rate", "1e-12"]) == 0
+    found = load(tmp_path / "run" / "last.safetensors")
+    assert found.config == MODEL
+    assert isinstance(STUDENT, TrainConfig)
+    for ours, theirs in zip(
+        jax.tree.leaves(found.params), jax.tree.leaves(teacher.params), strict=True
+    ):
+        np.testing.assert_allclose(ours, theirs, atol=1e-6)  # three steps of 1e-12, and decay
+
+
+def test_folders_of_one_parent_are_joined(shared) -> None:
+    images = shared / "city" / "Images"
+    both = places_of_images(open_sources([images / "Aston", images / "Brill"]))
+    whole = places_of_images(open_sources(images))
+    assert [both.path(i) for i in range(24)] == [whole.path(i) for i in range(24)]
+    assert both.root == images
+    assert both.image_counts.tolist() == [1] * 24
+    assert isinstance(both.path(0), pathlib.Path)
