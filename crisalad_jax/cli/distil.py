@@ -9,19 +9,20 @@ from typing import Annotated, Any
 from crisalad_jax.checkpoints.load import find_weights, load
 from crisalad_jax.checkpoints.runtime import read_model
 from crisalad_jax.cli.common import console, pick
-from crisalad_jax.cli.flags import FOLDER, JsonFlag, PluginFlag, ReadFlags
+from crisalad_jax.cli.flags import FOLDER, FrameFlags, JsonFlag, PluginFlag, ReadFlags
 from crisalad_jax.cli.help import asked_for
 from crisalad_jax.config.flags import find_flag, parse_settings, with_settings
 from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.recipes import recipe
+from crisalad_jax.utils import compiler
 
 
-class Distil(ReadFlags, PluginFlag, JsonFlag):
+class Distil(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
     """Train a small model to reproduce a larger one's descriptors; resume the run in OUT."""
 
     teacher: pathlib.Path
-    """Model to learn from: a file, starter, or a published model's name. It describes each image
+    """Model to learn from: a file, starter, or a published model's name. It describes the images
     once, at its own image size; its descriptors are cached for other students."""
     student: str
     """Model to train: tiny, s14, b14, l14 or g14, whose parts other flags replace, as in
@@ -33,8 +34,8 @@ class Distil(ReadFlags, PluginFlag, JsonFlag):
     images: tuple[pathlib.Path, ...] = ()
     """Folders of any images, or other sources (docs/how-to/image-sources.md); no labels needed."""
     data: pathlib.Path | None = None
-    """Labelled places instead of --images, as `train` takes them; --loss.kind.labels is the weight
-    of their labels."""
+    """Labelled places instead of --images, one set as `train` reads it; --loss.kind.labels is the
+    weight of their labels."""
     val: pathlib.Path | None = None
     """Evaluation set for early stopping, in any layout that `evaluate` reads."""
     val_images: pathlib.Path | None = None
@@ -54,6 +55,7 @@ def prepare(arguments: Sequence[str]) -> Sequence[str]:
     student = find_flag(arguments, "--student")
     if student is None or student in PRESETS or asked_for(arguments):
         return arguments
+    compiler.configure()
     file = find_weights(student, quiet="--quiet" in arguments)
     read_model(file)
     return [*arguments, "--student", str(file)]
@@ -61,52 +63,50 @@ def prepare(arguments: Sequence[str]) -> Sequence[str]:
 
 def parse(program: str, arguments: Sequence[str]) -> Distil:
     """Parse the flags, with one for every field of the configuration and of its parts."""
-    return parse_settings(Distil, program, arguments, defaults(arguments))
+    return parse_settings(Distil, program, arguments, *defaults(arguments))
 
 
 def command(arguments: Sequence[str]) -> type:
     """Return the class that these arguments are parsed into, for help and completion."""
-    return with_settings(Distil, arguments, defaults(arguments))
+    return with_settings(Distil, arguments, *defaults(arguments))
 
 
-def defaults(arguments: Sequence[str]) -> TrainConfig:
-    """Return the configuration that flags start from."""
-    student = find_flag(arguments, "--student") or "tiny"
-    if student in PRESETS:
-        config = recipe(student, "distil")
-    else:
-        model = read_model(student) if os.path.isfile(student) else None
-        config = recipe("tiny", "distil", model=model)
-    if find_flag(arguments, "--data") is None:
-        return config
-    return dataclasses.replace(config, places_per_batch=32, images_per_place=2, min_images=2)
+def defaults(arguments: Sequence[str]) -> tuple[TrainConfig, str]:
+    """Return the configuration that flags start from, and the preset that parts are sized by."""
+    student = find_flag(arguments, "--student") or "b14"
+    preset = student if student in PRESETS else "b14"
+    model = read_model(student) if os.path.isfile(student) else None
+    config = recipe(preset, "distil", model=model)
+    if find_flag(arguments, "--data") is not None:
+        batch = {"places_per_batch": 32, "images_per_place": 2, "min_images": 2}
+        config = dataclasses.replace(config, **batch)
+    return config, preset
 
 
 def run(arguments: Distil) -> dict[str, Any]:
     """Train the student, and print how the run ended."""
     from crisalad_jax.experiments.distil import distil
-    from crisalad_jax.training.start import read_start
 
     config: TrainConfig = arguments.settings
-    initial, quiet = None, arguments.quiet
-    if arguments.student not in PRESETS:
-        initial = read_start(config, weights=pathlib.Path(arguments.student), quiet=quiet)
     result = distil(
         config,
-        load(arguments.teacher, quiet=quiet),
+        load(arguments.teacher, quiet=arguments.quiet),
         arguments.images or None,
         arguments.out,
-        initial=initial,
+        weights=None if arguments.student in PRESETS else pathlib.Path(arguments.student),
         validation=arguments.val,
         validation_images=arguments.val_images,
         callbacks=arguments.callback,
         say=lambda line: console.print(line, soft_wrap=True),
-        **pick(arguments, "data", "reading"),
+        **pick(arguments, "data", "fps", "topic", "reading"),
     )
     last, best = arguments.out / "last.safetensors", None
     words = f"{result.steps} steps{', stopped early' if result.stopped_early else ''}"
     if result.best_recall is not None:
         best = {"name": config.monitor, "recall": result.best_recall}
         words += f", best {config.monitor} {100 * result.best_recall:.1f} in best.safetensors"
+    if result.skipped_images:
+        words += f", {result.skipped_images} unreadable images skipped"
     console.print(f"{arguments.out}: {words}; the student is {last}", soft_wrap=True)
-    return {"out": str(arguments.out), "steps": result.steps, "best": best, "last": str(last)}
+    found = {"out": str(arguments.out), "steps": result.steps, "best": best, "last": str(last)}
+    return found | {"skipped_images": result.skipped_images}

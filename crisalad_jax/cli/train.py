@@ -107,7 +107,7 @@ class Train(JsonFlag, PluginFlag, QuietFlag):
 
 def parse(program: str, arguments: Sequence[str]) -> Train:
     """Parse the flags, with one for every field of the configuration and of its parts."""
-    return parse_settings(Train, program, arguments, defaults(arguments))
+    return parse_settings(Train, program, arguments, defaults(arguments), preset_of(arguments))
 
 
 def prepare(arguments: Sequence[str]) -> Sequence[str]:
@@ -148,7 +148,12 @@ def _check_cached(weights: str) -> None:
 
 def command(arguments: Sequence[str]) -> type:
     """Return the class that these arguments are parsed into, for help and completion."""
-    return with_settings(Train, arguments, defaults(arguments))
+    return with_settings(Train, arguments, defaults(arguments), preset_of(arguments))
+
+
+def preset_of(arguments: Sequence[str]) -> str:
+    """Return the preset that parts are sized by."""
+    return find_flag(arguments, "--preset") or "b14"
 
 
 def defaults(arguments: Sequence[str]) -> TrainConfig:
@@ -170,7 +175,7 @@ def defaults(arguments: Sequence[str]) -> TrainConfig:
         return with_sets(read_config(TrainConfig, pathlib.Path(given)), names)
     weights = find_flag(arguments, "--weights")
     model = read_model(weights) if weights is not None and os.path.isfile(weights) else None
-    preset = find_flag(arguments, "--preset") or "b14"
+    preset = preset_of(arguments)
     return with_sets(recipe(preset, find_flag(arguments, "--recipe"), model=model), names)
 
 

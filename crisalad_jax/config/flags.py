@@ -278,7 +278,9 @@ def _unknown(tokens: Sequence[str], arguments: Sequence[str]) -> str:
     return f"{flag}: found {' '.join(values)!r}, expected {words}"
 
 
-def parse_settings(kind: type, program: str, arguments: Sequence[str], defaults: Any) -> Any:
+def parse_settings(
+    kind: type, program: str, arguments: Sequence[str], defaults: Any, preset: str
+) -> Any:
     """Parse a command's flags, with one for every field of a configuration and of its parts.
 
     Args:
@@ -287,6 +289,7 @@ def parse_settings(kind: type, program: str, arguments: Sequence[str], defaults:
         program: the command's name, for messages.
         arguments: the command line's.
         defaults: the configuration that flags start from.
+        preset: the size of the model, which parts come in.
 
     Returns:
         An instance of `kind`.
@@ -294,7 +297,9 @@ def parse_settings(kind: type, program: str, arguments: Sequence[str], defaults:
     Raises:
         InputError: no such part, or what the configuration's checks raise.
     """
-    parsed: Any = tyro.cli(with_settings(kind, arguments, defaults), prog=program, args=arguments)
+    parsed: Any = tyro.cli(
+        with_settings(kind, arguments, defaults, preset), prog=program, args=arguments
+    )
     given = parsed.settings
     if parsed.image_size is not None:
         # Before the checks: the preset's own size may not fit another backbone.
@@ -303,13 +308,13 @@ def parse_settings(kind: type, program: str, arguments: Sequence[str], defaults:
     return dataclasses.replace(parsed, settings=config_of(given))
 
 
-def with_settings(kind: type, arguments: Sequence[str], defaults: Any) -> type:
+def with_settings(kind: type, arguments: Sequence[str], defaults: Any, preset: str) -> type:
     """Make a command's class with a flag for every field of a configuration; see `parse_settings`.
 
     Raises:
         InputError: no such part.
     """
-    default = flags_of(defaults, arguments, find_flag(arguments, "--preset") or "b14")
+    default = flags_of(defaults, arguments, preset)
     hint = Annotated[type(default), tyro.conf.arg(name="")]
     members = {"__doc__": kind.__doc__, "__annotations__": {"settings": hint}, "settings": default}
     return type(kind.__name__, (kind,), members)

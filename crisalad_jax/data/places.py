@@ -24,7 +24,7 @@ from crisalad_jax.data.named_places import (
     read_msls_places,
     read_named_places,
 )
-from crisalad_jax.data.remote import address_of, check_address, is_file, is_folder
+from crisalad_jax.data.remote import address_of, check_address, is_file, is_folder, is_remote
 from crisalad_jax.data.sources import ImageSource, check_frames, open_source
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
@@ -203,16 +203,18 @@ def places_of_images(sources: Sequence[ImageSource]) -> Places:
         The images; of several sources under the names that they have in a common folder.
 
     Raises:
-        InputError: sources that have no folder in common.
+        InputError: several sources, of which one is at an address.
     """
-    roots = [source.root for source in sources]
-    try:
-        root = pathlib.Path(os.path.commonpath(roots))
-    except ValueError:
-        listed = ", ".join(map(address_of, roots))
-        raise InputError(f"--images: found {listed}, expected folders with one in common") from None
-    paths = dict.fromkeys(path for source in sources for path in source.paths)
-    files = tuple(path.relative_to(root).as_posix() for path in paths)
+    root = sources[0].root
+    if len(sources) > 1:
+        far = [address_of(source.root) for source in sources if is_remote(source.root)]
+        if far:
+            raise InputError(f"--images: found {', '.join(far)} of several, expected one source")
+        root = pathlib.Path(os.path.commonpath([os.path.abspath(each.root) for each in sources]))
+        paths = [os.path.abspath(path) for source in sources for path in source.paths]
+    else:
+        paths = sources[0].paths
+    files = tuple(os.path.relpath(path, root) for path in dict.fromkeys(paths))
     count = len(files)
     return Places(
         root=root,

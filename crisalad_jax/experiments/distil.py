@@ -10,16 +10,16 @@ import jax
 import numpy as np
 
 from crisalad_jax.config.checks import PATH, require, takes
-from crisalad_jax.data.benchmarks import open_benchmark
+from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.file_cache import CACHE_GB
 from crisalad_jax.data.frames import file_of
-from crisalad_jax.data.images import OnBadImage
-from crisalad_jax.data.places import Places, places_of_images, read_places
+from crisalad_jax.data.places import Places, places_of_images
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.remote import for_each, state_of
 from crisalad_jax.data.sources import open_sources
 from crisalad_jax.experiments.report import save_chart, training_curves
-from crisalad_jax.nn.model import Crisalad, Model, parameter_shapes
+from crisalad_jax.nn.config import check_unit_length
+from crisalad_jax.nn.model import Model, parameter_shapes
 from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.descriptor_files import read_descriptors
 from crisalad_jax.retrieval.extract import extract
@@ -29,8 +29,9 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import FitResult, fit
 from crisalad_jax.training.losses.distil import DistilConfig
-from crisalad_jax.training.run_files import check_run, write_data
-from crisalad_jax.utils.files import user_cache, wrap_os_errors
+from crisalad_jax.training.run_files import write_data
+from crisalad_jax.training.start import read_inputs
+from crisalad_jax.utils.files import real_path, user_cache, wrap_os_errors
 from crisalad_jax.utils.shapes import Float32
 
 Path = str | os.PathLike[str]
@@ -44,9 +45,11 @@ def distil(
     out: Path,
     *,
     data: Path | None = None,
-    initial: Crisalad | None = None,
+    weights: Path | None = None,
     validation: Path | None = None,
     validation_images: Path | None = None,
+    fps: float | None = None,
+    topic: str | None = None,
     reading: Reading = Reading(),
     cache_gb: float = CACHE_GB,
     callbacks: Sequence[Callback | str] = (),
@@ -54,9 +57,9 @@ def distil(
 ) -> FitResult:
     """Train a student on a teacher's descriptors of the same images, or resume the run in `out`.
 
-    The teacher describes each image once, at its own image size and without augmentation. Its
-    descriptors are cached (folder `teachers` of this package's cache), so other students reuse
-    them. The student trains on augmented images.
+    The teacher describes the images once, at its own image size and without augmentation. Its
+    descriptors are cached (folder `teachers` of this package's cache), so other students of the
+    same images reuse them. The student trains on augmented images.
 
     Args:
         config: how the student trains, usually `recipe(preset, "distil")`. The teacher's descriptor
@@ -66,9 +69,11 @@ def distil(
         data: labelled places instead, in a layout that `read_places` reads; the loss's term
             `labels` uses them.
         out: folder of the run; see `fit`.
-        initial: parameters of the student to start from; None draws them by the run's seed.
-        validation: evaluation set for early stopping.
-        validation_images: folder of the images that a file at `validation` names.
+        weights: the student's weights to start from, or a published model's name.
+        validation: evaluation set for early stopping, in any layout that `open_benchmark` reads.
+        validation_images: folder of the images that a .mat file or .npy lists at `validation` name.
+        fps: frames a second taken of videos and logs.
+        topic: the topic of images in a log.
         reading: how images are read.
         cache_gb: most gigabytes of images at addresses that are cached on this host's disk.
         callbacks: see `fit`.
@@ -78,36 +83,53 @@ def distil(
         How the run ended.
 
     Raises:
-        InputError: both or neither of `images` and `data`; a loss that learns from no teacher; what
+        InputError: both or neither of `images` and `data`; a loss without a teacher, or with labels
+            but single images; a student with a cross-image encoder; too few images; what
             `open_sources`, `read_places`, `extract`, `open_benchmark` and `fit` raise.
         Interrupted: the same call resumes.
 
     Example:
-        >>> import dataclasses, jax
-        >>> from crisalad_jax import init_crisalad, load, recipe
+        >>> import dataclasses
+        >>> from crisalad_jax import load, recipe
         >>> config = dataclasses.replace(recipe("tiny", "distil"), epochs=1, places_per_batch=4)
         >>> quiet = Reading(quiet=True)
         >>> distil(config, load("hog"), pictures, folder / "student", reading=quiet).steps
         1
     """
-    kind = config.loss.kind
+    kind, skip, out = config.loss.kind, reading.on_bad_image, pathlib.Path(out)
     require(
         isinstance(kind, DistilConfig),
         f"loss: found {kind.part_name}, expected distil (recipe distil)",
     )
-    require((images is None) != (data is None), "--images, --data: expected one of the two")
-    skip: OnBadImage = reading.on_bad_image
-    if data is not None:
-        places = read_places(data, min_images=config.min_images, on_bad_image=skip)
-    else:
-        assert images is not None  # checked above
-        places = places_of_images(open_sources(images, on_bad_image=skip))
+    assert isinstance(kind, DistilConfig)  # for pyright
+    found = "none" if images is None else "both"
+    require((images is None) != (data is None), f"--images, --data: found {found}, expected one")
+    pairs = kind.labels == 0 or (config.images_per_place > 1 and data is not None)
+    require(pairs, f"labels: found weight {kind.labels} for single images, expected 0, or --data")
+    encoder = config.model.cross_image
+    require(
+        not encoder.attends,
+        f"student: found cross-image encoder {encoder.part_name}, expected none: a teacher's "
+        "descriptors are of single images",
+    )
+    for name, model in (("--teacher", teacher.config), ("--student", config.model)):
+        check_unit_length(model, name)
     taught = dataclasses.replace(kind, teacher_dim=teacher.config.descriptor_dim)
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, kind=taught))
-    out = pathlib.Path(out)
-    check_run(out, config)
-    how: Any = {"images": validation_images, "on_bad_image": skip}
-    benchmark = None if validation is None else open_benchmark(validation, **how)
+    source: Any = data
+    if images is not None:
+        frames: Any = {"fps": fps, "topic": topic}
+        source = places_of_images(open_sources(images, **frames, on_bad_image=skip))
+    how: Any = {"on_bad_image": skip, "quiet": reading.quiet}
+    sets: Any = {"validation": validation, "validation_images": validation_images}
+    places, benchmark, initial = read_inputs(config, source, out, weights=weights, **sets, **how)
+    assert isinstance(places, Places)
+    count, batch = len(places.names), config.places_per_batch
+    kinds = "images" if images is not None else "places"
+    require(
+        count >= batch,
+        f"--images, --data: found {count} {kinds}, expected at least {batch} (--places-per-batch)",
+    )
     shapes = (parameter_shapes(each) for each in (config.model, teacher.config))
     numbers = [sum(leaf.size for leaf in jax.tree.leaves(each)) for each in shapes]
     say(
@@ -122,16 +144,15 @@ def distil(
         out,
         validation=benchmark,
         initial=initial,
-        on_bad_image=skip,
         num_threads=reading.threads,
         cache_gb=cache_gb,
         callbacks=callbacks,
-        quiet=reading.quiet,
         targets=teachers_descriptors(teacher, places, reading=reading),
+        **how,
     )
     if result.steps:
         save_chart(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
-        write_data(out, places.cities[0], places, benchmark)
+        write_data(out, real_path(places.root).name, places, benchmark)
     return result
 
 
@@ -155,11 +176,11 @@ def teachers_descriptors(
     paths = [places.path(image) for image in range(len(places.files))]
     states = for_each(lambda path: state_of(file_of(path)), paths)
     files = [f"{path} {state}" for path, state in zip(paths, states, strict=True)]
-    digest = digest_of(files, {"teacher": describer_of(teacher).digest})
+    config = to_plain(teacher.config)  # whose image size and types are not in the model's hash
+    digest = digest_of(files, {"teacher": describer_of(teacher).digest, "config": config})
     file = user_cache() / "teachers" / f"{digest[:16]}.npy"
-    if file.exists():
-        listed, found = read_descriptors(file)
-    else:
+    listed, found = read_descriptors(file) if file.exists() else ([], None)
+    if found is None or len(listed) < len(paths):  # an image may be readable now
         with wrap_os_errors(file):
             file.parent.mkdir(parents=True, exist_ok=True)
         listed, found, _ = extract(teacher, paths, file, reading=reading)

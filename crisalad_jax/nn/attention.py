@@ -212,8 +212,8 @@ _HEADS_LAST = _Axes("...ihd", "...jhd", "...hij")
 
 
 _SCORES = 2**20
-"""Most scores that a CPU computes at once: more do not stay in its cache. b14 describes batches of
-8 images 1.03 to 1.24 times as fast so, s14 images of 518 x 518 1.5 to 2.2 times
+"""Attention scores that a CPU computes at once: more don't stay in its cache. Images of 518 x 518
+are described 1.5 to 2.2 times as fast, batches of 224 x 224 0.94 to 1.22 times
 (docs/performance-studies.md, Growth)."""
 
 
@@ -273,16 +273,15 @@ def _mix_values(
         return (mixed / _beside_queries(totals, axes)).astype(values.dtype)
 
     mesh = image_mesh()
-    # Of a device, where the heads are first.
-    count = math.prod(queries.shape[:-1]) * keys.shape[-2] // (mesh.size if mesh else 1)
-    if axes == _HEADS_LAST or count <= _SCORES:
+    of_device = math.prod(queries.shape[:-1]) * keys.shape[-2] // (mesh.size if mesh else 1)
+    if axes == _HEADS_LAST or of_device <= _SCORES:
         return mix(queries, keys, values, dropout_mask)
 
     def mix_head(*parts: Array | None) -> Array:
         return mix(*jax.tree.map(lambda part: part[None], parts))[0]
 
     # A batch may be spread over devices and stays whole: a head's queries are cut instead.
-    cut = max(1, count // len(queries) // _SCORES)
+    cut = min(queries.shape[-2], -(-of_device // (len(queries) * _SCORES)))
     if cut == 1 or mask is not None or dropout_mask is not None:
         parts = queries, keys, values, dropout_mask
         return map_first_axis(lambda parts: mix_head(*parts), parts)

@@ -16,7 +16,7 @@ from crisalad_jax.nn.config import ModelConfig
 from crisalad_jax.nn.layers import TAPS
 from crisalad_jax.nn.model import attend_across_images, extract_tokens, parameter_shapes, self_mask
 from crisalad_jax.utils.pytree import named_leaves
-from crisalad_jax.utils.target import CPU, lowering_for
+from crisalad_jax.utils.target import PORTABLE, lowering_for
 
 _SCOPES = {
     "projection": "projection",
@@ -42,7 +42,7 @@ class PartCost(NamedTuple):
     """Number of multiply-accumulates per image in matrix products and convolutions."""
 
 
-@lowering_for(CPU)
+@lowering_for(PORTABLE)
 def part_costs(config: ModelConfig, *, images: int = 1) -> list[PartCost]:
     """Count the parameters of each part, and its multiply-accumulates per image.
 
@@ -90,7 +90,7 @@ def _part_of(text: str) -> str:
     return next((part for scope, part in _SCOPES.items() if scope in names), "")
 
 
-@lowering_for(CPU)  # whose products are all seen: a fused attention is one operation
+@lowering_for(PORTABLE)  # whose products are all seen: a fused attention is one operation
 def count_macs(function: Any, *arguments: Any) -> "collections.Counter[str]":
     """Count the multiply-accumulates of a function's program, in products and convolutions.
 

@@ -119,7 +119,7 @@ def fit(
             it.
         quiet: no progress bar.
         targets: a teacher's unit descriptor of each image of `places`, perhaps a memory map, for a
-            loss that learns from them.
+            loss that learns from them; zeros leave an image out.
 
     Returns:
         How the run ended.
@@ -153,11 +153,12 @@ def fit(
     called = Callbacks(callbacks)
     images = sum(len(each.files) for each in sets_of(places))
     taught = config.loss.kind.reads_targets
-    found = 0 if targets is None else len(targets)
+    found = () if targets is None else targets.shape
     require(
-        found == (images if taught else 0),
-        f"targets: found {found} descriptors for loss {config.loss.kind.part_name}, expected "
-        + (f"one for each of {images} images (`distil` makes them)" if taught else "none"),
+        found[:1] == (images,) and len(found) == 2 if taught else not found,
+        f"targets: found {f'shape {found}' if found else 'none'} for loss "
+        f"{config.loss.kind.part_name}, expected "
+        + (f"a descriptor of each of {images} images (`distil` makes them)" if taught else "none"),
     )
     if initial is None:
         initial = init_crisalad(run_keys(config.seed)[0], config.model)

@@ -36,7 +36,7 @@ RunInputs = tuple[TrainingSet, Benchmark | None, Crisalad | None]
 @ends_with_the_others
 def read_inputs(
     config: TrainConfig,
-    data: Path | Mapping[str, Path],
+    data: Path | Places | Mapping[str, Path],
     out: Path,
     *,
     images: Path | None = None,
@@ -55,7 +55,7 @@ def read_inputs(
 
     Args:
         config: the run's.
-        data: the training set, or those of `config.mixture` by name.
+        data: the training set, read or not, or those of `config.mixture` by name.
         out: folder of the run, which is checked first.
         images: folder of the images that a file of queries names.
         validation: evaluation set.
@@ -100,7 +100,7 @@ def read_inputs(
 
 def _read_set(
     config: TrainConfig,
-    data: Path | Mapping[str, Path],
+    data: Path | Places | Mapping[str, Path],
     images: Path | None,
     on_bad_image: OnBadImage,
     grouping: dict[str, Any],
@@ -116,6 +116,9 @@ def _read_set(
     given = [f"--{name.replace('_', '-')}" for name, value in unused.items() if value is not None]
     expected = f"found for a recipe that {what}, expected no such flag"
     require(not given, f"{', '.join(given)}: {expected}")
+
+    if isinstance(data, Places):
+        return data
 
     def places_at(root: Any, run: TrainConfig) -> Places:
         return read_places(

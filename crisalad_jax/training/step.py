@@ -56,12 +56,13 @@ class TrainState(NamedTuple):
     """Parameters of the loss, if it has any."""
 
     def saved_loss(self, config: LossConfig) -> PyTree:
-        """Return the loss's parameters that weight files hold; None for a vector of each class.
+        """Return the loss's parameters that weight files hold, if any.
 
-        These are as large as the training set, and of use for no other: `state/` alone has them.
+        Vectors of classes and projections to a teacher's length are large, and of no use after the
+        run: only `state/` has them.
         """
-        classifies = config.kind.grouping is not None
-        return None if classifies or self.classifiers is None else self.classifiers.weights
+        of_run = config.kind.grouping is not None or config.kind.reads_targets
+        return None if of_run or self.classifiers is None else self.classifiers.weights
 
     @property
     def averaged(self) -> PyTree:

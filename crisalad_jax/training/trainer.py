@@ -157,9 +157,12 @@ class Trainer:
         return merge_params(trainable, jax.tree.map(jnp.asarray, self._frozen), self._config.model)
 
     def _batch(self, batch: ImageBatch) -> Batch:
-        place = self._devices.shard_batch
-        targets = None if self._targets is None else place(self._targets[batch.indices])
-        return place(batch.images), place(batch.labels), place(batch.valid), targets
+        place, valid, targets = self._devices.shard_batch, batch.valid, None
+        if self._targets is not None:
+            rows = self._targets[batch.indices]
+            # Zeros are of an image that the teacher could not read.
+            valid, targets = valid & rows.any(axis=1), place(rows)
+        return place(batch.images), place(batch.labels), place(valid), targets
 
     def _no_images(self) -> Batch:
         """Return a batch of images that are not valid."""

@@ -28,8 +28,8 @@ os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(usable_cores()))
 import jax
 import torch
 
-# First calls are from nothing, whatever ran before.
 _Name = TypeVar("_Name", bound=Hashable)
+# First calls are from nothing, whatever ran before.
 _KERNELS = tempfile.TemporaryDirectory(prefix="inductor-")
 os.environ["TORCHINDUCTOR_CACHE_DIR"] = _KERNELS.name
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from crisalad_jax.cli.common import emit_json, prepare_output, show
 from crisalad_jax.cli.flags import Target
-from crisalad_jax.cli.train import defaults
+from crisalad_jax.cli.train import defaults, preset_of
 from crisalad_jax.config.flags import parse_settings
 from crisalad_jax.utils.errors import InputError
 from scripts.compile_check import compile_check, differences, read_check
@@ -54,7 +54,8 @@ class CompileCheck:
 def main() -> None:
     """Print the table of what was compiled, write it as JSON, and compare it where asked."""
     given = sys.argv[1:]
-    arguments = parse_settings(CompileCheck, "compile_check", given, defaults(given))
+    start = defaults(given), preset_of(given)
+    arguments = parse_settings(CompileCheck, "compile_check", given, *start)
     compile_on_cpu()
     prepare_output(arguments)
     expected = None if arguments.expect is None else read_check(arguments.expect)

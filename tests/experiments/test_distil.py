@@ -1,14 +1,15 @@
 """A student that learns a teacher's descriptors: what it learns, its cache, its resumption."""
 
 import dataclasses
-import pathlib
 
 import jax
 import numpy as np
 import pytest
 
 from crisalad_jax.checkpoints.load import load
+from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.cli import main
+from crisalad_jax.cli.distil import parse
 from crisalad_jax.data.places import places_of_images, read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import open_sources
@@ -18,7 +19,6 @@ from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.model import Model, describe, init_crisalad
 from crisalad_jax.retrieval.extract import extract
 from crisalad_jax.training.callbacks import Callback, StopTraining
-from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.losses import LossConfig
@@ -43,9 +43,10 @@ def teacher() -> Model:
     return Model(random_params(MODEL), MODEL)
 
 
-def test_a_student_comes_near_its_teacher(shared, teacher, tmp_path) -> None:
+def test_a_student_comes_near_its_teacher(shared, tmp_path) -> None:
     """It has the teacher's own form here, so that it can."""
-    config = dataclasses.replace(STUDENT, epochs=12, augmentation="none", model=teacher.config)
+    config = dataclasses.replace(STUDENT, epochs=12, augmentation="none")
+    teacher = Model(random_params(config.model), config.model)
     images = shared / "city" / "Images"
     result = distil(config, teacher, images, tmp_path / "run", reading=QUIET)
     assert result.steps == 36  # 24 images, 8 a step
@@ -81,6 +82,7 @@ def test_targets_follow_their_images(shared, teacher, monkeypatch, tmp_path) -> 
         loss=LossConfig(kind=DistilConfig(teacher_dim=targets.shape[1])),
     )
     fit(config, places, tmp_path / "run", targets=targets, quiet=True)
+    assert len(seen) == 3
     for pixels, given in seen:
         # Cross-image attention relates the images of a batch, so each is described by itself.
         alone = [describe(teacher.params, pixels[i : i + 1], teacher.config)[0] for i in range(8)]
@@ -152,14 +154,14 @@ def test_labels_count_with_places(shared, teacher, tmp_path) -> None:
 
 def test_what_does_not_fit_is_refused(shared, teacher, tmp_path) -> None:
     images, out = shared / "city" / "Images", tmp_path / "run"
-    with pytest.raises(InputError, match="--images, --data: expected one of the two"):
+    with pytest.raises(InputError, match="--images, --data: found both, expected one"):
         distil(STUDENT, teacher, images, out, data=shared / "city")
     with pytest.raises(InputError, match="loss: found multi-similarity, expected distil"):
         distil(RECIPE, teacher, images, out)
     places = read_places(shared / "city", min_images=2)
-    with pytest.raises(InputError, match="targets: found 0 descriptors for loss distil, expected "):
+    with pytest.raises(InputError, match="targets: found none for loss distil, expected a descrip"):
         fit(STUDENT, places, out)
-    with pytest.raises(InputError, match=r"targets: found 24 descriptors .*, expected none"):
+    with pytest.raises(InputError, match=r"targets: found shape \(24, 3\) .*, expected none"):
         fit(RECIPE, places, out, targets=np.zeros((24, 3), np.float32))
     with pytest.raises(InputError, match=r"TrainConfig\.images_per_place: found 1"):
         dataclasses.replace(STUDENT, loss=RECIPE.loss)
@@ -180,21 +182,47 @@ def test_the_command(shared, tmp_path, capsys) -> None:
     assert main(taught) == 2
     assert "the run started from other validation than are given now" in capsys.readouterr().err
     assert main(call) == 2
-    assert "--images, --data: expected one of the two" in capsys.readouterr().err
+    assert "--images, --data: found none, expected one" in capsys.readouterr().err
 
 
-def test_a_student_starts_from_weights(shared, teacher, tmp_path) -> None:
-    images, weights = str(shared / "city" / "Images"), str(shared / "weights.safetensors")
-    call = ["distil", "--teacher", "hog", "--student", weights, "--images", images, "--quiet"]
+def test_a_student_starts_from_weights(shared, tmp_path, capsys) -> None:
+    start = Model(random_params(STUDENT.model), STUDENT.model)
+    save_weights(tmp_path / "start.safetensors", start)
+    call = ["distil", "--teacher", "hog", "--images", str(shared / "city" / "Images"), "--quiet"]
     call += ["--out", str(tmp_path / "run"), "--epochs", "1", "--places-per-batch", "8"]
-    assert main([*call, "--optimiser.learning-rate", "1e-12"]) == 0
+    call += ["--optimiser.learning-rate", "1e-12"]
+    assert main([*call, "--student", str(tmp_path / "start.safetensors")]) == 0
     found = load(tmp_path / "run" / "last.safetensors")
-    assert found.config == MODEL
-    assert isinstance(STUDENT, TrainConfig)
-    for ours, theirs in zip(
-        jax.tree.leaves(found.params), jax.tree.leaves(teacher.params), strict=True
-    ):
+    assert found.config == STUDENT.model
+    for ours, theirs in zip(*map(jax.tree.leaves, (found.params, start.params)), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-6)  # three steps of 1e-12, and decay
+    capsys.readouterr()
+    assert main([*call, "--student", str(shared / "weights.safetensors")]) == 2
+    assert "student: found cross-image encoder transformer, expected" in capsys.readouterr().err
+
+
+def test_parts_have_the_students_size() -> None:
+    call = ["--teacher", "hog", "--student", "tiny", "--images", "a", "--out", "b"]
+    call += ["--model.backbone", "resnet", "--model.aggregator", "conv-ap"]
+    found = parse("distil", call).settings.model.backbone
+    assert (found.layers, found.stages) == (18, 2)  # of preset tiny
+
+
+def test_a_teacher_of_another_size_describes_again(shared, teacher) -> None:
+    places = places_of_images(open_sources(shared / "city" / "Images" / "Aston"))
+    small = np.array(teachers_descriptors(teacher, places, reading=QUIET))
+    resized = teacher._replace(config=dataclasses.replace(MODEL, image_size=(56, 56)))
+    assert np.abs(teachers_descriptors(resized, places, reading=QUIET) - small).max() > 1e-3
+
+
+def test_an_image_that_the_teacher_could_not_read_is_left_out(shared, tmp_path) -> None:
+    """Though the student can."""
+    places = places_of_images(open_sources(shared / "city" / "Images"))
+    targets = np.eye(24, 30, dtype=np.float32)
+    targets[5] = 0
+    loss = LossConfig(kind=DistilConfig(teacher_dim=30))
+    config = dataclasses.replace(STUDENT, epochs=1, loss=loss)
+    assert fit(config, places, tmp_path / "run", targets=targets, quiet=True).skipped_images == 1
 
 
 def test_folders_of_one_parent_are_joined(shared) -> None:
@@ -204,4 +232,3 @@ def test_folders_of_one_parent_are_joined(shared) -> None:
     assert [both.path(i) for i in range(24)] == [whole.path(i) for i in range(24)]
     assert both.root == images
     assert both.image_counts.tolist() == [1] * 24
-    assert isinstance(both.path(0), pathlib.Path)

@@ -7,7 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from crisalad_jax.config.checks import NonNegativeFloat, PositiveFloat, PositiveInt
+from crisalad_jax.config.checks import (
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    require,
+    require_field,
+)
 from crisalad_jax.nn.layers import Linear, init_linear, linear
 from crisalad_jax.training.losses.base import LOSSES, Loss, LossBatch, LossValue
 from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
@@ -34,11 +40,16 @@ class DistilConfig(Loss):
     between pairwise distances, each divided by its model's mean distance in the batch."""
     neighbours: NonNegativeFloat = 1.0
     """Weight of the KL divergence between the softmax of an image's similarities to the rest of the
-    batch, the teacher's and the student's (SEED: Fang et al., ICLR 2021)."""
+    batch, the teacher's and the student's (as in Passalis and Tefas, ECCV 2018)."""
     temperature: PositiveFloat = 0.05
     """Temperature of both softmaxes."""
     labels: NonNegativeFloat = 0.0
     """Weight of the multi-similarity loss of the images' places."""
+
+    def __post_init__(self) -> None:
+        """Check that some term counts."""
+        weights = self.cosine + self.relations + self.neighbours + self.labels
+        require_field(self, "cosine", weights > 0, "above 0, or another term's weight")
 
     def init(self, key: PRNGKeyArray, classes: int, dim: int) -> Linear | None:
         """Draw the projection to the teacher's length."""
@@ -50,7 +61,10 @@ class DistilConfig(Loss):
 
     def apply(self, params: Linear | None, batch: LossBatch) -> LossValue:
         """Compute the weighted sum; each term is logged before its weight."""
+        shape = len(batch.labels), self.teacher_dim
         assert batch.targets is not None  # `metric_loss` checks it
+        found = batch.targets.shape
+        require(found == shape, f"targets: found shape {found}, expected {shape}")
         targets = jnp.where(batch.valid[:, None], batch.targets, 0)
         pairs = batch.valid[:, None] & batch.valid & ~jnp.eye(len(targets), dtype=bool)
         teacher = dataclasses.replace(batch, descriptors=targets)

@@ -20,7 +20,14 @@ from crisalad_jax.training.losses.pairwise import MultiSimilarityConfig
 from crisalad_jax.utils.errors import InputError
 
 IMAGES, DIM, TEACHER = 9, 6, 11
-NOTHING = DistilConfig(teacher_dim=TEACHER, cosine=0.0, relations=0.0, neighbours=0.0)
+
+
+def only(**given: float) -> DistilConfig:
+    """The loss with these weights, and no other term."""
+    weights = {"cosine": 0.0, "relations": 0.0, "neighbours": 0.0} | given
+    return DistilConfig(teacher_dim=TEACHER, **weights)  # pyright: ignore
+
+
 LABELS = np.array([0, 0, 1, 1, 2, 2, 3, 3, 3])
 
 
@@ -58,7 +65,7 @@ def by_torch(term: str, ours: torch.Tensor, theirs: torch.Tensor) -> torch.Tenso
 
 @pytest.mark.parametrize("term", ["cosine", "relations", "neighbours"])
 def test_a_term_is_torchs(term: str) -> None:
-    kind = dataclasses.replace(NOTHING, **{term: 0.7})
+    kind = only(**{term: 0.7})
     raw = 3 * unit(0, DIM)  # our distances are those of unit vectors alone
 
     def loss(raw: jax.Array) -> jax.Array:
@@ -78,12 +85,12 @@ def test_labels_weigh_the_multi_similarity_loss() -> None:
     descriptors = jnp.asarray(unit(0, DIM))
     kind = LossConfig(kind=MultiSimilarityConfig(base=0.5))
     expected = metric_loss(descriptors, jnp.asarray(LABELS), kind).loss
-    found = loss_of(dataclasses.replace(NOTHING, labels=3.0), descriptors)
+    found = loss_of(only(labels=3.0), descriptors)
     assert float(found) == pytest.approx(3 * float(expected), rel=1e-6)  # one more product
 
 
 def test_a_student_that_is_its_teacher_has_nothing_to_learn() -> None:
-    kind = dataclasses.replace(NOTHING, teacher_dim=DIM, relations=1.0, neighbours=1.0)
+    kind = dataclasses.replace(only(relations=1.0, neighbours=1.0), teacher_dim=DIM)
     same = jnp.asarray(unit(0, DIM))
     value, gradient = jax.value_and_grad(lambda x: loss_of(kind, x, targets=same))(same)
     assert abs(float(value)) < 1e-6  # a difference of logarithms of order 10, in float32
@@ -93,7 +100,7 @@ def test_a_student_that_is_its_teacher_has_nothing_to_learn() -> None:
 @pytest.mark.parametrize("term", ["cosine", "relations", "neighbours", "labels"])
 def test_what_is_not_valid_takes_no_part(term: str) -> None:
     """Whatever its descriptors and targets are, NaN included."""
-    kind, valid = dataclasses.replace(NOTHING, **{term: 1.0}), np.arange(IMAGES) < 6
+    kind, valid = only(**{term: 1.0}), np.arange(IMAGES) < 6
     ours, theirs = unit(0, DIM), unit(1, TEACHER)
     expected = metric_loss(
         jnp.asarray(ours[:6]),
@@ -112,4 +119,11 @@ def test_what_is_not_valid_takes_no_part(term: str) -> None:
 
 def test_a_teacher_is_asked_for() -> None:
     with pytest.raises(InputError, match="loss distil: found no targets, expected a teacher's"):
-        loss_of(NOTHING, jnp.asarray(unit(0, DIM)), targets=None)
+        loss_of(DistilConfig(), jnp.asarray(unit(0, DIM)), targets=None)
+
+
+def test_a_width_that_does_not_fit_is_refused() -> None:
+    with pytest.raises(InputError, match=r"targets: found shape \(9, 11\), expected \(9, 12\)"):
+        loss_of(DistilConfig(teacher_dim=TEACHER + 1), jnp.asarray(unit(0, DIM)))
+    with pytest.raises(InputError, match=r"DistilConfig.cosine: found 0.0, expected above 0, or"):
+        only()
