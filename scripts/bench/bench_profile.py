@@ -33,7 +33,10 @@ from crisalad_jax.training.trainable import shards_batch
 KINDS: dict[str, tuple[str, str]] = {
     # By the name of an operation, and what it was made of.
     "between devices": (r"all-|collective|reduce-scatter", ""),
-    "attention's products": (r"dot|gemm|cublas|cudnn|onednn|ynn|custom-call", r"\.\.\.h[ij]"),
+    "attention's products": (
+        r"dot|gemm|cublas|cudnn|onednn|ynn|custom-call",
+        r"(h\.\.\.|\.\.\.h)[ij]",
+    ),
     "other products": (r"dot|gemm|cublas|cudnn|onednn|ynn|convolution|custom-call", ""),
     "constants written": (r"(wrapped_)?broadcast(_fusion)?(\.|$)", ""),
     "copies": (

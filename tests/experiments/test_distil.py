@@ -15,7 +15,6 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import open_sources
 from crisalad_jax.experiments import distil as module
 from crisalad_jax.experiments.distil import distil, teachers_descriptors
-from crisalad_jax.nn.config import PRESETS
 from crisalad_jax.nn.model import Model, describe, init_crisalad
 from crisalad_jax.retrieval.extract import extract
 from crisalad_jax.training.callbacks import Callback, StopTraining
@@ -33,7 +32,9 @@ STUDENT = dataclasses.replace(
     places_per_batch=8,
     images_per_place=1,
     min_images=1,
+    epochs=6,
 )
+"""Most tests have the same steps, so that one program is compiled."""
 TERMS = ("loss.cosine", "loss.relations", "loss.neighbours")
 QUIET = Reading(quiet=True, batch_size=8)
 
@@ -45,15 +46,15 @@ def teacher() -> Model:
 
 def test_a_student_comes_near_its_teacher(shared, tmp_path) -> None:
     """It has the teacher's own form here, so that it can."""
-    config = dataclasses.replace(STUDENT, epochs=12, augmentation="none")
+    config = dataclasses.replace(STUDENT, augmentation="none")
     teacher = Model(random_params(config.model), config.model)
     images = shared / "city" / "Images"
     result = distil(config, teacher, images, tmp_path / "run", reading=QUIET)
-    assert result.steps == 36  # 24 images, 8 a step
+    assert result.steps == 18  # 24 images, 8 a step
     steps = read_metrics(tmp_path / "run" / "metrics.jsonl")
     for name in TERMS:
         first, last = (np.mean([step[name] for step in part]) for part in (steps[:3], steps[-3:]))
-        assert last < 0.75 * first, name
+        assert last < 0.85 * first, name  # by 22 % or more in 18 steps
     total = sum(steps[0][name] for name in TERMS)
     assert steps[0]["loss"] == pytest.approx(total, rel=1e-5)  # a sum in float32
 
@@ -75,15 +76,11 @@ def test_targets_follow_their_images(shared, teacher, monkeypatch, tmp_path) -> 
         return step(*arguments)
 
     monkeypatch.setattr(trainer, "train_step", spy)
-    config = dataclasses.replace(
-        STUDENT,
-        epochs=1,
-        augmentation="none",
-        loss=LossConfig(kind=DistilConfig(teacher_dim=targets.shape[1])),
-    )
+    taught = LossConfig(kind=DistilConfig(teacher_dim=targets.shape[1]))
+    config = dataclasses.replace(STUDENT, augmentation="none", loss=taught)
     fit(config, places, tmp_path / "run", targets=targets, quiet=True)
-    assert len(seen) == 3
-    for pixels, given in seen:
+    assert len(seen) == 18
+    for pixels, given in seen[:4]:
         # Cross-image attention relates the images of a batch, so each is described by itself.
         alone = [describe(teacher.params, pixels[i : i + 1], teacher.config)[0] for i in range(8)]
         np.testing.assert_allclose(given, alone, atol=1e-5)  # unit vectors, float32
@@ -99,7 +96,7 @@ def test_a_resumed_run_has_the_same_bits(shared, teacher, tmp_path) -> None:
     whole = distil(STUDENT, teacher, images, tmp_path / "whole", reading=QUIET)
     distil(STUDENT, teacher, images, tmp_path / "parts", reading=QUIET, callbacks=[Stop()])
     parts = distil(STUDENT, teacher, images, tmp_path / "parts", reading=QUIET)
-    assert parts.steps == whole.steps == 9
+    assert parts.steps == whole.steps == 18
     assert_equal(parts.params, whole.params)
 
 
@@ -129,16 +126,15 @@ def test_an_image_that_changed_is_described_again(city, teacher) -> None:
 
 
 def test_an_unreadable_image_is_skipped_by_both(city, teacher, tmp_path) -> None:
-    folder = city / "Images" / "Aston"
-    broken = sorted(folder.iterdir())[2]
+    folder = city / "Images"
+    broken = sorted((folder / "Aston").iterdir())[2]
     broken.write_bytes(b"no picture")
     with pytest.raises(InputError, match=broken.name):
         distil(STUDENT, teacher, folder, tmp_path / "run", reading=QUIET)
     assert not (tmp_path / "run").exists()
     skip = dataclasses.replace(QUIET, on_bad_image="skip")
-    config = dataclasses.replace(STUDENT, epochs=1, places_per_batch=12)
-    result = distil(config, teacher, folder, tmp_path / "run", reading=skip)
-    assert result.skipped_images == 1
+    result = distil(STUDENT, teacher, folder, tmp_path / "run", reading=skip)
+    assert result.skipped_images == 6  # once an epoch
 
 
 def test_labels_count_with_places(shared, teacher, tmp_path) -> None:
@@ -169,36 +165,32 @@ def test_what_does_not_fit_is_refused(shared, teacher, tmp_path) -> None:
 
 
 def test_the_command(shared, tmp_path, capsys) -> None:
-    images, out = str(shared / "city" / "Images"), tmp_path / "run"
-    call = ["distil", "--teacher", "hog", "--student", "tiny", "--out", str(out), "--quiet"]
-    taught = [*call, "--images", images, "--epochs", "1", "--validate-every", "1"]
-    taught += ["--places-per-batch", "8"]
-    assert main([*taught, "--val", str(shared / "town")]) == 0
+    start = Model(random_params(STUDENT.model), STUDENT.model)
+    save_weights(tmp_path / "start.safetensors", start)
+    out, weights = tmp_path / "run", str(tmp_path / "start.safetensors")
+    call = ["distil", "--teacher", "hog", "--out", str(out), "--quiet", "--epochs", "1"]
+    call += ["--validate-every", "1", "--places-per-batch", "8"]
+    call += ["--optimiser.learning-rate", "1e-12"]
+    images = ["--images", str(shared / "city" / "Images")]
+    val = ["--val", str(shared / "town")]
+    assert main([*call, *images, *val, "--student", weights]) == 0
     said = capsys.readouterr().out
     assert "24 images; the student has" in said
     assert "3 steps, best R@5" in said
-    student = load(out / "last.safetensors")
-    assert student.config == dataclasses.replace(PRESETS["tiny"], cross_image="none")
-    assert main(taught) == 2
-    assert "the run started from other validation than are given now" in capsys.readouterr().err
-    assert main(call) == 2
-    assert "--images, --data: found none, expected one" in capsys.readouterr().err
-
-
-def test_a_student_starts_from_weights(shared, tmp_path, capsys) -> None:
-    start = Model(random_params(STUDENT.model), STUDENT.model)
-    save_weights(tmp_path / "start.safetensors", start)
-    call = ["distil", "--teacher", "hog", "--images", str(shared / "city" / "Images"), "--quiet"]
-    call += ["--out", str(tmp_path / "run"), "--epochs", "1", "--places-per-batch", "8"]
-    call += ["--optimiser.learning-rate", "1e-12"]
-    assert main([*call, "--student", str(tmp_path / "start.safetensors")]) == 0
-    found = load(tmp_path / "run" / "last.safetensors")
+    found = load(out / "last.safetensors")
     assert found.config == STUDENT.model
     for ours, theirs in zip(*map(jax.tree.leaves, (found.params, start.params)), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-6)  # three steps of 1e-12, and decay
-    capsys.readouterr()
-    assert main([*call, "--student", str(shared / "weights.safetensors")]) == 2
-    assert "student: found cross-image encoder transformer, expected" in capsys.readouterr().err
+    for given, words in (
+        ([*images, "--student", weights], "the run started from other validation than are given"),
+        (["--student", "tiny"], "--images, --data: found none, expected one"),
+        (
+            [*images, "--student", str(shared / "weights.safetensors")],
+            "student: found cross-image encoder transformer, expected none",
+        ),
+    ):
+        assert main([*call, *given]) == 2
+        assert words in capsys.readouterr().err
 
 
 def test_parts_have_the_students_size() -> None:
@@ -218,11 +210,11 @@ def test_a_teacher_of_another_size_describes_again(shared, teacher) -> None:
 def test_an_image_that_the_teacher_could_not_read_is_left_out(shared, tmp_path) -> None:
     """Though the student can."""
     places = places_of_images(open_sources(shared / "city" / "Images"))
-    targets = np.eye(24, 30, dtype=np.float32)
+    targets = np.eye(24, MODEL.descriptor_dim, dtype=np.float32)
     targets[5] = 0
-    loss = LossConfig(kind=DistilConfig(teacher_dim=30))
-    config = dataclasses.replace(STUDENT, epochs=1, loss=loss)
-    assert fit(config, places, tmp_path / "run", targets=targets, quiet=True).skipped_images == 1
+    taught = LossConfig(kind=DistilConfig(teacher_dim=MODEL.descriptor_dim))
+    config = dataclasses.replace(STUDENT, loss=taught)
+    assert fit(config, places, tmp_path / "run", targets=targets, quiet=True).skipped_images == 6
 
 
 def test_folders_of_one_parent_are_joined(shared) -> None:

@@ -53,7 +53,7 @@ def test_draws_are_of_different_lines_and_the_same_again(plant_faults):
     [
         (
             "training/losses/pairwise.py",
-            ["training/losses/test_losses.py", "training/losses/test_divergence.py"],
+            [f"training/losses/test_{name}.py" for name in ("distil", "losses", "divergence")],
         ),
         ("utils/checksums.py", ["utils/test_checksums.py"]),
     ],

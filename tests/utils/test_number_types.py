@@ -25,6 +25,7 @@ from crisalad_jax.nn.config import PRESETS, ModelConfig, with_aggregator
 from crisalad_jax.nn.model import Model, check_params, describe, init_crisalad
 from crisalad_jax.nn.tokens import Tokens
 from crisalad_jax.training.losses import LOSSES, LossConfig, metric_loss
+from crisalad_jax.training.losses.distil import DistilConfig
 from crisalad_jax.training.optimiser import make_optimiser
 from crisalad_jax.training.step import init_train_state, make_train_step, step_config
 from crisalad_jax.utils.errors import InputError
@@ -150,8 +151,12 @@ def test_losses_of_float32_are_float32(name: str) -> None:
     if config.kind.grouping is not None or config.kind.reads_tokens == "dense":
         pytest.skip("takes more than descriptors; the training step is tested above")
     tokens = jnp.asarray(rows[:, :, None]) if config.kind.reads_tokens else None
+    more: dict[str, Any] = {"tokens": tokens}
+    if isinstance(config.kind, DistilConfig):
+        more["params"] = config.kind.init(jax.random.key(0), 1, 6)
+        more["targets"] = jnp.ones((4, config.kind.teacher_dim), jnp.float32)
     with jax.enable_x64(True):
-        result = metric_loss(jnp.asarray(rows), jnp.asarray(LABELS), config, tokens=tokens)
+        result = metric_loss(jnp.asarray(rows), jnp.asarray(LABELS), config, **more)
     assert {leaf.dtype for leaf in jax.tree.leaves(result)} == {jnp.dtype("float32")}
 
 

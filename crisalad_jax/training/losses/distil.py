@@ -86,8 +86,8 @@ class DistilConfig(Loss):
             terms["neighbours"] = divergence.sum() / batch.anchors
         if self.labels:
             terms["labels"] = MultiSimilarityConfig(base=0.5).apply(None, batch).loss
-        total = sum((getattr(self, name) * term for name, term in terms.items()), jnp.zeros(()))
-        return LossValue(total, numbers=terms)
+        weighted = [getattr(self, name) * term for name, term in terms.items()]
+        return LossValue(jnp.stack(weighted).sum(), numbers=terms)
 
 
 def _cosines(a: Float[Array, "image dim"], b: Float[Array, "image dim"]) -> Float[Array, " image"]:

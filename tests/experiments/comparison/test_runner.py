@@ -7,7 +7,7 @@ import os
 import shutil
 import socket
 import statistics
-import threading
+import time
 import types
 
 import jax
@@ -366,16 +366,15 @@ def test_a_run_waits_for_a_worker_of_a_killed_command(finished, config, monkeypa
     for name in ("fit", "evaluate"):
         monkeypatch.delattr(runner, name)
 
-    def ended():
+    def ended(seconds):
         (finished / "result.json").rename(result)
         other.close()
 
     other.enter_context(locks.lock(folder))
-    timer = threading.Timer(0.3, ended)
-    timer.start()
+    waiting = types.SimpleNamespace(monotonic=time.monotonic, sleep=ended)
+    monkeypatch.setattr(locks, "time", waiting)
     with pytest.warns(Note, match=rf"^{folder}: waiting for another process"):
         run(config, finished)
-    timer.join()
 
 
 def test_the_run_of_a_killed_process_is_free(finished, config, monkeypatch):

@@ -182,9 +182,10 @@ REQUESTS = {
     "class attention": FeatureSpec(class_attention=True),
     "inserted tokens": FeatureSpec(insertion=1, inserted=INSERTED),
 }
+QUICK, SLOW = {"two levels", "inserted tokens"}, pytest.mark.slow
 KINDS = {
     "depthwise": (),
-    **dict.fromkeys(("multi-resolution", "serial-parallel", "side", "none"), pytest.mark.slow),
+    **dict.fromkeys(("multi-resolution", "serial-parallel", "side", "none"), SLOW),
 }
 
 
@@ -203,13 +204,13 @@ def fresh(config: VisionTransformer) -> ViT:
 @pytest.mark.parametrize(
     ("config", "name"),
     [
-        *((HALF, name) for name in REQUESTS),
+        *(pytest.param(HALF, name, marks=() if name in QUICK else SLOW) for name in REQUESTS),
         *(
             pytest.param(dataclasses.replace(HALF, adapter=kind), "the last tokens", marks=marks)
             for kind, marks in KINDS.items()
         ),
         (dataclasses.replace(HALF, registers=3), "inserted tokens"),
-        (DinoV3Config(dim=32, depth=2, heads=2), "the last tokens"),
+        pytest.param(DinoV3Config(dim=32, depth=2, heads=2), "the last tokens", marks=SLOW),
         (DinoV3Config(dim=32, depth=2, heads=2), "keys"),
     ],
     ids=lambda each: each if isinstance(each, str) else "",
