@@ -1,8 +1,6 @@
 """Train a small model to reproduce the descriptors of a larger one, on any images."""
 
 import dataclasses
-import os
-import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -17,7 +15,7 @@ from crisalad_jax.data.places import Places, places_of_images
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.remote import for_each, state_of
 from crisalad_jax.data.sources import open_sources
-from crisalad_jax.experiments.report import save_chart, training_curves
+from crisalad_jax.experiments.train import Path, finish_run
 from crisalad_jax.nn.config import check_unit_length
 from crisalad_jax.nn.model import Model, parameter_shapes
 from crisalad_jax.retrieval.describer import describer_of
@@ -26,15 +24,11 @@ from crisalad_jax.retrieval.extract import extract
 from crisalad_jax.retrieval.segments import digest_of
 from crisalad_jax.training.callbacks import Callback
 from crisalad_jax.training.config import TrainConfig
-from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import FitResult, fit
 from crisalad_jax.training.losses.distil import DistilConfig
-from crisalad_jax.training.run_files import write_data
 from crisalad_jax.training.start import read_inputs
 from crisalad_jax.utils.files import real_path, user_cache, wrap_os_errors
 from crisalad_jax.utils.shapes import Float32
-
-Path = str | os.PathLike[str]
 
 
 @takes(config=TrainConfig, teacher=Model, out=PATH)
@@ -96,7 +90,7 @@ def distil(
         >>> distil(config, load("hog"), pictures, folder / "student", reading=quiet).steps
         1
     """
-    kind, skip, out = config.loss.kind, reading.on_bad_image, pathlib.Path(out)
+    kind, skip = config.loss.kind, reading.on_bad_image
     require(
         isinstance(kind, DistilConfig),
         f"loss: found {kind.part_name}, expected distil (recipe distil)",
@@ -151,8 +145,7 @@ def distil(
         **how,
     )
     if result.steps:
-        save_chart(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
-        write_data(out, real_path(places.root).name, places, benchmark)
+        finish_run(out, real_path(places.root).name, places, benchmark)
     return result
 
 

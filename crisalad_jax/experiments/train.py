@@ -6,12 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from crisalad_jax.config.checks import PATH, takes
+from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.file_cache import CACHE_GB
 from crisalad_jax.data.images import OnBadImage
 from crisalad_jax.data.places import Places
 from crisalad_jax.data.query_set import QuerySet
 from crisalad_jax.data.remote import address_of
 from crisalad_jax.experiments.report import save_chart, training_curves
+from crisalad_jax.training.batches import TrainingSet
 from crisalad_jax.training.callbacks import Callback
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.distributed import is_primary
@@ -124,8 +126,13 @@ def train(
         **how,
     )
     if is_primary() and result.steps:
-        out = pathlib.Path(out)
-        save_chart(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
         names = [real_path(pathlib.Path(root)).name for root in roots.values()]
-        write_data(out, ", ".join(names), places, benchmark)
+        finish_run(out, ", ".join(names), places, benchmark)
     return result
+
+
+def finish_run(out: Path, name: str, places: TrainingSet, benchmark: Benchmark | None) -> None:
+    """Draw the curves of a run, and record what it trained on; see `write_data`."""
+    out = pathlib.Path(out)
+    save_chart(training_curves(read_metrics(out / "metrics.jsonl")), out / "curves.png")
+    write_data(out, name, places, benchmark)

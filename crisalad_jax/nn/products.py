@@ -63,7 +63,7 @@ def map_first_axis(function: Callable[[Any], Array], stacks: Any) -> Array:
     """Call a function for every index of the first axis of a tree of arrays, one after the other.
 
     Where XLA would widen a stack of bfloat16 (`widens_slices`), the loop reads and writes its bits.
-    There is no derivative.
+    It can't be differentiated.
     """
 
     def bits(x: Array) -> Array:

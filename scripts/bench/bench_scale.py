@@ -1,4 +1,4 @@
-"""Measure how time and memory grow with batch, image and clusters, beside torch.
+"""Measure how time and memory grow with batch, image and clusters, compared with torch.
 
     python scripts/bench/bench_scale.py [--out docs/performance]
         [--page docs/performance-studies.md] [--preset s14] [--rounds 3]

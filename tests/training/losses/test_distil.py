@@ -1,4 +1,4 @@
-"""Distillation's terms and their gradients beside torch's, written from their papers.
+"""The terms of distillation and their gradients, compared with torch's, written from their papers.
 
 Values agree to 1e-5 relative and gradients to 1e-4 of the largest: float32 similarities of order 1
 are divided by a temperature of 0.05.
