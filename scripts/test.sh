@@ -11,7 +11,8 @@ lint-imports
 # Most of the time is XLA's, which need not optimise programs that run for milliseconds. Its newer
 # emitters take twice as long to compile a training step: 17 to 24 s of a core, and 8 to 10 without.
 # XLA of jax 0.12 has no others, and ends at a flag that it does not know.
-flags="--xla_backend_optimization_level=0"
+# A program in one piece: both cores have a worker (134 -> 122 to 130 s of tests/training, tests/nn).
+flags="--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
 case "$(python -m pip show jax)" in *"Version: 0.10."*) flags+=" --xla_cpu_use_fusion_emitters=false" ;; esac
 export XLA_FLAGS="$flags ${XLA_FLAGS:-}"
 unset PYTHONDONTWRITEBYTECODE # or each of the hundreds of programs compiles the package again: 0.8 s

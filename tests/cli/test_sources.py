@@ -229,7 +229,10 @@ def test_a_bag_is_replayed_and_no_frame_is_lost(town_map, tmp_path, capfd):
 
 @pytest.mark.parametrize(
     ("number", "code", "words"),
-    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "ended by SIGTERM")],
+    [
+        (signal.SIGINT, 130, "interrupted"),
+        pytest.param(signal.SIGTERM, 143, "ended by SIGTERM", marks=pytest.mark.slow),
+    ],
 )
 def test_a_watch_ends_by_a_signal_with_its_summary(shared, town_map, tmp_path, number, code, words):
     """In a process of its own, as a shell starts it: the signal must reach no other test."""

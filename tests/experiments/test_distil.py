@@ -207,6 +207,7 @@ def test_a_teacher_of_another_size_describes_again(shared, teacher) -> None:
     assert np.abs(teachers_descriptors(resized, places, reading=QUIET) - small).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_an_image_that_the_teacher_could_not_read_is_left_out(shared, tmp_path) -> None:
     """Though the student can."""
     places = places_of_images(open_sources(shared / "city" / "Images"))

@@ -24,6 +24,7 @@ from crisalad_jax.nn.attention import (
 from crisalad_jax.nn.attention_fused import padded_length
 from crisalad_jax.nn.layers import init_linear, linear
 from crisalad_jax.utils.target import CPU, GPU, TPU, Target, lowering_for
+from tests.nn.conftest import slow_unless
 
 TOKENS, DIM, HEADS = 7, 12, 3
 
@@ -129,8 +130,9 @@ def assert_slopes_agree(found: Any, expected: Any, share: float) -> None:
     [
         (261, 128, 4),  # 224 x 224 and four registers; heads of 32
         (530, 128, 2),  # 322 x 322, whose queries are cut in two
-        (50, 256, 2),  # heads of 128
-        (7, 1024, 16),  # more heads than a step of the kernel takes
+        pytest.param(*(50, 256, 2), marks=pytest.mark.slow),  # heads of 128
+        # More heads than a step of the kernel takes.
+        pytest.param(*(7, 1024, 16), marks=pytest.mark.slow),
     ],
 )
 def test_a_tpus_kernel_is_the_cpus_attention(
@@ -226,7 +228,7 @@ UNFUSED = {
 }
 
 
-@pytest.mark.parametrize("name", UNFUSED)
+@pytest.mark.parametrize("name", slow_unless({"heads of 16"}, UNFUSED))
 def test_what_a_tpus_kernel_does_not_take_is_computed_all_the_same(
     interpreted: list[Any], name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -355,6 +357,7 @@ def test_a_cpu_computes_many_scores_in_parts_to_the_same_values(
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-6), results[0], found)
 
 
+@pytest.mark.slow
 def test_a_tpus_kernel_sees_no_padding(interpreted: list[Any]) -> None:
     x = sample(50, 128)
     more = jnp.pad(x, ((0, 0), (0, 6), (0, 0)), constant_values=100)

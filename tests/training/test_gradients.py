@@ -57,7 +57,10 @@ def by_hand(gradient: dict[str, np.ndarray], part: str, of_block: str) -> float:
 @pytest.mark.parametrize(
     ("trainable", "parts", "of_block"),
     [
-        ("all", ["backbone.patch_embed", "backbone.cls_token", *BLOCKS, *HEAD], ""),
+        pytest.param(
+            *("all", ["backbone.patch_embed", "backbone.cls_token", *BLOCKS, *HEAD], ""),
+            marks=pytest.mark.slow,
+        ),
         (CUT, ["backbone.cls_token", "backbone.blocks.1", *ADAPTERS, *HEAD], ".attn"),
     ],
 )

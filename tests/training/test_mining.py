@@ -429,7 +429,7 @@ def whole(street, tmp_path_factory) -> pathlib.Path:
     return out
 
 
-@pytest.mark.parametrize("call", [1, 4])
+@pytest.mark.parametrize("call", [pytest.param(1, marks=pytest.mark.slow), 4])
 def test_a_run_interrupted_in_a_round_goes_on_with_its_tuples(
     street, whole, tmp_path, monkeypatch, call
 ):

@@ -126,7 +126,11 @@ def test_a_norm_that_the_aggregator_leaves_out_stays_frozen() -> None:
 
 
 @pytest.mark.parametrize(
-    "trainable", ["adapters,head", "head,-adapters,backbone.blocks.1.attn,backbone.patch_embed"]
+    "trainable",
+    [
+        pytest.param("adapters,head", marks=pytest.mark.slow),
+        "head,-adapters,backbone.blocks.1.attn,backbone.patch_embed",
+    ],
 )
 def test_a_step_changes_what_trains_and_nothing_else(params, trainable: str) -> None:
     state, frozen = init_train_state(params, trainable, STEP)
@@ -243,7 +247,7 @@ def test_steps_of_an_optimiser_equal_torchs(name: str) -> None:
     np.testing.assert_allclose(ours, tensor.detach().numpy(), rtol=0, atol=bound)
 
 
-@pytest.mark.parametrize("kind", ["sgd", "adamw"])
+@pytest.mark.parametrize("kind", [pytest.param("sgd", marks=pytest.mark.slow), "adamw"])
 def test_gradients_of_several_batches_equal_torchs(kind: Literal["sgd", "adamw"]) -> None:
     """DINO-Mix's: four batches' mean, each number clipped; epochs of seven batches, so that the
     second step of each has three, whose sum is still divided by four, as in Lightning."""

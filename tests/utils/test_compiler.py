@@ -45,7 +45,9 @@ main(["info", "--preset", "tiny", "--json", "-"])
 """
 
 
-@pytest.mark.parametrize(("version", "warned"), [("0.10.2", 0), ("0.11.2", 1)])
+@pytest.mark.parametrize(
+    ("version", "warned"), [pytest.param("0.10.2", 0, marks=pytest.mark.slow), ("0.11.2", 1)]
+)
 def test_an_untested_jax_is_said_in_one_line(
     tmp_path: pathlib.Path, version: str, warned: int
 ) -> None:

@@ -30,6 +30,7 @@ from crisalad_jax.training.optimiser import make_optimiser
 from crisalad_jax.training.step import init_train_state, make_train_step, step_config
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL, RECIPE, assert_equal, random_params
+from tests.nn.conftest import slow_unless
 
 IMAGES = np.random.default_rng(0).integers(0, 256, (4, *MODEL.image_size, 3), np.uint8)
 LABELS = np.array([0, 0, 1, 1])
@@ -46,7 +47,9 @@ def in_both_modes(make: Callable[[], Any]) -> Any:
 
 
 # A hash head needs a backbone with two side paths, which no preset has.
-@pytest.mark.parametrize("name", sorted({*AGGREGATORS} - {"selavprpp-hash"}))
+@pytest.mark.parametrize(
+    "name", slow_unless({"salad", "boq", "netvlad"}, sorted({*AGGREGATORS} - {"selavprpp-hash"}))
+)
 def test_parameters_are_float32_and_the_same(name: str) -> None:
     alone = "none"
     config = with_aggregator(PRESETS["tiny"], name, "tiny", cross_image=alone)

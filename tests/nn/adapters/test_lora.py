@@ -98,7 +98,7 @@ GATED = ("qkv", "w12", "w3")
 @pytest.mark.parametrize(
     "backbone",
     [
-        dataclasses.replace(MODEL.backbone, adapter=LORA),
+        pytest.param(dataclasses.replace(MODEL.backbone, adapter=LORA), marks=pytest.mark.slow),
         pytest.param(
             DinoV3Config(dim=32, depth=2, heads=2, ffn="swiglu", adapter=LoraConfig(layers=GATED)),
             marks=pytest.mark.slow,

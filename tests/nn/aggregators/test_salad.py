@@ -13,6 +13,7 @@ from crisalad_jax.nn.aggregators.salad import Salad, SaladConfig
 from crisalad_jax.nn.backbones.base import Features
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.tokens import Tokens
+from tests.nn.conftest import slow_unless
 
 CONFIG = SaladConfig(clusters=3, cluster_dim=4, token_dim=8, hidden=16, dropout=0.5)
 
@@ -65,7 +66,7 @@ def test_dropout_stands_before_relu_of_the_two_local_networks(monkeypatch) -> No
 
 @pytest.mark.parametrize(
     "dustbin",
-    [pytest.param("none", marks=pytest.mark.slow), "column", "row and column", "token", "mass"],
+    slow_unless({"column", "token", "mass"}, ("none", "column", "row and column", "token", "mass")),
 )
 def test_a_batch_is_its_images_under_every_dustbin(dustbin: str) -> None:
     config = dataclasses.replace(CONFIG, dustbin=dustbin)

@@ -134,7 +134,7 @@ def test_sincos_positions_tell_places_apart_and_fall_off_with_distance() -> None
     assert similarity[0, 1] > similarity[0, 2] > similarity[0, 3]
 
 
-@pytest.mark.parametrize("depths", [(1, 2, 3), (2, 3), (3,)])
+@pytest.mark.parametrize("depths", [pytest.param((1, 2, 3), marks=pytest.mark.slow), (2, 3), (3,)])
 def test_levels_are_the_normed_tokens_of_backbones_cut_short(depths: tuple[int, ...]) -> None:
     params = CONFIG.init(jax.random.key(0))
     expected = [
@@ -182,7 +182,7 @@ REQUESTS = {
     "class attention": FeatureSpec(class_attention=True),
     "inserted tokens": FeatureSpec(insertion=1, inserted=INSERTED),
 }
-QUICK, SLOW = {"two levels", "inserted tokens"}, pytest.mark.slow
+QUICK, SLOW = {"two levels"}, pytest.mark.slow
 KINDS = {
     "depthwise": (),
     **dict.fromkeys(("multi-resolution", "serial-parallel", "side", "none"), SLOW),

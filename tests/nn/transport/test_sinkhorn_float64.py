@@ -199,7 +199,7 @@ def test_plan_and_gradient_of_every_solver(name: str) -> None:
 @pytest.mark.parametrize(
     "config",
     [
-        SinkhornConfig(step="newton", iterations=12),
+        pytest.param(SinkhornConfig(step="newton", iterations=12), marks=pytest.mark.slow),
         to_rest(step="newton", gradient="optimistix", iterations=40),
     ],
     ids=["unrolled", "optimistix"],

@@ -78,7 +78,7 @@ def test_the_gaussian_guess_is_exact_for_gaussians() -> None:
     assert np.ptp(exact.potentials.column - log_nu) > 1
 
 
-@pytest.mark.parametrize("start", ["gaussian", "network"])
+@pytest.mark.parametrize("start", slow_unless({"network"}, ("gaussian", "network")))
 def test_a_start_is_nearer_and_arrives_at_the_same_plan(start: str) -> None:
     """Scores of low rank, of which one Gaussian iteration leaves less than half the error."""
     keys = jax.random.split(jax.random.key(0))

@@ -34,6 +34,7 @@ from crisalad_jax.retrieval.reranking import (
 )
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import BATCH, MODEL, random_params
+from tests.nn.conftest import slow_unless
 
 QUIET = Reading(batch_size=BATCH, quiet=True)
 
@@ -115,7 +116,7 @@ def test_windows_of_any_length_are_refused(name: str) -> None:
 # FoL compares 3,600 features of each image, however small the rest is.
 MODELLED = [name for name, method in stage._METHODS.items() if method is not None]
 NAMES = pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n == "fol")) for n in MODELLED]
+    "name", slow_unless({*MODELLED} - {"fol", "sinkhorn-divergence", "pair-vpr"}, MODELLED)
 )
 
 
