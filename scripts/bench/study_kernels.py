@@ -72,7 +72,8 @@ def _heads_first(qkv: Array, heads: int) -> tuple[int, Array, Array, Array]:
     padded = -(-tokens // BLOCK) * BLOCK
     qkv = jnp.pad(qkv, ((0, 0), (0, padded - tokens), (0, 0)))
     parts = qkv.reshape(batch, padded, 3, heads, three // 3 // heads)
-    return padded, *jnp.moveaxis(parts, (2, 3), (0, 2))
+    queries, keys, values = jnp.moveaxis(parts, (2, 3), (0, 2))
+    return padded, queries, keys, values
 
 
 def _side_by_side(mixed: Array, qkv: Array) -> Array:
