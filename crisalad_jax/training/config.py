@@ -181,8 +181,9 @@ class TrainConfig:
     """Number of images of each of them."""
     micro_batch: int | None = None
     """So many images' activations are in memory at a time: a step takes less of it and a forward
-    pass longer, and is the same. None is the whole batch. Batch norms that follow the batch take
-    the statistics of so many images alone, as in several forward passes of torch's."""
+    pass longer, and is the same; of a convolutional backbone on a CPU ten times as long and more,
+    for XLA's loops have no fast convolutions. None is the whole batch. Batch norms that follow the
+    batch take the statistics of so many images alone, as in several forward passes of torch's."""
     min_images: int = 4
     """Places, or classes, with fewer images are left out."""
     mining: MiningConfig = MiningConfig()

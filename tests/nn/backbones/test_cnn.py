@@ -29,7 +29,7 @@ from crisalad_jax.nn.layers import BatchNorm, Conv
 from crisalad_jax.nn.model import check_params, describe
 from crisalad_jax.training.trainable import count_trainable, merge_params, split_params
 from crisalad_jax.utils.errors import InputError
-from tests.conftest import random_params
+from tests.conftest import assert_equal, random_params
 
 BARE = "none"
 SMALL = ModelConfig(
@@ -217,7 +217,13 @@ def test_a_batch_in_parts_is_the_whole_batch(monkeypatch: pytest.MonkeyPatch) ->
             parts > 1
         )
         found[parts] = apply(params.backbone, images)[0].patches
+        # A gradient is of the batch as a whole, whose program is the same.
+        slope = jax.grad(lambda params, apply=apply: apply(params, images)[0].patches.sum())
+        program = jax.make_jaxpr(slope)(params.backbone).pretty_print()
+        assert " scan[" not in program
+        found["slope", parts] = slope(params.backbone)
     for parts in (3, 6):
+        assert_equal(found["slope", parts], found["slope", 1])
         # Float32, of sums of thousands in another order; 1e-6 of the largest is measured.
         largest = np.abs(found[1]).max()
         np.testing.assert_allclose(found[parts] / largest, found[1] / largest, atol=4e-6, rtol=0)
