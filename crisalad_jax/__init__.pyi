@@ -41,6 +41,8 @@ from .evaluation.difference import paired_difference as paired_difference
 from .evaluation.evaluate import evaluate as evaluate
 from .evaluation.operating_point import operating_point as operating_point
 from .evaluation.record import evaluation_record as evaluation_record
+from .experiments.adapt import Adapted as Adapted
+from .experiments.adapt import adapt as adapt
 from .experiments.comparison import ComparisonConfig as ComparisonConfig
 from .experiments.comparison import compare as compare
 from .experiments.distil import distil as distil
@@ -105,6 +107,7 @@ from .retrieval.maps.live import query_live as query_live
 from .retrieval.maps.map import Map as Map
 from .retrieval.maps.pairs import image_pairs as image_pairs
 from .retrieval.maps.query import query as query
+from .retrieval.maps.remake import remake_map as remake_map
 from .retrieval.maps.where import Where as Where
 from .retrieval.neighbours import Neighbours as Neighbours
 from .retrieval.pca import fit_pca as fit_pca

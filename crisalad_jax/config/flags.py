@@ -285,7 +285,7 @@ def parse_settings(
 
     Args:
         kind: the command's class, whose subclasses become dataclasses. Its field `settings` takes
-            the configuration, and a field `image_size` replaces the model's.
+            the configuration, and a field `image_size`, if there is one, replaces the model's.
         program: the command's name, for messages.
         arguments: the command line's.
         defaults: the configuration that flags start from.
@@ -301,9 +301,10 @@ def parse_settings(
         with_settings(kind, arguments, defaults, preset), prog=program, args=arguments
     )
     given = parsed.settings
-    if parsed.image_size is not None:
+    size = getattr(parsed, "image_size", None)
+    if size is not None:
         # Before the checks: the preset's own size may not fit another backbone.
-        model = dataclasses.replace(given.model, image_size=parsed.image_size)
+        model = dataclasses.replace(given.model, image_size=size)
         given = dataclasses.replace(given, model=model)
     return dataclasses.replace(parsed, settings=config_of(given))
 

@@ -24,7 +24,7 @@ from crisalad_jax.data.named_places import (
     read_msls_places,
     read_named_places,
 )
-from crisalad_jax.data.remote import address_of, check_address, is_file, is_folder, is_remote
+from crisalad_jax.data.remote import address_of, check_address, is_file, is_folder
 from crisalad_jax.data.sources import ImageSource, check_frames, open_source
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path
@@ -171,10 +171,7 @@ def read_places(
             "for the layout of GSV-Cities or MSLS; for other images --place-radius, perhaps with "
             "--positions, or --place-frames, and --fps or --topic with either"
         )
-    if place_radius is not None and not 0 < place_radius < math.inf:
-        raise InputError(f"--place-radius: found {place_radius:g}, expected metres above 0")
-    if place_frames is not None and place_frames < 2:
-        raise InputError(f"--place-frames: found {place_frames}, expected at least 2")
+    check_grouping(place_radius, place_frames)
     names: tuple[str, ...] = ()
     if is_gsv:
         names, found = read_gsv_cities(root, cities, on_bad_image)
@@ -183,47 +180,51 @@ def read_places(
     elif groupings:
         source = open_source(root, fps=fps, topic=topic, on_bad_image=on_bad_image)
         check_frames(source.paths, fps=fps, topic=topic)
-        root = source.root
-        if place_radius is not None:
-            found = places_by_position(source, place_radius, positions)
-        else:
-            found = places_by_order(source, place_frames or 0)
+        return group_images(source, place_radius, place_frames, positions, min_images=min_images)
     else:
         root, names, found = read_named_places(root, on_bad_image)
     return _places(root, names or (real_path(root).name,), found, min_images)
 
 
-def places_of_images(sources: Sequence[ImageSource]) -> Places:
-    """Make a training set of which each image is a place of its own, for a loss without labels.
-
-    Args:
-        sources: of `open_sources`.
-
-    Returns:
-        The images; of several sources under the names that they have in a common folder.
+def check_grouping(place_radius: float | None, place_frames: int | None) -> None:
+    """Check what makes places of images; see `read_places`.
 
     Raises:
-        InputError: several sources, of which one is at an address.
+        InputError: no distance, or fewer than two frames.
     """
-    root = sources[0].root
-    if len(sources) > 1:
-        far = [address_of(source.root) for source in sources if is_remote(source.root)]
-        if far:
-            raise InputError(f"--images: found {', '.join(far)} of several, expected one source")
-        root = pathlib.Path(os.path.commonpath([os.path.abspath(each.root) for each in sources]))
-        paths = [os.path.abspath(path) for source in sources for path in source.paths]
+    if place_radius is not None and not 0 < place_radius < math.inf:
+        raise InputError(f"--place-radius: found {place_radius:g}, expected metres above 0")
+    if place_frames is not None and place_frames < 2:
+        raise InputError(f"--place-frames: found {place_frames}, expected at least 2")
+
+
+def group_images(
+    source: ImageSource,
+    place_radius: float | None = None,
+    place_frames: int | None = None,
+    positions: str | os.PathLike[str] | None = None,
+    *,
+    min_images: int = 1,
+) -> Places:
+    """Make places of a source's images, by their positions or their order, or one of each image.
+
+    Args:
+        source: the images.
+        place_radius: see `read_places`, as of what follows.
+        place_frames: number of consecutive images.
+        positions: table or track; None is what the source says.
+        min_images: places with fewer images are left out.
+
+    Raises:
+        InputError: no position, or no place large enough.
+    """
+    if place_radius is not None:
+        found = places_by_position(source, place_radius, positions)
+    elif place_frames is not None:
+        found = places_by_order(source, place_frames)
     else:
-        paths = sources[0].paths
-    files = tuple(os.path.relpath(path, root) for path in dict.fromkeys(paths))
-    count = len(files)
-    return Places(
-        root=root,
-        cities=(real_path(root).name,),
-        files=files,
-        place_start=np.arange(count + 1, dtype=np.int64),
-        place_city=np.zeros(count, np.int32),
-        names=files,
-    )
+        found = [FoundPlace(name, {name: None}) for name in source.names]
+    return _places(source.root, (real_path(source.root).name,), found, min_images)
 
 
 def _places(

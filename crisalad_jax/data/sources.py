@@ -217,6 +217,38 @@ def open_sources(
     return sources
 
 
+def join_sources(sources: Sequence[ImageSource]) -> ImageSource:
+    """Join the images of several sources.
+
+    Args:
+        sources: of `open_sources`.
+
+    Returns:
+        The images; of several sources each once, by the names that they have in a common folder.
+        They have positions if all that the sources have are in the same axes and zone.
+
+    Raises:
+        InputError: several sources, of which one is at an address.
+    """
+    if len(sources) == 1:
+        return sources[0]
+    far = [address_of(source.root) for source in sources if is_remote(source.root)]
+    if far:
+        raise InputError(f"--images: found {', '.join(far)} of several, expected one source")
+    placed: dict[pathlib.Path, tuple[float, float] | None] = {}
+    for source in sources:
+        of = {} if source.positions is None else source.positions.of
+        for name, path in zip(source.names, source.paths, strict=True):
+            placed.setdefault(pathlib.Path(os.path.abspath(path)), of.get(name))
+    root = pathlib.Path(os.path.commonpath([os.path.abspath(each.root) for each in sources]))
+    names = names_in(root, list(placed))
+    known = [each.positions for each in sources if each.positions is not None]
+    kinds = {(each.axes, each.zone) for each in known}
+    of = {name: at for name, at in zip(names, placed.values(), strict=True) if at is not None}
+    positions = known[0]._replace(of=of) if len(kinds) == 1 and of else None
+    return ImageSource(root, list(placed), names, positions)
+
+
 class _Frames(NamedTuple):
     """Which frames of videos and logs are taken."""
 

@@ -11,10 +11,10 @@ from crisalad_jax.config.checks import PATH, require, takes
 from crisalad_jax.config.io import to_plain
 from crisalad_jax.data.file_cache import CACHE_GB
 from crisalad_jax.data.frames import file_of
-from crisalad_jax.data.places import Places, places_of_images
+from crisalad_jax.data.places import Places, group_images
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.remote import for_each, state_of
-from crisalad_jax.data.sources import open_sources
+from crisalad_jax.data.sources import join_sources, open_sources
 from crisalad_jax.experiments.train import Path, finish_run
 from crisalad_jax.nn.config import check_unit_length
 from crisalad_jax.nn.model import Model, parameter_shapes
@@ -113,7 +113,8 @@ def distil(
     source: Any = data
     if images is not None:
         frames: Any = {"fps": fps, "topic": topic}
-        source = places_of_images(open_sources(images, **frames, on_bad_image=skip))
+        listed = open_sources(images, **frames, on_bad_image=skip)
+        source = group_images(join_sources(listed))
     how: Any = {"on_bad_image": skip, "quiet": reading.quiet}
     sets: Any = {"validation": validation, "validation_images": validation_images}
     places, benchmark, initial = read_inputs(config, source, out, weights=weights, **sets, **how)

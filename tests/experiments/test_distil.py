@@ -10,9 +10,9 @@ from crisalad_jax.checkpoints.load import load
 from crisalad_jax.checkpoints.weights import save_weights
 from crisalad_jax.cli import main
 from crisalad_jax.cli.distil import parse
-from crisalad_jax.data.places import places_of_images, read_places
+from crisalad_jax.data.places import group_images, read_places
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.data.sources import open_sources
+from crisalad_jax.data.sources import join_sources, open_sources
 from crisalad_jax.experiments import distil as module
 from crisalad_jax.experiments.distil import distil, teachers_descriptors
 from crisalad_jax.nn.model import Model, describe, init_crisalad
@@ -61,7 +61,7 @@ def test_a_student_comes_near_its_teacher(shared, tmp_path) -> None:
 
 def test_targets_follow_their_images(shared, teacher, monkeypatch, tmp_path) -> None:
     """Those of a step are the teacher's descriptors of its images."""
-    places = places_of_images(open_sources(shared / "city" / "Images"))
+    places = group_images(join_sources(open_sources(shared / "city" / "Images")))
     targets = teachers_descriptors(teacher, places, reading=QUIET)
     paths = [places.path(image) for image in range(len(places.files))]
     expected = extract(teacher, paths, reading=QUIET).descriptors
@@ -101,7 +101,7 @@ def test_a_resumed_run_has_the_same_bits(shared, teacher, tmp_path) -> None:
 
 
 def test_the_teacher_describes_once(shared, teacher, monkeypatch) -> None:
-    places = places_of_images(open_sources(shared / "city" / "Images" / "Aston"))
+    places = group_images(join_sources(open_sources(shared / "city" / "Images" / "Aston")))
     first = np.array(teachers_descriptors(teacher, places, reading=QUIET))
 
     def refuse(*_, **__):
@@ -116,7 +116,7 @@ def test_the_teacher_describes_once(shared, teacher, monkeypatch) -> None:
 
 def test_an_image_that_changed_is_described_again(city, teacher) -> None:
     folder = city / "Images" / "Aston"
-    places = places_of_images(open_sources(folder))
+    places = group_images(join_sources(open_sources(folder)))
     before = np.array(teachers_descriptors(teacher, places, reading=QUIET))
     picture, other = (folder / name for name in (places.files[0], places.files[5]))
     picture.write_bytes(other.read_bytes())
@@ -201,7 +201,7 @@ def test_parts_have_the_students_size() -> None:
 
 
 def test_a_teacher_of_another_size_describes_again(shared, teacher) -> None:
-    places = places_of_images(open_sources(shared / "city" / "Images" / "Aston"))
+    places = group_images(join_sources(open_sources(shared / "city" / "Images" / "Aston")))
     small = np.array(teachers_descriptors(teacher, places, reading=QUIET))
     resized = teacher._replace(config=dataclasses.replace(MODEL, image_size=(56, 56)))
     assert np.abs(teachers_descriptors(resized, places, reading=QUIET) - small).max() > 1e-3
@@ -210,7 +210,7 @@ def test_a_teacher_of_another_size_describes_again(shared, teacher) -> None:
 @pytest.mark.slow
 def test_an_image_that_the_teacher_could_not_read_is_left_out(shared, tmp_path) -> None:
     """Though the student can."""
-    places = places_of_images(open_sources(shared / "city" / "Images"))
+    places = group_images(join_sources(open_sources(shared / "city" / "Images")))
     targets = np.eye(24, MODEL.descriptor_dim, dtype=np.float32)
     targets[5] = 0
     taught = LossConfig(kind=DistilConfig(teacher_dim=MODEL.descriptor_dim))
@@ -220,8 +220,8 @@ def test_an_image_that_the_teacher_could_not_read_is_left_out(shared, tmp_path) 
 
 def test_folders_of_one_parent_are_joined(shared) -> None:
     images = shared / "city" / "Images"
-    both = places_of_images(open_sources([images / "Aston", images / "Brill"]))
-    whole = places_of_images(open_sources(images))
+    both = group_images(join_sources(open_sources([images / "Aston", images / "Brill"])))
+    whole = group_images(join_sources(open_sources(images)))
     assert [both.path(i) for i in range(24)] == [whole.path(i) for i in range(24)]
     assert both.root == images
     assert both.image_counts.tolist() == [1] * 24

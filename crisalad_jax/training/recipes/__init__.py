@@ -1,6 +1,7 @@
 """Training recipes of published methods, one module for each family."""
 
 from crisalad_jax.training.recipes import (  # noqa: F401, they register theirs
+    adapt,
     classical,
     classification,
     convolutional,

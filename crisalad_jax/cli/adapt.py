@@ -1,0 +1,81 @@
+"""`crisalad adapt`."""
+
+import pathlib
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from crisalad_jax.cli.common import console, pick
+from crisalad_jax.cli.flags import FOLDER, FrameFlags, JsonFlag, PluginFlag, ReadFlags
+from crisalad_jax.config.flags import find_flag, parse_settings, with_settings
+from crisalad_jax.retrieval.maps.metadata import existing_metadata, model_config
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.recipes import recipe
+
+
+class Adapt(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
+    """Fit the model of a map to its place: a few steps on its images; resume the run in OUT."""
+
+    map: pathlib.Path
+    """Map whose model is adapted; its images must be where they were indexed."""
+    out: Annotated[pathlib.Path, FOLDER]
+    """Folder for adapted.safetensors, the run and what was measured."""
+    settings: Any
+    weights: pathlib.Path | None = None
+    """Weights that made the map, if they are no longer where they were."""
+    images: tuple[pathlib.Path, ...] = ()
+    """More images of the place to train on, such as those of another day; they don't join the
+    map."""
+    place_radius: float = 10.0
+    """Metres from a place's centre, within which its images are, for a map with positions."""
+    place_frames: int | None = None
+    """Number of consecutive images that are a place, for a map without positions; by default each
+    image is one, seen under two augmentations."""
+    watch: tuple[pathlib.Path, ...] = ()
+    """Evaluation sets of other places, whose recall is compared before and after."""
+    most_lost: float = 0.005
+    """Most that Recall@1 of a watched set may fall, as a fraction; else the map is not replaced."""
+    replace: bool = False
+    """Make the map anew by the adapted model; the old one stays until the new one is whole."""
+
+
+def parse(program: str, arguments: Sequence[str]) -> Adapt:
+    """Parse the flags, with one for every field of the configuration and of its parts."""
+    return parse_settings(Adapt, program, arguments, *defaults(arguments))
+
+
+def command(arguments: Sequence[str]) -> type:
+    """Return the class that these arguments are parsed into, for help and completion."""
+    return with_settings(Adapt, arguments, *defaults(arguments))
+
+
+def defaults(arguments: Sequence[str]) -> tuple[TrainConfig, str]:
+    """Return the configuration that flags start from, of the map's model."""
+    folder = find_flag(arguments, "--map")
+    if folder is None or not pathlib.Path(folder).exists():
+        return recipe("b14", "adapt"), "b14"
+    model = model_config(existing_metadata(folder), folder)
+    return recipe("b14", "adapt", model=model), "b14"
+
+
+def run(arguments: Adapt) -> dict[str, Any]:
+    """Adapt the model, and print what was gained."""
+    from crisalad_jax.experiments.adapt import adapt, to_json
+
+    config: TrainConfig = arguments.settings
+    names = ("weights", "images", "place_radius", "place_frames", "watch", "most_lost", "replace")
+    result = adapt(
+        config,
+        arguments.map,
+        arguments.out,
+        say=lambda line: console.print(line, soft_wrap=True),
+        **pick(arguments, *names, "fps", "topic", "reading"),
+    )
+    before, after = result.held_out
+    words = f"{result.steps} steps, held-out frames {config.monitor} {100 * before:.1f}"
+    if result.weights is None:
+        words += f", no better after ({100 * after:.1f}); the map's model stays"
+    else:
+        words += f" before, {100 * after:.1f} after; the adapted model is {result.weights}"
+        words += "; the map is made anew" if result.replaced else ""
+    console.print(f"{arguments.out}: {words}", soft_wrap=True)
+    return {"out": str(arguments.out), **to_json(result)}

@@ -1,0 +1,246 @@
+"""Fit a model to the place of a map: a few steps on the map's own images."""
+
+import dataclasses
+import os
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from crisalad_jax.checkpoints.weights import load_weights, save_weights
+from crisalad_jax.config.checks import PATH, require, takes
+from crisalad_jax.config.io import differences
+from crisalad_jax.config.part import with_non_semantic_fields_of
+from crisalad_jax.config.short_repr import brief
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.places import check_grouping
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.data.sources import ImageSource, open_sources
+from crisalad_jax.evaluation.difference import Difference, paired_difference
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.evaluation.results import GroupingResult
+from crisalad_jax.experiments.held_out import held_out_benchmark, split_images, with_repeats
+from crisalad_jax.experiments.train import finish_run
+from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.remake import check_remakeable, remake_map, source_of_map
+from crisalad_jax.training.callbacks import Callback
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.loop import fit
+from crisalad_jax.training.run_files import check_run
+from crisalad_jax.training.validation import MONITORED
+from crisalad_jax.utils.files import real_path, write_json
+from crisalad_jax.utils.shapes import Bool
+
+Path = str | os.PathLike[str]
+
+
+@brief
+class Adapted(NamedTuple):
+    """What an adaptation gained, and where it cost something."""
+
+    steps: int
+    held_out: tuple[float, float]
+    """Recall of held-out frames by `TrainConfig.monitor`, before and after."""
+    others: dict[str, tuple[float, Difference]]
+    """Recall@1 of each watched set before, and its change."""
+    weights: pathlib.Path | None
+    """The adapted weights; None where held-out frames gained nothing."""
+    replaced: bool
+    """Whether the map was made anew by them."""
+
+
+@takes(config=TrainConfig, folder=PATH, out=PATH)
+def adapt(
+    config: TrainConfig,
+    folder: Path,
+    out: Path,
+    *,
+    weights: Path | None = None,
+    images: Path | Sequence[Path] = (),
+    place_radius: float = 10.0,
+    place_frames: int | None = None,
+    watch: Sequence[Path] = (),
+    most_lost: float = 0.005,
+    replace: bool = False,
+    fps: float | None = None,
+    topic: str | None = None,
+    reading: Reading = Reading(),
+    callbacks: Sequence[Callback | str] = (),
+    say: Callable[[str], None] = lambda line: None,
+) -> Adapted:
+    """Fit the model of a map to its place, or resume the run in `out`.
+
+    Images of a place are those within `place_radius`, of a map without positions so many
+    consecutive ones, and without `place_frames` each image by itself, under two augmentations. A
+    fifth of the images is held out. Augmented copies of them ask the rest of the map, which decides
+    how long to train, and whether anything was gained.
+
+    Args:
+        config: how to train, usually `recipe(name="adapt", model=...)` with the map's model.
+        folder: the map, whose images must be where they were indexed.
+        out: folder for the run, the held-out pictures and `adapted.safetensors`.
+        weights: the map's weights, where they are no longer at the path that it says.
+        images: more images of the place to train on, as `extract` takes them; they don't join the
+            map.
+        place_radius: metres from a place's centre, within which its images are.
+        place_frames: number of consecutive images that are a place, for a map without positions.
+        watch: evaluation sets of other places, whose recall is compared before and after.
+        most_lost: most that the Recall@1 of a watched set may fall, as a fraction; the map is not
+            replaced where it falls more.
+        replace: whether to make the map anew by the adapted model; see `remake_map`.
+        fps: frames a second taken of videos and logs among `images`.
+        topic: the topic of images in a log among `images`.
+        reading: how images are read.
+        callbacks: see `fit`.
+        say: called with each line to print.
+
+    Returns:
+        What was gained. `out` has it as `adapted.json`.
+
+    Raises:
+        InputError: another model than the map's; images that are gone; `place_frames` for a map
+            with positions; too few images; `replace` for a map that cannot be made anew; what
+            `open_sources`, `open_benchmark` and `fit` raise.
+        Interrupted: the same call resumes.
+
+    Example:
+        >>> import dataclasses, jax
+        >>> from crisalad_jax import PRESETS, Model, index, init_crisalad, recipe, save_weights
+        >>> model = Model(init_crisalad(jax.random.key(0), PRESETS["tiny"]), PRESETS["tiny"])
+        >>> weights, quiet = folder / "weights.safetensors", Reading(quiet=True)
+        >>> save_weights(weights, model)
+        >>> _ = index(model, pictures, folder / "map", weights=weights, reading=quiet)
+        >>> config = recipe("tiny", "adapt", model=model.config)
+        >>> config = dataclasses.replace(config, epochs=1, places_per_batch=2)
+        >>> adapt(config, folder / "map", folder / "run", reading=quiet).steps
+        1
+    """
+    out, folder = pathlib.Path(out), pathlib.Path(folder)
+    check_grouping(place_radius, place_frames)
+    skip: Any = {"on_bad_image": reading.on_bad_image}
+    quiet = dataclasses.replace(reading, quiet=True)
+    benchmarks = [open_benchmark(each, **skip) for each in watch]
+    for each in benchmarks:
+        each.ground_truth()
+    with Map.open(folder, calibrated=False) as places:
+        if replace:
+            check_remakeable(places.metadata, folder)
+        found = cast(Model, places.load_model(weights))
+        _check_model(config, found, folder)
+        model = Model(found.params, config.model)
+        source = source_of_map(places)
+        sources = [source, *_more(images, places, fps, topic, reading)]
+    is_placed = source.positions is not None
+    require(
+        not is_placed or place_frames is None,
+        f"--place-frames: found {place_frames} for a map with positions, expected --place-radius",
+    )
+    grouping: Any = {"place_radius": place_radius} if is_placed else {"place_frames": place_frames}
+    split = split_images(sources, config.seed, **grouping)
+    count = len(split.training.names)
+    require(count > 1, f"{folder}: found images of {count} place, expected several to tell apart")
+    # Neighbours are not in a batch together.
+    batch = min(config.places_per_batch, max(2, count // 3))
+    config = dataclasses.replace(config, places_per_batch=batch)
+    check_run(out / "run", config)
+    how = f"within {place_radius:g} m" if is_placed else f"of {place_frames} frames"
+    how = how if is_placed or place_frames else "of an image each (--place-frames takes several)"
+    say(f"{folder}: {count} places {how}; {len(split.answers)} images held out")
+    benchmark = held_out_benchmark(config, split, out / "held-out")
+    start = _recall(model, benchmark, config, quiet)
+    say(f"held-out frames: {config.monitor} {100 * start:.1f} before")
+    result = fit(
+        config,
+        with_repeats(split.training, config.images_per_place),
+        out / "run",
+        validation=benchmark,
+        initial=model.params,
+        num_threads=reading.threads,
+        callbacks=callbacks,
+        quiet=reading.quiet,
+        **skip,
+    )
+    if result.steps:
+        finish_run(out / "run", real_path(folder).name, split.training, benchmark)
+    best = result.best_recall or 0.0
+    gained = Adapted(result.steps, (start, best), {}, None, replaced=False)
+    if best > start:
+        file = out / "adapted.safetensors"
+        new = load_weights(out / "run" / "best.safetensors", expected=config.model)
+        save_weights(file, new)
+        for each in benchmarks:
+            before, after = (_firsts(one, each, quiet) for one in (model, new))
+            change = paired_difference(after, before)
+            gained.others[each.name] = float(before.mean()), change
+            name = f"{each.name}: R@1 {100 * before.mean():.1f} before"
+            low, high = change.interval
+            say(f"{name}, {100 * change.mean:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})")
+        kept = all(change.mean >= -most_lost for _, change in gained.others.values())
+        if replace and kept:
+            remake_map(folder, new, weights=file, reading=reading)
+        gained = gained._replace(weights=file, replaced=replace and kept)
+    write_json(out / "adapted.json", to_json(gained))
+    return gained
+
+
+def _check_model(config: TrainConfig, model: Model, folder: pathlib.Path) -> None:
+    """Check that a map's model is what is to be trained, but for dropout and types."""
+    expected = with_non_semantic_fields_of(config.model, model.config)
+    expected = dataclasses.replace(expected, image_size=model.config.image_size)
+    wrong = differences(config.model, expected)
+    require(not wrong, f"{folder}: the map's model is another: {'; '.join(wrong)}")
+
+
+def _more(
+    images: Path | Sequence[Path],
+    places: Map,
+    fps: float | None,
+    topic: str | None,
+    reading: Reading,
+) -> list[ImageSource]:
+    """List more images of a map's place, with positions as the map's."""
+    given = [images] if isinstance(images, str | os.PathLike) else list(images)
+    if not given:
+        return []
+    found = open_sources(given, fps=fps, topic=topic, on_bad_image=reading.on_bad_image)
+    if places.axes is None:
+        return found
+    return [
+        each._replace(positions=each.located().fitted(each.root, places.axes, places.zone))
+        for each in found
+    ]
+
+
+def _evaluated(model: Model, benchmark: Benchmark, reading: Reading) -> GroupingResult:
+    (found,) = evaluate(model, benchmark, groupings=("single",), reading=reading)
+    return found
+
+
+def _firsts(model: Model, benchmark: Benchmark, reading: Reading) -> Bool[np.ndarray, "1 q"]:
+    """Return whether each query's first retrieval is right."""
+    firsts = _evaluated(model, benchmark, reading).firsts
+    assert firsts is not None
+    return firsts
+
+
+def _recall(model: Model, benchmark: Benchmark, config: TrainConfig, reading: Reading) -> float:
+    recalls = _evaluated(model, benchmark, reading).recalls
+    return sum(recalls[k] for k in MONITORED[config.monitor])
+
+
+def to_json(found: Adapted) -> dict[str, Any]:
+    """Return what was gained as JSON values by name."""
+    before, after = found.held_out
+    others = {
+        name: {"before": recall, "change": change.mean, "interval": list(change.interval)}
+        for name, (recall, change) in found.others.items()
+    }
+    return {
+        "steps": found.steps,
+        "held_out": {"before": before, "after": after},
+        "others": others,
+        "weights": None if found.weights is None else str(found.weights),
+        "replaced": found.replaced,
+    }

@@ -1,0 +1,171 @@
+"""Divide the images of a map: places to train on, and held-out frames that ask the rest."""
+
+import collections
+import pathlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from crisalad_jax.data.benchmarks import Benchmark
+from crisalad_jax.data.benchmarks.benchmark import within
+from crisalad_jax.data.frames import sequence_of
+from crisalad_jax.data.images import read_pixels
+from crisalad_jax.data.metres import comparable
+from crisalad_jax.data.places import Places, group_images
+from crisalad_jax.data.positions import AXES
+from crisalad_jax.data.prepare import Preparation
+from crisalad_jax.data.sources import ImageSource, join_sources
+from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.utils.files import atomic_path, wrap_os_errors
+
+SHARE, MOST, COPIES = 0.2, 100, 2
+"""Share of a map's images that is held out, the most of them, and the changed copies of each."""
+
+
+class Split(NamedTuple):
+    """The images of a map, and more of its place, divided."""
+
+    source: ImageSource
+    """All of them, those of the map first."""
+    training: Places
+    """Places of those that are not held out."""
+    answers: dict[int, list[int]]
+    """Held-out image -> its right answers among the others; itself where it has none."""
+    database: list[int]
+    """Images of the map that held-out ones ask."""
+    rule: str
+    """What is a right answer, in words."""
+
+
+def split_images(
+    sources: Sequence[ImageSource],
+    seed: int,
+    *,
+    place_radius: float | None = None,
+    place_frames: int | None = None,
+) -> Split:
+    """Hold out some of a map's images, and make places of the rest.
+
+    Args:
+        sources: the map's images, and more of its place.
+        seed: draws the held-out images.
+        place_radius: metres within which images show the same place.
+        place_frames: number of consecutive images that show it; without both each image is a place.
+
+    Raises:
+        InputError: no place is left.
+    """
+    source, inside = join_sources(sources), len(sources[0].names)
+    if place_radius is not None:
+        near, rule = _near(source, place_radius), f"at most {place_radius:g} m away"
+    elif place_frames is not None:
+        near, rule = _consecutive(source, place_frames), f"within {place_frames - 1} frames"
+    else:
+        near, rule = [[] for _ in source.names], "the image itself"
+    count = min(MOST, max(1, round(SHARE * inside)))
+    held = np.random.default_rng(seed).permutation(inside)[:count].tolist()
+    away = set(held)
+    answers = {
+        image: [each for each in near[image] if each < inside and each not in away] or [image]
+        for image in sorted(held)
+    }
+    database = [each for each in range(inside) if answers.get(each, [each]) == [each]]
+    rest = [each for each in range(len(source.names)) if each not in away]
+    training = group_images(_chosen(source, rest), place_radius, place_frames)
+    return Split(source, training, answers, database, rule)
+
+
+def _chosen(source: ImageSource, numbers: Sequence[int]) -> ImageSource:
+    paths, names = ([each[number] for number in numbers] for each in source[1:3])
+    return source._replace(paths=paths, names=names)
+
+
+def _near(source: ImageSource, radius: float) -> list[list[int]]:
+    """List the others within a radius of each image; none of an image without a position."""
+    near: list[list[int]] = [[] for _ in source.names]
+    if source.positions is None:
+        return near
+    of = source.positions.of
+    placed = [number for number, name in enumerate(source.names) if name in of]
+    points = np.array([of[source.names[number]] for number in placed], np.float64)
+    if source.positions.axes == AXES[1]:
+        points = comparable(*points.T)
+    for image, others in zip(placed, within(points, points, radius), strict=True):
+        near[image] = [placed[other] for other in others if placed[other] != image]
+    return near
+
+
+def _consecutive(source: ImageSource, frames: int) -> list[list[int]]:
+    """List the others of each image's sequence that are less than so many frames away."""
+    sequences = collections.defaultdict[str, list[int]](list)
+    for number, path in enumerate(source.paths):
+        sequences[sequence_of(path)].append(number)
+    near: list[list[int]] = [[] for _ in source.names]
+    for numbers in sequences.values():
+        for place, image in enumerate(numbers):
+            window = numbers[max(0, place - frames + 1) : place + frames]
+            near[image] = [each for each in window if each != image]
+    return near
+
+
+def with_repeats(places: Places, images: int) -> Places:
+    """Name the images of a small place again, in turn, until it has so many.
+
+    A batch then has several augmentations of one image.
+    """
+    counts = np.maximum(places.image_counts, images)
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    files = []
+    for start, own, count in zip(places.place_start, places.image_counts, counts, strict=False):
+        files += [places.files[start + turn % own] for turn in range(count)]
+    return Places(
+        root=places.root,
+        cities=places.cities,
+        files=tuple(files),
+        place_start=starts,
+        place_city=places.place_city,
+        names=places.names,
+        near=places.near,
+    )
+
+
+def held_out_benchmark(config: TrainConfig, split: Split, folder: pathlib.Path) -> Benchmark:
+    """Write augmented copies of the held-out images, and make the set in which they ask the map.
+
+    Args:
+        config: the run's, whose augmentation changes the copies as it changes training images.
+        split: the images.
+        folder: where the copies are written, unless they are there.
+
+    Raises:
+        InputError: an image cannot be read, or the folder not be written to.
+    """
+    model, seed = config.model, config.seed
+    how = Preparation(model.input_size, model.preprocessing.for_training())
+    queries: list[pathlib.Path] = []
+    with wrap_os_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    for image in split.answers:
+        files = [folder / f"{image:06d}-{copy}.png" for copy in range(COPIES)]
+        queries += files
+        if all(file.exists() for file in files):
+            continue
+        path = split.source.paths[image]
+        pixels = how.prepare(read_pixels(path), str(path))
+        for copy, file in enumerate(files):
+            generator = np.random.default_rng((seed, image, copy))
+            changed = config.augmentation.apply(pixels, generator, of_place=generator)
+            with atomic_path(file) as temporary:
+                cv2.imwrite(str(temporary), cv2.cvtColor(changed, cv2.COLOR_RGB2BGR))
+    number = {image: row for row, image in enumerate(split.database)}
+    positives = [np.array([number[each] for each in own]) for own in split.answers.values()]
+    return Benchmark(
+        name="held-out frames",
+        root=folder,
+        database=tuple(split.source.paths[image] for image in split.database),
+        queries=tuple(queries),
+        positives=tuple(own for own in positives for _ in range(COPIES)),
+        rule=split.rule,
+    )

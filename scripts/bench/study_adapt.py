@@ -1,0 +1,91 @@
+"""What a model gains at a place by `crisalad adapt`, and what it loses elsewhere.
+
+    python scripts/bench/study_adapt.py --data SET... [--weights FILE] [--seeds 3] [--frames 3]
+        [--trainable head] [--learning-rate 1e-3] [--epochs 10] [--page docs/how-to/adapt.md]
+
+The database of each set becomes a map, to which the model is adapted once for each seed. Its
+queries, which no step has seen, ask before and after, and so do those of the other sets. Intervals
+are the paired bootstrap's over queries and seeds, of 95 %. `--frames` is of sets without positions.
+"""
+
+import argparse
+import dataclasses
+import os
+import pathlib
+import tempfile
+
+import numpy as np
+from tables import put
+
+from crisalad_jax.checkpoints import starter
+from crisalad_jax.checkpoints.load import load
+from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.evaluation.difference import paired_difference
+from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.experiments.adapt import adapt
+from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.maps.build import index
+from crisalad_jax.training.recipes import recipe
+
+QUIET = Reading(quiet=True)
+
+
+def firsts(model: Model, data: Benchmark) -> np.ndarray:
+    """Whether each query's first answer is right."""
+    (result,) = evaluate(model, data, groupings=["single"], reading=QUIET)
+    assert result.firsts is not None
+    return result.firsts[0]
+
+
+def adapted(model: Model, data: Benchmark, seed: int, given: argparse.Namespace) -> Model | None:
+    """Adapt a model to the database of a set; None where held-out frames gain nothing."""
+    config = recipe("b14", "adapt", model=model.config)
+    changes = {"trainable": given.trainable or config.trainable, "epochs": given.epochs}
+    rate = dataclasses.replace(config.optimiser, learning_rate=given.learning_rate)
+    config = dataclasses.replace(config, **changes, optimiser=rate, seed=seed)
+    frames = None if data.database_positions is not None else given.frames
+    with tempfile.TemporaryDirectory() as folder:
+        out = pathlib.Path(folder)
+        root = pathlib.Path(os.path.commonpath(data.database))
+        index(model, root, out / "map", weights=given.weights, reading=QUIET)
+        found = adapt(config, out / "map", out / "run", place_frames=frames, reading=QUIET)
+        before, after = (f"{100 * each:.1f}" for each in found.held_out)
+        print(
+            f"{data.name}, seed {seed}: {found.steps} steps, held out {before} -> {after}",
+            flush=True,
+        )
+        return None if found.weights is None else load(found.weights)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--data", type=pathlib.Path, nargs="+", required=True)
+    parser.add_argument("--weights", type=pathlib.Path, default=starter.FILE)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--frames", type=int, default=3)
+    parser.add_argument("--trainable")
+    parser.add_argument("--learning-rate", type=float, default=1e-3)
+    parser.add_argument("--epochs", type=int, default=10)
+    parser.add_argument("--page", type=pathlib.Path)
+    given = parser.parse_args()
+    model, sets = load(given.weights), [open_benchmark(each) for each in given.data]
+    before = {data.name: firsts(model, data) for data in sets}
+    lines = ["| adapted to | asked | R@1 before | change of R@1 |", "| --- | --- | ---: | ---: |"]
+    for data in sets:
+        models = [adapted(model, data, seed, given) or model for seed in range(given.seeds)]
+        for asked in sorted(sets, key=lambda each: each is not data):
+            hits = np.stack([firsts(each, asked) for each in models])
+            start = np.stack([before[asked.name]] * len(models))
+            change = paired_difference(hits, start)
+            low, high = (f"{100 * each:+.1f}" for each in change.interval)
+            cells = data.name, "itself" if asked is data else asked.name
+            was, now = f"{100 * start.mean():.1f}", f"{100 * change.mean:+.1f} ({low} to {high})"
+            lines.append(f"| {' | '.join((*cells, was, now))} |")
+            print(lines[-1], flush=True)
+    if given.page is not None:
+        put(given.page, "adapt", "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

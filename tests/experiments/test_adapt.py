@@ -1,0 +1,277 @@
+"""Adaptation to a map's place: what is held out, what is trained, and when the map changes."""
+
+import dataclasses
+import json
+import pathlib
+import shutil
+
+import cv2
+import jax
+import numpy as np
+import pytest
+
+from crisalad_jax.checkpoints.load import load
+from crisalad_jax.checkpoints.weights import model_hash, save_weights
+from crisalad_jax.cli import main
+from crisalad_jax.data.images import read_image
+from crisalad_jax.data.positions import AXES, Positions
+from crisalad_jax.data.reading import Reading
+from crisalad_jax.data.sources import ImageSource, open_source
+from crisalad_jax.experiments import adapt as module
+from crisalad_jax.experiments.adapt import adapt
+from crisalad_jax.experiments.held_out import (
+    COPIES,
+    held_out_benchmark,
+    split_images,
+    with_repeats,
+)
+from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.maps.build import index
+from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.remake import check_remakeable, remake_map
+from crisalad_jax.training.log import read_metrics
+from crisalad_jax.utils.errors import InputError
+from tests.conftest import MODEL, RECIPE, random_params
+
+QUIET = Reading(quiet=True, batch_size=4)
+CONFIG = dataclasses.replace(
+    RECIPE, places_per_batch=2, min_images=2, epochs=2, monitor="R@1", patience=None
+)
+
+
+ANOTHER = dataclasses.replace(CONFIG, model=dataclasses.replace(MODEL, cross_image="none"))
+OTHER = Model(jax.tree.map(lambda leaf: 1.1 * leaf, random_params(MODEL)), MODEL)
+
+
+def in_a_row(folder: pathlib.Path, east: list[float]) -> ImageSource:
+    names = [f"{number}.png" for number in range(len(east))]
+    of = {name: (at, 0.0) for name, at in zip(names, east, strict=True)}
+    return ImageSource(folder, [folder / name for name in names], names, Positions(AXES[0], of))
+
+
+def test_held_out_images_ask_their_neighbours_and_train_nothing(tmp_path) -> None:
+    """On a line; every seed holds out a fifth."""
+    east = [0, 6, 9, 100, 104, 108, 300, 500, 506, 700]
+    source = in_a_row(tmp_path, east)
+    seen = set[int]()
+    for seed in range(20):
+        split = split_images([source], seed, place_radius=10)
+        assert len(split.answers) == 2
+        seen.update(split.answers)
+        trained = {int(file.partition(".")[0]) for file in split.training.files}
+        assert trained == set(range(10)) - set(split.answers)
+        for image, right in split.answers.items():
+            near = {i for i, at in enumerate(east) if i != image and abs(at - east[image]) <= 10}
+            near -= set(split.answers)
+            assert set(right) == (near or {image})
+            assert (image in split.database) == (not near)
+        assert set(split.database) >= trained
+    assert seen == set(range(10))
+
+
+def test_frames_in_order_are_neighbours_in_their_own_folder(tmp_path) -> None:
+    paths = [tmp_path / folder / f"{number}.png" for folder in "ab" for number in range(5)]
+    names = [path.relative_to(tmp_path).as_posix() for path in paths]
+    source = ImageSource(tmp_path, paths, names)
+    for seed in range(20):
+        split = split_images([source], seed, place_frames=3)
+        for image, right in split.answers.items():
+            same = range(0, 5) if image < 5 else range(5, 10)
+            near = [i for i in same if 0 < abs(i - image) < 3 and i not in split.answers]
+            assert right == (near or [image])
+    alone = split_images([source], 0)
+    assert all(right == [image] for image, right in alone.answers.items())
+    assert alone.training.image_counts.tolist() == [1] * 8
+
+
+def test_more_images_train_and_answer_nothing(tmp_path) -> None:
+    first, second = in_a_row(tmp_path / "a", [0, 100, 200]), in_a_row(tmp_path / "b", [1, 99])
+    split = split_images([first, second], 0, place_radius=5)
+    assert [name for name in split.source.names if name.startswith("b/")] == ["b/0.png", "b/1.png"]
+    assert {"b/0.png", "b/1.png"} <= set(split.training.files)
+    assert max(split.database) < 3
+
+
+def test_a_place_of_one_image_has_it_twice(tmp_path) -> None:
+    source = in_a_row(tmp_path, [0, 1, 2, 300, 600, 900, 1200])
+    split = split_images([source], 1, place_radius=5)
+    places = split.training
+    filled = with_repeats(places, 2)
+    for number, name in enumerate(places.names):
+        own, full = (
+            each.files[each.place_start[number] : each.place_start[number + 1]]
+            for each in (places, filled)
+        )
+        assert filled.names[number] == name
+        assert full == (own * 2 if len(own) == 1 else own)
+    assert 1 in places.image_counts
+
+
+def test_held_out_copies_are_the_runs_augmentation(shared, tmp_path) -> None:
+    source = open_source(shared / "town" / "images" / "test" / "database")
+    split = split_images([source], 0)
+    found = held_out_benchmark(CONFIG, split, tmp_path / "held-out")
+    assert len(found.queries) == COPIES * len(split.answers)
+    (image, *_) = split.answers
+    pixels = cv2.resize(read_image(source.paths[image]), MODEL.input_size[::-1])
+    pictures = [read_image(path) for path in found.queries[:COPIES]]
+    assert len({picture.tobytes() for picture in pictures}) == COPIES
+    for picture in pictures:
+        assert picture.shape == pixels.shape
+        assert 0 < np.abs(picture.astype(int) - pixels).mean() < 60
+    stamps = [path.stat().st_mtime_ns for path in found.queries]
+    again = held_out_benchmark(CONFIG, split, tmp_path / "held-out")
+    assert [path.stat().st_mtime_ns for path in again.queries] == stamps
+    other = held_out_benchmark(CONFIG, split, tmp_path / "other")
+    assert [path.read_bytes() for path in other.queries] == [p.read_bytes() for p in found.queries]
+
+
+@pytest.fixture
+def folder(shared, tmp_path) -> pathlib.Path:
+    """A map of images without positions, which the test may change."""
+    work = tmp_path / "images"
+    shutil.copytree(shared / "city" / "Images", work)
+    weights = shared / "weights.safetensors"
+    index(load(weights), work, tmp_path / "map", weights=weights, reading=QUIET)
+    return tmp_path / "map"
+
+
+def forced(monkeypatch: pytest.MonkeyPatch, before: float) -> None:
+    """Let held-out frames recall so much before, whatever they do."""
+    monkeypatch.setattr(module, "_recall", lambda *_: before)
+
+
+def test_what_gains_makes_the_map_anew(shared, folder, tmp_path, monkeypatch) -> None:
+    forced(monkeypatch, -1.0)
+    said: list[str] = []
+    out = tmp_path / "out"
+    how = {"place_frames": 3, "watch": [shared / "town"], "most_lost": 1.0, "replace": True}
+    with Map.open(folder) as old:
+        names, before = [image.name for image in old.images], old.metadata
+    result = adapt(CONFIG, folder, out, **how, reading=QUIET, say=said.append)
+    assert result.weights == out / "adapted.safetensors"
+    assert result.replaced
+    new = load(result.weights)
+    lines = read_metrics(out / "run" / "metrics.jsonl")
+    assert result.steps == len([line for line in lines if "loss" in line])
+    best = max(line["R@1"] for line in lines if "R@1" in line)
+    assert result.held_out == (-1.0, best)
+    ((name, (recall, change)),) = result.others.items()
+    assert name in said[-1]
+    assert 0 <= recall <= 1
+    assert -1 <= change.mean <= 1
+    found = json.loads((out / "adapted.json").read_text())
+    assert found["held_out"] == {"before": -1.0, "after": best}
+    with Map.open(folder) as places:
+        assert [image.name for image in places.images] == names
+        assert places.metadata.model == model_hash(*new) != before.model
+        picture = pathlib.Path(places.images[3].root) / names[3]
+        assert places.locate(picture, k=1)[0].image.name == names[3]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["images", "map", "out"]
+
+
+def test_the_map_stays_where_nothing_is_gained_or_others_lose(
+    shared, folder, tmp_path, monkeypatch
+) -> None:
+    before = (folder / "map.json").read_bytes()
+    forced(monkeypatch, 2.0)
+    result = adapt(CONFIG, folder, tmp_path / "a", replace=True, reading=QUIET)
+    assert (result.weights, result.replaced) == (None, False)
+    assert not (tmp_path / "a" / "adapted.safetensors").exists()
+    forced(monkeypatch, -1.0)
+    lost = {"watch": [shared / "town"], "most_lost": -1.1}  # one that gains less than 1.1 has lost
+    result = adapt(CONFIG, folder, tmp_path / "a", replace=True, **lost, reading=QUIET)
+    assert result.weights is not None
+    assert not result.replaced
+    assert (folder / "map.json").read_bytes() == before
+
+
+def test_the_recall_before_is_that_of_the_maps_model(folder, tmp_path) -> None:
+    """And a run that goes on ends as it did."""
+    config = dataclasses.replace(
+        CONFIG, optimiser=dataclasses.replace(CONFIG.optimiser, learning_rate=1e-12)
+    )
+    result = adapt(config, folder, tmp_path / "out", place_frames=3, reading=QUIET)
+    assert result.held_out[0] == result.held_out[1]  # steps of 1e-12 change no ranking
+    assert result.weights is None
+    assert adapt(config, folder, tmp_path / "out", place_frames=3, reading=QUIET) == result
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"weights": "other"}, "found a map made by model"),
+        ({"config": ANOTHER}, "the map's model is another"),
+        ({"gone": "Brill"}, "gone, expected the image of"),
+        ({"place_frames": 1}, "--place-frames: found 1, expected at least 2"),
+        ({"one": "Aston", "place_frames": 12}, "found images of 1 place, expected several"),
+        ({"place_frames": 3, "watch": ["nowhere"]}, "nowhere"),
+    ],
+)
+def test_what_cannot_be_adapted_is_refused(folder, tmp_path, given, words) -> None:
+    given = dict(given)
+    config = given.pop("config", CONFIG)
+    if given.get("weights"):
+        given["weights"] = tmp_path / "other.safetensors"
+        save_weights(given["weights"], OTHER)
+    if one := given.pop("one", None):
+        folder, file = tmp_path / "one", tmp_path / "map" / "map.json"
+        weights = json.loads(file.read_text())["weights"]
+        index(load(weights), tmp_path / "images" / one, folder, weights=weights, reading=QUIET)
+    if gone := given.pop("gone", None):
+        shutil.rmtree(tmp_path / "images" / gone)
+    with pytest.raises(InputError, match=words):
+        adapt(config, folder, tmp_path / "out", **given, reading=QUIET)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command(shared, folder, tmp_path, capsys) -> None:
+    call = ["adapt", "--map", str(folder), "--out", str(tmp_path / "out"), "--quiet", "--epochs"]
+    call += ["1", "--places-per-batch", "2", "--optimiser.learning-rate", "1e-12"]
+    assert main([*call, "--place-frames", "3", "--json", str(tmp_path / "found.json")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "images held out" in said
+    assert "no better after" in said
+    assert json.loads((tmp_path / "found.json").read_text())["weights"] is None
+    assert main([*call, "--place-frames", "0"]) == 2
+    assert "--place-frames: found 0" in capsys.readouterr().err
+
+
+def test_a_map_is_remade_or_stays(folder, tmp_path, monkeypatch) -> None:
+    model = OTHER
+    weights = tmp_path / "new.safetensors"
+    save_weights(weights, model)
+    with Map.open(folder) as places:
+        image = places.images[5]
+        days = [part.added for part in places.images.parts]
+    path = pathlib.Path(image.root) / image.name
+    whole = path.read_bytes()
+    path.write_bytes(b"x" * len(whole))
+    mine = tmp_path / "map.old"
+    mine.mkdir()
+    before = sorted(each.name for each in tmp_path.iterdir())
+    digest = (folder / "map.json").read_bytes()
+    with pytest.raises(InputError, match=image.name):
+        remake_map(folder, model, weights=weights, reading=QUIET)
+    assert (folder / "map.json").read_bytes() == digest
+    assert sorted(each.name for each in tmp_path.iterdir()) == before
+    path.write_bytes(whole)
+    # Killed between the two renames: the same call goes on.
+    folder.rename(tmp_path / ".map.before-remake")
+    assert remake_map(folder, model, weights=weights, reading=QUIET) == 24
+    assert sorted(each.name for each in tmp_path.iterdir()) == before
+    with Map.open(folder) as places:
+        assert places.metadata.model == model_hash(*model)
+        assert [part.added for part in places.images.parts] == days
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [({"store": "milvus:a.db"}, "store milvus:a.db"), ({"pca": "abc"}, "components abc")],
+)
+def test_a_map_that_cannot_be_remade_is_refused(folder, change, words) -> None:
+    with Map.open(folder) as places:
+        check_remakeable(places.metadata, folder)
+        metadata = dataclasses.replace(places.metadata, **change)
+    with pytest.raises(InputError, match=words):
+        check_remakeable(metadata, folder)
