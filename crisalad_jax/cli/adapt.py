@@ -4,7 +4,7 @@ import pathlib
 from collections.abc import Sequence
 from typing import Annotated, Any
 
-from crisalad_jax.cli.common import console, pick
+from crisalad_jax.cli.common import console, find_given, pick
 from crisalad_jax.cli.flags import FOLDER, FrameFlags, JsonFlag, PluginFlag, ReadFlags
 from crisalad_jax.config.flags import find_flag, parse_settings, with_settings
 from crisalad_jax.retrieval.maps.metadata import existing_metadata, model_config
@@ -25,8 +25,9 @@ class Adapt(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
     images: tuple[pathlib.Path, ...] = ()
     """More images of the place to train on, such as those of another day; they don't join the
     map."""
-    place_radius: float = 10.0
-    """Metres from a place's centre, within which its images are, for a map with positions."""
+    place_radius: float | None = None
+    """Metres from a place's centre, within which its images are, for a map with positions; by
+    default 10."""
     place_frames: int | None = None
     """Number of consecutive images that are a place, for a map without positions; by default each
     image is one, seen under two augmentations."""
@@ -62,12 +63,13 @@ def run(arguments: Adapt) -> dict[str, Any]:
     from crisalad_jax.experiments.adapt import adapt, to_json
 
     config: TrainConfig = arguments.settings
-    names = ("weights", "images", "place_radius", "place_frames", "watch", "most_lost", "replace")
+    names = ("images", "place_radius", "place_frames", "watch", "most_lost", "replace")
     result = adapt(
         config,
         arguments.map,
         arguments.out,
         say=lambda line: console.print(line, soft_wrap=True),
+        weights=find_given(arguments.weights, quiet=arguments.quiet),
         **pick(arguments, *names, "fps", "topic", "reading"),
     )
     before, after = result.held_out

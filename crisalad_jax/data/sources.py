@@ -45,7 +45,7 @@ from crisalad_jax.data.tables import Disk
 from crisalad_jax.data.tracks import Track
 from crisalad_jax.data.video import count_frames, list_frames, name_frame
 from crisalad_jax.utils.errors import InputError
-from crisalad_jax.utils.files import check_source, read_text
+from crisalad_jax.utils.files import check_source, read_text, real_path
 from crisalad_jax.utils.output import warn
 
 _FORMS = (
@@ -238,9 +238,9 @@ def join_sources(sources: Sequence[ImageSource]) -> ImageSource:
     placed: dict[pathlib.Path, tuple[float, float] | None] = {}
     for source in sources:
         of = {} if source.positions is None else source.positions.of
-        for name, path in zip(source.names, source.paths, strict=True):
-            placed.setdefault(pathlib.Path(os.path.abspath(path)), of.get(name))
-    root = pathlib.Path(os.path.commonpath([os.path.abspath(each.root) for each in sources]))
+        for name in source.names:
+            placed.setdefault(real_path(source.root) / name, of.get(name))
+    root = pathlib.Path(os.path.commonpath([real_path(each.root) for each in sources]))
     names = names_in(root, list(placed))
     known = [each.positions for each in sources if each.positions is not None]
     kinds = {(each.axes, each.zone) for each in known}

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from crisalad_jax.checkpoints.runtime import read_header
 from crisalad_jax.checkpoints.weights import load_weights, save_weights
 from crisalad_jax.config.checks import PATH, require, takes
 from crisalad_jax.config.io import differences
@@ -20,7 +21,12 @@ from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.evaluation.difference import Difference, paired_difference
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.evaluation.results import GroupingResult
-from crisalad_jax.experiments.held_out import held_out_benchmark, split_images, with_repeats
+from crisalad_jax.experiments.held_out import (
+    count_apart,
+    held_out_benchmark,
+    split_images,
+    with_repeats,
+)
 from crisalad_jax.experiments.train import finish_run
 from crisalad_jax.nn.model import Model
 from crisalad_jax.retrieval.maps.map import Map
@@ -30,6 +36,7 @@ from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.run_files import check_run
 from crisalad_jax.training.validation import MONITORED
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path, write_json
 from crisalad_jax.utils.shapes import Bool
 
@@ -59,9 +66,9 @@ def adapt(
     *,
     weights: Path | None = None,
     images: Path | Sequence[Path] = (),
-    place_radius: float = 10.0,
+    place_radius: float | None = None,
     place_frames: int | None = None,
-    watch: Sequence[Path] = (),
+    watch: Path | Sequence[Path] = (),
     most_lost: float = 0.005,
     replace: bool = False,
     fps: float | None = None,
@@ -84,10 +91,11 @@ def adapt(
         weights: the map's weights, where they are no longer at the path that it says.
         images: more images of the place to train on, as `extract` takes them; they don't join the
             map.
-        place_radius: metres from a place's centre, within which its images are.
+        place_radius: metres from a place's centre, within which its images are, for a map with
+            positions; None is 10.
         place_frames: number of consecutive images that are a place, for a map without positions.
         watch: evaluation sets of other places, whose recall is compared before and after.
-        most_lost: most that the Recall@1 of a watched set may fall, as a fraction; the map is not
+        most_lost: most that the Recall@1 of a watched set may fall, a fraction; the map is not
             replaced where it falls more.
         replace: whether to make the map anew by the adapted model; see `remake_map`.
         fps: frames a second taken of videos and logs among `images`.
@@ -101,8 +109,9 @@ def adapt(
 
     Raises:
         InputError: another model than the map's; images that are gone; `place_frames` for a map
-            with positions; too few images; `replace` for a map that cannot be made anew; what
-            `open_sources`, `open_benchmark` and `fit` raise.
+            with positions, or `place_radius` for one without; too few images; `out` within the map;
+            `replace` for a map that cannot be made anew, or that was; what `open_sources`,
+            `open_benchmark` and `fit` raise.
         Interrupted: the same call resumes.
 
     Example:
@@ -119,14 +128,23 @@ def adapt(
     """
     out, folder = pathlib.Path(out), pathlib.Path(folder)
     check_grouping(place_radius, place_frames)
+    require(0 <= most_lost <= 1, f"--most-lost: found {most_lost:g}, expected 0 to 1")
+    require(config.cities is None, "cities: found some for a map, expected None")
+    inside = real_path(out).is_relative_to(real_path(folder))
+    require(not inside, f"{out}: found in the map {folder}, expected a folder beside it")
     skip: Any = {"on_bad_image": reading.on_bad_image}
     quiet = dataclasses.replace(reading, quiet=True)
-    benchmarks = [open_benchmark(each, **skip) for each in watch]
+    benchmarks = [open_benchmark(each, **skip) for each in _several(watch)]
+    names = [each.name for each in benchmarks]
+    require(len(set(names)) == len(names), f"--watch: found {', '.join(names)}, expected each once")
     for each in benchmarks:
         each.ground_truth()
     with Map.open(folder, calibrated=False) as places:
         if replace:
-            check_remakeable(places.metadata, folder)
+            check_remakeable(folder)
+        file = out / "adapted.safetensors"
+        if file.exists() and read_header(file)["model_sha256"] == places.metadata.model:
+            raise InputError(f"{folder}: found the map made by {file} already; see adapted.json")
         found = cast(Model, places.load_model(weights))
         _check_model(config, found, folder)
         model = Model(found.params, config.model)
@@ -137,17 +155,23 @@ def adapt(
         not is_placed or place_frames is None,
         f"--place-frames: found {place_frames} for a map with positions, expected --place-radius",
     )
-    grouping: Any = {"place_radius": place_radius} if is_placed else {"place_frames": place_frames}
+    require(
+        is_placed or place_radius is None,
+        f"--place-radius: found {place_radius} for a map without positions, expected none",
+    )
+    radius = 10.0 if place_radius is None else place_radius
+    grouping: Any = {"place_radius": radius} if is_placed else {"place_frames": place_frames}
     split = split_images(sources, config.seed, **grouping)
     count = len(split.training.names)
     require(count > 1, f"{folder}: found images of {count} place, expected several to tell apart")
-    # Neighbours are not in a batch together.
-    batch = min(config.places_per_batch, max(2, count // 3))
+    batch = min(config.places_per_batch, max(2, count_apart(split.training) // 2))
     config = dataclasses.replace(config, places_per_batch=batch)
     check_run(out / "run", config)
-    how = f"within {place_radius:g} m" if is_placed else f"of {place_frames} frames"
-    how = how if is_placed or place_frames else "of an image each (--place-frames takes several)"
-    say(f"{folder}: {count} places {how}; {len(split.answers)} images held out")
+    how = "of an image each (--place-frames takes several)"
+    if is_placed or place_frames is not None:
+        how = f"within {radius:g} m" if is_placed else f"of {place_frames} frames"
+    held = f"{len(split.answers)} images held out"
+    say(f"{folder}: {count} places {how}, {batch} of them in a batch; {held}")
     benchmark = held_out_benchmark(config, split, out / "held-out")
     start = _recall(model, benchmark, config, quiet)
     say(f"held-out frames: {config.monitor} {100 * start:.1f} before")
@@ -167,7 +191,6 @@ def adapt(
     best = result.best_recall or 0.0
     gained = Adapted(result.steps, (start, best), {}, None, replaced=False)
     if best > start:
-        file = out / "adapted.safetensors"
         new = load_weights(out / "run" / "best.safetensors", expected=config.model)
         save_weights(file, new)
         for each in benchmarks:
@@ -177,18 +200,29 @@ def adapt(
             name = f"{each.name}: R@1 {100 * before.mean():.1f} before"
             low, high = change.interval
             say(f"{name}, {100 * change.mean:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})")
-        kept = all(change.mean >= -most_lost for _, change in gained.others.values())
-        if replace and kept:
-            remake_map(folder, new, weights=file, reading=reading)
-        gained = gained._replace(weights=file, replaced=replace and kept)
+        gained = gained._replace(weights=file)
     write_json(out / "adapted.json", to_json(gained))
+    lost = [
+        name for name, (_, change) in gained.others.items() if round(-change.mean, 9) > most_lost
+    ]
+    if replace and lost:
+        say(f"{folder} stays: {', '.join(lost)} lost more than {100 * most_lost:g} (--most-lost)")
+    if replace and gained.weights is not None and not lost:
+        remake_map(folder, new, weights=gained.weights, reading=reading)
+        gained = gained._replace(replaced=True)
+        write_json(out / "adapted.json", to_json(gained))
     return gained
+
+
+def _several(given: Path | Sequence[Path]) -> list[Path]:
+    return [given] if isinstance(given, str | os.PathLike) else list(given)
 
 
 def _check_model(config: TrainConfig, model: Model, folder: pathlib.Path) -> None:
     """Check that a map's model is what is to be trained, but for dropout and types."""
     expected = with_non_semantic_fields_of(config.model, model.config)
-    expected = dataclasses.replace(expected, image_size=model.config.image_size)
+    prepared = {name: getattr(model.config, name) for name in ("image_size", "preprocessing")}
+    expected = dataclasses.replace(expected, **prepared)
     wrong = differences(config.model, expected)
     require(not wrong, f"{folder}: the map's model is another: {'; '.join(wrong)}")
 
@@ -201,15 +235,17 @@ def _more(
     reading: Reading,
 ) -> list[ImageSource]:
     """List more images of a map's place, with positions as the map's."""
-    given = [images] if isinstance(images, str | os.PathLike) else list(images)
+    given = _several(images)
     if not given:
         return []
     found = open_sources(given, fps=fps, topic=topic, on_bad_image=reading.on_bad_image)
     if places.axes is None:
         return found
+    axes, zone = places.axes, places.zone
+    fitted = [each.located().fitted(each.root, axes, zone) for each in found]
     return [
-        each._replace(positions=each.located().fitted(each.root, places.axes, places.zone))
-        for each in found
+        each._replace(positions=at._replace(axes=axes, zone=zone))
+        for each, at in zip(found, fitted, strict=True)
     ]
 
 
@@ -226,6 +262,8 @@ def _firsts(model: Model, benchmark: Benchmark, reading: Reading) -> Bool[np.nda
 
 
 def _recall(model: Model, benchmark: Benchmark, config: TrainConfig, reading: Reading) -> float:
+    size = config.validation_size or config.model.image_size
+    model = Model(model.params, dataclasses.replace(config.model, image_size=size))
     recalls = _evaluated(model, benchmark, reading).recalls
     return sum(recalls[k] for k in MONITORED[config.monitor])
 

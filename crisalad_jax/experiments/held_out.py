@@ -1,6 +1,7 @@
 """Divide the images of a map: places to train on, and held-out frames that ask the rest."""
 
 import collections
+import dataclasses
 import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,6 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from crisalad_jax.config.checks import require
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.benchmarks.benchmark import within
 from crisalad_jax.data.frames import sequence_of
@@ -55,9 +57,10 @@ def split_images(
         place_frames: number of consecutive images that show it; without both each image is a place.
 
     Raises:
-        InputError: no place is left.
+        InputError: the map has one image, or no place is left.
     """
     source, inside = join_sources(sources), len(sources[0].names)
+    require(inside > 1, f"{source.root}: found a map of one image, expected several to tell apart")
     if place_radius is not None:
         near, rule = _near(source, place_radius), f"at most {place_radius:g} m away"
     elif place_frames is not None:
@@ -78,7 +81,7 @@ def split_images(
 
 
 def _chosen(source: ImageSource, numbers: Sequence[int]) -> ImageSource:
-    paths, names = ([each[number] for number in numbers] for each in source[1:3])
+    paths, names = ([of[number] for number in numbers] for of in (source.paths, source.names))
     return source._replace(paths=paths, names=names)
 
 
@@ -120,15 +123,16 @@ def with_repeats(places: Places, images: int) -> Places:
     files = []
     for start, own, count in zip(places.place_start, places.image_counts, counts, strict=False):
         files += [places.files[start + turn % own] for turn in range(count)]
-    return Places(
-        root=places.root,
-        cities=places.cities,
-        files=tuple(files),
-        place_start=starts,
-        place_city=places.place_city,
-        names=places.names,
-        near=places.near,
-    )
+    return dataclasses.replace(places, files=tuple(files), place_start=starts, views=None)
+
+
+def count_apart(places: Places) -> int:
+    """Count places that may be in one batch: each in turn that none before it is near."""
+    taken = set[int]()
+    for place in range(len(places.names)):
+        if places.near is None or taken.isdisjoint(places.near[place].tolist()):
+            taken.add(place)
+    return len(taken)
 
 
 def held_out_benchmark(config: TrainConfig, split: Split, folder: pathlib.Path) -> Benchmark:
@@ -137,7 +141,7 @@ def held_out_benchmark(config: TrainConfig, split: Split, folder: pathlib.Path) 
     Args:
         config: the run's, whose augmentation changes the copies as it changes training images.
         split: the images.
-        folder: where the copies are written, unless they are there.
+        folder: where the copies are written.
 
     Raises:
         InputError: an image cannot be read, or the folder not be written to.
@@ -150,8 +154,6 @@ def held_out_benchmark(config: TrainConfig, split: Split, folder: pathlib.Path) 
     for image in split.answers:
         files = [folder / f"{image:06d}-{copy}.png" for copy in range(COPIES)]
         queries += files
-        if all(file.exists() for file in files):
-            continue
         path = split.source.paths[image]
         pixels = how.prepare(read_pixels(path), str(path))
         for copy, file in enumerate(files):

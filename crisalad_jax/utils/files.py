@@ -1,6 +1,7 @@
 """Read regular files, and write files so that a reader never sees half of one."""
 
 import contextlib
+import ctypes
 import io
 import json
 import os
@@ -394,6 +395,20 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     with _renamed_to(path, temporary):
         temporary.mkdir()
         yield temporary
+
+
+def exchange(first: pathlib.Path, second: pathlib.Path) -> None:
+    """Give two folders each other's names at once, by Linux's `renameat2`.
+
+    Raises:
+        InputError: the system or the file system has no such call; both stay as they are.
+    """
+    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    here, both = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of <fcntl.h> and <linux/fs.h>
+    given = here, os.fsencode(first), here, os.fsencode(second), both
+    if call is None or call(*given) != 0:
+        why = "no renameat2" if call is None else os.strerror(ctypes.get_errno())
+        raise InputError(f"{second}: could not exchange it with {first} ({why})")
 
 
 def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> None:

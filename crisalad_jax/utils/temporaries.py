@@ -45,11 +45,11 @@ _made: list[pathlib.Path] = []
 
 
 @contextlib.contextmanager
-def in_use(path: pathlib.Path) -> Iterator[pathlib.Path]:
+def in_use(path: pathlib.Path) -> Iterator[None]:
     """Remove a temporary file or folder after the block, or when a signal ends the process."""
     _in_use.add(path)
     try:
-        yield path
+        yield
     finally:
         _remove(path)
         _in_use.discard(path)

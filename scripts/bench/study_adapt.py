@@ -10,7 +10,6 @@ are the paired bootstrap's over queries and seeds, of 95 %. `--frames` is of set
 
 import argparse
 import dataclasses
-import os
 import pathlib
 import tempfile
 
@@ -20,6 +19,7 @@ from tables import put
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import load
 from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
+from crisalad_jax.data.positions import AXES, Positions
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.difference import paired_difference
 from crisalad_jax.evaluation.evaluate import evaluate
@@ -41,14 +41,27 @@ def firsts(model: Model, data: Benchmark) -> np.ndarray:
 def adapted(model: Model, data: Benchmark, seed: int, given: argparse.Namespace) -> Model | None:
     """Adapt a model to the database of a set; None where held-out frames gain nothing."""
     config = recipe("b14", "adapt", model=model.config)
-    changes = {"trainable": given.trainable or config.trainable, "epochs": given.epochs}
-    rate = dataclasses.replace(config.optimiser, learning_rate=given.learning_rate)
-    config = dataclasses.replace(config, **changes, optimiser=rate, seed=seed)
-    frames = None if data.database_positions is not None else given.frames
+    rate = given.learning_rate or config.optimiser.learning_rate
+    config = dataclasses.replace(
+        config,
+        trainable=given.trainable or config.trainable,
+        optimiser=dataclasses.replace(config.optimiser, learning_rate=rate),
+        epochs=given.epochs,
+        seed=seed,
+    )
     with tempfile.TemporaryDirectory() as folder:
         out = pathlib.Path(folder)
-        root = pathlib.Path(os.path.commonpath(data.database))
-        index(model, root, out / "map", weights=given.weights, reading=QUIET)
+        images = [str(path.resolve()) for path in data.database]
+        (out / "images.txt").write_text("\n".join(images))
+        at = data.database_positions
+        frames = given.frames if at is None else None
+        # Names of a list are relative to its folder, or to the root of the file system.
+        positions = None
+        if at is not None:
+            names = [name.removeprefix("/") for name in images]
+            positions = Positions(AXES[0], dict(zip(names, map(tuple, at.tolist()), strict=True)))
+        how = {"weights": given.weights, "positions": positions, "reading": QUIET}
+        index(model, out / "images.txt", out / "map", **how)
         found = adapt(config, out / "map", out / "run", place_frames=frames, reading=QUIET)
         before, after = (f"{100 * each:.1f}" for each in found.held_out)
         print(
@@ -65,7 +78,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--frames", type=int, default=3)
     parser.add_argument("--trainable")
-    parser.add_argument("--learning-rate", type=float, default=1e-3)
+    parser.add_argument("--learning-rate", type=float)
     parser.add_argument("--epochs", type=int, default=10)
     parser.add_argument("--page", type=pathlib.Path)
     given = parser.parse_args()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import pathlib
 import shutil
 
@@ -21,15 +22,21 @@ from crisalad_jax.experiments import adapt as module
 from crisalad_jax.experiments.adapt import adapt
 from crisalad_jax.experiments.held_out import (
     COPIES,
+    Split,
     held_out_benchmark,
     split_images,
     with_repeats,
 )
 from crisalad_jax.nn.model import Model
+from crisalad_jax.retrieval.extract import extract
+from crisalad_jax.retrieval.maps import remake
+from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.map import Map
+from crisalad_jax.retrieval.maps.metadata import existing_metadata
 from crisalad_jax.retrieval.maps.remake import check_remakeable, remake_map
 from crisalad_jax.training.log import read_metrics
+from crisalad_jax.utils import files
 from crisalad_jax.utils.errors import InputError
 from tests.conftest import MODEL, RECIPE, random_params
 
@@ -119,11 +126,15 @@ def test_held_out_copies_are_the_runs_augmentation(shared, tmp_path) -> None:
     for picture in pictures:
         assert picture.shape == pixels.shape
         assert 0 < np.abs(picture.astype(int) - pixels).mean() < 60
-    stamps = [path.stat().st_mtime_ns for path in found.queries]
+    asked = [image for image in split.answers for _ in range(COPIES)]
+    for query, image, right in zip(found.queries, asked, found.positives, strict=True):
+        assert query.name.startswith(f"{image:06d}-")
+        paths = [found.database[number] for number in right]
+        assert paths == [source.paths[number] for number in split.answers[image]]
+    bits = [path.read_bytes() for path in found.queries]
+    found.queries[0].write_bytes(b"of another run")
     again = held_out_benchmark(CONFIG, split, tmp_path / "held-out")
-    assert [path.stat().st_mtime_ns for path in again.queries] == stamps
-    other = held_out_benchmark(CONFIG, split, tmp_path / "other")
-    assert [path.read_bytes() for path in other.queries] == [p.read_bytes() for p in found.queries]
+    assert [path.read_bytes() for path in again.queries] == bits
 
 
 @pytest.fixture
@@ -179,8 +190,18 @@ def test_the_map_stays_where_nothing_is_gained_or_others_lose(
     assert (result.weights, result.replaced) == (None, False)
     assert not (tmp_path / "a" / "adapted.safetensors").exists()
     forced(monkeypatch, -1.0)
-    lost = {"watch": [shared / "town"], "most_lost": -1.1}  # one that gains less than 1.1 has lost
+    (start, *_) = jax.tree.leaves(load(shared / "weights.safetensors").params)
+
+    def firsts(model: Model, *_: object) -> np.ndarray:
+        """All right before, and one of four wrong after."""
+        is_start = np.array_equal(jax.tree.leaves(model.params)[0], start)
+        return np.array([[True, True, True, is_start]])
+
+    monkeypatch.setattr(module, "_firsts", firsts)
+    lost = {"watch": [shared / "town"], "most_lost": 0.24}
     result = adapt(CONFIG, folder, tmp_path / "a", replace=True, **lost, reading=QUIET)
+    ((recall, change),) = result.others.values()
+    assert (recall, change.mean) == (1, -0.25)
     assert result.weights is not None
     assert not result.replaced
     assert (folder / "map.json").read_bytes() == before
@@ -203,6 +224,9 @@ def test_the_recall_before_is_that_of_the_maps_model(folder, tmp_path) -> None:
         ({"weights": "other"}, "found a map made by model"),
         ({"config": ANOTHER}, "the map's model is another"),
         ({"gone": "Brill"}, "gone, expected the image of"),
+        ({"place_radius": 5.0}, "--place-radius: found 5.0 for a map without positions"),
+        ({"most_lost": 1.5}, "--most-lost: found 1.5, expected 0 to 1"),
+        ({"inside": True}, "found in the map"),
         ({"place_frames": 1}, "--place-frames: found 1, expected at least 2"),
         ({"one": "Aston", "place_frames": 12}, "found images of 1 place, expected several"),
         ({"place_frames": 3, "watch": ["nowhere"]}, "nowhere"),
@@ -220,12 +244,13 @@ def test_what_cannot_be_adapted_is_refused(folder, tmp_path, given, words) -> No
         index(load(weights), tmp_path / "images" / one, folder, weights=weights, reading=QUIET)
     if gone := given.pop("gone", None):
         shutil.rmtree(tmp_path / "images" / gone)
+    out = (folder if given.pop("inside", False) else tmp_path) / "out"
     with pytest.raises(InputError, match=words):
-        adapt(config, folder, tmp_path / "out", **given, reading=QUIET)
-    assert not (tmp_path / "out").exists()
+        adapt(config, folder, out, **given, reading=QUIET)
+    assert not out.exists()
 
 
-def test_the_command(shared, folder, tmp_path, capsys) -> None:
+def test_the_command(folder, tmp_path, capsys) -> None:
     call = ["adapt", "--map", str(folder), "--out", str(tmp_path / "out"), "--quiet", "--epochs"]
     call += ["1", "--places-per-batch", "2", "--optimiser.learning-rate", "1e-12"]
     assert main([*call, "--place-frames", "3", "--json", str(tmp_path / "found.json")]) == 0
@@ -237,41 +262,109 @@ def test_the_command(shared, folder, tmp_path, capsys) -> None:
     assert "--place-frames: found 0" in capsys.readouterr().err
 
 
-def test_a_map_is_remade_or_stays(folder, tmp_path, monkeypatch) -> None:
-    model = OTHER
-    weights = tmp_path / "new.safetensors"
-    save_weights(weights, model)
-    with Map.open(folder) as places:
-        image = places.images[5]
+@pytest.fixture
+def placed(shared, tmp_path) -> pathlib.Path:
+    """A map in float16 of two folders, with positions, and a search that is approximate."""
+    weights = shared / "weights.safetensors"
+    for number, city in enumerate(("Aston", "Brill")):
+        images = shutil.copytree(shared / "city" / "Images" / city, tmp_path / city)
+        names = [path.name for path in sorted(images.iterdir())]
+        of = {name: (float(i), 100.0 * number) for i, name in enumerate(names)}
+        given = {"weights": weights, "positions": Positions(AXES[0], of), "dtype": "float16"}
+        search = "hnsw" if number else None
+        index(load(weights), images, tmp_path / "map", **given, search=search, reading=QUIET)
+    return tmp_path / "map"
+
+
+def test_a_map_is_made_anew_with_all_that_it_had(placed, tmp_path) -> None:
+    weights = tmp_path / "other.safetensors"
+    save_weights(weights, OTHER)
+    with Map.open(placed) as places:
+        images, kind = list(places.images), places.search_kind
         days = [part.added for part in places.images.parts]
-    path = pathlib.Path(image.root) / image.name
-    whole = path.read_bytes()
-    path.write_bytes(b"x" * len(whole))
-    mine = tmp_path / "map.old"
-    mine.mkdir()
-    before = sorted(each.name for each in tmp_path.iterdir())
-    digest = (folder / "map.json").read_bytes()
-    with pytest.raises(InputError, match=image.name):
-        remake_map(folder, model, weights=weights, reading=QUIET)
-    assert (folder / "map.json").read_bytes() == digest
-    assert sorted(each.name for each in tmp_path.iterdir()) == before
-    path.write_bytes(whole)
-    # Killed between the two renames: the same call goes on.
-    folder.rename(tmp_path / ".map.before-remake")
-    assert remake_map(folder, model, weights=weights, reading=QUIET) == 24
-    assert sorted(each.name for each in tmp_path.iterdir()) == before
-    with Map.open(folder) as places:
-        assert places.metadata.model == model_hash(*model)
+    (tmp_path / ".map.remake").mkdir()  # of a call that was killed
+    before = sorted(path.name for path in tmp_path.iterdir())
+    assert remake_map(placed, OTHER, weights=weights, reading=QUIET) == 24
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted({*before} - {".map.remake"})
+    with Map.open(placed) as places:
+        assert list(places.images) == images
         assert [part.added for part in places.images.parts] == days
+        assert (places.search_kind, places.metadata.dtype) == (kind, "float16")
+        assert places.metadata.model == model_hash(*OTHER)
+        found = places.descriptors_of([image.name for image in images])
+    paths = [pathlib.Path(image.root) / image.name for image in images]
+    _, expected, _ = extract(OTHER, paths, tmp_path / "d.npy", reading=QUIET)
+    # Half a unit of float16 in the last place, of numbers up to 1.
+    np.testing.assert_allclose(found, expected, atol=2**-11)
+
+
+def test_a_map_stays_where_it_cannot_be_made_anew(placed, tmp_path, monkeypatch) -> None:
+    weights = tmp_path / "other.safetensors"
+    save_weights(weights, OTHER)
+    path = tmp_path / "Aston" / sorted(os.listdir(tmp_path / "Aston"))[2]
+    whole = path.read_bytes()
+    digest = (placed / "map.json").read_bytes()
+    before = sorted(each.name for each in tmp_path.iterdir())
+    skip = dataclasses.replace(QUIET, on_bad_image="skip")
+
+    def fails(words: str) -> None:
+        with pytest.raises(InputError, match=words):
+            remake_map(placed, OTHER, weights=weights, reading=skip)
+        assert (placed / "map.json").read_bytes() == digest
+        assert sorted(each.name for each in tmp_path.iterdir()) == before
+
+    path.write_bytes(b"x" * len(whole))
+    fails(path.name)
+    path.write_bytes(whole[:-1])
+    fails(f"{path.name}: found {len(whole) - 1} bytes, expected the image of {len(whole)}")
+    path.write_bytes(whole)
+    (placed / "added").mkdir()
+    fails("found added beside the map")
+    (placed / "added").rmdir()
+    monkeypatch.setattr(files.ctypes, "CDLL", lambda *_, **__: object())
+    fails("could not exchange it")
+    monkeypatch.undo()
+    with (
+        open_for_appending(placed, existing_metadata(placed)),
+        pytest.raises(InputError, match="another process that writes"),
+    ):
+        remake_map(placed, OTHER, weights=weights, reading=QUIET)
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [({"store": "milvus:a.db"}, "store milvus:a.db"), ({"pca": "abc"}, "components abc")],
+    [({"store": "milvus:a.db"}, "descriptors in milvus:a.db"), ({"pca": "abc"}, "components")],
 )
-def test_a_map_that_cannot_be_remade_is_refused(folder, change, words) -> None:
-    with Map.open(folder) as places:
-        check_remakeable(places.metadata, folder)
-        metadata = dataclasses.replace(places.metadata, **change)
+def test_a_map_of_another_kind_is_refused(folder, monkeypatch, change, words) -> None:
+    metadata = dataclasses.replace(check_remakeable(folder), **change)
+    monkeypatch.setattr(remake, "existing_metadata", lambda _: metadata)
     with pytest.raises(InputError, match=words):
-        check_remakeable(metadata, folder)
+        check_remakeable(folder)
+
+
+def test_more_images_are_those_of_the_map_once(placed, tmp_path, monkeypatch) -> None:
+    """Also by another name of their folder; with positions of the map's kind."""
+    (tmp_path / "link").symlink_to(tmp_path / "Aston")
+    (first, *_), (second, *_) = (sorted(os.listdir(tmp_path / city)) for city in ("Aston", "Brill"))
+    shutil.copytree(tmp_path / "Brill", tmp_path / "more")
+    for name, folder, picture in (("one", "link", first), ("two", "more", second)):
+        table = tmp_path / folder / f"{name}.csv"
+        table.write_text(f"name,east,north\n{picture},50,50\n")
+    seen: list[Split] = []
+
+    class Stop(Exception):
+        pass
+
+    def split(*arguments: object, **options: object) -> Split:
+        seen.append(split_images(*arguments, **options))
+        raise Stop
+
+    monkeypatch.setattr(module, "split_images", split)
+    tables = [tmp_path / "link" / "one.csv", tmp_path / "more" / "two.csv"]
+    with pytest.raises(Stop):
+        adapt(CONFIG, placed, tmp_path / "out", images=tables, reading=QUIET)
+    source = seen[0].source
+    assert len(source.names) == 25
+    assert source.positions is not None
+    assert source.positions.of[f"more/{second}"] == (50, 50)
+    assert source.positions.of[f"Aston/{first}"] == (0, 0)

@@ -1,5 +1,6 @@
 """Describe a map's images anew by another model, and put that map in the old one's place."""
 
+import dataclasses
 import os
 import pathlib
 import shutil
@@ -10,19 +11,25 @@ import numpy as np
 
 from crisalad_jax.config.checks import require
 from crisalad_jax.data.reading import Reading
-from crisalad_jax.data.remote import for_each, size_of
+from crisalad_jax.data.remote import address_of, for_each, size_of
 from crisalad_jax.data.sources import ImageSource, join_sources
 from crisalad_jax.retrieval.describe import described
 from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.retrieval.maps.appending import open_for_appending
-from crisalad_jax.retrieval.maps.calibration import CALIBRATION
+from crisalad_jax.retrieval.maps.approximate import FOLDER
 from crisalad_jax.retrieval.maps.images import NewImages
 from crisalad_jax.retrieval.maps.map import Map
-from crisalad_jax.retrieval.maps.metadata import MapMetadata, existing_metadata, new_metadata
-from crisalad_jax.utils.files import wrap_os_errors
+from crisalad_jax.retrieval.maps.metadata import (
+    METADATA,
+    SEGMENTS,
+    MapMetadata,
+    existing_metadata,
+    new_metadata,
+)
+from crisalad_jax.utils.files import exchange, real_path
 from crisalad_jax.utils.output import warn
 from crisalad_jax.utils.progress import progress_bar
-from crisalad_jax.utils.temporaries import in_use, temporary_beside
+from crisalad_jax.utils.temporaries import LOCK, in_use, is_temporary
 
 if TYPE_CHECKING:
     from crisalad_jax.nn.model import Model
@@ -40,13 +47,7 @@ def source_of_map(places: Map) -> ImageSource:
     Raises:
         InputError: a file is gone or has another size; or folders of which one is at an address.
     """
-    paths = [pathlib.Path(image.root) / image.name for image in places.images]
-    for path, size, image in zip(paths, for_each(size_of, paths), places.images, strict=True):
-        require(
-            size == image.bytes,
-            f"{places.folder}: found {path} {'gone' if size is None else f'of {size} bytes'}, "
-            f"expected the image of {image.bytes} bytes that was indexed",
-        )
+    check_images(places)
     roots: dict[str, list[str]] = {}
     for image in places.images:
         roots.setdefault(image.root, []).append(image.name)
@@ -62,21 +63,48 @@ def source_of_map(places: Map) -> ImageSource:
     return join_sources(sources)
 
 
-def check_remakeable(metadata: MapMetadata, folder: str | os.PathLike[str]) -> None:
-    """Check that `remake_map` can make a map anew.
+def check_images(places: Map) -> None:
+    """Check that a map's images are where they were indexed.
 
     Raises:
-        InputError: its descriptors are in Milvus, or components shorten them.
+        InputError: one is gone, or has another size.
     """
-    for name, found, expected in (
-        ("store", metadata.store, "files"),
-        ("components", metadata.pca[:12] or "none", "none: they were fitted to its descriptors"),
-    ):
+    paths = [pathlib.Path(image.root) / image.name for image in places.images]
+    for path, size, image in zip(paths, for_each(size_of, paths), places.images, strict=True):
+        found = "it gone" if size is None else f"{size} bytes"
         require(
-            found == expected.partition(":")[0],
-            f"{folder}: found a map of {name} {found}, expected {expected} (`crisalad index` makes "
-            "another map)",
+            size == image.bytes,
+            f"{address_of(path)}: found {found}, expected the image of {image.bytes} bytes that "
+            f"{places.folder} describes",
         )
+
+
+def check_remakeable(folder: str | os.PathLike[str]) -> MapMetadata:
+    """Check that `remake_map` can make the map in a folder anew, and return its metadata.
+
+    Raises:
+        InputError: its descriptors are in Milvus, components shorten them, or the folder holds
+            other files too, such as pictures that a service was sent, which would be lost.
+    """
+    folder, metadata = pathlib.Path(folder), existing_metadata(folder)
+    advice = "`crisalad index` makes another map"
+    require(
+        metadata.store == "files",
+        f"{folder}: found descriptors in {metadata.store}, expected files ({advice})",
+    )
+    require(
+        not metadata.pca,
+        f"{folder}: found components, which were fitted to its descriptors, expected none "
+        f"({advice})",
+    )
+    own = {METADATA, SEGMENTS, LOCK, FOLDER, *(path.name for path in folder.glob("calibration*"))}
+    found = {path.name for path in folder.iterdir() if not is_temporary(path)}
+    others = sorted(found - own)
+    require(
+        not others,
+        f"{folder}: found {', '.join(others)} beside the map, expected the map alone ({advice})",
+    )
+    return metadata
 
 
 def remake_map(
@@ -88,21 +116,23 @@ def remake_map(
 ) -> int:
     """Describe a map's images anew by another model, and put that map in the old one's place.
 
-    The old map stays until the new one is whole, so a call that is killed leaves one of the two,
-    and the same call goes on. Positions, folders, days and the kind of search stay. A calibration
-    does not, nor what the map knows of images that were removed.
+    The two change places at once when the new map is whole, so that a call that is killed leaves
+    one of them. Positions, folders, days and the kind of search stay. A calibration does not, nor
+    what the map knows of images that were removed. A service that is running goes on with the old
+    one.
 
     Args:
         folder: the map's.
         model: what describes the images.
         weights: the file of the model, which queries load by default.
-        reading: how images are read.
+        reading: how images are read; each must be readable.
 
     Returns:
         The number of images.
 
     Raises:
-        InputError: what `check_remakeable`, `source_of_map`, `extract` and `Map.open` raise.
+        InputError: an image is gone, changed or cannot be read; another process writes into the
+            map; the file system cannot exchange two folders; what `check_remakeable` raises.
 
     Example:
         >>> import jax
@@ -118,19 +148,18 @@ def remake_map(
         >>> remake_map(folder / "map", models[1], **second)
         4
     """
-    folder = pathlib.Path(os.path.abspath(folder))
-    old = folder.with_name(f".{folder.name}.before-remake")
-    with wrap_os_errors(folder):
-        if old.exists() and not folder.exists():  # killed between the two names
-            old.rename(folder)
-    existing = existing_metadata(folder)
-    check_remakeable(existing, folder)
+    folder = real_path(folder)
+    existing = check_remakeable(folder)
     describer = describer_of(model)
     metadata = new_metadata(describer, weights, folder, dtype=existing.dtype)
+    reading = dataclasses.replace(reading, on_bad_image="stop")
     with Map.open(folder, calibrated=False) as places:
-        source_of_map(places)
+        check_images(places)
         kind = places.stale_search or places.search_kind
-    with open_for_appending(folder, existing) as places, in_use(temporary_beside(folder)) as new:
+    calibrated = any(folder.glob("calibration*"))
+    new = folder.with_name(f".{folder.name}.remake")
+    with open_for_appending(folder, existing) as places, in_use(new):
+        shutil.rmtree(new, ignore_errors=True)  # of a call that was killed
         with (
             open_for_appending(new, metadata) as target,
             progress_bar("images", len(places), "images", quiet=reading.quiet) as bar,
@@ -139,23 +168,17 @@ def remake_map(
             def parts() -> Iterator[NewImages]:
                 for part in places.parts():
                     paths = [pathlib.Path(part.root) / name for name in part.names]
-                    valid = np.zeros(len(paths), bool)
                     rows = np.zeros((len(paths), metadata.descriptor_length), np.float32)
                     for batch in described(describer, paths, reading):
                         rows[batch.indices] = batch.descriptors
-                        valid[batch.indices] = True
                         bar.advance(len(batch.indices))
-                    yield part._replace(descriptors=rows).only(valid.tolist())
+                    yield part._replace(descriptors=rows)
 
             target.change("merge", added=parts())
             count = len(target)
             if kind != "exact":
                 target.build_search(kind, quiet=reading.quiet)
-        with wrap_os_errors(folder):
-            shutil.rmtree(old, ignore_errors=True)
-            folder.rename(old)
-            new.rename(folder)
-    if (old / CALIBRATION).exists():
+        exchange(new, folder)  # the old map, now called `new`, is removed
+    if calibrated:
         warn(f"{folder}: its least similarity is no longer known; `crisalad calibrate` measures it")
-    shutil.rmtree(old, ignore_errors=True)
     return count
