@@ -1,7 +1,7 @@
 """What a model gains at a place by `crisalad adapt`, and what it loses elsewhere.
 
     python scripts/bench/study_adapt.py --data SET... [--weights FILE] [--seeds 3] [--frames 3]
-        [--trainable head] [--learning-rate 1e-3] [--epochs 10] [--page docs/how-to/adapt.md]
+        [--trainable head] [--learning-rate 1e-3] [--epochs 10]
 
 The database of each set becomes a map, to which the model is adapted once for each seed. Its
 queries, which no step has seen, ask before and after, and so do those of the other sets. Intervals
@@ -14,7 +14,6 @@ import pathlib
 import tempfile
 
 import numpy as np
-from tables import put
 
 from crisalad_jax.checkpoints import starter
 from crisalad_jax.checkpoints.load import load
@@ -80,11 +79,10 @@ def main() -> None:
     parser.add_argument("--trainable")
     parser.add_argument("--learning-rate", type=float)
     parser.add_argument("--epochs", type=int, default=10)
-    parser.add_argument("--page", type=pathlib.Path)
     given = parser.parse_args()
     model, sets = load(given.weights), [open_benchmark(each) for each in given.data]
     before = {data.name: firsts(model, data) for data in sets}
-    lines = ["| adapted to | asked | R@1 before | change of R@1 |", "| --- | --- | ---: | ---: |"]
+    print("| adapted to | asked | R@1 before | change of R@1 |\n| --- | --- | ---: | ---: |")
     for data in sets:
         models = [adapted(model, data, seed, given) or model for seed in range(given.seeds)]
         for asked in sorted(sets, key=lambda each: each is not data):
@@ -94,10 +92,7 @@ def main() -> None:
             low, high = (f"{100 * each:+.1f}" for each in change.interval)
             cells = data.name, "itself" if asked is data else asked.name
             was, now = f"{100 * start.mean():.1f}", f"{100 * change.mean:+.1f} ({low} to {high})"
-            lines.append(f"| {' | '.join((*cells, was, now))} |")
-            print(lines[-1], flush=True)
-    if given.page is not None:
-        put(given.page, "adapt", "\n".join(lines))
+            print(f"| {' | '.join((*cells, was, now))} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -149,7 +149,7 @@ def test_no_command_prints_the_usage(capfd):
         ("help querry", r"found no command 'querry'; did you mean query\? \("),
         ("xyz", "found no command 'xyz'; expected demo, render, train, .*, completion"),
         ("info --preset b16", "preset: found 'b16', expected one of b14, g14, l14, s14, tiny"),
-        ("train --data d --out o --recipe dbow", "recipe: found 'dbow', expected one of anyloc"),
+        ("train --data d --out o --recipe dbow", "recipe: found 'dbow', expected one of adapt"),
         ("train --data d --out o --recipe salad --config c", "--recipe: found with --config"),
         ("train --data d --out o --epoch 3", "--epochs"),  # perhaps you meant
         ("info --plugin --quiet", "--plugin: found no value, expected FILE.py or MODULE"),

@@ -277,7 +277,7 @@ def test_a_part_alone_is_told():
     assert swapped.model.aggregator.sinkhorn.step.part_name == "newton"
     assert swapped.optimiser == recipe("b14", "salad").optimiser
     for name in ("crisalad+crisalad", "gem+salad", "crisalad+", "eigenplaces"):
-        with pytest.raises(InputError, match=r"^recipe: found '.*', expected one of anyloc"):
+        with pytest.raises(InputError, match=r"^recipe: found '.*', expected one of adapt"):
             recipe("tiny", name)
 
 
