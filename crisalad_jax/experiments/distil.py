@@ -111,12 +111,13 @@ def distil(
     taught = dataclasses.replace(kind, teacher_dim=teacher.config.descriptor_dim)
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, kind=taught))
     source: Any = data
+    frames: Any = {"fps": fps, "topic": topic}
     if images is not None:
-        frames: Any = {"fps": fps, "topic": topic}
         listed = open_sources(images, **frames, on_bad_image=skip)
         source = group_images(join_sources(listed))
     how: Any = {"on_bad_image": skip, "quiet": reading.quiet}
     sets: Any = {"validation": validation, "validation_images": validation_images}
+    sets |= frames if images is None else {}  # which `read_places` refuses
     places, benchmark, initial = read_inputs(config, source, out, weights=weights, **sets, **how)
     assert isinstance(places, Places)
     count, batch = len(places.names), config.places_per_batch

@@ -152,6 +152,8 @@ def test_what_does_not_fit_is_refused(shared, teacher, tmp_path) -> None:
     images, out = shared / "city" / "Images", tmp_path / "run"
     with pytest.raises(InputError, match="--images, --data: found both, expected one"):
         distil(STUDENT, teacher, images, out, data=shared / "city")
+    with pytest.raises(InputError, match="--place-frames, and --fps or --topic with either"):
+        distil(STUDENT, teacher, None, out, data=shared / "city", fps=2.0)
     with pytest.raises(InputError, match="loss: found multi-similarity, expected distil"):
         distil(RECIPE, teacher, images, out)
     places = read_places(shared / "city", min_images=2)
