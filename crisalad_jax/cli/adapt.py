@@ -21,7 +21,7 @@ class Adapt(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
     """Folder for adapted.safetensors, the run and what was measured."""
     settings: Any
     weights: pathlib.Path | None = None
-    """Weights that made the map, if they are no longer where they were."""
+    """Weights that made the map, if they were moved since."""
     images: tuple[pathlib.Path, ...] = ()
     """More images of the place to train on, such as those of another day; they don't join the
     map."""
@@ -36,7 +36,7 @@ class Adapt(ReadFlags, FrameFlags, PluginFlag, JsonFlag):
     most_lost: float = 0.005
     """Most that Recall@1 of a watched set may fall, as a fraction; else the map is not replaced."""
     replace: bool = False
-    """Make the map anew by the adapted model; the old one stays until the new one is whole."""
+    """Rebuild the map with the adapted model; the old map stays until the new one is complete."""
 
 
 def parse(program: str, arguments: Sequence[str]) -> Adapt:
@@ -78,6 +78,6 @@ def run(arguments: Adapt) -> dict[str, Any]:
         words += f", no better after ({100 * after:.1f}); the map's model stays"
     else:
         words += f" before, {100 * after:.1f} after; the adapted model is {result.weights}"
-        words += "; the map is made anew" if result.replaced else ""
+        words += "; the map is rebuilt" if result.replaced else ""
     console.print(f"{arguments.out}: {words}", soft_wrap=True)
     return {"out": str(arguments.out), **to_json(result)}

@@ -20,7 +20,6 @@ from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.evaluation.difference import Difference, paired_difference
 from crisalad_jax.evaluation.evaluate import evaluate
-from crisalad_jax.evaluation.results import GroupingResult
 from crisalad_jax.experiments.held_out import (
     count_apart,
     held_out_benchmark,
@@ -35,7 +34,7 @@ from crisalad_jax.training.callbacks import Callback
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.training.loop import fit
 from crisalad_jax.training.run_files import check_run
-from crisalad_jax.training.validation import MONITORED
+from crisalad_jax.training.validation import Validator
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import real_path, write_json
 from crisalad_jax.utils.shapes import Bool
@@ -55,7 +54,7 @@ class Adapted(NamedTuple):
     weights: pathlib.Path | None
     """The adapted weights; None where held-out frames gained nothing."""
     replaced: bool
-    """Whether the map was made anew by them."""
+    """Whether the map was rebuilt with them."""
 
 
 @takes(config=TrainConfig, folder=PATH, out=PATH)
@@ -88,7 +87,7 @@ def adapt(
         config: how to train, usually `recipe(name="adapt", model=...)` with the map's model.
         folder: the map, whose images must be where they were indexed.
         out: folder for the run, the held-out pictures and `adapted.safetensors`.
-        weights: the map's weights, where they are no longer at the path that it says.
+        weights: the map's weights, if they were moved; None is the path that the map records.
         images: more images of the place to train on, as `extract` takes them; they don't join the
             map.
         place_radius: metres from a place's centre, within which its images are, for a map with
@@ -97,7 +96,7 @@ def adapt(
         watch: evaluation sets of other places, whose recall is compared before and after.
         most_lost: most that the Recall@1 of a watched set may fall, a fraction; the map is not
             replaced where it falls more.
-        replace: whether to make the map anew by the adapted model; see `remake_map`.
+        replace: whether to rebuild the map with the adapted model; see `remake_map`.
         fps: frames a second taken of videos and logs among `images`.
         topic: the topic of images in a log among `images`.
         reading: how images are read.
@@ -110,8 +109,8 @@ def adapt(
     Raises:
         InputError: another model than the map's; images that are gone; `place_frames` for a map
             with positions, or `place_radius` for one without; too few images; `out` within the map;
-            `replace` for a map that cannot be made anew, or that was; what `open_sources`,
-            `open_benchmark` and `fit` raise.
+            `replace` for a map that cannot be rebuilt; a map that was rebuilt with `out`'s weights;
+            what `open_sources`, `open_benchmark` and `fit` raise.
         Interrupted: the same call resumes.
 
     Example:
@@ -134,7 +133,8 @@ def adapt(
     require(not inside, f"{out}: found in the map {folder}, expected a folder beside it")
     skip: Any = {"on_bad_image": reading.on_bad_image}
     quiet = dataclasses.replace(reading, quiet=True)
-    benchmarks = [open_benchmark(each, **skip) for each in _several(watch)]
+    watched = [watch] if isinstance(watch, str | os.PathLike) else watch
+    benchmarks = [open_benchmark(each, **skip) for each in watched]
     names = [each.name for each in benchmarks]
     require(len(set(names)) == len(names), f"--watch: found {', '.join(names)}, expected each once")
     for each in benchmarks:
@@ -164,6 +164,7 @@ def adapt(
     split = split_images(sources, config.seed, **grouping)
     count = len(split.training.names)
     require(count > 1, f"{folder}: found images of {count} place, expected several to tell apart")
+    # Neighbours never share a batch; half of those apart leaves the sampler a choice.
     batch = min(config.places_per_batch, max(2, count_apart(split.training) // 2))
     config = dataclasses.replace(config, places_per_batch=batch)
     check_run(out / "run", config)
@@ -173,7 +174,7 @@ def adapt(
     held = f"{len(split.answers)} images held out"
     say(f"{folder}: {count} places {how}, {batch} of them in a batch; {held}")
     benchmark = held_out_benchmark(config, split, out / "held-out")
-    start = _recall(model, benchmark, config, quiet)
+    start = _recall(model, benchmark, config, reading)
     say(f"held-out frames: {config.monitor} {100 * start:.1f} before")
     result = fit(
         config,
@@ -214,10 +215,6 @@ def adapt(
     return gained
 
 
-def _several(given: Path | Sequence[Path]) -> list[Path]:
-    return [given] if isinstance(given, str | os.PathLike) else list(given)
-
-
 def _check_model(config: TrainConfig, model: Model, folder: pathlib.Path) -> None:
     """Check that a map's model is what is to be trained, but for dropout and types."""
     expected = with_non_semantic_fields_of(config.model, model.config)
@@ -235,10 +232,9 @@ def _more(
     reading: Reading,
 ) -> list[ImageSource]:
     """List more images of a map's place, with positions as the map's."""
-    given = _several(images)
-    if not given:
+    if not images:
         return []
-    found = open_sources(given, fps=fps, topic=topic, on_bad_image=reading.on_bad_image)
+    found = open_sources(images, fps=fps, topic=topic, on_bad_image=reading.on_bad_image)
     if places.axes is None:
         return found
     axes, zone = places.axes, places.zone
@@ -249,23 +245,17 @@ def _more(
     ]
 
 
-def _evaluated(model: Model, benchmark: Benchmark, reading: Reading) -> GroupingResult:
-    (found,) = evaluate(model, benchmark, groupings=("single",), reading=reading)
-    return found
-
-
 def _firsts(model: Model, benchmark: Benchmark, reading: Reading) -> Bool[np.ndarray, "1 q"]:
     """Return whether each query's first retrieval is right."""
-    firsts = _evaluated(model, benchmark, reading).firsts
-    assert firsts is not None
-    return firsts
+    (found,) = evaluate(model, benchmark, groupings=("single",), reading=reading)
+    assert found.firsts is not None
+    return found.firsts
 
 
 def _recall(model: Model, benchmark: Benchmark, config: TrainConfig, reading: Reading) -> float:
-    size = config.validation_size or config.model.image_size
-    model = Model(model.params, dataclasses.replace(config.model, image_size=size))
-    recalls = _evaluated(model, benchmark, reading).recalls
-    return sum(recalls[k] for k in MONITORED[config.monitor])
+    """Return what the run's validations monitor, as they measure it."""
+    as_in_fit = Reading(on_bad_image=reading.on_bad_image, quiet=True)
+    return Validator(config, benchmark, as_in_fit).validate(model.params).monitored
 
 
 def to_json(found: Adapted) -> dict[str, Any]:

@@ -397,13 +397,18 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
         yield temporary
 
 
+def _renameat2() -> Any:
+    """Return Linux's call of that name; None on other systems."""
+    return getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+
+
 def exchange(first: pathlib.Path, second: pathlib.Path) -> None:
     """Give two folders each other's names at once, by Linux's `renameat2`.
 
     Raises:
         InputError: the system or the file system has no such call; both stay as they are.
     """
-    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    call = _renameat2()
     here, both = -100, 2  # AT_FDCWD and RENAME_EXCHANGE of <fcntl.h> and <linux/fs.h>
     given = here, os.fsencode(first), here, os.fsencode(second), both
     if call is None or call(*given) != 0:

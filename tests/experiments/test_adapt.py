@@ -321,8 +321,9 @@ def test_a_map_stays_where_it_cannot_be_made_anew(placed, tmp_path, monkeypatch)
     (placed / "added").mkdir()
     fails("found added beside the map")
     (placed / "added").rmdir()
-    monkeypatch.setattr(files.ctypes, "CDLL", lambda *_, **__: object())
-    fails("could not exchange it")
+    for call, why in ((None, "no renameat2"), (lambda *_: -1, "")):
+        monkeypatch.setattr(files, "_renameat2", lambda call=call: call)
+        fails(f"could not exchange it with .*{why}")
     monkeypatch.undo()
     with (
         open_for_appending(placed, existing_metadata(placed)),

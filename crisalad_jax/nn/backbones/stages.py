@@ -97,7 +97,7 @@ def _compute_in_parts(
     """Call `run` on some images at a time, where no gradient is asked for.
 
     A gradient is of the whole batch: XLA has no fast convolutions for the backward pass in a loop
-    (ResNet-18 of width 32 took 14 s in parts, 0.9 s whole).
+    (16 images through a ResNet-18 of width 32: 13.8 s in parts, 0.8 s whole).
     """
     # A part takes some images of every device's: a batch's first axis is spread over them.
     split = images.reshape(-1, parts, *images.shape[1:]).swapaxes(0, 1)

@@ -1,4 +1,4 @@
-"""Describe a map's images anew by another model, and put that map in the old one's place."""
+"""Rebuild a map with another model, and exchange it with the old one when it is complete."""
 
 import dataclasses
 import os
@@ -80,7 +80,7 @@ def check_images(places: Map) -> None:
 
 
 def check_remakeable(folder: str | os.PathLike[str]) -> MapMetadata:
-    """Check that `remake_map` can make the map in a folder anew, and return its metadata.
+    """Check that `remake_map` can rebuild the map in a folder, and return its metadata.
 
     Raises:
         InputError: its descriptors are in Milvus, components shorten them, or the folder holds
@@ -114,12 +114,12 @@ def remake_map(
     weights: str | os.PathLike[str],
     reading: Reading = Reading(),
 ) -> int:
-    """Describe a map's images anew by another model, and put that map in the old one's place.
+    """Rebuild a map by describing its images with another model.
 
-    The two change places at once when the new map is whole, so that a call that is killed leaves
-    one of them. Positions, folders, days and the kind of search stay. A calibration does not, nor
-    what the map knows of images that were removed. A service that is running goes on with the old
-    one.
+    The new map is exchanged with the old one in a single step when it is complete, so a call that
+    is killed leaves one of them. Positions, folders, days and the kind of search are preserved. The
+    calibration and the record of removed images are not. A running service continues with the old
+    map.
 
     Args:
         folder: the map's.
@@ -136,7 +136,7 @@ def remake_map(
 
     Example:
         >>> import jax
-        >>> from crisalad_jax import PRESETS, Map, Model, Reading, index, init_crisalad
+        >>> from crisalad_jax import PRESETS, Model, Reading, index, init_crisalad
         >>> from crisalad_jax import save_weights
         >>> config, quiet = PRESETS["tiny"], Reading(quiet=True)
         >>> models = [Model(init_crisalad(jax.random.key(seed), config), config) for seed in (0, 1)]
