@@ -18,7 +18,7 @@ from crisalad_jax.utils.output import counted
 
 
 class Render(JsonFlag, QuietFlag):
-    """Render a world of streets, corridors and country: places to train on, and others to test."""
+    """Render a world of streets, rooms, country and more: places to train on, others to test."""
 
     out: Annotated[pathlib.Path, FOLDER]
     """Folder for the world: train/ in the layout of GSV-Cities, test/ in that of
@@ -40,6 +40,8 @@ class Render(JsonFlag, QuietFlag):
     varied: tuple[Variation, ...] = VARIATIONS
     """What changes between the training images of a place, besides paint. Test images change in all
     of these."""
+    hard: float = WorldConfig.hard
+    """Share of the images that are taken from far aside, turned, or through a crowd."""
     seed: int = WorldConfig.seed
     """Draws the world."""
 

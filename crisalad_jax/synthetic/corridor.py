@@ -1,4 +1,4 @@
-"""One place indoors: a corridor, a hall or a tunnel, with all that stands and hangs in it."""
+"""One place indoors: a corridor, a hall or a room, with all that stands and hangs in it."""
 
 from typing import NamedTuple
 
@@ -44,14 +44,46 @@ class _Box(NamedTuple):
 
 def corridor(rng: Rng) -> Place:
     """Build a corridor; one in four is a wide hall with columns."""
-    mesh = Mesh(_EYE)
-    mesh.layer = GROUND_LAYER + 1  # walls and ceiling, before all that stands in the corridor
     hall = rng.random() < 0.25
     width = rng.uniform(5.0, 16.0) if hall else rng.uniform(1.5, 4.2)
     height = rng.uniform(3.0, 8.0) if hall else rng.uniform(2.2, 3.4)
     length = rng.uniform(14.0, 50.0)
     left = -width * rng.uniform(0.3, 0.7)
     box = _Box(left, left + width, height, length)
+    mesh = _shell(rng, box)
+    if hall or rng.random() < 0.15:
+        _columns(mesh, rng, box)
+    if rng.random() < 0.5:
+        _hanging(mesh, rng, box)
+    return _place(mesh, rng, box, step=rng.uniform(1.2, 2.5))
+
+
+def room(rng: Rng) -> Place:
+    """Build a room: a wide box with things along its end, too, and furniture on its floor."""
+    width, length = rng.uniform(3.5, 10.0), rng.uniform(7.0, 13.0)
+    left = -width * rng.uniform(0.3, 0.7)
+    box = _Box(left, left + width, rng.uniform(2.3, 4.2), length)
+    mesh = _shell(rng, box)
+    end = mesh.front(0.0, length, 0, layer=GROUND_LAYER + 1)
+    _stains(end, rng, pick(rng, WALLS), box)
+    _along_wall(end, rng, box.left + 0.2, box.right, box.height)
+    for z in sorted(rng.uniform(1.5, length - 0.5, int(rng.integers(3, 14))), reverse=True):
+        _stand(mesh.at(rng.uniform(box.left + 0.5, box.right - 0.5), z), rng)
+    return _place(mesh, rng, box, step=(length - 3.0) / 3.5)
+
+
+def _place(mesh: Mesh, rng: Rng, box: _Box, step: float) -> Place:
+    """Draw where cameras stand and look, for a place inside a box."""
+    lateral = min(0.8, 0.12 * (box.right - box.left))
+    reach = Reach((0.5, min(1.9, box.height - 0.4)), lateral, forward=0.3, step=step)
+    heading, lanes = rng.uniform(-12, 12), (box.left, box.left, box.right, box.right)
+    return Place(mesh.scene(), heading, lanes, reach, indoors=True, traffic=False)
+
+
+def _shell(rng: Rng, box: _Box) -> Mesh:
+    """Build floor, ceiling, end and side walls, with what is on them."""
+    mesh, height, length = Mesh(_EYE), box.height, box.length
+    mesh.layer = GROUND_LAYER + 1  # walls and ceiling, before all that stands in the corridor
     walls = [pick(rng, WALLS), pick(rng, WALLS)]
     if rng.random() < 0.7:
         walls[1] = walls[0]
@@ -69,15 +101,8 @@ def corridor(rng: Rng) -> Place:
             front.add(rects(_START, 0, length, band), dado)
             front.add(rects(_START, band, length, band + 0.06), skirting)
         front.add(rects(_START, 0, length, 0.12), skirting)
-        _along_wall(front, rng, box)
-    if hall or rng.random() < 0.15:
-        _columns(mesh, rng, box)
-    if rng.random() < 0.5:
-        _hanging(mesh, rng, box)
-    lateral = min(0.8, 0.12 * width)
-    reach = Reach((0.5, min(1.9, height - 0.4)), lateral, forward=0.3, step=rng.uniform(1.2, 2.5))
-    heading, lanes = rng.uniform(-12, 12), (box.left, box.left, box.right, box.right)
-    return Place(mesh.scene(), heading, lanes, reach, indoors=True, traffic=False)
+        _along_wall(front, rng, _START, length, height)
+    return mesh
 
 
 def _floor(mesh: Mesh, rng: Rng, box: _Box) -> None:
@@ -202,18 +227,19 @@ def _stains(front: Mesh, rng: Rng, wall: Colour, box: _Box) -> None:
         front.add(spots, rng.uniform(0.75, 1.2) * wall)
 
 
-def _along_wall(front: Mesh, rng: Rng, box: _Box) -> None:
+def _along_wall(front: Mesh, rng: Rng, start: float, stop: float, height: float) -> None:
     """Add doors, windows, boards and furniture along one wall, each at its place."""
     doors, trim = pick(rng, _WOOD), 0.9 * pick(rng, _WOOD)
     # What recurs in this corridor; the distances, and what comes between, make the place.
     kinds = ("door", "recess", "window", "board", "pillar", "cupboard", "bench", "box")
     kinds += ("opening", "pipe")
     weights = rng.dirichlet(np.full(len(kinds), 0.7))
-    top = min(2.1, box.height - 0.15)
-    z = _START + rng.uniform(0.0, 2.0)
-    while z < box.length - 1.2:
+    top = min(2.1, height - 0.15)
+    u = start + rng.uniform(0.0, 2.0)
+    while u < stop - 1.2:
         kind = rng.choice(kinds, p=weights)
-        here = front.at(z, 0.0, layer=GROUND_LAYER - 1 - z * 1e-3)  # after both walls
+        z = float(front.world(np.array((u, 0.0, 0.0)))[2])
+        here = front.at(u, 0.0, layer=GROUND_LAYER - 1 - z * 1e-3)  # after all walls
         wide = rng.uniform(0.75, 1.1)
         if kind == "door":
             _door(here, rng, wide, top, doors, trim)
@@ -227,7 +253,7 @@ def _along_wall(front: Mesh, rng: Rng, box: _Box) -> None:
             here.add(rects(wide * 0.5, 0, wide, top * 1.05), inner)
         elif kind == "window":
             wide *= rng.uniform(1.0, 2.0)
-            sill, high = rng.uniform(0.5, 1.2), box.height - rng.uniform(0.2, 0.7)
+            sill, high = rng.uniform(0.5, 1.2), height - rng.uniform(0.2, 0.7)
             here.add(rects(-0.08, sill - 0.1, wide + 0.08, high + 0.08), trim)
             here.add(rects(0, sill, wide, high), (1.0, 1.0, 1.0), Kind.WINDOW)
             panes = np.linspace(0, wide, int(rng.integers(1, 4)) + 1)[1:-1]
@@ -237,13 +263,13 @@ def _along_wall(front: Mesh, rng: Rng, box: _Box) -> None:
             wide *= rng.uniform(0.5, 1.8)
             here.add(rects(0, v, wide, v + tall), pick(rng, SIGNS + WALLS, 0.2))
             n = int(rng.integers(0, 9))
-            u, w = rng.uniform(0, 0.7, n) * wide, v + rng.uniform(0, 0.7, n) * tall
-            notes = rects(u, w, u + 0.25 * wide, w + 0.25 * tall)
+            left, low = rng.uniform(0, 0.7, n) * wide, v + rng.uniform(0, 0.7, n) * tall
+            notes = rects(left, low, left + 0.25 * wide, low + 0.25 * tall)
             here.add(notes[: n // 2], pick(rng, SIGNS, 0.3))
             here.add(notes[n // 2 :], (0.9, 0.9, 0.88))
         else:
-            _furniture(front.at(z, 0.0, layer=z), rng, kind, wide, box.height)
-        z += wide + rng.exponential(1.6) + 0.15
+            _furniture(front.at(u, 0.0, layer=z), rng, kind, wide, height)
+        u += wide + rng.exponential(1.6) + 0.15
 
 
 def _door(here: Mesh, rng: Rng, wide: float, top: float, doors: Colour, trim: Colour) -> None:
@@ -280,6 +306,36 @@ def _furniture(here: Mesh, rng: Rng, kind: str, wide: float, height: float) -> N
     here.boxes(rect, out, colour)
     if kind == "cupboard":
         here.add(bars(wide / 2, 0.02, 0.05, rect[3] - 0.05, 0.45), 0.6 * colour)
+
+
+def _stand(foot: Mesh, rng: Rng) -> None:
+    """Add what stands free on a floor: a table, a chair, a shelf, a plant or a lamp."""
+    colour = pick(rng, _WOOD + SIGNS)
+    half, deep, tall = rng.uniform(0.2, 0.9), rng.uniform(0.4, 1.2), rng.uniform(0.4, 0.8)
+    kind = draw_kind(rng, table=0.35, chair=0.25, chest=0.2, plant=0.1, lamp=0.1)
+    if kind == "table":
+        legs = np.array((-half + 0.05, half - 0.05))
+        foot.add(bars(legs, 0.03, 0, tall, deep), 0.7 * colour)
+        foot.block((-half, tall, 0), (half, tall + 0.06, deep), colour)
+        foot.add(bars(legs, 0.03, 0, tall), 0.7 * colour)
+        if rng.random() < 0.5:
+            u = rng.uniform(-half, 0.5 * half)
+            foot.add(rects(u, tall, u + 0.4, tall + rng.uniform(0.1, 0.4), 0.2), pick(rng, SIGNS))
+    elif kind == "chair":
+        foot.block((-0.22, 0.35, 0), (0.22, 0.45, 0.45), colour)
+        foot.add(bars(np.array((-0.19, 0.19)), 0.03, 0, 0.4), 0.7 * colour)
+        foot.add(rects(-0.22, 0.4, 0.22, 0.95, rng.choice((0.0, 0.45))), 0.9 * colour)
+    elif kind == "chest":
+        foot.block((-half, 0, 0), (half, 2 * tall, deep / 2), colour)
+        shelves = np.linspace(0, 2 * tall, int(rng.integers(2, 6)))[1:-1]
+        foot.add(rects(-half, shelves - 0.02, half, shelves + 0.02), 0.6 * colour)
+    elif kind == "plant":
+        foot.add(bars(0, 0.15, 0, 0.3), colour)
+        for x, y, radius in rng.uniform((-0.2, 0.5, 0.1), (0.2, 1.2, 0.3), (7, 3)):
+            foot.add(discs(x, y, radius), (0.18, 0.34 * rng.uniform(0.7, 1.2), 0.16), Kind.NEEDLE)
+    else:
+        foot.add(bars(0, 0.02, 0, 1.5), (0.2, 0.2, 0.2))
+        foot.add(bars(0, 0.2, 1.4, 1.7, top=0.12), (0.96, 0.92, 0.8), Kind.LAMP)
 
 
 def _columns(mesh: Mesh, rng: Rng, box: _Box) -> None:

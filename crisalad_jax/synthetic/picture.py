@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from crisalad_jax.config.checks import require
-from crisalad_jax.synthetic.corridor import corridor
+from crisalad_jax.synthetic.corridor import corridor, room
 from crisalad_jax.synthetic.country import country
 from crisalad_jax.synthetic.light import (
     GLOW,
@@ -20,6 +20,7 @@ from crisalad_jax.synthetic.light import (
     shining,
 )
 from crisalad_jax.synthetic.mesh import GROUND_LAYER, Kind, Place, Rng, Scene
+from crisalad_jax.synthetic.shapes import shapes
 from crisalad_jax.synthetic.street import street
 from crisalad_jax.synthetic.things import build_passers
 from crisalad_jax.synthetic.view import (
@@ -33,7 +34,7 @@ from crisalad_jax.synthetic.view import (
 )
 
 _SUPERSAMPLING = 2
-_BUILDERS = dict(zip(SCENERIES, (street, corridor, country), strict=True))
+_BUILDERS = dict(zip(SCENERIES, (street, corridor, country, room, shapes), strict=True))
 
 
 @functools.lru_cache(maxsize=32)
@@ -65,7 +66,7 @@ def render(
     scene, picture = place.scene, _Picture(place, view, image_size)
     draw = picture.rng.random(len(scene.polygon_sizes))
     if view.occluders is not None:
-        passers = build_passers(view.occluders, place.lanes, place.traffic)
+        passers = build_passers(view.occluders, place.lanes, place.traffic, view.crowd)
         scene = Scene(*map(np.concatenate, zip(scene, passers, strict=True)))
         # A draw of 0 switches the lights of every vehicle on.
         draw = np.concatenate((draw, np.zeros(len(passers.polygon_sizes))))

@@ -101,18 +101,27 @@ def monument(mesh: Mesh, rng: Rng, x: float, z: float) -> None:
 
 
 @functools.lru_cache(maxsize=8)
-def build_passers(seed: int, lanes: Lanes, traffic: bool) -> Scene:
-    """Build cars along the kerbs, traffic in the lanes, and people on the pavements.
+def build_passers(seed: int, lanes: Lanes, traffic: bool, crowd: int = 0) -> Scene:
+    """Build cars along the kerbs, traffic in the lanes, people on the pavements, and a crowd.
 
     Without traffic there are people alone; one is far away, so that there is somebody.
     """
     rng = np.random.default_rng((seed, 1))
     mesh = Mesh()
-    left, left_kerb, right_kerb, right = lanes
+    left, *_, right = lanes
     if not traffic:
         for z in (120.0, *rng.uniform(3.0, 20.0, int(rng.integers(0, 3)))):
             _person(mesh, rng, rng.uniform(left * 0.8, right * 0.8), z)
-        return mesh.scene()
+    else:
+        _traffic(mesh, rng, lanes)
+    for z in rng.uniform(2.5, 15.0, crowd):
+        _person(mesh, rng, rng.uniform(left * 0.9, right * 0.9), z)
+    return mesh.scene()
+
+
+def _traffic(mesh: Mesh, rng: Rng, lanes: Lanes) -> None:
+    """Add cars along the kerbs, traffic in the lanes, and people on the pavements."""
+    left, left_kerb, right_kerb, right = lanes
     for x, away in ((left_kerb + 1.1, False), (right_kerb - 1.1, True)):
         if rng.random() < 0.6:
             z = rng.uniform(4.0, 12.0)
@@ -128,7 +137,6 @@ def build_passers(seed: int, lanes: Lanes, traffic: bool) -> Scene:
     for _ in range(int(rng.integers(1, 6))):
         low, high = ((left, left_kerb), (right_kerb, right))[int(rng.integers(2))]
         _person(mesh, rng, rng.uniform(low + 0.4, high - 0.4), rng.uniform(4.5, 26.0))
-    return mesh.scene()
 
 
 def _vehicle(mesh: Mesh, rng: Rng, x: float, z: float, *, bus: bool, away: bool) -> None:

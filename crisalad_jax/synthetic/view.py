@@ -12,8 +12,9 @@ from crisalad_jax.config.checks import check_types, limited, require
 Season = Literal["spring", "summer", "autumn", "winter"]
 Time = Literal["noon", "dusk", "night"]
 Weather = Literal["clear", "overcast", "haze", "rain"]
-Scenery = Literal["street", "corridor", "country"]
-"""What a place is: a city's street, a corridor or hall, a road or railway through the country."""
+Scenery = Literal["street", "corridor", "country", "room", "shapes"]
+"""What a place is: a city's street, a corridor or hall, a road or railway through the country, a
+furnished room, or boxes, poles and sheets in the open that mean nothing."""
 
 SEASONS: tuple[Season, ...] = get_args(Season)
 TIMES: tuple[Time, ...] = get_args(Time)
@@ -52,6 +53,8 @@ class View:
     weather: Weather = "clear"
     occluders: int | None = None
     """Seed of the cars, buses and people in the street; None leaves it empty."""
+    crowd: Annotated[int, limited(0)] = 0
+    """People besides those, where it is not empty."""
     exposure: float = 0.0
     """Exposure in stops."""
     noise: Annotated[float, limited(0, 255)] = 0.0

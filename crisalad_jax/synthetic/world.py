@@ -3,11 +3,11 @@
 import dataclasses
 import os
 from collections.abc import Iterator, Sequence
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 
-from crisalad_jax.config.checks import PositiveInt, Seed, check_types, require
+from crisalad_jax.config.checks import PositiveInt, Seed, check_types, limited, require
 from crisalad_jax.synthetic.layouts import (
     Files,
     Shot,
@@ -38,7 +38,7 @@ The sun's place, the clouds and the white balance come of a picture's seed, whic
 VARIATIONS: tuple[Variation, ...] = get_args(Variation)
 _FIELDS: dict[Variation, tuple[str, ...]] = {
     "stand": ("lateral", "forward", "heading", "height", "pitch", "field"),
-    "traffic": ("occluders",),
+    "traffic": ("occluders", "crowd"),
     "exposure": ("exposure", "noise"),
 }
 """Fields of `View` that are one variation, where that is not the field of its name."""
@@ -52,7 +52,7 @@ class WorldConfig:
     """Size and seed of a world."""
 
     scenes: PositiveInt = 2400
-    """Scenes to train on, of streets, corridors and country in turn."""
+    """Scenes to train on, of each kind in turn."""
     stations: PositiveInt = 4
     """Places of a scene, one behind the other: they look alike."""
     images_per_place: PositiveInt = 4
@@ -66,6 +66,8 @@ class WorldConfig:
     varied: tuple[Variation, ...] = VARIATIONS
     """What changes between the training images of a place. The rest is as in a plain `View`, the
     stand as the scene's camera. Test images change in all of these."""
+    hard: Annotated[float, limited(0, 1)] = 0.3
+    """Share of the images that are taken from far aside, turned, or through a crowd."""
     seed: Seed = 0
 
     def __post_init__(self) -> None:
@@ -139,7 +141,24 @@ def views(config: WorldConfig, seed: int, scenery: Scenery, station: int, rng: R
     still = set(VARIATIONS) - set(config.varied)
     fixed = {name: getattr(plain, name) for each in still for name in _FIELDS.get(each, (each,))}
     drawn = [_draw_view(plain, reach, config.repaint, rng) for _ in range(config.images_per_place)]
+    apart = np.random.default_rng((seed, station, 7))
+    hard = apart.random(len(drawn)) < config.hard
+    drawn = [
+        _harden(view, reach, apart) if at else view for view, at in zip(drawn, hard, strict=True)
+    ]
     return [dataclasses.replace(view, **fixed) for view in drawn]
+
+
+def _harden(view: View, reach: Reach, rng: Rng) -> View:
+    """Move the camera far aside and turn it, and let a crowd pass in one of three."""
+    return dataclasses.replace(
+        view,
+        lateral=rng.uniform(-2.2, 2.2) * reach.lateral,
+        heading=rng.uniform(-22, 22),
+        pitch=view.pitch + rng.uniform(-4, 4),
+        field=view.field * rng.uniform(0.85, 1.15),
+        crowd=int(rng.integers(5, 40)) if rng.random() < 1 / 3 else 0,
+    )
 
 
 def _draw_view(plain: View, reach: Reach, repaint: float, rng: Rng) -> View:

@@ -40,6 +40,8 @@ from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.progress import progress_bar
 
+WORLD = WorldConfig(sceneries=("street", "corridor", "country"), hard=0.0)
+"""The world of the tables in docs/small.md, before it had rooms, shapes and hard stands."""
 WORLD_BASE = pathlib.Path(__file__).parents[2] / "docs" / "small" / "world_base.json"
 BATCH = {"places_per_batch": 24, "images_per_place": 2, "min_images": 2}
 DUSTBINS = ("dustbin a token", "dustbin's mass learnt")
@@ -119,7 +121,7 @@ def small_resnet() -> TrainConfig:
 
 def transport() -> list[Arm]:
     """Each transport in the place of the published one."""
-    world = WorldConfig()
+    world = WORLD
     return [
         Arm(label, with_transport(small_vit(), fields), world)
         for label, fields in TRANSPORTS.items()
@@ -136,7 +138,7 @@ def transport_more() -> list[Arm]:
 
 def adapters() -> list[Arm]:
     """A frozen backbone that has seen no seasons, times or weather, and adapters that then do."""
-    world = WorldConfig()
+    world = WORLD
 
     def config(adapter: str, trainable: str) -> TrainConfig:
         scratch = small_vit()
@@ -159,7 +161,7 @@ def adapters() -> list[Arm]:
 
 def encoder() -> list[Arm]:
     """Without and with the cross-image encoder."""
-    without, world = small_vit(), WorldConfig()
+    without, world = small_vit(), WORLD
     return [Arm("without", without, world), Arm("with", with_encoder(without), world)]
 
 
@@ -303,8 +305,8 @@ def main() -> None:
     parser.add_argument("--data", type=pathlib.Path, nargs="*", default=[], help="also asked")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     arguments = read_some(parser, STUDIES)
-    whole = arguments.runs / "worlds" / named(WorldConfig())
-    write_world(whole, WorldConfig())
+    whole = arguments.runs / "worlds" / named(WORLD)
+    write_world(whole, WORLD)
     asked = {"rendered": open_asked(whole / "test")}
     for path in arguments.data:
         if path.name in asked:

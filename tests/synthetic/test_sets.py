@@ -25,6 +25,7 @@ from crisalad_jax.synthetic import (
 )
 from crisalad_jax.synthetic import city as city_files
 from crisalad_jax.synthetic import world as world_files
+from crisalad_jax.synthetic.picture import build_place
 from crisalad_jax.synthetic.world import views
 from crisalad_jax.utils.errors import InputError
 
@@ -213,13 +214,13 @@ def test_a_part_of_a_world_is_the_whole_ones(world, tmp_path):
 
 
 STAND = {"lateral", "forward", "heading", "height", "pitch", "field"}
-VIEWS = {"stand": STAND, "traffic": {"occluders"}, "exposure": {"exposure", "noise"}}
+VIEWS = {"stand": STAND, "traffic": {"occluders", "crowd"}, "exposure": {"exposure", "noise"}}
 
 
 @pytest.mark.parametrize("left_out", VARIATIONS)
 def test_what_does_not_vary_is_the_same_in_every_view_and_the_rest_as_before(left_out):
-    """Twenty views each of two stations of two scenes."""
-    whole = dataclasses.replace(WORLD, images_per_place=20)
+    """Sixty views each of two stations of two scenes."""
+    whole = dataclasses.replace(WORLD, images_per_place=60)
     less = dataclasses.replace(whole, varied=tuple(v for v in VARIATIONS if v != left_out))
     for seed, station in itertools.product((3, 4), (0, 2)):
         before, after = (
@@ -237,6 +238,26 @@ def test_what_does_not_vary_is_the_same_in_every_view_and_the_rest_as_before(lef
                 assert min(old) < value < max(old)
             else:
                 assert value == getattr(View(), name)
+
+
+def test_hard_images_are_a_share_seen_from_farther_aside_or_through_a_crowd():
+    """Of 400 views about 120 stand elsewhere, and the others are bit for bit those of `hard` 0."""
+    with_hard = dataclasses.replace(WORLD, images_per_place=400, hard=0.3)
+    easy, hard = (
+        views(config, 3, "street", 1, np.random.default_rng(0))
+        for config in (dataclasses.replace(with_hard, hard=0.0), with_hard)
+    )
+    moved = [(a, b) for a, b in zip(easy, hard, strict=True) if a != b]
+    assert 80 < len(moved) < 160  # 120 by a binomial whose deviation is 9
+    reach = build_place(3, "street").reach
+    assert max(abs(view.lateral) for view in easy) <= reach.lateral
+    assert 1.5 * reach.lateral < max(abs(b.lateral) for _, b in moved) <= 2.2 * reach.lateral
+    assert 15 < max(abs(b.heading) for _, b in moved) <= 22
+    crowded = sum(b.crowd > 0 for _, b in moved)
+    assert 20 < crowded < 60
+    assert not any(view.crowd for view in easy)
+    # Season, hour and weather are not touched.
+    assert all((a.season, a.time, a.weather) == (b.season, b.time, b.weather) for a, b in moved)
 
 
 def test_test_images_vary_in_everything(world, tmp_path):
@@ -269,6 +290,7 @@ def test_views_vary_within_the_place(world):
             {"stations": -1},
             "WorldConfig.stations: found -1, expected a whole number of at least 1",
         ),
+        (WorldConfig, {"hard": 1.5}, "WorldConfig.hard: found 1.5, expected 0 to 1"),
         (WorldConfig, {"repaint": -0.5}, "WorldConfig.repaint: found -0.5, expected 0 to 3"),
         (WorldConfig, {"varied": ("sun",)}, "WorldConfig.varied: found ('sun',), expected a tuple"),
         (WorldConfig, {"sceneries": ()}, "WorldConfig.sceneries: found none, expected at least"),
