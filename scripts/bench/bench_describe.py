@@ -44,6 +44,7 @@ import torch  # isort: skip
 from crisalad_jax.nn.aggregators.gem import CosPlaceConfig
 from crisalad_jax.nn.aggregators.salad import SaladConfig
 from crisalad_jax.nn.backbones.resnet import ResNetConfig
+from crisalad_jax.nn.backbones.vgg import VggConfig
 from crisalad_jax.nn.backbones.vit import ViTConfig
 from crisalad_jax.nn.config import PRESETS, ModelConfig
 from crisalad_jax.nn.costs import part_costs
@@ -71,6 +72,12 @@ MODELS: Mapping[str, ModelConfig] = {
         image_size=(224, 224),
         backbone=ResNetConfig(),
         aggregator=CosPlaceConfig(dim=2048),
+        cross_image="none",
+    ),
+    "vgg16": ModelConfig(
+        image_size=(224, 224),
+        backbone=VggConfig(),
+        aggregator=CosPlaceConfig(dim=512),
         cross_image="none",
     ),
     "megaloc": ModelConfig(
