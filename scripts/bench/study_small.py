@@ -3,10 +3,11 @@
     python scripts/bench/study_small.py --runs RUNS [--data SET...] [--page PAGE] [STUDY...]
 
 Studies: transport, transport_more and encoder (a small ViT with SALAD), adapters (such a ViT that
-was trained on a plainer world, frozen) and world (a small ResNet with Conv-AP, from which the world
-leaves out one variation at a time). All train on rendered places alone, and are asked on other
-rendered places and on each SET, by its folder's name. Runs that RUNS already holds are gone on
-with. A run takes about two minutes of a core.
+was trained on a plainer world, frozen), world (a small ResNet with Conv-AP, from which the world
+leaves out one variation at a time) and distil (the model in the package, for a quarter of the
+pixels, taught by places' labels, by that model, or by both, in as many steps). All train on
+rendered places alone, and are asked on other rendered places and on each SET, by its folder's name.
+Runs that RUNS already holds are gone on with. A run takes two to ten minutes of two cores.
 """
 
 import collections
@@ -23,6 +24,7 @@ import scipy.stats
 from study_transport import VARIANTS, WATCHED, with_transport
 from tables import Study, Table, flags, leave, read_some
 
+from crisalad_jax.checkpoints.load import load
 from crisalad_jax.checkpoints.public import with_backbone_of
 from crisalad_jax.config.io import read_config, to_plain
 from crisalad_jax.data.augmentations.light import LightAugmentConfig
@@ -30,12 +32,15 @@ from crisalad_jax.data.benchmarks import Benchmark, open_benchmark
 from crisalad_jax.data.places import read_places
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.evaluation.evaluate import evaluate
+from crisalad_jax.experiments.distil import distil
 from crisalad_jax.nn.cross_image import CrossImage
 from crisalad_jax.nn.model import Model, init_crisalad
+from crisalad_jax.retrieval.describer import describer_of
 from crisalad_jax.synthetic import SCENERIES, VARIATIONS, WorldConfig, write_world
-from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.training.config import LossConfig, TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit, run_keys
+from crisalad_jax.training.losses.distil import DistilConfig
 from crisalad_jax.training.recipes import recipe
 from crisalad_jax.utils.files import write_json
 from crisalad_jax.utils.progress import progress_bar
@@ -87,6 +92,8 @@ class Arm(NamedTuple):
     world: WorldConfig
     start: "Arm | None" = None
     """Whose run with the same seed gives the backbone to start from."""
+    teacher: str | None = None
+    """The model that it learns from, as `load` takes it."""
 
 
 def small_vit() -> TrainConfig:
@@ -185,12 +192,26 @@ def world() -> list[Arm]:
     return arms
 
 
+def distillation() -> list[Arm]:
+    """Labels alone, the teacher alone, and both."""
+    start = read_config(TrainConfig, WORLD_BASE)
+    model = dataclasses.replace(start.model, image_size=(96, 128))
+    config = dataclasses.replace(start, model=model, epochs=6, **BATCH)
+    whole = dataclasses.replace(WORLD, scenes=600, test_scenes=1)
+    arms = [Arm("labels", config, whole)]
+    for label, weight in (("teacher", 0.0), ("teacher and labels", 1.0)):
+        loss = LossConfig(kind=DistilConfig(labels=weight))
+        arms.append(Arm(label, dataclasses.replace(config, loss=loss), whole, teacher="starter"))
+    return arms
+
+
 STUDIES = {
     "transport": transport,
     "transport_more": transport_more,
     "encoder": encoder,
     "adapters": adapters,
     "world": world,
+    "distil": distillation,
 }
 
 
@@ -215,6 +236,8 @@ def folder_of(arm: Arm, seed: int, runs: pathlib.Path) -> pathlib.Path:
     names = [named(dataclasses.replace(arm.config, seed=seed)), named(arm.world)]
     if arm.start is not None:
         names.append(folder_of(arm.start, seed, runs).name)
+    if arm.teacher is not None:
+        names.append(describer_of(load(arm.teacher)).digest[:12])
     return runs / "runs" / "-".join(names)
 
 
@@ -223,6 +246,13 @@ def trained(arm: Arm, seed: int, runs: pathlib.Path) -> Model:
     config = dataclasses.replace(arm.config, seed=seed)
     root = runs / "worlds" / named(arm.world)
     write_world(root, arm.world)
+    folder = folder_of(arm, seed, runs)
+    if arm.teacher is not None:
+        teacher, quiet = load(arm.teacher), Reading(quiet=True)
+        return Model(
+            distil(config, teacher, None, folder, data=root / "train", reading=quiet).params,
+            config.model,
+        )
     places = read_places(root / "train", min_images=config.min_images)
     initial = None
     if arm.start is not None:
@@ -231,7 +261,7 @@ def trained(arm: Arm, seed: int, runs: pathlib.Path) -> Model:
         initial = with_backbone_of(
             init_crisalad(run_keys(seed)[0], config.model), config.model, file
         )
-    params = fit(config, places, folder_of(arm, seed, runs), initial=initial, quiet=True).params
+    params = fit(config, places, folder, initial=initial, quiet=True).params
     return Model(params, config.model)
 
 
