@@ -5,6 +5,7 @@ A frame of a video is `walk.mp4#t=12.500`, in seconds of the file. One of a log 
 taken wherever the path of an image is.
 """
 
+import collections
 import os
 import pathlib
 import re
@@ -144,6 +145,19 @@ def sequence_of(path: pathlib.PurePath) -> str:
     """
     is_frame = parse_frame(path) is not None
     return path.as_posix().rpartition("#t=")[0] if is_frame else path.parent.as_posix()
+
+
+def by_sequence(paths: Sequence[pathlib.PurePath]) -> list[list[int]]:
+    """Return the numbers of the images of each folder, video or topic, in order; see `sequence_of`.
+
+    Example:
+        >>> by_sequence([pathlib.PurePosixPath(name) for name in ("a/1.jpg", "b/1.jpg", "a/2.jpg")])
+        [[0, 2], [1]]
+    """
+    found: dict[str, list[int]] = collections.defaultdict(list)
+    for number, path in enumerate(paths):
+        found[sequence_of(path)].append(number)
+    return list(found.values())
 
 
 def check_rate(fps: float) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from crisalad_jax.data.benchmarks.msls import MSLS_CITIES, city_folders, read_side
 from crisalad_jax.data.benchmarks.on_disk import find_images, has_sides, has_split, listing
-from crisalad_jax.data.frames import has_frames, sequence_of
+from crisalad_jax.data.frames import by_sequence, has_frames
 from crisalad_jax.data.images import OnBadImage, is_image, list_images
 from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.positions import AXES
@@ -290,15 +290,12 @@ def places_by_order(source: ImageSource, frames: int) -> list[FoundPlace]:
 
     A place and the next one of the same folder or video are too near for one batch.
     """
-    sequences: dict[str, list[str]] = collections.defaultdict(list)
-    for path, name in zip(source.paths, source.names, strict=True):
-        sequences[sequence_of(path)].append(name)
     places: list[FoundPlace] = []
-    for sequence in sequences.values():
+    for sequence in by_sequence(source.paths):
         first, last = len(places), len(places) + (len(sequence) - 1) // frames
         for number in range(first, last + 1):
             start = (number - first) * frames
-            part = sequence[start : start + frames]
+            part = [source.names[image] for image in sequence[start : start + frames]]
             near = [each for each in (number - 1, number + 1) if first <= each <= last]
             places.append(FoundPlace(part[0], dict.fromkeys(part), near))
     return places

@@ -21,6 +21,8 @@ from crisalad_jax.data.sources import ImageSource, open_sources
 from crisalad_jax.evaluation.difference import Difference, paired_difference
 from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments.held_out import (
+    CHOOSING,
+    JUDGING,
     count_apart,
     held_out_benchmark,
     split_images,
@@ -48,7 +50,8 @@ class Adapted(NamedTuple):
 
     steps: int
     held_out: tuple[float, float]
-    """Recall of held-out frames by `TrainConfig.monitor`, before and after."""
+    """Recall of held-out frames by `TrainConfig.monitor`, before and after. The copies of them that
+    ask are others than those that stopped the training."""
     others: dict[str, tuple[float, Difference]]
     """Recall@1 of each watched set before, and its change."""
     weights: pathlib.Path | None
@@ -80,8 +83,8 @@ def adapt(
 
     Images of a place are those within `place_radius`, of a map without positions so many
     consecutive ones, and without `place_frames` each image by itself, under two augmentations. A
-    fifth of the images is held out. Augmented copies of them ask the rest of the map, which decides
-    how long to train, and whether anything was gained.
+    fifth of the images is held out. Augmented copies of them ask the rest of the map: two of each
+    decide how long to train, and two others whether anything was gained.
 
     Args:
         config: how to train, usually `recipe(name="adapt", model=...)` with the map's model.
@@ -130,7 +133,7 @@ def adapt(
     require(0 <= most_lost <= 1, f"--most-lost: found {most_lost:g}, expected 0 to 1")
     require(config.cities is None, "cities: found some for a map, expected None")
     inside = real_path(out).is_relative_to(real_path(folder))
-    require(not inside, f"{out}: found in the map {folder}, expected a folder beside it")
+    require(not inside, f"{out}: found in the map {folder}, expected a folder outside it")
     skip: Any = {"on_bad_image": reading.on_bad_image}
     quiet = dataclasses.replace(reading, quiet=True)
     watched = [watch] if isinstance(watch, str | os.PathLike) else watch
@@ -173,8 +176,11 @@ def adapt(
         how = f"within {radius:g} m" if is_placed else f"of {place_frames} frames"
     held = f"{len(split.answers)} images held out"
     say(f"{folder}: {count} places {how}, {batch} of them in a batch; {held}")
-    benchmark = held_out_benchmark(config, split, out / "held-out")
-    start = _recall(model, benchmark, config, reading)
+    benchmark, judges = (
+        held_out_benchmark(config, split, out / "held-out", copies)
+        for copies in (CHOOSING, JUDGING)
+    )
+    start = _recall(model, judges, config, reading)
     say(f"held-out frames: {config.monitor} {100 * start:.1f} before")
     result = fit(
         config,
@@ -189,10 +195,10 @@ def adapt(
     )
     if result.steps:
         finish_run(out / "run", real_path(folder).name, split.training, benchmark)
-    best = result.best_recall or 0.0
-    gained = Adapted(result.steps, (start, best), {}, None, replaced=False)
-    if best > start:
-        new = load_weights(out / "run" / "best.safetensors", expected=config.model)
+    new = load_weights(out / "run" / "best.safetensors", expected=config.model)
+    end = _recall(new, judges, config, reading)
+    gained = Adapted(result.steps, (start, end), {}, None, replaced=False)
+    if end > start:
         save_weights(file, new)
         for each in benchmarks:
             before, after = (_firsts(one, each, quiet) for one in (model, new))

@@ -1,6 +1,5 @@
 """Divide the images of a map: places to train on, and held-out frames that ask the rest."""
 
-import collections
 import dataclasses
 import pathlib
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ import numpy as np
 from crisalad_jax.config.checks import require
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.benchmarks.benchmark import within
-from crisalad_jax.data.frames import sequence_of
+from crisalad_jax.data.frames import by_sequence
 from crisalad_jax.data.images import read_pixels
 from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.places import Places, group_images
@@ -22,8 +21,11 @@ from crisalad_jax.data.sources import ImageSource, join_sources
 from crisalad_jax.training.config import TrainConfig
 from crisalad_jax.utils.files import atomic_path, wrap_os_errors
 
-SHARE, MOST, COPIES = 0.2, 100, 2
-"""Share of a map's images that is held out, the most of them, and the changed copies of each."""
+SHARE, MOST = 0.2, 100
+"""Share of a map's images that is held out, and the most of them."""
+CHOOSING, JUDGING = range(2), range(2, 4)
+"""Changed copies of a held-out image that stop the training, and those that say what it gained:
+the best of several validations is too high."""
 
 
 class Split(NamedTuple):
@@ -102,11 +104,8 @@ def _near(source: ImageSource, radius: float) -> list[list[int]]:
 
 def _consecutive(source: ImageSource, frames: int) -> list[list[int]]:
     """List the others of each image's sequence that are less than so many frames away."""
-    sequences = collections.defaultdict[str, list[int]](list)
-    for number, path in enumerate(source.paths):
-        sequences[sequence_of(path)].append(number)
     near: list[list[int]] = [[] for _ in source.names]
-    for numbers in sequences.values():
+    for numbers in by_sequence(source.paths):
         for place, image in enumerate(numbers):
             window = numbers[max(0, place - frames + 1) : place + frames]
             near[image] = [each for each in window if each != image]
@@ -135,13 +134,16 @@ def count_apart(places: Places) -> int:
     return len(taken)
 
 
-def held_out_benchmark(config: TrainConfig, split: Split, folder: pathlib.Path) -> Benchmark:
+def held_out_benchmark(
+    config: TrainConfig, split: Split, folder: pathlib.Path, copies: Sequence[int]
+) -> Benchmark:
     """Write augmented copies of the held-out images, and make the set in which they ask the map.
 
     Args:
         config: the run's, whose augmentation changes the copies as it changes training images.
         split: the images.
         folder: where the copies are written.
+        copies: numbers of the copies of each image, which draw how they are changed.
 
     Raises:
         InputError: an image cannot be read, or the folder not be written to.
@@ -152,11 +154,11 @@ def held_out_benchmark(config: TrainConfig, split: Split, folder: pathlib.Path) 
     with wrap_os_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     for image in split.answers:
-        files = [folder / f"{image:06d}-{copy}.png" for copy in range(COPIES)]
+        files = [folder / f"{image:06d}-{copy}.png" for copy in copies]
         queries += files
         path = split.source.paths[image]
         pixels = how.prepare(read_pixels(path), str(path))
-        for copy, file in enumerate(files):
+        for copy, file in zip(copies, files, strict=True):
             generator = np.random.default_rng((seed, image, copy))
             changed = config.augmentation.apply(pixels, generator, of_place=generator)
             with atomic_path(file) as temporary:
@@ -168,6 +170,6 @@ def held_out_benchmark(config: TrainConfig, split: Split, folder: pathlib.Path) 
         root=folder,
         database=tuple(split.source.paths[image] for image in split.database),
         queries=tuple(queries),
-        positives=tuple(own for own in positives for _ in range(COPIES)),
+        positives=tuple(own for own in positives for _ in copies),
         rule=split.rule,
     )

@@ -18,10 +18,12 @@ from crisalad_jax.data.images import read_image
 from crisalad_jax.data.positions import AXES, Positions
 from crisalad_jax.data.reading import Reading
 from crisalad_jax.data.sources import ImageSource, open_source
+from crisalad_jax.evaluation.evaluate import evaluate
 from crisalad_jax.experiments import adapt as module
 from crisalad_jax.experiments.adapt import adapt
 from crisalad_jax.experiments.held_out import (
-    COPIES,
+    CHOOSING,
+    JUDGING,
     Split,
     held_out_benchmark,
     split_images,
@@ -34,7 +36,7 @@ from crisalad_jax.retrieval.maps.appending import open_for_appending
 from crisalad_jax.retrieval.maps.build import index
 from crisalad_jax.retrieval.maps.map import Map
 from crisalad_jax.retrieval.maps.metadata import existing_metadata
-from crisalad_jax.retrieval.maps.remake import check_remakeable, remake_map
+from crisalad_jax.retrieval.maps.remake import check_remakeable, remake_map, source_of_map
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.utils import files
 from crisalad_jax.utils.errors import InputError
@@ -117,23 +119,27 @@ def test_a_place_of_one_image_has_it_twice(tmp_path) -> None:
 def test_held_out_copies_are_the_runs_augmentation(shared, tmp_path) -> None:
     source = open_source(shared / "town" / "images" / "test" / "database")
     split = split_images([source], 0)
-    found = held_out_benchmark(CONFIG, split, tmp_path / "held-out")
-    assert len(found.queries) == COPIES * len(split.answers)
+    found = held_out_benchmark(CONFIG, split, tmp_path / "held-out", CHOOSING)
+    count = len(CHOOSING)
+    assert len(found.queries) == count * len(split.answers)
     (image, *_) = split.answers
     pixels = cv2.resize(read_image(source.paths[image]), MODEL.input_size[::-1])
-    pictures = [read_image(path) for path in found.queries[:COPIES]]
-    assert len({picture.tobytes() for picture in pictures}) == COPIES
+    pictures = [read_image(path) for path in found.queries[:count]]
+    assert len({picture.tobytes() for picture in pictures}) == count
     for picture in pictures:
         assert picture.shape == pixels.shape
         assert 0 < np.abs(picture.astype(int) - pixels).mean() < 60
-    asked = [image for image in split.answers for _ in range(COPIES)]
+    asked = [image for image in split.answers for _ in CHOOSING]
     for query, image, right in zip(found.queries, asked, found.positives, strict=True):
         assert query.name.startswith(f"{image:06d}-")
         paths = [found.database[number] for number in right]
         assert paths == [source.paths[number] for number in split.answers[image]]
     bits = [path.read_bytes() for path in found.queries]
     found.queries[0].write_bytes(b"of another run")
-    again = held_out_benchmark(CONFIG, split, tmp_path / "held-out")
+    again = held_out_benchmark(CONFIG, split, tmp_path / "held-out", CHOOSING)
+    assert [path.read_bytes() for path in again.queries] == bits
+    others = held_out_benchmark(CONFIG, split, tmp_path / "held-out", JUDGING)
+    assert not {path.read_bytes() for path in others.queries} & set(bits)
     assert [path.read_bytes() for path in again.queries] == bits
 
 
@@ -148,8 +154,9 @@ def folder(shared, tmp_path) -> pathlib.Path:
 
 
 def forced(monkeypatch: pytest.MonkeyPatch, before: float) -> None:
-    """Let held-out frames recall so much before, whatever they do."""
-    monkeypatch.setattr(module, "_recall", lambda *_: before)
+    """Let held-out frames recall so much before, whatever they do, and as they do after."""
+    measure, told = module._recall, iter([before])
+    monkeypatch.setattr(module, "_recall", lambda *given: next(told, None) or measure(*given))
 
 
 def test_what_gains_makes_the_map_anew(shared, folder, tmp_path, monkeypatch) -> None:
@@ -159,20 +166,23 @@ def test_what_gains_makes_the_map_anew(shared, folder, tmp_path, monkeypatch) ->
     how = {"place_frames": 3, "watch": [shared / "town"], "most_lost": 1.0, "replace": True}
     with Map.open(folder) as old:
         names, before = [image.name for image in old.images], old.metadata
+        split = split_images([source_of_map(old)], CONFIG.seed, place_frames=3)
     result = adapt(CONFIG, folder, out, **how, reading=QUIET, say=said.append)
     assert result.weights == out / "adapted.safetensors"
     assert result.replaced
     new = load(result.weights)
     lines = read_metrics(out / "run" / "metrics.jsonl")
     assert result.steps == len([line for line in lines if "loss" in line])
-    best = max(line["R@1"] for line in lines if "R@1" in line)
-    assert result.held_out == (-1.0, best)
+    judges = held_out_benchmark(CONFIG, split, out / "held-out", JUDGING)
+    (judged,) = evaluate(new, judges, groupings=["single"], reading=QUIET)
+    after = judged.recalls[1]
+    assert result.held_out == (-1.0, after)
     ((name, (recall, change)),) = result.others.items()
     assert name in said[-1]
     assert 0 <= recall <= 1
     assert -1 <= change.mean <= 1
     found = json.loads((out / "adapted.json").read_text())
-    assert found["held_out"] == {"before": -1.0, "after": best}
+    assert found["held_out"] == {"before": -1.0, "after": after}
     with Map.open(folder) as places:
         assert [image.name for image in places.images] == names
         assert places.metadata.model == model_hash(*new) != before.model
