@@ -177,7 +177,7 @@ def adapt(
     held = f"{len(split.answers)} images held out"
     say(f"{folder}: {count} places {how}, {batch} of them in a batch; {held}")
     benchmark, judges = (
-        held_out_benchmark(config, split, out / "held-out", copies)
+        held_out_benchmark(config, split, out / "held-out", copies, **skip)
         for copies in (CHOOSING, JUDGING)
     )
     start = _recall(model, judges, config, reading)

@@ -12,13 +12,14 @@ from crisalad_jax.config.checks import require
 from crisalad_jax.data.benchmarks import Benchmark
 from crisalad_jax.data.benchmarks.benchmark import within
 from crisalad_jax.data.frames import by_sequence
-from crisalad_jax.data.images import read_pixels
+from crisalad_jax.data.images import OnBadImage, read_pixels
 from crisalad_jax.data.metres import comparable
 from crisalad_jax.data.places import Places, group_images
 from crisalad_jax.data.positions import AXES
 from crisalad_jax.data.prepare import Preparation
 from crisalad_jax.data.sources import ImageSource, join_sources
 from crisalad_jax.training.config import TrainConfig
+from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.files import atomic_path, wrap_os_errors
 
 SHARE, MOST = 0.2, 100
@@ -135,7 +136,11 @@ def count_apart(places: Places) -> int:
 
 
 def held_out_benchmark(
-    config: TrainConfig, split: Split, folder: pathlib.Path, copies: Sequence[int]
+    config: TrainConfig,
+    split: Split,
+    folder: pathlib.Path,
+    copies: Sequence[int],
+    on_bad_image: OnBadImage = "stop",
 ) -> Benchmark:
     """Write augmented copies of the held-out images, and make the set in which they ask the map.
 
@@ -144,32 +149,40 @@ def held_out_benchmark(
         split: the images.
         folder: where the copies are written.
         copies: numbers of the copies of each image, which draw how they are changed.
+        on_bad_image: whether an unreadable image is left out.
 
     Raises:
-        InputError: an image cannot be read, or the folder not be written to.
+        InputError: an image cannot be read, or none can, or the folder not be written to.
     """
     model, seed = config.model, config.seed
     how = Preparation(model.input_size, model.preprocessing.for_training())
     queries: list[pathlib.Path] = []
+    positives: list[np.ndarray] = []
+    number = {image: row for row, image in enumerate(split.database)}
     with wrap_os_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    for image in split.answers:
+    for image, answers in split.answers.items():
+        path = split.source.paths[image]
+        try:
+            pixels = how.prepare(read_pixels(path), str(path))
+        except InputError:
+            if on_bad_image == "skip":
+                continue
+            raise
         files = [folder / f"{image:06d}-{copy}.png" for copy in copies]
         queries += files
-        path = split.source.paths[image]
-        pixels = how.prepare(read_pixels(path), str(path))
+        positives += [np.array([number[each] for each in answers])] * len(files)
         for copy, file in zip(copies, files, strict=True):
             generator = np.random.default_rng((seed, image, copy))
             changed = config.augmentation.apply(pixels, generator, of_place=generator)
             with atomic_path(file) as temporary:
                 cv2.imwrite(str(temporary), cv2.cvtColor(changed, cv2.COLOR_RGB2BGR))
-    number = {image: row for row, image in enumerate(split.database)}
-    positives = [np.array([number[each] for each in own]) for own in split.answers.values()]
+    require(bool(queries), f"{split.source.root}: found no readable image among those held out")
     return Benchmark(
         name="held-out frames",
         root=folder,
         database=tuple(split.source.paths[image] for image in split.database),
         queries=tuple(queries),
-        positives=tuple(own for own in positives for _ in copies),
+        positives=tuple(positives),
         rule=split.rule,
     )

@@ -143,6 +143,20 @@ def test_held_out_copies_are_the_runs_augmentation(shared, tmp_path) -> None:
     assert [path.read_bytes() for path in again.queries] == bits
 
 
+def test_an_unreadable_held_out_image_asks_nothing(shared, tmp_path) -> None:
+    shutil.copytree(shared / "town" / "images" / "test" / "database", tmp_path / "images")
+    split = split_images([open_source(tmp_path / "images")], 0)
+    (broken, *_) = split.answers
+    split.source.paths[broken].write_bytes(b"no picture")
+    how = CONFIG, split, tmp_path / "held-out", JUDGING
+    with pytest.raises(InputError, match=split.source.paths[broken].name):
+        held_out_benchmark(*how)
+    found = held_out_benchmark(*how, "skip")
+    asked = {int(query.name[:6]) for query in found.queries}
+    assert asked == split.answers.keys() - {broken}
+    assert len(found.positives or ()) == len(found.queries)
+
+
 @pytest.fixture
 def folder(shared, tmp_path) -> pathlib.Path:
     """A map of images without positions, which the test may change."""
