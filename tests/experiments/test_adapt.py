@@ -144,7 +144,7 @@ def test_held_out_copies_are_the_runs_augmentation(shared, tmp_path) -> None:
 
 
 def test_an_unreadable_held_out_image_asks_nothing(shared, tmp_path) -> None:
-    shutil.copytree(shared / "town" / "images" / "test" / "database", tmp_path / "images")
+    shutil.copytree(shared / "city" / "Images", tmp_path / "images")
     split = split_images([open_source(tmp_path / "images")], 0)
     (broken, *_) = split.answers
     split.source.paths[broken].write_bytes(b"no picture")
