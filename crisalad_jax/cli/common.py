@@ -31,6 +31,8 @@ if TYPE_CHECKING:  # commands that load no model of a file start without these
     from crisalad_jax.data.tracks import Track
     from crisalad_jax.nn.config import ModelConfig
     from crisalad_jax.nn.model import Model
+    from crisalad_jax.training.config import TrainConfig
+    from crisalad_jax.training.loop import FitResult
 
 _WIDE = 10_000
 """Columns that no table fills."""
@@ -191,6 +193,18 @@ def _given(flags: Mapping[str, Any]) -> list[str]:
         for name, value in flags.items()
         if value is not None and value is not False and value != ()
     ]
+
+
+def fit_words(result: "FitResult", config: "TrainConfig") -> str:
+    """Say how a run ended: its steps, its best recall, the images that it skipped."""
+    words = [f"{result.steps} steps"]
+    if result.stopped_early:
+        words.append("stopped early")
+    if result.best_recall is not None:
+        words.append(f"best {config.monitor} {100 * result.best_recall:.1f} in best.safetensors")
+    if result.skipped_images:
+        words.append(f"{result.skipped_images} unreadable images skipped")
+    return ", ".join(words)
 
 
 def find_given(

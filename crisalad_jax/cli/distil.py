@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from crisalad_jax.checkpoints.load import find_weights, load
 from crisalad_jax.checkpoints.runtime import read_model
-from crisalad_jax.cli.common import console, pick
+from crisalad_jax.cli.common import console, fit_words, pick
 from crisalad_jax.cli.flags import FOLDER, FrameFlags, JsonFlag, PluginFlag, ReadFlags
 from crisalad_jax.cli.help import asked_for
 from crisalad_jax.config.flags import find_flag, parse_settings, with_settings
@@ -101,12 +101,9 @@ def run(arguments: Distil) -> dict[str, Any]:
         **pick(arguments, "data", "fps", "topic", "reading"),
     )
     last, best = arguments.out / "last.safetensors", None
-    words = f"{result.steps} steps{', stopped early' if result.stopped_early else ''}"
     if result.best_recall is not None:
         best = {"name": config.monitor, "recall": result.best_recall}
-        words += f", best {config.monitor} {100 * result.best_recall:.1f} in best.safetensors"
-    if result.skipped_images:
-        words += f", {result.skipped_images} unreadable images skipped"
+    words = fit_words(result, config)
     console.print(f"{arguments.out}: {words}; the student is {last}", soft_wrap=True)
     found = {"out": str(arguments.out), "steps": result.steps, "best": best, "last": str(last)}
     return found | {"skipped_images": result.skipped_images}

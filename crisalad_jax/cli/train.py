@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from crisalad_jax.checkpoints.load import find_weights
 from crisalad_jax.checkpoints.runtime import read_model
-from crisalad_jax.cli.common import console, pick, refuse_with, refuse_without
+from crisalad_jax.cli.common import console, fit_words, pick, refuse_with, refuse_without
 from crisalad_jax.cli.flags import FOLDER, JsonFlag, PluginFlag, QuietFlag
 from crisalad_jax.cli.help import asked_for
 from crisalad_jax.config.checks import require
@@ -224,17 +224,12 @@ def run(arguments: Train) -> dict[str, Any] | None:
         callbacks=arguments.callback,
         say=lambda line: console.print(line, soft_wrap=True),
     )
-    out, words, best = arguments.out, [f"{result.steps} steps"], None
-    if result.stopped_early:
-        words.append("stopped early")
+    out, best = arguments.out, None
     if result.best_recall is not None:
-        file, recall = out / "best.safetensors", result.best_recall
-        best = {"name": config.monitor, "recall": recall, "file": str(file)}
-        words.append(f"best {config.monitor} {100 * recall:.1f} in {file.name}")
-    if result.skipped_images:
-        words.append(f"{result.skipped_images} unreadable images skipped")
-    curves = out / "curves.png"
-    console.print(f"{out}: {', '.join(words)}; curves in {curves}", soft_wrap=True)
+        best = {"name": config.monitor, "recall": result.best_recall}
+        best |= {"file": str(out / "best.safetensors")}
+    words, curves = fit_words(result, config), out / "curves.png"
+    console.print(f"{out}: {words}; curves in {curves}", soft_wrap=True)
     if not distributed.is_primary():
         return None
     return {

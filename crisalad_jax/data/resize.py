@@ -208,15 +208,10 @@ def _machine_code(once: bool) -> Callable[..., None] | None:
         config.CACHE_DIR = before
 
 
-def _resample(
-    pixels: np.ndarray,
-    line_taps: tuple[np.ndarray, ...],
-    column_taps: tuple[np.ndarray, ...],
-    resized: np.ndarray,
-) -> None:
+def _resample(pixels: np.ndarray, rows: _Taps, columns: _Taps, resized: np.ndarray) -> None:
     """Resample line after line, so that the rows between the two passes stay in the L1 cache."""
-    first_line, line_count, line_weights = line_taps
-    first_column, column_count, column_weights = column_taps
+    first_line, line_count, line_weights = rows
+    first_column, column_count, column_weights = columns
     line = np.empty(pixels.shape[1], np.float32)
     for row in range(resized.shape[0]):
         line[:] = 0
@@ -240,15 +235,11 @@ def _resample(
 
 
 def _resample_floats(
-    pixels: np.ndarray,
-    line_taps: tuple[np.ndarray, ...],
-    column_taps: tuple[np.ndarray, ...],
-    resized: np.ndarray,
-    rounds: bool,
+    pixels: np.ndarray, rows: _Taps, columns: _Taps, resized: np.ndarray, rounds: bool
 ) -> None:
     """Resample along rows, then along columns, as Pillow does; with `rounds` to 0 to 255."""
-    first_line, line_count, line_weights = line_taps
-    first_column, column_count, column_weights = column_taps
+    first_line, line_count, line_weights = rows
+    first_column, column_count, column_weights = columns
     lines = np.empty((pixels.shape[0], resized.shape[1]), np.float32)
     for row in range(pixels.shape[0]):
         line = lines[row]

@@ -55,10 +55,6 @@ class DistilConfig(Loss):
         """Draw the projection to the teacher's length."""
         return init_linear(key, dim, self.teacher_dim) if self.cosine else None
 
-    def from_scratch(self) -> Loss:
-        """Return the loss unchanged: a teacher's descriptors prevent collapse."""
-        return self
-
     def apply(self, params: Linear | None, batch: LossBatch) -> LossValue:
         """Compute the weighted sum; each term is logged before its weight."""
         shape = len(batch.labels), self.teacher_dim
