@@ -29,7 +29,7 @@ DOCUMENTED = {
 }
 FUNCTIONS = {name: value for name, value in DOCUMENTED.items() if not inspect.isclass(value)}
 SLOW = {
-    *("Map", "attend_across_images", "build_vocabulary", "convert", "evaluate", "extract"),
+    *("Map", "adapt", "attend_across_images", "build_vocabulary", "convert", "evaluate", "extract"),
     *(
         "evaluation_record",
         "extract_features",

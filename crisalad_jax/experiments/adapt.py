@@ -181,7 +181,7 @@ def adapt(
         for copies in (CHOOSING, JUDGING)
     )
     start = _recall(model, judges, config, reading)
-    say(f"held-out frames: {config.monitor} {100 * start:.1f} before")
+    say(f"held-out frames: {config.monitor} {100 * start:.1f} before; validations ask other copies")
     result = fit(
         config,
         with_repeats(split.training, config.images_per_place),
@@ -195,6 +195,8 @@ def adapt(
     )
     if result.steps:
         finish_run(out / "run", real_path(folder).name, split.training, benchmark)
+    if skipped := result.skipped_images + len(split.answers) - len(judges.queries) // len(JUDGING):
+        say(f"{skipped} unreadable images skipped in training and among those held out")
     new = load_weights(out / "run" / "best.safetensors", expected=config.model)
     end = _recall(new, judges, config, reading)
     gained = Adapted(result.steps, (start, end), {}, None, replaced=False)
@@ -244,7 +246,11 @@ def _more(
     if places.axes is None:
         return found
     axes, zone = places.axes, places.zone
-    fitted = [each.located().fitted(each.root, axes, zone) for each in found]
+    located = [each.located() for each in found]
+    for each, at in zip(found, located, strict=True):
+        expected = f"{', '.join(axes)} as in the map (docs/how-to/image-sources.md)"
+        require(bool(at.of), f"{each.root}: found images without positions, expected {expected}")
+    fitted = [at.fitted(each.root, axes, zone) for each, at in zip(found, located, strict=True)]
     return [
         each._replace(positions=at._replace(axes=axes, zone=zone))
         for each, at in zip(found, fitted, strict=True)

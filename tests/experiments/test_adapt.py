@@ -372,6 +372,8 @@ def test_more_images_are_those_of_the_map_once(placed, tmp_path, monkeypatch) ->
     (tmp_path / "link").symlink_to(tmp_path / "Aston")
     (first, *_), (second, *_) = (sorted(os.listdir(tmp_path / city)) for city in ("Aston", "Brill"))
     shutil.copytree(tmp_path / "Brill", tmp_path / "more")
+    with pytest.raises(InputError, match="more: found images without positions, expected east, no"):
+        adapt(CONFIG, placed, tmp_path / "out", images=tmp_path / "more", reading=QUIET)
     for name, folder, picture in (("one", "link", first), ("two", "more", second)):
         table = tmp_path / folder / f"{name}.csv"
         table.write_text(f"name,east,north\n{picture},50,50\n")

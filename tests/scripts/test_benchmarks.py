@@ -133,7 +133,7 @@ def test_races_of_this_machine_stay_unless_they_are_run_anew(scripts: Any) -> No
     assert found == [("float32", 1), ("float32", 8), ("bfloat16", 1)]
 
 
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+@pytest.mark.parametrize("dtype", ["float32", pytest.param("bfloat16", marks=pytest.mark.slow)])
 def test_what_users_write_computes_what_the_reference_does(scripts: Any, dtype: str) -> None:
     """Attention, biases and narrow weights; a mask too."""
     usual = scripts("usual")

@@ -153,6 +153,7 @@ def test_a_map_killed_at_any_step_of_an_append_is_whole_and_goes_on(tmp_path):
     assert steps[1] >= 4 * 2
 
 
+@pytest.mark.slow  # the next one kills an append
 def test_a_map_killed_at_any_step_of_a_change_is_as_before_or_after(tmp_path):
     steps = list(map(int, killed("changes", tmp_path)))
     assert len(steps) == 5
