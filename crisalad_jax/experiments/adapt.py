@@ -195,8 +195,9 @@ def adapt(
     )
     if result.steps:
         finish_run(out / "run", real_path(folder).name, split.training, benchmark)
-    if skipped := result.skipped_images + len(split.answers) - len(judges.queries) // len(JUDGING):
-        say(f"{skipped} unreadable images skipped in training and among those held out")
+    unread = len(split.answers) - len(judges.queries) // len(JUDGING)
+    if unread or result.skipped_images:
+        say(f"unreadable: {unread} held-out images; in training {result.skipped_images} skipped")
     new = load_weights(out / "run" / "best.safetensors", expected=config.model)
     end = _recall(new, judges, config, reading)
     gained = Adapted(result.steps, (start, end), {}, None, replaced=False)

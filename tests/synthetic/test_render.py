@@ -85,11 +85,11 @@ def test_passers_change_the_street_and_nothing_above_it():
 
 @pytest.mark.parametrize("scenery", SCENERIES)
 def test_a_crowd_hides_more_of_a_place(scenery):
-    """Twenty people cover pixels that stay as they were without them, and change no others."""
+    """Twenty people change some pixels, and leave most as they were."""
     for place in PLACES[:4]:
         few, many = (render(place, View(occluders=1, crowd=n), (60, 80), scenery) for n in (0, 20))
-        # 3 to 40 % was measured over 100 places of each kind.
-        assert 0.01 < np.any(few != many, axis=-1).mean() < 0.7
+        # At most 0.143 was measured over 100 places of each kind.
+        assert 0.01 < np.any(few != many, axis=-1).mean() < 0.3
 
 
 def test_a_step_to_the_right_moves_near_fronts_more_than_far_ones():
