@@ -29,7 +29,8 @@ DOCUMENTED = {
 }
 FUNCTIONS = {name: value for name, value in DOCUMENTED.items() if not inspect.isclass(value)}
 SLOW = {
-    *("Map", "adapt", "attend_across_images", "build_vocabulary", "convert", "evaluate", "extract"),
+    *("Map", "adapt", "attend_across_images", "build_vocabulary", "convert", "distil"),
+    *("evaluate", "extract"),
     *(
         "evaluation_record",
         "extract_features",

@@ -132,7 +132,7 @@ def distil(
         f"{len(places.files)} images; the student has {numbers[0]:,} parameters, "
         f"the teacher {numbers[1]:,}"
     )
-    if numbers[0] > numbers[1] > 0:
+    if numbers[0] > numbers[1]:
         say("Note: the student is larger than its teacher.")
     result = fit(
         config,
