@@ -143,13 +143,14 @@ def test_a_private_name_would_be_found():
 
 
 def test_readme_is_short():
-    assert len(README.read_text(encoding="utf-8").splitlines()) <= 150
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 130
 
 
 @pytest.mark.parametrize("page", TEXTS[:4], ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_links_outside_of_the_site_lead_somewhere(page):
     text = page.read_text(encoding="utf-8")
     relative = [link.partition("#")[0] for link in LINK.findall(text) if ":" not in link]
+    relative = [link for link in relative if not link.startswith("../../actions/")]  # a badge
     assert not [link for link in relative if link and not (page.parent / link).exists()]
 
 

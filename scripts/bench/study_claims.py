@@ -96,7 +96,8 @@ def models() -> Study:
 
 
 def best() -> str:
-    """The rows with the highest mean of Pitts30k and MSLS, of images described alone."""
+    """The rows with the highest mean of Pitts30k and MSLS, for independent images, and speeds."""
+    speeds = json.loads((FOLDER / "speed.json").read_text(encoding="utf-8"))["images_per_second"]
     alone = [
         row
         for row in rows()
@@ -106,12 +107,13 @@ def best() -> str:
     ]
     alone.sort(key=lambda row: -(row["pitts30k"] + row["msls"]))
     lines = [
-        "| model | Pitts30k | MSLS-val | Nordland | name |",
-        "| --- | ---: | ---: | ---: | --- |",
+        "| model | Pitts30k | MSLS-val | Nordland | images/s | name |",
+        "| --- | ---: | ---: | ---: | ---: | --- |",
     ]
     for row in alone[:BEST]:
-        cells = (recall(row, name) for name in SETS[:3])
-        lines.append(f"| {row['title']} | {' | '.join(cells)} | `{row['models'][0]}` |")
+        name = row["models"][0]
+        cells = (*(recall(row, each) for each in SETS[:3]), f"{speeds[name]:,.0f}")
+        lines.append(f"| {row['title']} | {' | '.join(cells)} | `{name}` |")
     return "\n" + "\n".join(lines) + "\n"
 
 
