@@ -29,7 +29,10 @@ METADATA, SEGMENTS = "map.json", "segments"
 """Names of the metadata's file, and of the folder of additions."""
 COMPONENTS = "pca.safetensors"
 """Name of the components that shorten descriptors."""
-_PARTS = (METADATA, SEGMENTS, COMPONENTS, LOCK, "calibration.json", "approximate", "added")
+_PARTS = (
+    *(METADATA, SEGMENTS, COMPONENTS, LOCK, "calibration.json", "calibration-verified.json"),
+    *("approximate", "similar", "added"),
+)
 """All names that a map may have in its folder."""
 
 

@@ -3,7 +3,7 @@
 import pathlib
 
 from crisalad_jax.retrieval.maps.approximate import indexed_images
-from crisalad_jax.retrieval.maps.calibration import CALIBRATION
+from crisalad_jax.retrieval.maps.calibration import CALIBRATION, VERIFIED
 from crisalad_jax.retrieval.maps.metadata import SEGMENTS
 from crisalad_jax.utils.errors import InputError
 from crisalad_jax.utils.output import warn
@@ -26,8 +26,8 @@ def remove_unrecorded(folder: pathlib.Path, images: int) -> None:
     recorded = {path.name.partition(".")[0] for path in (folder / SEGMENTS).glob("[0-9]*.json")}
     unrecorded = [path for path in files if path.stem not in recorded]
     lost = [path for path, count in indexed_images(folder) if count > images]
-    if not images and (folder / CALIBRATION).exists():
-        lost.append(folder / CALIBRATION)
+    if not images:
+        lost += [path for name in (CALIBRATION, VERIFIED) if (path := folder / name).exists()]
     if len(unrecorded) > 1:
         lost += unrecorded
     if lost:

@@ -67,7 +67,10 @@ def reseal(path: pathlib.Path, **changes) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["segments", "segments/0000000000.npy", "added", "added/a", "approximate", "calibration.json"],
+    [
+        *("segments", "segments/0000000000.npy", "added", "added/a", "approximate", "similar"),
+        *("calibration.json", "calibration-verified.json"),
+    ],
 )
 def test_a_link_in_a_map_is_neither_read_nor_written_through(tmp_path, folder, name):
     outside, link = tmp_path / "outside", folder / name
@@ -199,6 +202,7 @@ GRAPH = "approximate/hnsw-0123456789abcdef.index"
     ("told", "value", "images", "words"),
     [
         ("calibration.json", {}, 1, "found it in a map with records of 0 images alone"),
+        ("calibration-verified.json", {}, 1, "found it in a map with records of 0 images alone"),
         (GRAPH, {"images": 7}, 7, "found it in a map with records of 3 images alone, expected the"),
     ],
 )
