@@ -36,7 +36,7 @@ from crisalad_jax.experiments.distil import distil
 from crisalad_jax.nn.cross_image import CrossImage
 from crisalad_jax.nn.model import Model, init_crisalad
 from crisalad_jax.retrieval.describer import describer_of
-from crisalad_jax.synthetic import SCENERIES, VARIATIONS, WorldConfig, write_world
+from crisalad_jax.synthetic import VARIATIONS, WorldConfig, write_world
 from crisalad_jax.training.config import LossConfig, TrainConfig
 from crisalad_jax.training.log import read_metrics
 from crisalad_jax.training.loop import fit, run_keys
@@ -138,7 +138,7 @@ def transport() -> list[Arm]:
 def transport_more() -> list[Arm]:
     """Further transports, each in the place of the published one."""
     return [
-        Arm(label, with_transport(small_vit(), fields), WorldConfig())
+        Arm(label, with_transport(small_vit(), fields), WORLD)
         for label, fields in MORE_TRANSPORTS.items()
     ]
 
@@ -174,14 +174,14 @@ def encoder() -> list[Arm]:
 
 def world() -> list[Arm]:
     """The whole world, and worlds that leave out one variation each."""
-    whole, config = WorldConfig(scenes=600, test_scenes=1), small_resnet()
+    whole, config = dataclasses.replace(WORLD, scenes=600, test_scenes=1), small_resnet()
     arms = [Arm("whole", config, whole)]
     for name in VARIATIONS:
         varied = tuple(one for one in VARIATIONS if one != name)
         arms.append(Arm(f"no {name}", config, dataclasses.replace(whole, varied=varied)))
     arms.append(Arm("no paint", config, dataclasses.replace(whole, repaint=0.0)))
-    for name in SCENERIES:
-        kinds = tuple(one for one in SCENERIES if one != name)
+    for name in WORLD.sceneries:
+        kinds = tuple(one for one in WORLD.sceneries if one != name)
         arms.append(Arm(f"no {name}", config, dataclasses.replace(whole, sceneries=kinds)))
     camera: Any = config.augmentation
     light = {
